@@ -48,7 +48,8 @@ def main() -> None:
         off = np.exp(rng.uniform(-math.log(5.0), math.log(5.0), 2))
         guess = bench_cane(modulus * off[0], damping * off[1])
         track = measure(truth, Experiment(duration=2.0, angle=angle, seed=seed))
-        shaped, straight = tune(with_cloud(guess, scan(truth, rng)), track), tune(guess, track)
+        shaped = tune(with_cloud(guess, scan(truth, rng)), track)
+        straight = tune(guess, track)
         row: dict[str, object] = {"bench": "bent_canes", "bow_rad": bow, "pull_deg": angle}
         for name, fit in (("cloud", shaped), ("straight", straight)):
             row[f"{name}_ok"] = fit.ok

@@ -41,7 +41,8 @@ BARS = ((0.3, 1.975), (0.6, 1.9), (0.85, 1.75))
 BAR_RADIUS = 0.012
 SWEEPS = 20
 """Largest number of sweeps: a GPU waits for the tree that takes most."""
-SCENES, SCENE_STEPS = ((2, 10), (8, 64)), 120
+SCENES = ((2, 10), (8, 64))
+SCENE_STEPS = 120
 """Bars of two combs, and canes between them; steps."""
 PEERS = ("discrete", "implicitfast")
 """Integrators of mujoco-warp."""
@@ -54,10 +55,17 @@ def cane(side: float) -> TreeBuilder:
     tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
     last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
     tree.add_body(
-        last, offset=(1 / 16, 0, 0), rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH),
+        last,
+        offset=(1 / 16, 0, 0),
+        rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])),
+        organ=int(Organ.BUNCH),
         mass=0.5,
-        com=(0.1, 0, 0), inertia=(5e-4, 5e-4, 5e-4), length=0.15, radius=(0.05, 0.05), damping=(0.002, 0.002, 0.002),
-    )  # fmt: skip
+        com=(0.1, 0, 0),
+        inertia=(5e-4, 5e-4, 5e-4),
+        length=0.15,
+        radius=(0.05, 0.05),
+        damping=(0.002, 0.002, 0.002),
+    )
     return tree
 
 
@@ -65,8 +73,11 @@ def bars() -> dict[str, np.ndarray]:
     """Level bars across the canes."""
     start = np.array([(x, -1.0, z) for x, z in BARS], np.float32)
     end = start * [1, -1, 1]
-    return {"fixed_start": start, "fixed_end": end.astype(np.float32),
-            "fixed_radius": np.full((len(BARS), 2), BAR_RADIUS, np.float32)}  # fmt: skip
+    return {
+        "fixed_start": start,
+        "fixed_end": end.astype(np.float32),
+        "fixed_radius": np.full((len(BARS), 2), BAR_RADIUS, np.float32),
+    }
 
 
 def forest(count: int, spacing: float = 0.5, **fixed: np.ndarray) -> Model:
@@ -166,10 +177,15 @@ def peer_scene(with_contacts: bool, integrator: str) -> Any:
     else:
         world = MujocoScene(model, []).world
         is_plant = world.geom_bodyid > 0
-        world.geom_contype[:], world.geom_conaffinity[:] = is_plant, ~is_plant
-        world.body_contype[:], world.body_conaffinity[:] = 1, 0
-        world.body_contype[0], world.body_conaffinity[0] = 0, 1
-        world.opt.enableflags, world.opt.disableflags, world.opt.impratio = 0, 0, 1.0
+        world.geom_contype[:] = is_plant
+        world.geom_conaffinity[:] = ~is_plant
+        world.body_contype[:] = 1
+        world.body_conaffinity[:] = 0
+        world.body_contype[0] = 0
+        world.body_conaffinity[0] = 1
+        world.opt.enableflags = 0
+        world.opt.disableflags = 0
+        world.opt.impratio = 1.0
         world.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
     if integrator == "implicitfast":  # ``discrete`` adds dt K of damping by itself
         world.dof_damping[:] = np.repeat(model.joint_damping[:, 1], 3)
@@ -189,7 +205,8 @@ def peer_milliseconds(count: int, integrator: str, start: State | None = None) -
     data = mujoco.MjData(world)
     mujoco.mj_forward(world, data)
     room = {} if start is None else {"nconmax": 12, "njmax": 48}
-    model, worlds = mujoco_warp.put_model(world), mujoco_warp.put_data(world, data, nworld=count, **room)
+    model = mujoco_warp.put_model(world)
+    worlds = mujoco_warp.put_data(world, data, nworld=count, **room)
     if start is not None:
         worlds.qpos.assign(frames.to_wxyz(start.joint_q).reshape(count, -1).astype(np.float32))
         rates = frames.rotate(frames.conjugate(start.joint_q), start.joint_qd)
@@ -218,7 +235,8 @@ def compare_contacts(about: dict, theirs: Any, ours: dict[str, np.ndarray]) -> N
     """How far canes that fall on bars are from the CPU's, and how far the forces are that bear them."""
     apart = np.abs(theirs["contact_early_q"] - ours["contact_early_q"])[:, :3].max()
     say(about, "256 canes fall on bars, 20 ticks: largest distance from the CPU's bodies", 1e3 * float(apart), "mm")
-    weight, off = theirs["contact_force"].sum(0), (theirs["contact_force"] - ours["contact_force"]).sum(0)
+    weight = theirs["contact_force"].sum(0)
+    off = (theirs["contact_force"] - ours["contact_force"]).sum(0)
     share = float(np.linalg.norm(off) / np.linalg.norm(weight))
     say(about, "the same after 300 ticks: force on all, difference from the CPU's, of it", share, "1")
     counts = int(theirs["contact_count"].sum()), int(ours["contact_count"].sum())
@@ -231,7 +249,8 @@ def scene_steps(device: str, bars: int, canes: int) -> tuple[np.ndarray, Physics
     physics = Physics(scenes.cane_row(canes), device=device)
     physics.add_robot(scenes.combs("combs", bars, canes))
     scenes.keep_awake(physics, np.arange(canes))
-    position, took = [], []
+    position = []
+    took = []
     for tick in range(SCENE_STEPS):
         physics.rigid.command("combs", np.full(2, 0.005 * min(1.0, tick / 100)))
         start = time.perf_counter()
@@ -261,15 +280,23 @@ def measure_contacts(about: dict, device: str, count: int, with_peer: bool) -> N
     took = 1e3 * seconds(lambda: plants.advance(TICKS, contacts.solve)) / TICKS
     plants.download()
     assert np.isfinite(plants.state.body_q).all()
-    per_tree, sweeps = float(contacts.count.mean()), contacts.sweeps
+    per_tree = float(contacts.count.mean())
+    sweeps = contacts.sweeps
     case = f"{count} trees of {PER_TREE} bodies, resident, with contacts: {per_tree:.2f} a tree"
-    also = {"sweeps_mean": float(sweeps.mean()), "share_at_most_sweeps": float((sweeps >= SWEEPS).mean()),
-            "dropped": contacts.dropped}  # fmt: skip
+    also = {
+        "sweeps_mean": float(sweeps.mean()),
+        "share_at_most_sweeps": float((sweeps >= SWEEPS).mean()),
+        "dropped": contacts.dropped,
+    }
     say(about | also, case, took, "ms/tick")
     for integrator in PEERS[:1] if with_peer else ():  # the other one is unstable in contact
         theirs, their_contacts = peer_milliseconds(count, integrator, plants.state)
-        beside = {"peer": f"mujoco-warp {integrator}", "peer_value": theirs, "ratio": theirs / took,
-                  "peer_contacts_a_tree": their_contacts}  # fmt: skip
+        beside = {
+            "peer": f"mujoco-warp {integrator}",
+            "peer_value": theirs,
+            "ratio": theirs / took,
+            "peer_contacts_a_tree": their_contacts,
+        }
         say(about | also | beside, f"{case}, beside mujoco-warp", took, "ms/tick")
 
 
@@ -296,7 +323,8 @@ def main() -> None:
         compare_scenes(about, given.device)
         return
     if given.compare:
-        theirs, ours = np.load(given.compare), trajectory(given.device)
+        theirs = np.load(given.compare)
+        ours = trajectory(given.device)
         apart = np.abs(theirs["body_q"][:, :3] - ours["body_q"][:, :3]).max()
         say(about, "256 trees, 200 ticks, pushed: largest distance from the CPU's bodies", 1e3 * float(apart), "mm")
         off = np.abs(theirs["response"] - ours["response"]).max() / np.abs(theirs["response"]).max()

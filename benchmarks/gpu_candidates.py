@@ -21,7 +21,9 @@ import warp as wp
 from vinesim.bench.tuning_cases import bench_cane
 from vinesim.tune.candidates import Candidates
 
-SECONDS, RATE, DT = 3.0, 30.0, 0.01
+SECONDS = 3.0
+RATE = 30.0
+DT = 0.01
 CHECKED = 64
 
 

@@ -85,7 +85,8 @@ class Report:
 def running_client(device: str, plants: str) -> Iterator[tuple[Client, sensor_process.SensorProcess]]:
     """A client whose robot pushes a bunch again and again; its sensors on ``device``, its plants on ``plants``."""
     scene = load_scene("demo")
-    model, robot = generate(scene), load_description("vinebot")
+    model = generate(scene)
+    robot = load_description("vinebot")
     cameras = tuple(msgspec.structs.replace(robot.cameras[0], name=f"camera_{i}") for i in range(CAMERAS))
     lidars = (msgspec.structs.replace(robot.lidars[0], type="os1_64"),)
     robot = dataclasses.replace(robot, cameras=cameras, lidars=lidars)
@@ -112,7 +113,8 @@ def running_client(device: str, plants: str) -> Iterator[tuple[Client, sensor_pr
 def measure_client(report: Report, device: str, plants: str, seconds: float) -> None:
     """Rates of all sensors and the tick beside them, in real time."""
     with running_client(device, plants) as (client, sensors):
-        loop, marks = RateLoop(client.physics.dt), []
+        loop = RateLoop(client.physics.dt)
+        marks = []
         stop = threading.Event()
 
         def watch() -> None:
@@ -131,7 +133,8 @@ def measure_client(report: Report, device: str, plants: str, seconds: float) -> 
     text = f"client, {CAMERAS} cameras and a lidar on {device}, plants on {plants}"
     for key, unit in (("tick_hz", "Hz"), ("tick_p50_ms", "ms"), ("tick_p99_ms", "ms"), ("overruns", "1")):
         report(f"{text}: {key}", ticks[key], unit)
-    (begin, before), (end, after) = next(m for m in marks if m[0] > log.begins[0] + WARM_UP), marks[-1]
+    (begin, before) = next(m for m in marks if m[0] > log.begins[0] + WARM_UP)
+    (end, after) = marks[-1]
     for what in ("frames", "frames_dropped"):
         for name, count in after[what].items():
             report(f"{text}: {what} of {name}", (count - before[what].get(name, 0)) / (end - begin), "Hz")
@@ -147,13 +150,15 @@ def measure_camera(report: Report, device: str, seconds: float) -> None:
         spec = CameraSpec.load(kind)
         for quality in ("fast", "full"):
             camera = Camera(spec, spec.info("optical"), quality=quality, device=device)
-            count, end = 0, np.inf
+            count = 0
+            end = np.inf
             for number in range(1_000_000):
                 eye = np.array([-0.6 + 1e-4 * (number % 1000), 1.0, 1.45])
                 camera.render(primitives, look_at(eye, np.array([8.0, 1.35, 1.45])), outputs=RGBD)
                 now = time.perf_counter()
                 if number == 3:
-                    begin, end = now, now + seconds
+                    begin = now
+                    end = now + seconds
                 count += number > 3
                 if now > end:
                     break
@@ -169,7 +174,8 @@ def measure_dataset(report: Report, device: str, images: int) -> None:
         subprocess.run([*command, "--device", device], check=True, stdout=subprocess.DEVNULL)
         took = time.time() - start
         done = np.sort([file.stat().st_mtime for file in (out / "records").iterdir()])
-    low, high = images // 10, images - images // 10 - 1
+    low = images // 10
+    high = images - images // 10 - 1
     report(f"dataset of {images} images of 640x480, starts and annotations included", images / took, "1/s")
     if high > low and done[high] > done[low]:
         report("dataset, from its first to its last tenth", (high - low) / (done[high] - done[low]), "1/s")
@@ -183,7 +189,8 @@ def main() -> None:
     ask.add_argument("--images", type=int, default=320)
     ask.add_argument("--only", choices=("client", "camera", "dataset"))
     given = ask.parse_args()
-    report, device = Report(given.device), given.device
+    report = Report(given.device)
+    device = given.device
     start = time.perf_counter()
     compile_kernels(device=device)
     report("kernels compiled or loaded", time.perf_counter() - start, "s")

@@ -48,12 +48,18 @@ BARS = {"phone": 30.0, "laptop": 60.0, "headset": 72.0}
 SECONDS = 5.0
 SETTLING = 10.0
 """[s] In which the page finds out how much it can draw."""
-UNCHANGED, PATIENCE = 75, 60.0
+UNCHANGED = 75
+PATIENCE = 60.0
 """A headset's scale has settled when so many pictures had the same; and [s] for which that is waited for."""
 GPU = (
-    "--use-angle=vulkan", "--enable-features=Vulkan", "--disable-vulkan-surface", "--ignore-gpu-blocklist",
-    "--enable-gpu", "--disable-frame-rate-limit", "--disable-gpu-vsync",
-)  # fmt: skip
+    "--use-angle=vulkan",
+    "--enable-features=Vulkan",
+    "--disable-vulkan-surface",
+    "--ignore-gpu-blocklist",
+    "--enable-gpu",
+    "--disable-frame-rate-limit",
+    "--disable-gpu-vsync",
+)
 CARD = """(() => {
   const gl = vinesim.viewer.renderer.getContext(), names = gl.getExtension("WEBGL_debug_renderer_info");
   return gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER);
@@ -117,7 +123,8 @@ def record(path: pathlib.Path, name: str) -> None:
     from vinesim.scene.values import HumanSpec
 
     scene = load_scene(name)
-    model, robot = generate(scene), load_description("vinebot")
+    model = generate(scene)
+    robot = load_description("vinebot")
     compile_kernels()
     client = Client(scene, model, robot, MemoryHub().bus("robot"), name="robot", pose=start_pose(scene, 0))
     base = start_pose(scene, 0)
@@ -162,10 +169,12 @@ class Recorded:
 
     def __init__(self, path: pathlib.Path) -> None:
         with zipfile.ZipFile(path) as archive:
-            self._scene, self._rigid = archive.read("scene"), archive.read("rigid")
+            self._scene = archive.read("scene")
+            self._rigid = archive.read("rigid")
             self.name = archive.read("name").decode()
             self._states = [archive.read(f"state{k:04d}") for k in range(RECORDED)]
-        self._count, self._sent = 0, 0
+        self._count = 0
+        self._sent = 0
 
     def advance(self) -> None:
         """A state is new."""
@@ -287,13 +296,15 @@ def _wear(page: browser.Page, world: Recorded, address: str, eyes: tuple[int, in
 
 def _wait_for_scale(page: browser.Page) -> None:
     """Until a headset's page has asked for the same number of pixels for a while."""
-    ask, end = f"[{SCALE}, vinesim.core.frames]", time.monotonic() + PATIENCE
+    ask = f"[{SCALE}, vinesim.core.frames]"
+    end = time.monotonic() + PATIENCE
     scale, since = page.run(ask)
     while time.monotonic() < end:
         time.sleep(0.2)
         now, count = page.run(ask)
         if now != scale:
-            scale, since = now, count
+            scale = now
+            since = count
         elif count - since >= UNCHANGED:
             break
 

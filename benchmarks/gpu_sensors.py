@@ -79,7 +79,8 @@ class Report:
 
 def compare(say: Report, model: Model, device: str) -> None:
     """What a camera and a lidar see, beside the CPU of the same machine."""
-    (ours, _), (theirs, _) = world(model, device), world(model, "cpu")
+    (ours, _) = world(model, device)
+    (theirs, _) = world(model, "cpu")
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
     for name, (eye, target) in VIEWS.items():
@@ -148,7 +149,8 @@ def rate(work: Callable[[int], object], device: str, count: int = 300) -> float:
 def revolution(lasers: int, steps: int) -> np.ndarray:
     """Directions [ray, 3] of a lidar's revolution, 15 degrees up and down, laser by laser."""
     height, turn = np.meshgrid(np.radians(np.linspace(-15.0, 15.0, lasers)), np.arange(steps) * (2.0 * np.pi / steps))
-    height, turn = height.T.ravel(), turn.T.ravel()
+    height = height.T.ravel()
+    turn = turn.T.ravel()
     flat = np.cos(height)
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), np.sin(height)], 1).astype(np.float32)
 
@@ -212,7 +214,8 @@ def main() -> None:
     ask.add_argument("--device", default="cuda")
     ask.add_argument("--scene", default="vsp")
     given = ask.parse_args()
-    say, model = Report(given.device), generate(load_scene(given.scene))
+    say = Report(given.device)
+    model = generate(load_scene(given.scene))
     compare(say, model, given.device)
     measure(say, model, given.device)
 

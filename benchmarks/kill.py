@@ -50,9 +50,13 @@ class Round:
 
 
 def kill(
-    times: int, seed: int, announce: Callable[[str], None] = lambda _: None, *, ros: bool = True,
+    times: int,
+    seed: int,
+    announce: Callable[[str], None] = lambda _: None,
+    *,
+    ros: bool = True,
     kinds: Sequence[str] = KINDS,
-) -> Iterator[Measurement]:  # fmt: skip
+) -> Iterator[Measurement]:
     """Kill ``times`` programs or a few more, of each of the ``kinds`` as many, with SIGKILL.
 
     Before each round a bunch is picked. ``announce`` takes a line for each round. :class:`ProcessFailed` if a program
@@ -129,9 +133,14 @@ def _rows(rounds: Sequence[Round], kinds: Sequence[str], picked: int) -> Iterato
     good = [one.took for one in rounds if not one.missing]
     for kind in kinds:
         yield Measurement(
-            "kill", f"{kind}: kills after which all went on", len(good), "1", "kills", len(rounds),
+            "kill",
+            f"{kind}: kills after which all went on",
+            len(good),
+            "1",
+            "kills",
+            len(rounds),
             len(good) / len(rounds),
-        )  # fmt: skip
+        )
     if good:
         yield Measurement("kill", "from the last kill of a round until all went on, p50", statistics.median(good), "s")
         yield Measurement("kill", "from the last kill of a round until all went on, at most", max(good), "s")
@@ -140,7 +149,12 @@ def _rows(rounds: Sequence[Round], kinds: Sequence[str], picked: int) -> Iterato
         yield Measurement("kill", "sensors: from the new start to ready, p50", statistics.median(restarts), "s")
         worst = max(restarts)
         yield Measurement(
-            "kill", "sensors: from the new start to ready, at most", worst, "s", "budget, at most", RESTART_BOUND,
+            "kill",
+            "sensors: from the new start to ready, at most",
+            worst,
+            "s",
+            "budget, at most",
+            RESTART_BOUND,
             RESTART_BOUND / worst,
-        )  # fmt: skip
+        )
     yield Measurement("kill", "bunches picked, and so on all clients after every round", picked, "1")

@@ -36,7 +36,9 @@ from vinesim.scene.values import HumanPose, HumanSpec, Measurement
 ACTORS = 64
 APART = 1.2
 """Distance between neighbours [m]."""
-DELAY, JITTER, LOSS = 0.02, 0.004, 0.01
+DELAY = 0.02
+JITTER = 0.004
+LOSS = 0.01
 """Of the network: one way [s], [s], and the share of messages that is lost."""
 PUSH = 0.15
 """Distance by which each pushes its box [m]."""
@@ -47,7 +49,8 @@ HEIGHT = 1.75
 """Of people [m]."""
 CLIENTS = 2
 """Of the command: each simulates half of the actors, and has copies of the others."""
-MEETING_LIMIT, REST_LIMIT = 10.0, 20.0
+MEETING_LIMIT = 10.0
+REST_LIMIT = 20.0
 """Limits of simulated time [s]: until each has bodies of all others, and until all is at rest."""
 
 
@@ -80,7 +83,8 @@ def _place(number: int, count: int) -> np.ndarray:
 
 def yard(count: int) -> Model:
     """A short cane with a bunch 0.35 m beside each of ``count`` places, and a box before each."""
-    trees, boxes = [], []
+    trees = []
+    boxes = []
     for number in range(count):
         x, y = _place(number, count)
         tree = TreeBuilder(frames.pose(np.array([x - 0.2, y + 0.6, 1.6])))
@@ -98,7 +102,9 @@ class Crowd:
 
     def __init__(self, count: int, robot: RobotDescription, clients: int | None = None) -> None:
         """``count`` actors that so many ``clients`` share; None: each has a client of its own."""
-        self.count, self.now, self.model = count, 100.0, yard(count)
+        self.count = count
+        self.now = 100.0
+        self.model = yard(count)
         self.hub = MemoryHub(delay=DELAY, jitter=JITTER, loss=LOSS, seed=1)
         self._records = RetainedState()
         self._server = self.hub.bus("server")
@@ -112,13 +118,21 @@ class Crowd:
         for number in range(count):
             x, y = _place(number, count)
             person = number % 2 == 1
-            name, pose = f"{'person' if person else 'robot'}{number}", frames.pose([x, y, 0.0])
-            source, bus = self._walk(x, y), self.hub.bus(name)
+            name = f"{'person' if person else 'robot'}{number}"
+            pose = frames.pose([x, y, 0.0])
+            source = self._walk(x, y)
+            bus = self.hub.bus(name)
             if clients is None or number < clients:
                 client = Client(
-                    scene, self.model, None if person else robot, bus, name=name, pose=pose,
-                    source=source if person else None, clock=lambda: self.now,
-                )  # fmt: skip
+                    scene,
+                    self.model,
+                    None if person else robot,
+                    bus,
+                    name=name,
+                    pose=pose,
+                    source=source if person else None,
+                    clock=lambda: self.now,
+                )
                 client.physics.wind = None
                 self.clients.append(client)
                 continue
@@ -127,7 +141,8 @@ class Crowd:
                 client.add_human(HumanSpec(name, label_index(name), standing_pose(pose, HEIGHT), HEIGHT), source, bus)
             else:
                 client.add_robot(robot, name, pose, bus)
-        self.ticks, self.busy = 0, 0.0
+        self.ticks = 0
+        self.busy = 0.0
 
     def _reply(self, cell: tuple[int, int], _: bytes) -> bytes:
         return messages.encode_records(self._records.in_cell(cell))
@@ -146,7 +161,8 @@ class Crowd:
         start = time.thread_time()
         for client in self.clients:
             client.tick()
-        self.busy, self.ticks = self.busy + time.thread_time() - start, self.ticks + 1
+        self.busy = self.busy + time.thread_time() - start
+        self.ticks = self.ticks + 1
         for key, payload in self._server.poll():
             _, x, y, _ = key.split("/")
             for record in messages.decode_records(payload):

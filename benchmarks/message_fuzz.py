@@ -47,9 +47,16 @@ MESSAGES_PER_STEP = 50
 """Messages in one step: 5,000 a second, as many as eighty robots send."""
 
 _EXTREMES = (
-    b"\x00" * 8, b"\xff" * 8, struct.pack("<d", float("nan")), struct.pack("<d", float("inf")),
-    struct.pack("<d", 1e308), struct.pack("<d", -1.0), struct.pack("<f", float("nan")), b"\x7f\xff", b"\x80\x00",
-)  # fmt: skip
+    b"\x00" * 8,
+    b"\xff" * 8,
+    struct.pack("<d", float("nan")),
+    struct.pack("<d", float("inf")),
+    struct.pack("<d", 1e308),
+    struct.pack("<d", -1.0),
+    struct.pack("<f", float("nan")),
+    b"\x7f\xff",
+    b"\x80\x00",
+)
 
 
 class Sender(Protocol):
@@ -89,9 +96,14 @@ def valid_message(model: Model, actor: Sender, now: float, chance: random.Random
         number = np.array([_object_id(model, chance.choice((ObjectKind.BUNCH, ObjectKind.BOX)), chance)])
         flags = np.array([messages.TOUCHED])
         record = messages.ObjectStates(
-            now, number, np.array([claim.ownership]), np.array([claim.authority]), flags,
-            frames.pose(np.array([[0.5, 0.5, 1.0]])), np.zeros((1, 6)),
-        )  # fmt: skip
+            now,
+            number,
+            np.array([claim.ownership]),
+            np.array([claim.authority]),
+            flags,
+            frames.pose(np.array([[0.5, 0.5, 1.0]])),
+            np.zeros((1, 6)),
+        )
         return "c", messages.encode_objects(record, (0, 0))[0][0]
     if kind == "own":
         number = _object_id(model, chance.choice(tuple(ObjectKind)), chance)
@@ -99,14 +111,16 @@ def valid_message(model: Model, actor: Sender, now: float, chance: random.Random
     if kind == "fact":
         records = [_record(model, claim, now, chance) for _ in range(chance.randint(1, 3))]
         return kind, messages.encode_records(records)
-    return chance.choice(("own", "fact", "c", "tree", "near")), chance.choice((
-        messages.encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
-        messages.encode_time(now, chance.uniform(-1e9, 1e9)),
-        messages.encode_welcome(messages.Welcome("go away")),
-        messages.encode_part(messages.MeshPart("0" * 40, 36, 0, chance.randbytes(36))),
-        messages.encode_request(chance.randrange(100)),
-        messages.encode_wanted(messages.MeshWanted(chance.randrange(100))),
-    ))  # fmt: skip
+    return chance.choice(("own", "fact", "c", "tree", "near")), chance.choice(
+        (
+            messages.encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
+            messages.encode_time(now, chance.uniform(-1e9, 1e9)),
+            messages.encode_welcome(messages.Welcome("go away")),
+            messages.encode_part(messages.MeshPart("0" * 40, 36, 0, chance.randbytes(36))),
+            messages.encode_request(chance.randrange(100)),
+            messages.encode_wanted(messages.MeshWanted(chance.randrange(100))),
+        )
+    )
 
 
 def _object_id(model: Model, kind: ObjectKind, chance: random.Random) -> int:
@@ -120,12 +134,19 @@ def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: ra
     flags = chance.choice((0, messages.TOUCHED, messages.RESTING))
     count = chance.randint(1, min(3, len(q))) if chance.random() < 0.3 else 0
     states = messages.TreeStates(
-        now, np.array([tree]), np.array([claim.ownership]), np.array([claim.authority]), np.array([flags]),
-        np.array([len(q)]), q, qd,
-        roots=np.array([count]), root=np.array(sorted(chance.sample(range(len(q)), count)), np.int64),
+        now,
+        np.array([tree]),
+        np.array([claim.ownership]),
+        np.array([claim.authority]),
+        np.array([flags]),
+        np.array([len(q)]),
+        q,
+        qd,
+        roots=np.array([count]),
+        root=np.array(sorted(chance.sample(range(len(q)), count)), np.int64),
         root_x=np.array([[chance.uniform(-3.0, 3.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
         root_xd=np.array([[chance.uniform(-30.0, 30.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
-    )  # fmt: skip
+    )
     return messages.encode_trees(states)[0][0]
 
 
@@ -150,13 +171,19 @@ def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> Re
     x, y, z = (chance.choice((chance.uniform(-3.0, 3.0), chance.uniform(-1e5, 1e5))) for _ in range(3))
     pose = (x, y, z, 0.0, 0.0, 0.0, 1.0)
     record = RetainedRecord(
-        number, claim.ownership, claim.authority, claim.owner, pose=pose, moving=chance.random() < 0.3,
+        number,
+        claim.ownership,
+        claim.authority,
+        claim.owner,
+        pose=pose,
+        moving=chance.random() < 0.3,
         parent=chance.choice(_PARENTS) if kind != ObjectKind.TREE or chance.random() < 0.1 else "",
-    )  # fmt: skip
+    )
     if kind != ObjectKind.TREE and chance.random() < 0.9:
         return record
     tree = min(number, len(model.tree_first) - 1) if kind == ObjectKind.TREE else 0
-    first, size = int(model.tree_first[tree]), int(model.tree_size[tree])
+    first = int(model.tree_first[tree])
+    size = int(model.tree_size[tree])
     bodies = range(first, first + size + (chance.random() < 0.1))
     cut = tuple(sorted(chance.sample(bodies, chance.randint(0, min(3, len(bodies))))))
     other = tree if chance.random() < 0.8 else chance.randrange(len(model.tree_first))
@@ -165,9 +192,23 @@ def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> Re
 
 
 _PARENTS = (
-    "", "box/0", "box/1", "box/2", "bunch/0", "ada/base_link", "evil/hand", "unknown/link", "box/-1", "box/1e9",
-    "box/" + "9" * 40, "tree/0", "box/", "/", "box/\u0661", "\x00",
-)  # fmt: skip
+    "",
+    "box/0",
+    "box/1",
+    "box/2",
+    "bunch/0",
+    "ada/base_link",
+    "evil/hand",
+    "unknown/link",
+    "box/-1",
+    "box/1e9",
+    "box/" + "9" * 40,
+    "tree/0",
+    "box/",
+    "/",
+    "box/\u0661",
+    "\x00",
+)
 """Parents of records: boxes that lie in each other, links, and names of nothing."""
 
 
@@ -224,9 +265,15 @@ def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
 
 
 def storm(
-    model: Model, actor: Sender, seed: int, now: float = 0.0, names: Sequence[str] = (), *, pool_size: int = 0,
+    model: Model,
+    actor: Sender,
+    seed: int,
+    now: float = 0.0,
+    names: Sequence[str] = (),
+    *,
+    pool_size: int = 0,
     period: float = 0.001,
-) -> Iterator[tuple[str, bytes]]:  # fmt: skip
+) -> Iterator[tuple[str, bytes]]:
     """Corrupted messages without end, each with the key it is sent under; ``names`` of senders instead of the actor's
     own.
 
@@ -341,7 +388,8 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
     Every tenth step the actor's greeting is corrupted as well, and every hundredth one it leaves and comes back. Raises
     what the product raises, or :class:`benchmarks.support.fuzz_world.LawBroken`.
     """
-    done, chance = Attack(), random.Random(seed)
+    done = Attack()
+    chance = random.Random(seed)
     with FuzzWorld(kind=kind, is_stranger=is_stranger, seed=seed) as world:
         names = (
             [f"stranger_{number}" for number in range(200)] if is_stranger else [ATTACKER] * 17 + ["ada", "bob", "x"]
@@ -371,12 +419,11 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
         world.run(1.0)  # and the world goes on
         world.check()
         counters = world.client.replicator.counters
-        done.sent, done.arrived = (step + 1) * MESSAGES_PER_TICK, received_count(world.client) - before
-        done.malformed, done.records, done.tick = (
-            counters.malformed,
-            world.store.counters.received,
-            done.tick / (step + 1),
-        )
+        done.sent = (step + 1) * MESSAGES_PER_TICK
+        done.arrived = received_count(world.client) - before
+        done.malformed = counters.malformed
+        done.records = world.store.counters.received
+        done.tick = done.tick / (step + 1)
         world.check_store()
     return done
 

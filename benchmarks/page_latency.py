@@ -29,7 +29,8 @@ SEEN = 0.5
 """Share of a move that counts as seen [1]."""
 PAUSE = 0.06
 """Between two moves [s], and up to a tick more, so that they fall into all phases of the client's steps."""
-P50, P99 = 25.0, 60.0
+P50 = 25.0
+P99 = 60.0
 """Budgets from input to picture [ms], drawing included."""
 
 
@@ -48,9 +49,14 @@ def page() -> Iterator[Measurement]:
     for share, budget in ((50, P50), (99, P99)):
         value = float(np.percentile(took, share))
         yield Measurement(
-            "page", f"input to state, percentile {share} of {len(took)}", value, "ms", "budget with drawing", budget,
+            "page",
+            f"input to state, percentile {share} of {len(took)}",
+            value,
+            "ms",
+            "budget with drawing",
+            budget,
             budget / value,
-        )  # fmt: skip
+        )
 
 
 async def _measure(address: str) -> dict[str, Any]:
@@ -63,7 +69,8 @@ async def _measure(address: str) -> dict[str, Any]:
         async with session.ws_connect(address + "state", max_msg_size=0) as socket:
             page = _Page(session, address, socket, head)
             await page.settle()
-            sizes, start = page.sizes, time.monotonic()
+            sizes = page.sizes
+            start = time.monotonic()
             page.sizes = []
             rng = np.random.default_rng(1)
             took = [await page.move(float(rng.uniform(0.0, 0.01))) for _ in range(MOVES)]
@@ -76,11 +83,16 @@ class _Page:
 
     def __init__(
         self, session: aiohttp.ClientSession, address: str, socket: aiohttp.ClientWebSocketResponse, head: list[float]
-    ) -> None:  # fmt: skip
-        self._session, self._address, self._socket = session, address, socket
-        self._head, self._side = head, 0
-        self._row, self._rigid = -1, 0
-        self._y, self._tick = np.nan, -1
+    ) -> None:
+        self._session = session
+        self._address = address
+        self._socket = socket
+        self._head = head
+        self._side = 0
+        self._row = -1
+        self._rigid = 0
+        self._y = np.nan
+        self._tick = -1
         self.sizes: list[int] = []
         """Of the states since they were counted last [B]."""
 
@@ -110,7 +122,8 @@ class _Page:
         if header["rigid"] != self._rigid:
             async with self._session.get(self._address + "rigid") as answer:
                 names = array_message.decode(await answer.read())[0]["names"]
-            self._rigid, self._row = header["rigid"], names.index(f"{NAME}/head")
+            self._rigid = header["rigid"]
+            self._row = names.index(f"{NAME}/head")
         self._y = float(arrays["rigid_place"].reshape(-1, 3)[self._row, 1])
         await self._send()
 

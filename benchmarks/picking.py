@@ -29,7 +29,8 @@ CLASSES = (-np.inf, 0.0, 0.005, 0.015, pick_planning.FULL_CLEARANCE, np.inf)
 def class_name(clearance: float) -> str:
     """The class of a clearance [m]."""
     number = int(np.searchsorted(CLASSES, clearance, side="right")) - 1
-    low, high = 1e3 * CLASSES[number], 1e3 * CLASSES[number + 1]
+    low = 1e3 * CLASSES[number]
+    high = 1e3 * CLASSES[number + 1]
     if low < 0.0:
         return "hand overlaps its neighbours"
     return f"{low:g} mm or more" if np.isinf(high) else f"{low:g} to {high:g} mm"
@@ -38,7 +39,8 @@ def class_name(clearance: float) -> str:
 def picking() -> Iterator[Measurement]:
     """Success over all bunches in reach, by clearance, for the freest, and how many cannot be tried."""
     scene = load_scene(SCENE)
-    model, near = generate(scene), spawn_pose(scene, 0)[:2]
+    model = generate(scene)
+    near = spawn_pose(scene, 0)[:2]
     around = int((np.linalg.norm(bunch_centres(model)[:, :2] - near, axis=1) < REACH).sum())
     tries = [attempt_pick(model, Grasp(*one)) for one in pick_planning.freest_bases(model, near, REACH)]
     case = f"{SCENE}, bunches within {REACH:g} m of start place 0"

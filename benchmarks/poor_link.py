@@ -58,9 +58,11 @@ def run_poor_link(protocol: str, seconds: float) -> tuple[int, int, float]:
 
         def start_process(name: str, x: float) -> FakeClientProcess:
             return FakeClientProcess(
-                f"{protocol}/{net.hub(name)}:7447", [{"name": name, "place": [x, 0.0]}],
-                start=lambda *a, **k: net.start(name, *a, **k), certificates=str(certificates) if secured else "",
-            )  # fmt: skip
+                f"{protocol}/{net.hub(name)}:7447",
+                [{"name": name, "place": [x, 0.0]}],
+                start=lambda *a, **k: net.start(name, *a, **k),
+                certificates=str(certificates) if secured else "",
+            )
 
         with start_process("ada", 1.0) as ada, start_process("bob", 2.0) as bob:
             return _watch(ada, bob, seconds)
@@ -75,7 +77,9 @@ def _watch(ada: FakeClientProcess, bob: FakeClientProcess, seconds: float) -> tu
     ada.command(touch=[0])
     while "0" not in bob.command()["heard"] and time.monotonic() < end:
         time.sleep(POLL_PERIOD)
-    lost, gap, reports = 0, 0.0, [ada.command(), bob.command()]
+    lost = 0
+    gap = 0.0
+    reports = [ada.command(), bob.command()]
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         reports = [ada.command(), bob.command()]

@@ -44,11 +44,15 @@ def tree_of_cylinders(cylinders: np.ndarray, wood: RodMaterial) -> TreeBuilder:
             (0: none); parents before children.
         wood: of all of them.
     """
-    radius, length, start, axis = cylinders[:, 0], cylinders[:, 1], cylinders[:, 2:5], cylinders[:, 5:8]
+    radius = cylinders[:, 0]
+    length = cylinders[:, 1]
+    start = cylinders[:, 2:5]
+    axis = cylinders[:, 5:8]
     turn = frames.from_x_axis(axis)
     tree = TreeBuilder(frames.pose(np.zeros(3)))
     for k, parent in enumerate(cylinders[:, 8].astype(int) - 1):
-        offset, rest = np.zeros(3), turn[k]
+        offset = np.zeros(3)
+        rest = turn[k]
         if parent >= 0:
             back = frames.conjugate(turn[parent])
             offset = frames.rotate(back, start[k] - start[parent])
@@ -60,7 +64,8 @@ def tree_of_cylinders(cylinders: np.ndarray, wood: RodMaterial) -> TreeBuilder:
 
 def sway(cylinders: np.ndarray, wood: RodMaterial, *, pull: float = PULL) -> np.ndarray:
     """Direction of the trunk [step, 2] after a pull with ``pull`` [N] at half height was let go, at 100 Hz."""
-    parent, height = cylinders[:, 8].astype(int) - 1, cylinders[:, 4] - cylinders[0, 4]
+    parent = cylinders[:, 8].astype(int) - 1
+    height = cylinders[:, 4] - cylinders[0, 4]
     stem = [0]
     while (children := np.flatnonzero(parent == stem[-1])).size:
         stem.append(int(children[np.argmax(cylinders[children, 0])]))

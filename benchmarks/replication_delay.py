@@ -44,7 +44,8 @@ DT = 0.01
 DELAYS = (0.0, 0.020, 0.050, 0.100)
 """One way [s]."""
 
-JITTER, LOSS = 0.2, 0.01
+JITTER = 0.2
+LOSS = 0.01
 """Share of the delay, to both sides; probability that a message is lost."""
 
 LATE = (0.020, 0.050, 0.100, 0.150)
@@ -53,7 +54,8 @@ LATE = (0.020, 0.050, 0.100, 0.150)
 REST_AT = 0.050
 """The delay at which a pushed bunch is followed until it rests [s]."""
 
-BUFFERS, BUFFERED_JITTER = (0.0, 0.050, 0.080, 0.100, 0.150), (0.0, 0.020, 0.040)
+BUFFERS = (0.0, 0.050, 0.080, 0.100, 0.150)
+BUFFERED_JITTER = (0.0, 0.020, 0.040)
 """Jitter buffers, and the jitter they are tested with, at 50 ms of delay [s]."""
 
 SEEN = 0.001
@@ -159,7 +161,8 @@ class RemoteAuthority:
 
     def __init__(self, pair: Pair) -> None:
         self.pair = pair
-        self._bus, self._screen = pair.hub.bus("authority"), pair.hub.bus("screen")
+        self._bus = pair.hub.bus("authority")
+        self._screen = pair.hub.bus("screen")
         self._bus.subscribe("authority/pose")
         self._screen.subscribe("authority/trees", KEEP_ALL)
         self._say = self._screen.publisher("authority/pose")
@@ -171,7 +174,8 @@ class RemoteAuthority:
 
     def tick(self) -> None:
         """Before the hub's time goes on."""
-        pair, physics = self.pair, self.physics
+        pair = self.pair
+        physics = self.physics
         robot = pair.first.robot
         self._say.put(messages.encode_robot(robot.update(pair.now)))
         for _, payload in self._bus.poll():
@@ -185,9 +189,15 @@ class RemoteAuthority:
             bodies = np.concatenate([np.arange(b.start, b.stop) for b in map(pair.model.bodies_of, awake.tolist())])
             zeros = np.zeros(len(awake), int)
             said = messages.TreeStates(
-                pair.now, awake, zeros, zeros, zeros, pair.model.tree_size[awake].astype(int),
-                physics.state.joint_q[bodies].astype(float), physics.state.joint_qd[bodies].astype(float),
-            )  # fmt: skip
+                pair.now,
+                awake,
+                zeros,
+                zeros,
+                zeros,
+                pair.model.tree_size[awake].astype(int),
+                physics.state.joint_q[bodies].astype(float),
+                physics.state.joint_qd[bodies].astype(float),
+            )
             for message in messages.encode_trees(said)[0]:
                 self._answer.put(message)
         for _, payload in self._screen.poll():
@@ -234,7 +244,8 @@ class RunRecorder:
     """Records one row a step."""
 
     def __init__(self, pair: Pair, authority: RemoteAuthority | None = None) -> None:
-        self.pair, self.authority = pair, authority
+        self.pair = pair
+        self.authority = authority
         self._rows: list[tuple] = []
 
     def tick(self) -> None:
@@ -315,7 +326,8 @@ def extrapolation(rows: RunRows, ahead: float) -> tuple[tuple[float, float], tup
     told = dead_reckoning.extrapolate(tree, rate, dead_reckoning.faded_age(ahead))[:-shift]
     errors = [dead_reckoning.angle_between(later, guess).max(-1) for guess in (told, tree[:-shift])]
     moves = np.abs(rows.rate).max((1, 2))[:-shift] > 0.02
-    own, speed = rows.joints[:, 0], rows.speed
+    own = rows.joints[:, 0]
+    speed = rows.speed
     robot = [np.abs(own[shift:] - guess).max(-1) for guess in ((own + ahead * speed)[:-shift], own[:-shift])]
     drives = np.abs(speed).max(-1)[:-shift] > 0.02
 
@@ -327,7 +339,9 @@ def extrapolation(rows: RunRows, ahead: float) -> tuple[tuple[float, float], tup
 
 def count_reversals(signal: np.ndarray, least: float = 0.010) -> int:
     """How often a signal [step] reverses by at least ``least``."""
-    count, way, extreme = 0, 0, float(signal[0])
+    count = 0
+    way = 0
+    extreme = float(signal[0])
     for value in signal.tolist():
         if way == 0:
             way = int(np.sign(value - extreme)) if abs(value - extreme) >= least else 0
@@ -335,7 +349,9 @@ def count_reversals(signal: np.ndarray, least: float = 0.010) -> int:
         elif way * (value - extreme) > 0.0:
             extreme = value
         elif way * (extreme - value) >= least:
-            count, way, extreme = count + 1, -way, value
+            count = count + 1
+            way = -way
+            extreme = value
     return count
 
 
@@ -364,13 +380,16 @@ def buffered(rows: RunRows, delay: float, jitter: float, wait: float, seed: int 
     The path: where they were ``wait`` earlier. Of the joint with the largest error.
     """
     chance = np.random.default_rng(seed)
-    own, speed = rows.joints[:, 0], rows.speed
+    own = rows.joints[:, 0]
+    speed = rows.speed
     sent = np.arange(0.0, DT * (len(own) - 1), 1.0 / POSE_RATE)
     tick = np.rint(sent / DT).astype(int)
     arrives = DT * tick + delay + chance.uniform(-jitter, jitter, len(sent))
     arrives[chance.random(len(sent)) < LOSS] = np.inf
     mail = sorted(zip(arrives.tolist(), tick.tolist(), strict=True))
-    buffer, now_errors, path_errors = JitterBuffer(wait), [], []
+    buffer = JitterBuffer(wait)
+    now_errors = []
+    path_errors = []
     for k in range(len(own)):
         while mail and mail[0][0] <= DT * k:
             _, when = mail.pop(0)
@@ -429,7 +448,8 @@ def _sync(delays: tuple[float, ...], fights: dict[tuple[float, bool], RunRows]) 
                     case = f"50 ms, jitter {1e3 * jitter:.0f} ms: buffer {1e3 * wait:.0f} ms"
                     yield line(f"{case}, off where it is now", now, "mrad")
                     yield line(f"{case}, off its path", path, "mrad")
-        fight, naive = both_push(delay), both_push(delay, naive=True)
+        fight = both_push(delay)
+        naive = both_push(delay, naive=True)
         fights[delay, False], fights[delay, True] = fight, naive
         theirs, worse = (float(np.percentile(one.divergence(), 95)) for one in (fight, naive))
         one = float(np.percentile(mine, 95))

@@ -27,7 +27,8 @@ def draw(lines: list[Measurement], fights: dict[tuple[float, bool], np.ndarray],
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), layout="constrained")
     (latency, copies), (fight, buffer) = axes
 
-    own, far = "touch to motion, one's own", "touch to motion, seen by another"
+    own = "touch to motion, one's own"
+    far = "touch to motion, seen by another"
     latency.plot(*_by_delay(lines, own), "o-", label="one's own bunch, simulated here")
     latency.plot(*_by_delay(lines, far), "s-", label="the same, seen by another client")
     asked = [(float(line.case.split()[0]), line.peer_value) for line in lines if line.case.endswith(own)]

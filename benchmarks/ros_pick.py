@@ -84,15 +84,20 @@ def pick(seed: int) -> dict[str, object]:
         said = picker.stdout.strip().splitlines()[-1:] or picker.stderr.strip().splitlines()[-1:]
         in_box = bool(tried) and lies_in_a_box(tried[-1])
     except subprocess.TimeoutExpired:
-        tried, said, in_box = [], ["timed out"], False
+        tried = []
+        said = ["timed out"]
+        in_box = False
     finally:
         client.send_signal(signal.SIGINT)
         lines = client.communicate()[0].splitlines()
     status = next((json.loads(line) for line in reversed(lines) if line.startswith("{")), {})
     return {
-        "in_box": in_box, "tried": len(tried), "said": said[0] if said else "", "s": round(time.monotonic() - began, 1),
+        "in_box": in_box,
+        "tried": len(tried),
+        "said": said[0] if said else "",
+        "s": round(time.monotonic() - began, 1),
         "tick_hz": round(status.get("tick_hz", 0.0), 2),
-    }  # fmt: skip
+    }
 
 
 def lies_in_a_box(bunch: str) -> bool:
@@ -114,10 +119,14 @@ def lies_in_a_box(bunch: str) -> bool:
         rclpy.spin_until_future_complete(node, answer, timeout_sec=30.0)
         found = answer.result()
         poses = {
-            name: np.array([*(getattr(state.pose.position, a) for a in "xyz"),
-                            *(getattr(state.pose.orientation, a) for a in "xyzw")])
+            name: np.array(
+                [
+                    *(getattr(state.pose.position, a) for a in "xyz"),
+                    *(getattr(state.pose.orientation, a) for a in "xyzw"),
+                ]
+            )
             for name, state in zip(found.entities, found.states, strict=True)
-        }  # fmt: skip
+        }
         node.destroy_node()
     finally:
         rclpy.shutdown()

@@ -100,7 +100,8 @@ def measure_plants(
     for away in RANGES:
         for _ in range(VIEWS_PER_RANGE):
             frame = camera.render(primitives, _towards_a_bunch(rng, model, snapshot, away))
-            organ, exact = frame.labels // LABEL_STRIDE, _exact_depth(frame)
+            organ = frame.labels // LABEL_STRIDE
+            exact = _exact_depth(frame)
             for name, number in (("leaves", Organ.LEAF), ("bunches", Organ.BUNCH)):
                 for at in RANGES:
                     mine = (organ == int(number)) & (np.abs(exact / at - 1.0) < 0.1)
@@ -184,8 +185,10 @@ class PixelView:
 
 def compare_renderers(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dict[str, PixelView]:
     """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
-    info, pose = spec.info("optical"), look_at(*RENDERER_VIEW)
-    lens, found = pinhole(info, pose), {}
+    info = spec.info("optical")
+    pose = look_at(*RENDERER_VIEW)
+    lens = pinhole(info, pose)
+    found = {}
     for name in ("warp", "taichi"):
         try:
             primitives = Primitives(model, renderer=name)
@@ -204,7 +207,8 @@ def compare_renderers(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dic
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
     """Figures of all sensor models; ``plot``: a folder for the pictures."""
     model = generate(load_scene("demo"))
-    primitives, snapshot = Primitives(model), rest_snapshot(model)
+    primitives = Primitives(model)
+    snapshot = rest_snapshot(model)
     spec = CameraSpec.load("d435")
     depths = {"plane": measure_plane(spec), **measure_plants(spec, model, primitives, snapshot)}
     for name, one in depths.items():

@@ -42,9 +42,12 @@ PERSON_DISTANCE = 1.5
 GROWTH_BUDGET = 1.0
 """Growth of a process after settling [MB/h]: 24 MB a day."""
 TOPICS = (
-    "joint_states", "mobile_base_controller/odom", "head_front_camera/rgb/image_raw",
-    "head_front_camera/depth/image_raw", "lidar/points",
-)  # fmt: skip
+    "joint_states",
+    "mobile_base_controller/odom",
+    "head_front_camera/rgb/image_raw",
+    "head_front_camera/depth/image_raw",
+    "lidar/points",
+)
 """What the listener of a robot subscribes to, below the robot's namespace."""
 
 
@@ -150,10 +153,19 @@ class _Run:
         """Start them; what they write goes below ``folder``."""
         self._folder = folder
         self.server = group.start(
-            "server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json",
-            "--state-dir", str(folder / "state"),
-            "--real-time-factor", "auto" if cast.real_time_factor is None else f"{cast.real_time_factor:g}",
-        )  # fmt: skip
+            "server",
+            "-m",
+            "vinesim",
+            "server",
+            "--listen",
+            "tcp/127.0.0.1:0",
+            "--status",
+            "json",
+            "--state-dir",
+            str(folder / "state"),
+            "--real-time-factor",
+            "auto" if cast.real_time_factor is None else f"{cast.real_time_factor:g}",
+        )
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
         self._endpoint = self._figures["endpoints"][0]
         self.clients: dict[str, Process] = {}
@@ -200,9 +212,19 @@ class _Run:
     def _start_client(self, group: ProcessGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
         common = ["--connect", self._endpoint, "--scene", cast.scene, "--status", "json"]
         self.clients[name] = group.start(
-            name, "-m", "vinesim", "client", "--role", role, "--name", name, *common, "--out",
-            str(self._folder / name), *options,
-        )  # fmt: skip
+            name,
+            "-m",
+            "vinesim",
+            "client",
+            "--role",
+            role,
+            "--name",
+            name,
+            *common,
+            "--out",
+            str(self._folder / name),
+            *options,
+        )
         self.processes.append(("robot client" if role == "robot" else "person's client", self.clients[name]))
 
     def read(self) -> None:

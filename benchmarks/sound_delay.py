@@ -36,7 +36,8 @@ LISTENING = 0.7
 """[s] After each alarm."""
 PAUSE = 0.5
 """[s] Of silence between two alarms; the voices begin anew."""
-WAVEFORM, WORD = 500.0, 700.0
+WAVEFORM = 500.0
+WORD = 700.0
 """[Hz] Of the alarm as a waveform, and of the word."""
 PAGE_WAITS = 0.01
 """From the first frame of a voice until a page plays it [s] (``vinesim/web/page/voice_worklet.js``)."""
@@ -45,18 +46,21 @@ HEARD = 0.01
 BUDGET = 500.0
 """[ms] Of voices (CANOPIES D6.4, section 5.5)."""
 
-LIGHT, TONE_OF_LIGHTS, AS_WAVEFORM, VOICE = (
-    "the light is seen", "its tone is heard", "the alarm as a waveform is heard", "a word reaches a microphone",
-)  # fmt: skip
+LIGHT = "the light is seen"
+TONE_OF_LIGHTS = "its tone is heard"
+AS_WAVEFORM = "the alarm as a waveform is heard"
+VOICE = "a word reaches a microphone"
 
 
 class _PageEars:
     """Notes what a page gets."""
 
-    is_open, decodes_opus = True, True
+    is_open = True
+    decodes_opus = True
 
     def __init__(self) -> None:
-        self.frames, self.has_tone = 0, False
+        self.frames = 0
+        self.has_tone = False
 
     def hear(self, step: SoundStep) -> None:
         self.frames += len(step.frames)
@@ -69,15 +73,23 @@ class _World:
     def __init__(self, delay: float) -> None:
         self.hub = MemoryHub(delay=delay, jitter=0.2 * delay, loss=0.01, seed=1)
         self.now = 100.0
-        scene, model, robot = load_scene("demo"), tree_row(1), load_description("vinebot")
+        scene = load_scene("demo")
+        model = tree_row(1)
+        robot = load_description("vinebot")
         self.bot, self.anna = (
             Client(
-                scene, model, description, self.hub.bus(name), name=name, clock=lambda: self.now,
+                scene,
+                model,
+                description,
+                self.hub.bus(name),
+                name=name,
+                clock=lambda: self.now,
                 pose=frames.pose(np.array([x, -5.0, 0.0])),
             )
             for name, description, x in (("bot", robot, 0.0), ("anna", None, 3.0))
-        )  # fmt: skip
-        self.at_bot, self.at_anna = Ear(self.bot, "bot"), _PageEars()
+        )
+        self.at_bot = Ear(self.bot, "bot")
+        self.at_anna = _PageEars()
         self.anna.sound.listen("anna", self.at_anna)
         self.run(1.0)
 
@@ -97,7 +109,8 @@ class _World:
 
     def is_lit(self) -> bool:
         """Whether the person sees the alarm."""
-        robot, anna = self.anna.remote_actors["bot"], self.anna
+        robot = self.anna.remote_actors["bot"]
+        anna = self.anna
         assert isinstance(robot, RobotInstance)
         return robot.lights.shown(anna.physics.time + anna.world_time.offset) not in (None, UNLIT)
 
@@ -107,7 +120,9 @@ class _World:
         self.run(PAUSE)
         while not 0.0 <= self.world_time() * FREQUENCY[LightPattern.ALARM] % 1.0 < 0.04:
             self.step()  # to the beginning of a flash
-        self.at_bot.blocks, self.at_anna.frames, self.at_anna.has_tone = [], 0, False
+        self.at_bot.blocks = []
+        self.at_anna.frames = 0
+        self.at_anna.has_tone = False
         begin = self.now
         self.bot.robot.lights = Lights(LightPattern.ALARM, (255, 0, 0), True)
         self.bot.sound.play("bot", to_pcm(_tone(WAVEFORM, 0.3)))
@@ -120,9 +135,11 @@ class _World:
             after = self.now - begin
             has_word = any(_level(block.samples, WORD) > HEARD for block in self.at_bot.blocks)
             for what, is_so in (
-                (LIGHT, self.is_lit()), (TONE_OF_LIGHTS, self.at_anna.has_tone), (VOICE, has_word),
+                (LIGHT, self.is_lit()),
+                (TONE_OF_LIGHTS, self.at_anna.has_tone),
+                (VOICE, has_word),
                 (AS_WAVEFORM, self.at_anna.frames > 0),
-            ):  # fmt: skip
+            ):
                 if is_so:
                     found.setdefault(what, after + (PAGE_WAITS if what == AS_WAVEFORM else 0.0))
             self.at_bot.blocks = []
@@ -148,6 +165,11 @@ def sound(delays: tuple[float, ...] = DELAYS, alarms: int = ALARMS) -> Iterator[
             took = 1e3 * np.array([one.get(what, np.inf) for one in found])
             for name, value in (("median", float(np.median(took))), ("largest", float(took.max()))):
                 yield Measurement(
-                    "sound", f"{1e3 * delay:g} ms: {what}, {name} of {alarms}", value, "ms", "budget", BUDGET,
+                    "sound",
+                    f"{1e3 * delay:g} ms: {what}, {name} of {alarms}",
+                    value,
+                    "ms",
+                    "budget",
+                    BUDGET,
                     BUDGET / value,
-                )  # fmt: skip
+                )

@@ -24,8 +24,10 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement, RobotUpdate
 
-ROBOTS, PEOPLE = 10, 5
-BUNCHES, BRANCHES = 3, 2
+ROBOTS = 10
+PEOPLE = 5
+BUNCHES = 3
+BRANCHES = 2
 """Trees with and without a bunch that each actor touches."""
 
 HZ = 60.0
@@ -50,7 +52,8 @@ OVERHEAD = 6
 
 def places(model: Model, share: float, seed: int = 3) -> np.ndarray:
     """Positions of all actors [actor, 2] m: anywhere in a ``share`` of the edges of the block."""
-    low, high = model.tree_pose[:, :2].min(0), model.tree_pose[:, :2].max(0)
+    low = model.tree_pose[:, :2].min(0)
+    high = model.tree_pose[:, :2].max(0)
     return low + share * (high - low) * np.random.default_rng(seed).uniform(size=(ROBOTS + PEOPLE, 2))
 
 
@@ -66,7 +69,7 @@ def place_actors(hub: MemoryHub, model: Model, where: np.ndarray) -> list[FakeCl
         name = f"{'person' if person else 'robot'}{number}"
         fake_client = FakeClient(
             hub.bus(name), model, (float(place[0]), float(place[1])), kind="human" if person else "robot"
-        )  # fmt: skip
+        )
         near = np.argsort(np.linalg.norm(roots - place, axis=1), kind="stable").tolist()
         for wanted, has in ((BUNCHES, True), (BRANCHES, False)):
             mine = [tree for tree in near if tree not in taken and (laden[tree] or not has)][:wanted]
@@ -109,7 +112,9 @@ def traffic() -> Iterator[Measurement]:
         def line(what: str, value: float, size: str = size, all_: float = everything) -> Measurement:
             return Measurement("traffic", f"{size}: {what}", value / 1e3, "kB/s", "broadcast", all_ / 1e3, all_ / value)
 
-        received, sent, count = rates[..., 0], rates[..., 1], rates[..., 2]
+        received = rates[..., 0]
+        sent = rates[..., 1]
+        count = rates[..., 2]
         mean = received.mean(0)
         yield line("received by a client, mean of all", float(mean.mean()))
         yield line("received by the client that receives most, mean", float(mean.max()))

@@ -37,7 +37,8 @@ SIDES = {"ada": -1.0, "bob": 1.0}
 PULL = 0.1
 """Way of each hand outwards [m]; a hand pulls with 100 N/m."""
 
-PULLS_AT, PULLS_UNTIL = 6.0, 7.0
+PULLS_AT = 6.0
+PULLS_UNTIL = 7.0
 """When both pull [s after the start]."""
 
 SETTLE = 2.0
@@ -93,14 +94,16 @@ def run_client(connect: str, name: str, seconds: float, out: str) -> None:
     """Be one of the two; ``out``: file for :class:`Seen`. Standard input says when it starts [s, clock of the host]."""
     from vinesim.net.transport.zenoh_bus import ZenohBus
 
-    side, start = SIDES[name], threading.Event()
+    side = SIDES[name]
+    start = threading.Event()
     model, body = hanging_bunch()
     length = float(model.body_length[body])
     rest = middle(model.forward_kinematics(model.joint_settled)[body], length)
     place = frames.pose([rest[0], rest[1] + 0.7 * side, 0.0], frames.from_yaw(-side * 0.5 * np.pi))
     stand = standing_pose(place)
     palm = frames.multiply(frames.from_yaw(-side * 0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
-    begins, rows = [0.0], []
+    begins = [0.0]
+    rows = []
     first = 2.0 + 2.0 * (side > 0.0)  # one grasps after the other
     times = [first, first + 1.0, PULLS_AT, PULLS_UNTIL]
     ways = [_NEAR + 0.1, _NEAR, _NEAR, _NEAR + PULL]
@@ -121,7 +124,8 @@ def run_client(connect: str, name: str, seconds: float, out: str) -> None:
         client = Client(load_scene("demo"), model, None, bus, name=name, pose=place, source=pose)
         client.physics.wind = None
         threading.Thread(target=read_start, daemon=True).start()
-        loop, has_met = RateLoop(client.physics.dt), False
+        loop = RateLoop(client.physics.dt)
+        has_met = False
         while not (start.is_set() and time.monotonic() > begins[0] + seconds):
             loop.begin()
             client.tick()
@@ -228,7 +232,7 @@ def outcome(begin: float, seen: dict[str, Seen]) -> Outcome:
         ),
         alone=max(float(one.alone[one.clock > begin].mean()) for one in seen.values()),
         rate=min(float((one.clock > begin).sum() / (end - begin)) for one in seen.values()),
-    )  # fmt: skip
+    )
 
 
 def two_pullers() -> Iterator[Measurement]:

@@ -27,15 +27,20 @@ _Frames = dict[str, list[tuple[float, str]]]
 """By event, the times [ms] of frames and their data."""
 BURSTS = 60
 """Measured bursts."""
-FREQUENCY, LENGTH, LEVEL = 600.0, 0.12, 0.5
+FREQUENCY = 600.0
+LENGTH = 0.12
+LEVEL = 0.5
 """Of the tone of a burst [Hz, s, 1]."""
-PERIOD, VARIATION = 0.7, 0.1
+PERIOD = 0.7
+VARIATION = 0.1
 """From one burst to the next, and at most so much more, so that they fall into all phases of the frames [s]."""
-HEARD_LEVEL, QUIET = 0.05, 0.3
+HEARD_LEVEL = 0.05
+QUIET = 0.3
 """Amplitude from which a burst has begun after silence of so long [1, s]."""
 LATEST = 0.6
 """A burst that is heard later than this is lost [s]."""
-FIRST, SECOND = ("anna", "-6 -3.5 0"), ("ben", "-3 -3.5 3.1")
+FIRST = ("anna", "-6 -3.5 0")
+SECOND = ("ben", "-3 -3.5 3.1")
 """Names, and places x y yaw beside the vines [m, rad]."""
 ADDRESS = "?triangles=100&rate=2&shadows=0"
 TIMEOUT = 300.0
@@ -109,12 +114,13 @@ def voice() -> Iterator[Measurement]:
     mouth_to_ear = float(np.percentile(took, 95)) + output
     yield Measurement(
         "voice", "mouth to ear, percentile 95", mouth_to_ear, "ms", "budget", BUDGET, BUDGET / mouth_to_ear
-    )  # fmt: skip
+    )
 
 
 def _bursts() -> np.ndarray:
     """Bursts of a tone at 48 kHz."""
-    rng, rate = np.random.default_rng(1), 48_000
+    rng = np.random.default_rng(1)
+    rate = 48_000
     burst = LEVEL * np.sin(2.0 * np.pi * FREQUENCY * np.arange(round(LENGTH * rate)) / rate)
     pauses = (np.zeros(round((PERIOD - LENGTH + VARIATION * rng.random()) * rate)) for _ in range(40))
     return np.concatenate([part for pause in pauses for part in (pause, burst)])
@@ -124,13 +130,30 @@ def _start(group: ProcessGroup) -> list[str]:
     """Start a server and two people; addresses of their pages."""
     server = group.start("server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json")
     endpoint = json.loads(server.next_line(START_TIMEOUT))["endpoints"][0]
-    ports, people = [], []
+    ports = []
+    people = []
     for name, pose in (FIRST, SECOND):
         ports.append(free_port())
-        people.append(group.start(
-            name, "-m", "vinesim", "client", "--role", "human", "--name", name, "--connect", endpoint, "--page",
-            str(ports[-1]), "--pose", *pose.split(), "--status", "json",
-        ))  # fmt: skip
+        people.append(
+            group.start(
+                name,
+                "-m",
+                "vinesim",
+                "client",
+                "--role",
+                "human",
+                "--name",
+                name,
+                "--connect",
+                endpoint,
+                "--page",
+                str(ports[-1]),
+                "--pose",
+                *pose.split(),
+                "--status",
+                "json",
+            )
+        )
     for person in people:
         while len(json.loads(person.next_line(START_TIMEOUT))["others"]) < 1:
             pass
@@ -140,7 +163,9 @@ def _start(group: ProcessGroup) -> list[str]:
 def _stages(said: np.ndarray, took: np.ndarray, times: _Frames) -> np.ndarray:
     """How long each of :data:`STAGES` took [stage, burst] ms for the first frame that was full after a burst began and
     was sent: nothing is sent for silence; NaN: not known. ``times`` [ms] of frames and their data."""
-    sent, received, decoded = times["sent"], times["received"], times["decoded"]
+    sent = times["sent"]
+    received = times["received"]
+    decoded = times["decoded"]
     full = np.array([at for at, _ in times["full"]])
     full = full[np.maximum(np.searchsorted(full, [at for at, _ in sent], "right") - 1, 0)]
     stages = np.full((len(STAGES), len(said)), np.nan)

@@ -10,7 +10,8 @@ cane = vinesim.CaneBuilder(
 )
 simulation = vinesim.Simulation(cane)
 robot = simulation.add_robot("vinebot", pose=(0.0, 0.0, 0.0))  # x, y, yaw
-start, largest = simulation.tip(), 0.0
+start = simulation.tip()
+largest = 0.0
 for _ in range(300):
     robot.command_base(0.2, 0.0, simulation.time)  # m/s ahead, rad/s to the left
     simulation.step()

@@ -107,7 +107,9 @@ def test_the_damping_ratio_is_that_of_the_decrement(ratio):
         way.append(simulation.tip()[1])
     way = np.array(way)
     inner = np.flatnonzero((np.abs(way[1:-1]) > np.abs(way[:-2])) & (np.abs(way[1:-1]) >= np.abs(way[2:]))) + 1
-    left, top, right = np.abs(way[inner - 1]), np.abs(way[inner]), np.abs(way[inner + 1])
+    left = np.abs(way[inner - 1])
+    top = np.abs(way[inner])
+    right = np.abs(way[inner + 1])
     peaks = (top + (left - right) ** 2 / (8.0 * (2.0 * top - left - right)))[:7]  # of the parabola through three
     decrement = -np.polyfit(0.5 * np.arange(len(peaks)), np.log(peaks), 1)[0]  # two peaks a period
     assert decrement / np.hypot(2.0 * np.pi, decrement) == pytest.approx(ratio, rel=0.03)
@@ -176,7 +178,8 @@ def test_energy_of_a_pendulum():
     begin = simulation.energy()
     assert begin.kinetic == 0.0
     assert begin.gravitational == pytest.approx(mass * G * 2.0, rel=1e-5)
-    tips, samples = [simulation.tip()], [begin]
+    tips = [simulation.tip()]
+    samples = [begin]
     for _ in range(300):
         simulation.step()
         tips.append(simulation.tip())
@@ -224,10 +227,13 @@ def test_momentum_of_a_floating_tree():
     simulation = vinesim.Simulation(cane, sleep=False)
     simulation.cut(0)
     mass = float(simulation.model.body_mass.sum())
-    body, force, dt = simulation.tip_body(), np.array([0.5, 2.0, 1.0]), simulation.dt
+    body = simulation.tip_body()
+    force = np.array([0.5, 2.0, 1.0])
+    dt = simulation.dt
     point = simulation.tip()
     simulation.apply_wrench(body, force, at=point)
-    before, centre = simulation.momentum(), center_of_mass(simulation)
+    before = simulation.momentum()
+    centre = center_of_mass(simulation)
     simulation.step()
     after = simulation.momentum()
     weight = np.array([0.0, 0.0, -mass * G])
@@ -341,7 +347,8 @@ def test_invalid_calls_are_refused_in_one_line(call, message):
 
 def test_cameras_and_lidars_render_the_current_state():
     simulation = vinesim.Simulation(vinesim.CaneBuilder(radius=0.02, shape="equilibrium"))
-    camera, pose = vinesim.Camera("pinhole", size=(64, 48)), vinesim.look_at((0.5, -0.6, 1.0), (0.5, 0.0, 1.0))
+    camera = vinesim.Camera("pinhole", size=(64, 48))
+    pose = vinesim.look_at((0.5, -0.6, 1.0), (0.5, 0.0, 1.0))
     frame = camera.render(simulation, pose)
     assert frame.rgb.shape == (48, 64, 3)
     cane = frame.organs == vinesim.Organ.CANE
@@ -400,7 +407,8 @@ def test_the_vineyard_of_a_client_in_a_cell_of_a_notebook():
 @pytest.mark.parametrize("by_itself", [False, True])
 def test_a_world_goes_on_without_a_robot_that_was_removed(by_itself):
     simulation = vinesim.Simulation([])
-    first, second = simulation.add_robot("vinebot", (0.0, 0.0, 0.0)), simulation.add_robot("vinebot", (0.0, 3.0, 0.0))
+    first = simulation.add_robot("vinebot", (0.0, 0.0, 0.0))
+    second = simulation.add_robot("vinebot", (0.0, 3.0, 0.0))
     simulation.push_robot(first.name, "arm_left_7_link", (1.0, 0.0, 0.0))
     if by_itself:
         first.remove()
@@ -439,7 +447,8 @@ def test_a_push_on_a_robot_acts_in_one_call_of_step_and_is_felt_in_its_joints():
     def felt():
         return robot.sample(simulation.time).joints.effort[joint]
 
-    free, link = felt(), "arm_left_7_link"
+    free = felt()
+    link = "arm_left_7_link"
     centre = simulation.physics.rigid.link_centre(robot.name, link)
     simulation.push_robot(robot.name, link, (0.0, 0.0, 10.0))
     simulation.step(100)

@@ -48,8 +48,10 @@ def assert_same(found: dict[str, np.ndarray]) -> None:
     assert list(found) == list(ARRAYS)
     for name, array in ARRAYS.items():
         assert (found[name].dtype, found[name].shape, found[name].tobytes()) == (
-            array.dtype, array.shape, array.tobytes(),
-        )  # fmt: skip
+            array.dtype,
+            array.shape,
+            array.tobytes(),
+        )
         assert found[name].flags.writeable
 
 
@@ -247,7 +249,9 @@ def test_a_lock_that_is_held_for_too_long_is_ignored(cache: pathlib.Path, monkey
 
 
 def test_exclusive_returns_whether_it_waited(cache: pathlib.Path) -> None:
-    entered, leave, waited = threading.Event(), threading.Event(), []
+    entered = threading.Event()
+    leave = threading.Event()
+    waited = []
 
     def hold() -> None:
         with disk_cache.exclusive("work"):
@@ -258,7 +262,8 @@ def test_exclusive_returns_whether_it_waited(cache: pathlib.Path) -> None:
         with disk_cache.exclusive("work") as one:
             waited.append(one)
 
-    holder, waiter = threading.Thread(target=hold), threading.Thread(target=enter)
+    holder = threading.Thread(target=hold)
+    waiter = threading.Thread(target=enter)
     holder.start()
     entered.wait()
     waiter.start()

@@ -17,7 +17,8 @@ def same(q, r):
 
 
 def test_products_rotations_inverses():
-    a, b = A.as_quat(), B.as_quat()
+    a = A.as_quat()
+    b = B.as_quat()
     assert same(frames.multiply(a, b), A * B)
     assert same(frames.conjugate(a), A.inv())
     assert np.allclose(frames.rotate(a, V), A.apply(V), atol=1e-12)
@@ -49,7 +50,8 @@ def test_from_x_axis_aligns_x_and_keeps_z_upwards():
 
 
 def test_poses_compose_and_invert():
-    a, b = frames.pose(V, A.as_quat()), frames.pose(V[::-1], B.as_quat())
+    a = frames.pose(V, A.as_quat())
+    b = frames.pose(V[::-1], B.as_quat())
     joint = frames.compose(a, b)
     assert np.allclose(joint[:, :3], V + A.apply(V[::-1]))
     assert same(joint[:, 3:], A * B)

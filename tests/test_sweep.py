@@ -25,7 +25,8 @@ def test_another_executor_takes_the_tasks():
 
 
 def test_an_error_on_an_executor_cancels_what_has_not_begun():
-    begun, ended = [], threading.Event()
+    begun = []
+    ended = threading.Event()
 
     def task(number):
         begun.append(number)
@@ -63,9 +64,13 @@ def test_dask_workers_give_the_bits_of_local_processes_though_one_is_killed(tmp_
     local = vinesim.sweep(swing, undisturbed, workers=2)
     before = set(psutil.Process().children(recursive=True))  # Python's tracker of resources stays
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
         local_directory=str(tmp_path),
-    )  # fmt: skip
+    )
     with cluster, distributed.Client(cluster) as client:
         on_dask = vinesim.sweep(swing, tasks("dask"), executor=client.get_executor())
     assert on_dask == local

@@ -67,9 +67,7 @@ def eye(urdf: Urdf) -> None:
     urdf.link("front_camera_link", camera, mass=0.072)  # RealSense D435 data sheet
     urdf.fix("front_camera_link", "base_link", (0.38, 0, 0.54), (0, 0.75, 0))
     urdf.link("front_camera_rgb_optical_frame")
-    urdf.fix(
-        "front_camera_rgb_optical_frame", "front_camera_link", (0.014, 0, 0), (-math.pi / 2, 0, -math.pi / 2)
-    )  # fmt: skip
+    urdf.fix("front_camera_rgb_optical_frame", "front_camera_link", (0.014, 0, 0), (-math.pi / 2, 0, -math.pi / 2))
 
 
 def clamp(urdf: Urdf, end: str, way: float) -> None:
@@ -85,10 +83,18 @@ def clamp(urdf: Urdf, end: str, way: float) -> None:
     beam = box((0.03, 0.70, 0.06), (0, 0, 0), colour="grey")
     urdf.link(f"lift_{end}_link", (beam,), mass=6.0)
     urdf.move(
-        f"lift_{end}_joint", "prismatic", f"mast_{end}_link", f"lift_{end}_link",
-        xyz=(way * 0.035, 0, GRASP - 0.10), axis=(0, 0, 1), lower=0.0, upper=0.30, effort=800.0, velocity=0.15,
+        f"lift_{end}_joint",
+        "prismatic",
+        f"mast_{end}_link",
+        f"lift_{end}_link",
+        xyz=(way * 0.035, 0, GRASP - 0.10),
+        axis=(0, 0, 1),
+        lower=0.0,
+        upper=0.30,
+        effort=800.0,
+        velocity=0.15,
         damping=50.0,
-    )  # fmt: skip
+    )
     urdf.link(f"clamp_{end}_link")
     urdf.fix(f"clamp_{end}_link", f"lift_{end}_link", (way * (CLAMP - 0.405), 0, 0))
     for side, outward in (("left", 1.0), ("right", -1.0)):
@@ -98,10 +104,18 @@ def clamp(urdf: Urdf, end: str, way: float) -> None:
         )
         urdf.link(f"paddle_{end}_{side}_link", paddle, mass=1.5)
         urdf.move(
-            f"paddle_{end}_{side}_joint", "prismatic", f"lift_{end}_link", f"paddle_{end}_{side}_link",
-            xyz=(0, outward * HALF, 0), axis=(0, outward, 0), lower=0.0, upper=0.09, effort=300.0, velocity=0.10,
+            f"paddle_{end}_{side}_joint",
+            "prismatic",
+            f"lift_{end}_link",
+            f"paddle_{end}_{side}_link",
+            xyz=(0, outward * HALF, 0),
+            axis=(0, outward, 0),
+            lower=0.0,
+            upper=0.09,
+            effort=300.0,
+            velocity=0.10,
             damping=50.0,
-        )  # fmt: skip
+        )
 
 
 if __name__ == "__main__":

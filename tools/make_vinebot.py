@@ -78,7 +78,8 @@ class Piece:
 
 def rotation(rpy: tuple[float, float, float]) -> np.ndarray:
     """Rotation matrix of URDF's fixed-axis roll, pitch, yaw."""
-    (sr, sp, sy), (cr, cp, cy) = np.sin(rpy), np.cos(rpy)
+    (sr, sp, sy) = np.sin(rpy)
+    (cr, cp, cy) = np.cos(rpy)
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -118,7 +119,8 @@ def beacon(x: float, y: float, z: float) -> tuple[Piece, ...]:
 
 def lugs(y: float, z: float, half: float, radius: float, width: float) -> list[Piece]:
     """Bars across a rubber track whose wheels of this radius stand ``half`` before and behind the middle."""
-    bars, step = [], 0.055
+    bars = []
+    step = 0.055
     count = round(2.0 * half / step)
     for side in (1.0, -1.0):
         for k in range(count + 1):
@@ -252,9 +254,10 @@ def base(urdf: Urdf) -> None:
         *(box((0.05, 0.006, 0.002), (0.20, 0.11 + 0.016 * k, 0.2405), colour="dark", solid=False) for k in range(5)),
         *(
             cylinder(0.006, 0.004, (x, y, 0.241), colour="steel", solid=False)
-            for x in (0.27, -0.04) for y in (0.19, -0.19)
+            for x in (0.27, -0.04)
+            for y in (0.19, -0.19)
         ),
-    )  # fmt: skip
+    )
     urdf.link("base_link", (*body, *tracks), mass=140.0)
     urdf.fix("base_link", "base_footprint", (0, 0, 0.12))
 
@@ -305,9 +308,18 @@ def torso(urdf: Urdf) -> None:
     urdf.link("torso_lift_link", yoke, mass=14.0)
     # A ball-screw column: its effort carries arms and yoke (45 kg) twice over, its speed is a linear actuator's.
     urdf.move(
-        "torso_lift_joint", "prismatic", "torso_fixed_link", "torso_lift_link",
-        xyz=(0.02, 0, 0.59), axis=(0, 0, 1), lower=0.0, upper=0.45, effort=1500.0, velocity=0.15, damping=50.0,
-    )  # fmt: skip
+        "torso_lift_joint",
+        "prismatic",
+        "torso_fixed_link",
+        "torso_lift_link",
+        xyz=(0.02, 0, 0.59),
+        axis=(0, 0, 1),
+        lower=0.0,
+        upper=0.45,
+        effort=1500.0,
+        velocity=0.15,
+        damping=50.0,
+    )
 
 
 def head(urdf: Urdf) -> None:
@@ -315,9 +327,18 @@ def head(urdf: Urdf) -> None:
     neck = (cylinder(0.05, 0.06, (0, 0, 0.03), colour="dark"), box((0.06, 0.10, 0.06), (0, 0, 0.08), colour="white"))
     urdf.link("head_1_link", neck, mass=1.2)
     urdf.move(
-        "head_1_joint", "revolute", "torso_lift_link", "head_1_link",
-        xyz=(0.02, 0, 0.21), axis=(0, 0, 1), lower=-1.3, upper=1.3, effort=8.0, velocity=2.0, damping=0.2,
-    )  # fmt: skip
+        "head_1_joint",
+        "revolute",
+        "torso_lift_link",
+        "head_1_link",
+        xyz=(0.02, 0, 0.21),
+        axis=(0, 0, 1),
+        lower=-1.3,
+        upper=1.3,
+        effort=8.0,
+        velocity=2.0,
+        damping=0.2,
+    )
     face = (
         box((0.10, 0.16, 0.09), (0.02, 0, 0.05), colour="white"),
         cylinder(0.045, 0.16, (0.07, 0, 0.05), ACROSS, colour="white"),
@@ -329,9 +350,18 @@ def head(urdf: Urdf) -> None:
     )
     urdf.link("head_2_link", face, mass=1.6)
     urdf.move(
-        "head_2_joint", "revolute", "head_1_link", "head_2_link",
-        xyz=(0, 0, 0.11), axis=(0, -1, 0), lower=-1.05, upper=0.79, effort=8.0, velocity=2.0, damping=0.2,
-    )  # fmt: skip
+        "head_2_joint",
+        "revolute",
+        "head_1_link",
+        "head_2_link",
+        xyz=(0, 0, 0.11),
+        axis=(0, -1, 0),
+        lower=-1.05,
+        upper=0.79,
+        effort=8.0,
+        velocity=2.0,
+        damping=0.2,
+    )
 
     camera = (
         box((0.025, 0.09, 0.025), (-0.0125, 0, 0), colour="grey"),
@@ -341,7 +371,7 @@ def head(urdf: Urdf) -> None:
             for y in (-0.030, -0.008, 0.012, 0.030)
         ),
         box((0.02, 0.02, 0.02), (-0.0125, 0, -0.02), colour="dark", solid=False),
-    )  # fmt: skip
+    )
     urdf.link("head_front_camera_link", camera, mass=0.072)  # mass and size: Intel RealSense D435 data sheet
     urdf.fix("head_front_camera_link", "head_2_link", (0.10, 0, 0.115))
     optical = (-math.pi / 2, 0, -math.pi / 2)
@@ -354,7 +384,8 @@ def head(urdf: Urdf) -> None:
 
 def limb(length: float, radius: float, start: float, colour: str) -> tuple[Piece, ...]:
     """A rounded tube hanging down from ``start`` below the joint, with a dark seam at either end."""
-    top, bottom = (0, 0, -start), (0, 0, -start - length)
+    top = (0, 0, -start)
+    bottom = (0, 0, -start - length)
     middle = (0, 0, -start - 0.5 * length)
     seams = (cylinder(radius + 0.0015, 0.006, end, colour="dark", solid=False) for end in (top, bottom))
     tube = cylinder(radius, length, middle, colour=colour)
@@ -366,9 +397,16 @@ def hub(radius: float, length: float) -> tuple[Piece, ...]:
     cap = cylinder(0.78 * radius, length + 0.008, (0, 0, 0), ACROSS, colour="grey", solid=False)
     turns = [2.0 * math.pi * k / 6.0 for k in range(6)]
     bolts = (
-        cylinder(0.004, length + 0.012, (0.6 * radius * math.cos(a), 0, 0.6 * radius * math.sin(a)), ACROSS,
-                 colour="dark", solid=False) for a in turns
-    )  # fmt: skip
+        cylinder(
+            0.004,
+            length + 0.012,
+            (0.6 * radius * math.cos(a), 0, 0.6 * radius * math.sin(a)),
+            ACROSS,
+            colour="dark",
+            solid=False,
+        )
+        for a in turns
+    )
     return cylinder(radius, length, (0, 0, 0), ACROSS, colour="dark"), cap, *bolts
 
 
@@ -413,9 +451,18 @@ def arm(urdf: Urdf, side: str, mirror: float) -> None:
         parent = name(number - 1) if number > 1 else "torso_lift_link"
         damping = 1.0 if number < 5 else 0.4
         urdf.move(
-            f"arm_{side}_{number}_joint", "revolute", parent, name(number),
-            where, axis, lower, upper, effort, velocity, damping,
-        )  # fmt: skip
+            f"arm_{side}_{number}_joint",
+            "revolute",
+            parent,
+            name(number),
+            where,
+            axis,
+            lower,
+            upper,
+            effort,
+            velocity,
+            damping,
+        )
 
 
 def gripper(urdf: Urdf, side: str, mirror: float) -> None:
@@ -440,8 +487,11 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
     for finger, outward in (("left", 1.0), ("right", -1.0)):
         # two faces that slope towards each other: a round thing comes to rest between them and cannot slide out ahead;
         # they reach down to where a bunch that is held below its upper end is thickest
-        slope, face, deep = math.radians(20.0), 0.0287, 0.008
-        back, aside = 0.5 * (face * math.sin(slope) + deep * math.cos(slope)), 0.5 * deep * math.sin(slope)
+        slope = math.radians(20.0)
+        face = 0.0287
+        deep = 0.008
+        back = 0.5 * (face * math.sin(slope) + deep * math.cos(slope))
+        aside = 0.5 * deep * math.sin(slope)
         pad = (
             box((face, deep, 0.06), (0.0515 - aside, outward * back, -0.015), (0, 0, outward * slope), colour="rubber"),
             box(
@@ -452,9 +502,18 @@ def gripper(urdf: Urdf, side: str, mirror: float) -> None:
         )
         urdf.link(f"{prefix}_{finger}_finger_link", pad, mass=0.12)
         urdf.move(
-            f"{prefix}_{finger}_finger_joint", "prismatic", f"{prefix}_base_link", f"{prefix}_{finger}_finger_link",
-            xyz=(0.06, 0, 0), axis=(0, outward, 0), lower=0.0, upper=0.075, effort=60.0, velocity=0.10, damping=5.0,
-        )  # fmt: skip
+            f"{prefix}_{finger}_finger_joint",
+            "prismatic",
+            f"{prefix}_base_link",
+            f"{prefix}_{finger}_finger_link",
+            xyz=(0.06, 0, 0),
+            axis=(0, outward, 0),
+            lower=0.0,
+            upper=0.075,
+            effort=60.0,
+            velocity=0.10,
+            damping=5.0,
+        )
     urdf.link(f"{prefix}_grasping_link")
     urdf.fix(f"{prefix}_grasping_link", f"{prefix}_base_link", (0.125, 0, 0))
     # Two prongs above the fingers, between which the stalk comes to stand while they hold the bunch by its thickest

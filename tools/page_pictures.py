@@ -79,7 +79,8 @@ class Photographer:
     """A browser before the page of a client, which steps while the browser draws."""
 
     def __init__(self, client: Spectator, page: Page) -> None:
-        self.client, self.page = client, page
+        self.client = client
+        self.page = page
         self.world = PageWorld(client)
 
     def wait(self, script: str) -> None:
@@ -99,7 +100,8 @@ class Photographer:
 
     def photographs(self, name: str) -> Iterator[tuple[str, np.ndarray]]:
         """Names and pictures of the page in all sizes, beside the camera's, and in a headset."""
-        page, (eye, target) = self.page, map(np.array, VIEWS[name])
+        page = self.page
+        (eye, target) = map(np.array, VIEWS[name])
         with PageServer(self.world) as self.server:
             page.open(self.server.address + "?triangles=300000&rate=1", before=emulated_headset())
             self.wait("window.vinesim?.viewer !== undefined")

@@ -68,7 +68,8 @@ class Physics:
         detachment: whether bunches detach when they are pulled too hard.
         """
         p = parameters
-        self.model, self.parameters = model, p
+        self.model = model
+        self.parameters = p
         self.state = State.at_rest(model)
         self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
         warn_of_raised_damping(model, p.dt, p.phi)
@@ -166,7 +167,8 @@ class Physics:
     def _integrate_plants(self) -> None:
         self.plants.integrate(self.contact_solver.bodies, self.contact_solver.wrenches)
         if len(self.plants.awake):
-            self._body_q, self._kinematics_current = None, False
+            self._body_q = None
+            self._kinematics_current = False
 
     def _integrate_rigid(self) -> None:
         self.rigid.integrate(self.contact_solver.rigid_force)
@@ -250,7 +252,8 @@ class Physics:
 
     def visuals(self) -> tuple[RigidVisual, ...]:
         """All rigid bodies and dormant bunches that have a shape; the same tuple until one is added or removed."""
-        rigid, dormant = self.rigid.visuals(), self.dormant_bunches.visuals()
+        rigid = self.rigid.visuals()
+        dormant = self.dormant_bunches.visuals()
         if self._visuals[0] is not rigid or self._visuals[1] is not dormant:
             self._visuals = rigid, dormant, rigid + dormant
         return self._visuals[2]

@@ -26,10 +26,17 @@ TIMEOUT = 120.0
 """Longest time in which the browser answers [s]."""
 PROGRAMS = ("chromium", "google-chrome")
 OPTIONS = (
-    "--headless", "--no-sandbox", "--no-first-run", "--disable-quic", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--disable-dev-shm-usage", "--remote-debugging-port=0",
+    "--headless",
+    "--no-sandbox",
+    "--no-first-run",
+    "--disable-quic",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--disable-dev-shm-usage",
+    "--remote-debugging-port=0",
     "--window-size=640,480",
-)  # fmt: skip
+)
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options of a browser that draws without a graphics card."""
 IWER = pathlib.Path(__file__).parents[3] / "build" / "page" / "iwer.min.js"
@@ -49,9 +56,11 @@ AS_RECORDED = """
 def microphone(path: pathlib.Path) -> tuple[str, ...]:
     """Options of a browser whose microphone hears a file, again and again."""
     return (
-        "--use-fake-ui-for-media-stream", "--use-fake-device-for-media-stream",
-        f"--use-file-for-fake-audio-capture={path}", "--autoplay-policy=no-user-gesture-required",
-    )  # fmt: skip
+        "--use-fake-ui-for-media-stream",
+        "--use-fake-device-for-media-stream",
+        f"--use-file-for-fake-audio-capture={path}",
+        "--autoplay-policy=no-user-gesture-required",
+    )
 
 
 def write_tone(path: pathlib.Path, frequency: float, level: float) -> pathlib.Path:
@@ -90,7 +99,9 @@ class Page:
     """One page of a browser. All calls wait until the browser has answered."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
-        self._loop, self._socket, self._count = loop, socket, 0
+        self._loop = loop
+        self._socket = socket
+        self._count = 0
         self._before: str | None = None
         """Of the script that runs before the page."""
         self.errors: list[str] = []

@@ -16,7 +16,9 @@ class Ear:
     is_open = True
 
     def __init__(self, client: Client, name: str, *, decodes_opus: bool = True) -> None:
-        self._client, self._name, self.decodes_opus = client, name, decodes_opus
+        self._client = client
+        self._name = name
+        self.decodes_opus = decodes_opus
         self.microphone = Microphone()
         self.blocks: list[Block] = []
         """What was recorded since the last :meth:`take`."""
@@ -33,5 +35,6 @@ class Ear:
 
     def take(self) -> np.ndarray:
         """Samples [n] since the last call."""
-        blocks, self.blocks = self.blocks, []
+        blocks = self.blocks
+        self.blocks = []
         return np.concatenate([block.samples for block in blocks])

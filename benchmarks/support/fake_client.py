@@ -40,7 +40,8 @@ STEP_PERIOD = 0.01
 ROBOT_JOINTS = 27
 """Joints of a robot, as many as vinebot has."""
 
-SWAY, SWING = 0.12, 1.3
+SWAY = 0.12
+SWING = 1.3
 """Amplitude [m] and frequency [Hz] of the tip of a touched tree: its owner must then publish 12 to 20 times a second,
 as for a cane that a robot pushes (measured: 13 messages in the 0.4 s of a push, then 14 in a second of holding)."""
 
@@ -79,10 +80,13 @@ class FakeClient:
         """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are equal."""
         joints = 0 if kind == "human" else joints
         hello = Hello(bus.name, kind=kind, scene="fake_clients", digest=digest, joints=joints)
-        self.bus, self.model, self.name = bus, model, bus.name
+        self.bus = bus
+        self.model = model
+        self.name = bus.name
         self.replicator = Replicator(bus, hello, model, interest_radius=near)
         self.place = np.array([*place, 0.0])
-        self.joints, self.restless = joints, restless
+        self.joints = joints
+        self.restless = restless
         self.touching: set[int] = set()
         """Trees it is in contact with."""
         self.swinging: set[int] = set()
@@ -129,7 +133,8 @@ class FakeClient:
             (self._rested.add if update.resting else self._rested.discard)(update.tree)
         for object_id in inbox.objects:
             if object_id.object not in self.moved or not np.array_equal(self.moved[object_id.object], object_id.pose):
-                self.moved[object_id.object], self.heard[object_id.object] = object_id.pose, now
+                self.moved[object_id.object] = object_id.pose
+                self.heard[object_id.object] = now
         for record, holds in inbox.records:
             self.facts[record.object] = {
                 "parent": record.parent,
@@ -139,13 +144,21 @@ class FakeClient:
             }
         self.released += inbox.released
         self.robots = {**inbox.robots, **inbox.people}
-        grabbed, self.grabbing = self.grabbing, set()
-        picked, self.picking = self.picking, set()
+        grabbed = self.grabbing
+        self.grabbing = set()
+        picked = self.picking
+        self.picking = set()
         self.carrying |= picked
         self.replicator.send(
-            now, self.pose(now), touched=self.touching | self.carrying, moving=self.swinging, read=self.read,
-            grabbed=grabbed | picked, detached=picked, pose_on_support=self.pose_on_support,
-        )  # fmt: skip
+            now,
+            self.pose(now),
+            touched=self.touching | self.carrying,
+            moving=self.swinging,
+            read=self.read,
+            grabbed=grabbed | picked,
+            detached=picked,
+            pose_on_support=self.pose_on_support,
+        )
         self.ticks += 1
 
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
@@ -163,7 +176,8 @@ class FakeClient:
     def carried_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] of what it carries: to and fro above its place."""
         phase = 2.0 * np.pi * SWING * (self._now + self.replicator.offset) + object_id
-        pose, velocity = frames.pose(self.place + np.array([0.2 * np.sin(phase), 0.0, 1.0])), np.zeros(6)
+        pose = frames.pose(self.place + np.array([0.2 * np.sin(phase), 0.0, 1.0]))
+        velocity = np.zeros(6)
         velocity[0] = 0.4 * np.pi * SWING * np.cos(phase)
         return pose, velocity
 
@@ -262,8 +276,10 @@ class FakeClientProcess:
         wanted = json.dumps({"connect": connect, "fake_clients": list(fake_clients), **options})
         self.process = start(
             [sys.executable, "-m", "benchmarks.support.fake_client", wanted],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
         self._read_line()
 
     def command(self, who: str = "", **command: Any) -> dict[str, Any]:
@@ -300,20 +316,28 @@ class FakeClientProcess:
 
 
 def run(
-    connect: str, fake_clients: list[dict[str, Any]], *, trees: int = 12, apart: float = 1.0, tick: float = STEP_PERIOD,
-    skew: float = 0.0, certificates: str = "",
-) -> None:  # fmt: skip
+    connect: str,
+    fake_clients: list[dict[str, Any]],
+    *,
+    trees: int = 12,
+    apart: float = 1.0,
+    tick: float = STEP_PERIOD,
+    skew: float = 0.0,
+    certificates: str = "",
+) -> None:
     """Step clients over Zenoh and apply commands from standard input until it ends. ``skew`` [s]: clock error;
     ``certificates``: folder with those of all, for ``tls/`` and ``quic/``."""
     from vinesim.net.transport.zenoh_bus import ZenohBus
 
-    model, folder = tree_row(trees, apart=apart), pathlib.Path(certificates) if certificates else None
+    model = tree_row(trees, apart=apart)
+    folder = pathlib.Path(certificates) if certificates else None
     commands: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
     by_name: dict[str, FakeClient] = {}
     late = 0
     try:
         for one in fake_clients:
-            name, place = one.pop("name"), one.pop("place")
+            name = one.pop("name")
+            place = one.pop("place")
             by_name[name] = FakeClient(ZenohBus(name, connect=connect, certificates=folder), model, place, **one)
         threading.Thread(target=_read_commands, args=(commands,), daemon=True).start()
         _write_line({"ready": True})

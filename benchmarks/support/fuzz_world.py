@@ -41,7 +41,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose, HumanUpdate, RobotUpdate
 
-ATTACKER, WORLD = "evil", "vineyard"
+ATTACKER = "evil"
+WORLD = "vineyard"
 HEIGHT = 1.75
 """Of people [m]."""
 DT = 0.01
@@ -78,21 +79,29 @@ class FuzzWorld:
     def __init__(self, *, is_stranger: bool = False, kind: str = "robot", seed: int = 0) -> None:
         """``is_stranger``: the attacker was never admitted, and no bus checks the names under which it sends; else it
         is admitted as ``kind``."""
-        self.model, self.now, self.is_stranger = small_vineyard(), 100.0, is_stranger
+        self.model = small_vineyard()
+        self.now = 100.0
+        self.is_stranger = is_stranger
         self.counts = object_counts(self.model)
         self.hub = MemoryHub(delay=0.005, seed=seed)
         self.hub.binds_names = not is_stranger
         self._folder = tempfile.TemporaryDirectory()
         self.store = RetainedStore(pathlib.Path(self._folder.name), Quota(1e9, 1e12))
-        self.meshes, self.admission = MeshStore(), AdmissionControl()
+        self.meshes = MeshStore()
+        self.admission = AdmissionControl()
         self.robot = load_description("vinebot")
         self._declare_server()
         self._kind = kind
         scene = load_scene("demo")
         self.client = Client(
-            scene, self.model, self.robot, self.hub.bus("ada"), name="ada", pose=frames.pose([0.0, 0.0, 0.0]),
+            scene,
+            self.model,
+            self.robot,
+            self.hub.bus("ada"),
+            name="ada",
+            pose=frames.pose([0.0, 0.0, 0.0]),
             clock=lambda: self.now,
-        )  # fmt: skip
+        )
         self.client.physics.wind = None
         self.ear = Ear(self.client, "ada")
         self.bob = FakeClient(
@@ -124,10 +133,15 @@ class FuzzWorld:
     def hello(self, kind: str = "robot", **values: object) -> Hello:
         """A greeting that is true, but for ``values``."""
         hello = Hello(
-            ATTACKER, kind=kind, robot=self.robot.name, urdf=self.robot.urdf,
-            sidecar=encode_sidecar(self.robot.base_limits, self.robot.groups), scene="demo",
-            digest=self.model.digest(), joints=len(self.robot.joints) if kind == "robot" else 0,
-        )  # fmt: skip
+            ATTACKER,
+            kind=kind,
+            robot=self.robot.name,
+            urdf=self.robot.urdf,
+            sidecar=encode_sidecar(self.robot.base_limits, self.robot.groups),
+            scene="demo",
+            digest=self.model.digest(),
+            joints=len(self.robot.joints) if kind == "robot" else 0,
+        )
         return msgspec.structs.replace(hello, **values)
 
     def greet(self, hello: Hello | bytes) -> None:
@@ -217,8 +231,10 @@ class FuzzWorld:
 
     def broken_laws(self) -> Iterator[str]:
         """What is wrong now."""
-        physics, client = self.client.physics, self.client
-        state, data = physics.state, physics.rigid.mj_data
+        physics = self.client.physics
+        client = self.client
+        state = physics.state
+        data = physics.rigid.mj_data
         if self.ear.blocks and not np.isfinite(self.ear.take()).all():
             yield "what the microphone hears is not finite"
         for name in ("joint_q", "joint_qd", "joint_x", "joint_xd"):

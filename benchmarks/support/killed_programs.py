@@ -66,12 +66,14 @@ class Vineyard:
 
     def __init__(self, group: ProcessGroup, folder: pathlib.Path, *, ros: bool, seed: int) -> None:
         """Start all; ``folder`` takes the server's state. ``ros``: with ROS processes and a listener."""
-        self._group, self._random = group, np.random.default_rng(seed)
+        self._group = group
+        self._random = np.random.default_rng(seed)
         self.ros = ros and middleware.unavailable_reason() is None
         self.programs: dict[str, Program] = {}
         self.picked: set[int] = set()
         """Bunches that the person has picked."""
-        server, router = _free_endpoint(), _free_endpoint()
+        server = _free_endpoint()
+        router = _free_endpoint()
         command = ("-m", "vinesim", "server", "--status", "json", "--listen")
         self._start("server", *command, server, "--state-dir", str(folder / "state"))
         if self.ros:
@@ -84,9 +86,20 @@ class Vineyard:
             options = ("--standby", "--spawn", str(i), "--sensor-hz", SENSOR_HZ, "--namespace", name if i else "")
             options += () if self.ros else ("--no-ros",)
             self._start(
-                name, "-m", "vinesim", "client", "--status", "json", "--scene", SCENE, "--name", name, "--connect",
-                endpoint, *options,
-            )  # fmt: skip
+                name,
+                "-m",
+                "vinesim",
+                "client",
+                "--status",
+                "json",
+                "--scene",
+                SCENE,
+                "--name",
+                name,
+                "--connect",
+                endpoint,
+                *options,
+            )
         self._stack = contextlib.ExitStack()
         scene = load_scene(SCENE)
         self._model = generate(scene)
@@ -174,7 +187,8 @@ class Vineyard:
         said = self.programs[name].since(moment + SETTLING)
         if len(said) < 2 or said[-1]["time"] <= said[0]["time"]:
             return ["steps"]
-        newest, missing = said[-1], []
+        newest = said[-1]
+        missing = []
         if set(newest["others"]) != {WITNESS, *ROBOTS} - {name}:
             missing.append(f"others ({', '.join(newest['others'])})")
         if newest["bunches_picked"] != len(self.picked):

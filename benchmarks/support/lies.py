@@ -60,7 +60,8 @@ class Liar:
     find the shortest lies that break it."""
 
     def __init__(self, *, kind: str = "robot") -> None:
-        self.kind, self.told = kind, 0
+        self.kind = kind
+        self.told = 0
         self.world: FuzzWorld | None = None
 
     def tell(self, lies_at_once: list[Lie]) -> None:
@@ -106,9 +107,12 @@ def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
 
     @hypothesis.seed(seed)
     @hypothesis.settings(
-        max_examples=examples, deadline=None, database=None, print_blob=False,
+        max_examples=examples,
+        deadline=None,
+        database=None,
+        print_blob=False,
         suppress_health_check=_HEALTH_CHECKS,
-    )  # fmt: skip
+    )
     @hypothesis.given(st.lists(lies(small_vineyard()), min_size=1, max_size=8))
     def tell(series: list[Lie]) -> None:
         liar.tell(series)
@@ -123,11 +127,18 @@ def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
 def lies(model: Model) -> st.SearchStrategy[Lie]:
     """Lies about a model, of all kinds alike."""
     return st.one_of(
-        _composite(_about_trees, model), _composite(_about_objects, model), _composite(_about_owners, model),
-        _composite(_records, model), _composite(_robot_pose, model), _composite(_human_pose, model),
-        _composite(_wrenches, model), _composite(_couplings, model), _composite(_greeting, model),
-        _composite(_mesh, model), _composite(_control, model),
-    )  # fmt: skip
+        _composite(_about_trees, model),
+        _composite(_about_objects, model),
+        _composite(_about_owners, model),
+        _composite(_records, model),
+        _composite(_robot_pose, model),
+        _composite(_human_pose, model),
+        _composite(_wrenches, model),
+        _composite(_couplings, model),
+        _composite(_greeting, model),
+        _composite(_mesh, model),
+        _composite(_control, model),
+    )
 
 
 def _composite(make: Callable[[Draw, Model], Lie | None], model: Model) -> st.SearchStrategy[Lie]:
@@ -174,15 +185,24 @@ def _about_trees(draw: Draw, model: Model) -> Lie:
     trees = sorted(draw(st.sets(st.integers(0, len(model.tree_first) - 1), min_size=1, max_size=2)))
     sizes = np.array([int(model.tree_size[tree]) + draw(st.sampled_from((0, 0, 0, 0, 1))) for tree in trees])
     roots = [sorted(draw(st.sets(st.integers(0, int(size) - 1), max_size=3))) for size in sizes]
-    total, cut = int(sizes.sum()), sum(map(len, roots))
+    total = int(sizes.sum())
+    cut = sum(map(len, roots))
     ownership, authority = (np.array([draw(SEQUENCE) for _ in trees]) for _ in range(2))
     flags = np.array([draw(st.integers(0, 3)) for _ in trees])
     states = TreeStates(
-        draw(TIME_ERROR), np.array(trees), ownership, authority, flags, sizes,
-        _quaternions(draw, total), _vectors(draw, UNIT, total, 3, scale=83.0),
-        np.array([len(one) for one in roots]), np.array([body for one in roots for body in one], np.int64),
-        _vectors(draw, FAR, cut, 3), _vectors(draw, UNIT, cut, 3, scale=32.7),
-    )  # fmt: skip
+        draw(TIME_ERROR),
+        np.array(trees),
+        ownership,
+        authority,
+        flags,
+        sizes,
+        _quaternions(draw, total),
+        _vectors(draw, UNIT, total, 3, scale=83.0),
+        np.array([len(one) for one in roots]),
+        np.array([body for one in roots for body in one], np.int64),
+        _vectors(draw, FAR, cut, 3),
+        _vectors(draw, UNIT, cut, 3, scale=32.7),
+    )
     family = draw(st.sampled_from(("tree", "near", "own")))
     return Lie("put", messages.encode_trees(states)[0][0], f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
@@ -190,14 +210,20 @@ def _about_trees(draw: Draw, model: Model) -> Lie:
 def _about_objects(draw: Draw, model: Model) -> Lie:
     """Boxes and bunches that hang, of others or that there are not, at absurd places and speeds."""
     numbers = sorted({_object(draw, model, (ObjectKind.BUNCH, ObjectKind.BOX)) for _ in range(draw(st.integers(1, 3)))})
-    count, cell = len(numbers), (draw(CELL), draw(CELL))
+    count = len(numbers)
+    cell = (draw(CELL), draw(CELL))
     pose = np.concatenate([_vectors(draw, NEAR, count, 3), _quaternions(draw, count)], 1)
     ownership, authority = (np.array([draw(SEQUENCE) for _ in numbers]) for _ in range(2))
     velocity = _vectors(draw, st.one_of(UNIT, st.floats(-4000.0, 4000.0, width=32)), count, 6)
     states = ObjectStates(
-        draw(TIME_ERROR), np.array(numbers), ownership, authority,
-        np.array([draw(st.integers(0, 3)) for _ in numbers]), pose, velocity,
-    )  # fmt: skip
+        draw(TIME_ERROR),
+        np.array(numbers),
+        ownership,
+        authority,
+        np.array([draw(st.integers(0, 3)) for _ in numbers]),
+        pose,
+        velocity,
+    )
     return Lie("put", messages.encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
 
 
@@ -210,10 +236,29 @@ def _about_owners(draw: Draw, model: Model) -> Lie:
     return Lie("put", messages.encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
-PARENTS = st.sampled_from((
-    "", "box/0", "box/1", "box/2", "box/3", "box/4", "box/-1", "box/" + "9" * 40, "bunch/0", "tree/0", "ada/base_link",
-    "ada/no link", "bob/chest", "bob/left_hand", f"{ATTACKER}/base_link", "unknown/link", "/", "box/", "x" * 200,
-))  # fmt: skip
+PARENTS = st.sampled_from(
+    (
+        "",
+        "box/0",
+        "box/1",
+        "box/2",
+        "box/3",
+        "box/4",
+        "box/-1",
+        "box/" + "9" * 40,
+        "bunch/0",
+        "tree/0",
+        "ada/base_link",
+        "ada/no link",
+        "bob/chest",
+        "bob/left_hand",
+        f"{ATTACKER}/base_link",
+        "unknown/link",
+        "/",
+        "box/",
+        "x" * 200,
+    )
+)
 
 
 def _records(draw: Draw, model: Model) -> Lie:
@@ -222,17 +267,24 @@ def _records(draw: Draw, model: Model) -> Lie:
     for _ in range(draw(st.integers(1, 3))):
         number = _object(draw, model, tuple(ObjectKind))
         tree = min(number, len(model.tree_first) - 1)
-        first, size = int(model.tree_first[tree]), int(model.tree_size[tree])
+        first = int(model.tree_first[tree])
+        size = int(model.tree_size[tree])
         cut = sorted(draw(st.sets(st.one_of(st.integers(first, first + size), st.integers(0, 1 << 20)), max_size=3)))
         state = draw(st.one_of(st.just(b""), st.binary(max_size=30), _composite(_about_trees, model)))
         pose = (*_vectors(draw, FAR, 3).tolist(), *_quaternions(draw, 1)[0].tolist())
         records.append(
             RetainedRecord(
-                number, draw(SEQUENCE), draw(SEQUENCE), draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))), pose,
-                draw(PARENTS), tuple(cut) if draw(st.booleans()) else (),
-                state.payload if isinstance(state, Lie) else state, draw(st.booleans()),
+                number,
+                draw(SEQUENCE),
+                draw(SEQUENCE),
+                draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))),
+                pose,
+                draw(PARENTS),
+                tuple(cut) if draw(st.booleans()) else (),
+                state.payload if isinstance(state, Lie) else state,
+                draw(st.booleans()),
             )
-        )  # fmt: skip
+        )
     payload = messages.encode_records(records)
     messages.decode_records(payload)
     return Lie("put", payload, f"fact/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
@@ -248,10 +300,13 @@ def _robot_pose(draw: Draw, _: Model) -> Lie:
     near = draw(st.booleans())
     base = np.concatenate([_vectors(draw, NEAR if near else FARTHER, 3), _quaternions(draw, 1)[0]])
     update = RobotUpdate(
-        ATTACKER, draw(TIME_ERROR), base, _vectors(draw, st.floats(-1e3, 1e3, width=32), 6),
+        ATTACKER,
+        draw(TIME_ERROR),
+        base,
+        _vectors(draw, st.floats(-1e3, 1e3, width=32), 6),
         _vectors(draw, UNIT, count, scale=draw(st.sampled_from((1.0, 10.0, 9e8)))) if count > 12 else np.zeros(count),
         _vectors(draw, UNIT, count, scale=83.0),
-    )  # fmt: skip
+    )
     return Lie("put", encode_robot(update), _pose_key(draw))
 
 
@@ -323,18 +378,22 @@ SIDECARS = (None, "", "{}", "[]", "null", '{"groups": 3}', '{"base_limits": [1e9
 def _greeting(draw: Draw, model: Model) -> Lie:
     """Greetings whose parts contradict each other, of robots that cannot be."""
     robot = load_description("vinebot")
-    urdf, sidecar = draw(st.sampled_from(URDFS)), draw(st.sampled_from(SIDECARS))
+    urdf = draw(st.sampled_from(URDFS))
+    sidecar = draw(st.sampled_from(SIDECARS))
     hello = Hello(
         draw(st.sampled_from((ATTACKER, ATTACKER, "ada", "bob"))),
         draw(st.sampled_from(("robot", "human", "spectator"))),
         draw(st.sampled_from(("vinebot", "logistic", "../../etc/passwd", "", "x" * 1000))),
         robot.urdf if urdf is None else urdf,
-        encode_sidecar(robot.base_limits, robot.groups) if sidecar is None else sidecar, "demo",
+        encode_sidecar(robot.base_limits, robot.groups) if sidecar is None else sidecar,
+        "demo",
         draw(st.sampled_from((model.digest(), model.digest(), model.digest(), "", "0" * 64))),
-        index=draw(st.sampled_from((0, 1, 4095))), joints=draw(st.sampled_from((-1, 0, 1, 27, 256))),
-        seed=draw(st.sampled_from((-1, 0, (1 << 63) - 1))), height=draw(st.sampled_from((1.0, 1.75, 2.5))),
+        index=draw(st.sampled_from((0, 1, 4095))),
+        joints=draw(st.sampled_from((-1, 0, 1, 27, 256))),
+        seed=draw(st.sampled_from((-1, 0, (1 << 63) - 1))),
+        height=draw(st.sampled_from((1.0, 1.75, 2.5))),
         outfit=draw(st.sampled_from(("", "green", "no-such-outfit"))),
-    )  # fmt: skip
+    )
     return Lie(draw(st.sampled_from(("greet", "greet", "join"))), messages.encode_hello(hello))
 
 
@@ -353,9 +412,14 @@ def _mesh(draw: Draw, _: Model) -> Lie:
 def _control(draw: Draw, model: Model) -> Lie:
     """Answers that were not asked for, under keys of other kinds; clocks."""
     number = draw(st.floats(allow_nan=False, allow_infinity=False))
-    payload = draw(st.sampled_from((
-        messages.encode_time(number, -number), messages.encode_welcome(messages.Welcome("go away")),
-        messages.encode_wanted(messages.MeshWanted(0, "no")),
-    )))  # fmt: skip
+    payload = draw(
+        st.sampled_from(
+            (
+                messages.encode_time(number, -number),
+                messages.encode_welcome(messages.Welcome("go away")),
+                messages.encode_wanted(messages.MeshWanted(0, "no")),
+            )
+        )
+    )
     family = draw(st.sampled_from(("own", "fact", "c", "tree", "near")))
     return Lie("put", payload, f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")

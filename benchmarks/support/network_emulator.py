@@ -33,7 +33,9 @@ HUB = "hub"
 """Name of the end to which all links lead."""
 
 _PREFIX = "vinesim-link"
-_TUNSETIFF, _TUN, _NO_PACKET_INFO = 0x400454CA, 0x0001, 0x1000
+_TUNSETIFF = 0x400454CA
+_TUN = 0x0001
+_NO_PACKET_INFO = 0x1000
 _MAX_PACKET = 2048
 
 
@@ -229,7 +231,9 @@ class _Direction:
     """Packets on their way from one device to another."""
 
     def __init__(self, source: int, target: int, way: LinkProfile) -> None:
-        self.source, self.target, self.way = source, target, way
+        self.source = source
+        self.target = target
+        self.way = way
         self.packets = self.bytes = self.lost = 0
         self.last = 0.0
 

@@ -12,7 +12,9 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Bool, String
 
-LOW, EMPTY = 0.20, 0.05  # share of the charge
+# share of the charge
+LOW = 0.20
+EMPTY = 0.05
 MARGIN = 0.02  # by which it has to rise before a light goes off again
 
 

@@ -11,8 +11,12 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-STIFFNESS, DAMPING = 50.0, 15.0  # N m/rad, N m s/rad
-PUSHED, BACK = 0.03, 0.01  # rad
+# N m/rad, N m s/rad
+STIFFNESS = 50.0
+DAMPING = 15.0
+# rad
+PUSHED = 0.03
+BACK = 0.01
 
 
 class CompliantArm(Node):
@@ -34,9 +38,7 @@ class CompliantArm(Node):
         if not self.equilibrium:
             if all(topic.get_subscription_count() for topic in self.topics.values()):
                 self.equilibrium = here
-                for what, values in (
-                    ("stiffness", [STIFFNESS] * 7), ("damping", [DAMPING] * 7), ("equilibrium", here)
-                ):  # fmt: skip
+                for what, values in (("stiffness", [STIFFNESS] * 7), ("damping", [DAMPING] * 7), ("equilibrium", here)):
                     self.topics[what].publish(Float64MultiArray(data=values))
                 print("soft", flush=True)
             return

@@ -43,7 +43,8 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
     for piece in range(1, count):
         rows, columns = np.nonzero((pieces == piece) & np.isfinite(metres))
         if len(rows) > 150:
-            z, (near, far) = np.median(metres[rows, columns]), np.percentile(metres[rows, columns], (10, 90))
+            z = np.median(metres[rows, columns])
+            (near, far) = np.percentile(metres[rows, columns], (10, 90))
             size = np.ptp([columns, rows], axis=1) * z / k[0, 0]
             if size.max() < 0.3 and far - near < 0.1:  # grass and soil stretch into the distance
                 places.append(np.linalg.inv(k) @ [np.median(columns) * z, np.median(rows) * z, z])

@@ -35,7 +35,8 @@ class Localiser(Node):
         """Integrate the turn and the way since the last message."""
         now = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         if self.last is not None:
-            turn, way = message.angular_velocity.z * (now - self.last), self.speed * (now - self.last)
+            turn = message.angular_velocity.z * (now - self.last)
+            way = self.speed * (now - self.last)
             self.x += way * math.cos(self.yaw + 0.5 * turn)
             self.y += way * math.sin(self.yaw + 0.5 * turn)
             self.yaw += turn
@@ -44,13 +45,16 @@ class Localiser(Node):
     def travel(self, message: Odometry) -> None:
         """Publish where odom lies: there odometry's pose of the base is the integrated one."""
         self.speed = message.twist.twist.linear.x
-        place, q = message.pose.pose.position, message.pose.pose.orientation
+        place = message.pose.pose.position
+        q = message.pose.pose.orientation
         angle = self.yaw - math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y**2 + q.z**2))
         odom = TransformStamped(child_frame_id="odom")
-        odom.header.frame_id, odom.header.stamp = "map", message.header.stamp
+        odom.header.frame_id = "map"
+        odom.header.stamp = message.header.stamp
         odom.transform.translation.x = self.x - math.cos(angle) * place.x + math.sin(angle) * place.y
         odom.transform.translation.y = self.y - math.sin(angle) * place.x - math.cos(angle) * place.y
-        odom.transform.rotation.z, odom.transform.rotation.w = math.sin(0.5 * angle), math.cos(0.5 * angle)
+        odom.transform.rotation.z = math.sin(0.5 * angle)
+        odom.transform.rotation.w = math.cos(0.5 * angle)
         self.tf.publish(TFMessage(transforms=[odom]))
 
 

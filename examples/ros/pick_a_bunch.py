@@ -33,7 +33,9 @@ from control_msgs.action import FollowJointTrajectory, GripperCommand  # noqa: E
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 DEPTH = 0.06  # m below a bunch's upper end: there the cutter is at its stalk
-AHEAD, ASIDE = 0.88, 0.28  # m from the base to the bunch at the pick
+# m from the base to the bunch at the pick
+AHEAD = 0.88
+ASIDE = 0.28
 OPEN = 0.15  # m between the fingers: as wide as they go, since a bunch may be 0.13 m wide
 ALLEY = (1.36, 1.75, 0.8, 6.7)  # m: y and x in which the base may stand and turn
 LANE = 1.06  # m: y of the base beside a box
@@ -95,7 +97,8 @@ class Robot:
     def grip(self, side: str, opening: float, effort: float = 0.0) -> GripperCommand.Result:
         """Move a gripper to an opening [m] with an effort [N] of each finger at most."""
         goal = GripperCommand.Goal()
-        goal.command.position, goal.command.max_effort = opening, effort
+        goal.command.position = opening
+        goal.command.max_effort = effort
         return self.act((GripperCommand, f"/gripper_{side}_controller/gripper_cmd", goal))[0]
 
 
@@ -113,7 +116,8 @@ class Arm:
     """One arm and the lift: straight lines of its hand, by damped inverse kinematics on the URDF."""
 
     def __init__(self, robot: Robot, side: str) -> None:
-        self.robot, self.side = robot, side
+        self.robot = robot
+        self.side = side
         groups = robot.description.groups
         self.parts = {"torso": groups["torso"].joints, f"arm_{side}": groups[f"arm_{side}"].joints}
         self.names = [name for joints in self.parts.values() for name in joints]
@@ -193,7 +197,8 @@ def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None
 
     def command(linear: float, angular: float) -> None:
         twist = TwistStamped()
-        twist.twist.linear.x, twist.twist.angular.z = linear, angular
+        twist.twist.linear.x = linear
+        twist.twist.angular.z = angular
         robot.velocity.publish(twist)
         end = time.monotonic() + 0.04
         while time.monotonic() < end:
@@ -203,7 +208,8 @@ def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None
             seen.clear()
         if len(seen) > 100 and np.linalg.norm(seen[-1][:2] - seen[-100][:2]) < 0.01:
             for _ in range(40):
-                twist.twist.linear.x, twist.twist.angular.z = -0.3, 0.0
+                twist.twist.linear.x = -0.3
+                twist.twist.angular.z = 0.0
                 robot.velocity.publish(twist)
                 rclpy.spin_once(robot.node, timeout_sec=0.05)
             raise RuntimeError("something is in the way of the base")
@@ -307,9 +313,11 @@ def put_into_box(robot: Robot, side: str) -> None:
     drive(robot, np.array([lane[0] - ahead * 0.6, LANE]), heading)
     drive(robot, lane, heading)
     arm = Arm(robot, side)
-    level, down = np.array([0.0, 0.0, 0.0, 1.0]), frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
+    level = np.array([0.0, 0.0, 0.0, 1.0])
+    down = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
     middle = frames.compose(frames.inverse(robot.base()), box)[:3] + np.array([0.02, 0.0, 0.0])
-    over, low = middle + 0.80 * UP, middle + 0.22 * UP
+    over = middle + 0.80 * UP
+    low = middle + 0.22 * UP
     arm.move(over, level)
     arm.move(over, down)
     arm.move(low, down, speed=0.15)

@@ -30,7 +30,8 @@ def frames_of(samples, speaker="anna", gain=1.0, start=START):
 def record(microphone, *voices, seconds=1.0, lateness=0.0):
     """What is recorded when each frame arrives as soon as it is over, and so much later [s]."""
     frames = sorted((frame for voice in voices for frame in voice), key=lambda frame: frame.time)
-    blocks, now = [*microphone.blocks(START)], START
+    blocks = [*microphone.blocks(START)]
+    now = START
     while now < START + seconds + MAX_DELAY:
         while frames and frames[0].time + FRAME + lateness <= now + 1e-9:
             microphone.hear(frames.pop(0))
@@ -66,7 +67,8 @@ def test_a_voice_is_recorded_as_it_was_said():
 
 
 def test_voices_add_up_each_by_its_loudness():
-    near, far = tone(440.0), tone(700.0)
+    near = tone(440.0)
+    far = tone(700.0)
     heard = record(
         Microphone(), frames_of(near, "anna", loudness.gain(2.0)), frames_of(far, "ben", loudness.gain(10.0))
     )
@@ -75,7 +77,8 @@ def test_voices_add_up_each_by_its_loudness():
 
 
 def test_a_lost_frame_is_filled_and_counted():
-    microphone, said = Microphone(), tone(440.0)
+    microphone = Microphone()
+    said = tone(440.0)
     kept = [frame for frame in frames_of(said) if frame.number != 20]
     heard = record(microphone, kept)
     hole = slice(20 * FRAME_SAMPLES, 21 * FRAME_SAMPLES)
@@ -93,7 +96,8 @@ def test_frames_that_come_too_late_are_counted_and_the_delay_grows_until_they_ar
 
 
 def test_what_is_no_sound_is_counted_and_nothing_else_suffers():
-    microphone, said = Microphone(), tone(440.0)
+    microphone = Microphone()
+    said = tone(440.0)
     noise = [HeardFrame("evil", n, START + n * FRAME, Codec.OPUS, bytes((8, n, 255 - n)), 1.0) for n in range(40)]
     far_off = [HeardFrame("clock", n, START + 1e6 * (n - 20), Codec.PCM16, bytes(640), 1.0) for n in range(40)]
     heard = record(microphone, frames_of(said), noise, far_off)
@@ -102,7 +106,9 @@ def test_what_is_no_sound_is_counted_and_nothing_else_suffers():
 
 
 def test_the_tone_of_lights_begins_and_ends_without_a_click():
-    microphone, now, blocks = Microphone(), START, []
+    microphone = Microphone()
+    now = START
+    blocks = []
     blocks += microphone.blocks(now)
     for step in range(100):
         lit = step % 50 < 25
@@ -153,7 +159,9 @@ def test_opus_of_a_browser_is_decoded():
 
 def test_a_loudspeaker_plays_messages_of_any_length_without_gaps():
     said = to_pcm(tone(300.0))
-    loudspeaker, now, played = Loudspeaker(), START, []
+    loudspeaker = Loudspeaker()
+    now = START
+    played = []
     parts = [said[at : at + 1026] for at in range(0, len(said), 1026)]  # 32 ms and a sample
     due = START
     for _ in range(200):
@@ -200,19 +208,21 @@ def unpack(text):
         data = data[1 + data[0] :]
 
 
-PACKETS = list(unpack(
-    "HAsTuw`^9o^Z)_`yT0Coc88)j39$Hl_D1JGGlpIIw|3*5(jlmxv1jr9*pcy*`M@l9esC;Es(znW<0-"
-    "t7rJ<NzWl83exXD|U>uHw)5q_<jgaqn5hy7q__PxU80)~JpNT2z+WnSKsq&7gq!f)Od|2IYuk8`=Gzh!4k+xGrJTaBxhqS!(h@qjHzpZU3XT"
-    "!>dS8A}I>Cz?+9Z3I-"
-    "VWMI3ELsp!lNN?+40Ei4_ds>B<GJHY6FG!#Hx4aj>DNQ9m0LJhWigfHLA{c3|35T4(e7pg_3@qNT(tafK7;Pig7{nl!E=ZsGxp-"
-    "WR6EVJAyt$}Tdrto1F-7-{kTtbC2vEzR^aM!hmtwn>K8BCqX}Rz*NT2z)ycfVLek55I;nXUi5JT)kQb-LAHQDS{!mG1wMCZYqF|koPz<;4bn"
-    "OJ&#*d|Dy`MG#pi{o<u@un%`Sx$Gv|B<Eqh<C~Jvb2F3gnBA<Bw6~JC`h3~8F*ZXS0K)r8P`(HY9<&dk0FV1(5_(rhK4iiJp+7vKbf#ia4tx"
-    "pLK%2mh%iL5oNO_~obq8N>1>OJ|C<01NQin`ZM&Q;?l0@mjX~%UJcruXC`h3~Crf^bI*`L3qiHFawRgjb9CkH}MT!4B1P&R(_5LI=F>1xdfG"
-    "9|zLhKM((qTdOf^JJ1{E7V`!9jG`l3hHKOQcCzHJA}<g-Zt_rX(y#p+XsDUf#`)a+`6k!~RdSBOLJ=^F(C%*L|qWx+JSn7Tt!Fb-"
-    "&iGK#YJXNTEU*cwC5CLG~2xt-iP=lEHt7FE{q|&)YTSv&^3XhAr$*mMQ!05GhEZsQz=NP6fI~T;Wl?%%`bbI{uqRW_v$LV3tz-"
-    "9>O(lqKF}QL-m#>NTP~|OMZz$yAiH?5orLCVSmeB=gHR}ujme14;j(~4$<Pv-"
-    "1IC+qKbKVT!>njr0?t%JaB9+eNoZU?XVBEs}NL5tcI>*yz!7;ApeL~wOz$BNTP~)cwCGWc{((MO!hpuon8#^Lr&gE<B^I`tnLQ;B*ncfeQ?i"
-    "Wt6=lfi`X#hPQWNgqte-"
-    "UT!J`_?JwbIm~VouSWfPM+@x4)K>P6lY|;RDl<XY#vz*E)NTbr(cwB-2l?E9=@F;t6HNpz&{sFLx@?;}h6uPhGVJjOL;S7f`Km"
-))  # fmt: skip
+PACKETS = list(
+    unpack(
+        "HAsTuw`^9o^Z)_`yT0Coc88)j39$Hl_D1JGGlpIIw|3*5(jlmxv1jr9*pcy*`M@l9esC;Es(znW<0-"
+        "t7rJ<NzWl83exXD|U>uHw)5q_<jgaqn5hy7q__PxU80)~JpNT2z+WnSKsq&7gq!f)Od|2IYuk8`=Gzh!4k+xGrJTaBxhqS!(h@qjHzpZU3XT"
+        "!>dS8A}I>Cz?+9Z3I-"
+        "VWMI3ELsp!lNN?+40Ei4_ds>B<GJHY6FG!#Hx4aj>DNQ9m0LJhWigfHLA{c3|35T4(e7pg_3@qNT(tafK7;Pig7{nl!E=ZsGxp-"
+        "WR6EVJAyt$}Tdrto1F-7-{kTtbC2vEzR^aM!hmtwn>K8BCqX}Rz*NT2z)ycfVLek55I;nXUi5JT)kQb-LAHQDS{!mG1wMCZYqF|koPz<;4bn"
+        "OJ&#*d|Dy`MG#pi{o<u@un%`Sx$Gv|B<Eqh<C~Jvb2F3gnBA<Bw6~JC`h3~8F*ZXS0K)r8P`(HY9<&dk0FV1(5_(rhK4iiJp+7vKbf#ia4tx"
+        "pLK%2mh%iL5oNO_~obq8N>1>OJ|C<01NQin`ZM&Q;?l0@mjX~%UJcruXC`h3~Crf^bI*`L3qiHFawRgjb9CkH}MT!4B1P&R(_5LI=F>1xdfG"
+        "9|zLhKM((qTdOf^JJ1{E7V`!9jG`l3hHKOQcCzHJA}<g-Zt_rX(y#p+XsDUf#`)a+`6k!~RdSBOLJ=^F(C%*L|qWx+JSn7Tt!Fb-"
+        "&iGK#YJXNTEU*cwC5CLG~2xt-iP=lEHt7FE{q|&)YTSv&^3XhAr$*mMQ!05GhEZsQz=NP6fI~T;Wl?%%`bbI{uqRW_v$LV3tz-"
+        "9>O(lqKF}QL-m#>NTP~|OMZz$yAiH?5orLCVSmeB=gHR}ujme14;j(~4$<Pv-"
+        "1IC+qKbKVT!>njr0?t%JaB9+eNoZU?XVBEs}NL5tcI>*yz!7;ApeL~wOz$BNTP~)cwCGWc{((MO!hpuon8#^Lr&gE<B^I`tnLQ;B*ncfeQ?i"
+        "Wt6=lfi`X#hPQWNgqte-"
+        "UT!J`_?JwbIm~VouSWfPM+@x4)K>P6lY|;RDl<XY#vz*E)NTbr(cwB-2l?E9=@F;t6HNpz&{sFLx@?;}h6uPhGVJjOL;S7f`Km"
+    )
+)
 """Of libopus at 12 kbit/s: 440 Hz with the amplitude 0.25."""

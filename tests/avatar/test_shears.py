@@ -88,8 +88,9 @@ def test_two_hands_that_close_in_one_step_report_each_its_own_cut(bunches):
     assert eva.run(5) == []
     closures = eva.run(1, left_closed=True, right_closed=True)
     assert [(one.side, one.bunches, one.canes) for one in closures] == [
-        ("left", bunches[0], 0), ("right", bunches[1], 0)
-    ]  # fmt: skip
+        ("left", bunches[0], 0),
+        ("right", bunches[1], 0),
+    ]
     assert physics.state.bunch_attached.tolist() == [not cuts for cuts in bunches]
 
 

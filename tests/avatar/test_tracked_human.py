@@ -24,7 +24,8 @@ def test_without_input_it_stands_still(human):
 
 def test_inputs_at_the_rate_of_a_display_give_the_velocity_of_the_person(human):
     """A hand that moves at 1 m/s, told 50 times a second, moves at 1 m/s in every step once the rate is known."""
-    start, head = human.pose.right.copy(), human.pose.head
+    start = human.pose.right.copy()
+    head = human.pose.head
     places = []
     for step in range(200):
         if step % 2 == 0:

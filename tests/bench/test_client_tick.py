@@ -34,7 +34,7 @@ def test_a_client_with_subscribers_passes_every_step_to_them() -> None:
     with contextlib.ExitStack() as stack:
         pushing = client_tick.PushingClient(
             scene, generate(scene), load_description("vinebot"), stack, has_subscribers=True
-        )  # fmt: skip
+        )
         times = pushing.measure(4, is_paced=False)
         assert times.cpu.shape == times.wall.shape == (4, len(client_tick.PARTS) + 1)
         assert pushing.taken_steps == 4
@@ -46,7 +46,7 @@ def test_the_measured_client_pushes_and_sends_updates() -> None:
     with contextlib.ExitStack() as stack:
         pushing = client_tick.PushingClient(
             scene, generate(scene), load_description("vinebot"), stack, has_visitor=True
-        )  # fmt: skip
+        )
         client = pushing.client
         for _ in range(600):
             pushing.tick()

@@ -11,7 +11,8 @@ def test_the_mujoco_reference_of_the_contact_bench_has_the_same_contacts() -> No
     """A bar lifts three canes, a gripper holds the bunch of a fourth: same number of contacts, same body positions."""
     model = scenes.cane_row(4)
     robots = [scenes.bar("bar", 0, 3), scenes.gripper("hand", scenes.bunch_center(3))]
-    ours, reference = Physics(model), MujocoScene(model, robots)
+    ours = Physics(model)
+    reference = MujocoScene(model, robots)
     for robot in robots:
         ours.add_robot(robot)
     scenes.keep_awake(ours, np.arange(4))

@@ -15,10 +15,13 @@ from vinesim.scene.spec import load_scene, with_seed
 @pytest.mark.parametrize(
     ("clearance", "name"),
     [
-        (-0.02, "hand overlaps its neighbours"), (0.0, "0 to 5 mm"), (0.005, "5 to 15 mm"), (0.02, "15 to 30 mm"),
+        (-0.02, "hand overlaps its neighbours"),
+        (0.0, "0 to 5 mm"),
+        (0.005, "5 to 15 mm"),
+        (0.02, "15 to 30 mm"),
         (0.03, "30 mm or more"),
     ],
-)  # fmt: skip
+)
 def test_every_clearance_has_one_class(clearance, name):
     assert class_name(clearance) == name
 
@@ -40,7 +43,8 @@ def test_success_is_counted_over_all_and_by_class():
 @pytest.mark.long
 def test_narrow_bunches_are_tried_as_well_and_the_freest_is_the_one_that_a_job_takes():
     scene = with_seed(load_scene("harvest"), 7)
-    model, near = generate(scene), spawn_pose(scene, 0)[:2]
+    model = generate(scene)
+    near = spawn_pose(scene, 0)[:2]
     found = list(pick_planning.freest_bases(model, near, 3.0))
     assert len({bunch for bunch, *_ in found}) == len(found) > 5
     assert min(clearance for *_, clearance in found) < 0.0

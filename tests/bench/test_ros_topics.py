@@ -43,7 +43,8 @@ def test_every_message_is_in_one_count() -> None:
         row.case: row.value for row in loss_rows(topics, dict.fromkeys(TOPICS, 210), 0)
     }  # the last of each were sent and never came
     count = len(TOPICS)
-    before, after = sum(range(count)), sum(10 - i for i in range(count))
+    before = sum(range(count))
+    after = sum(10 - i for i in range(count))
     assert rows["whole run: sent by the publisher's count"] == 210 * count
     assert rows["whole run: received"] == 198 * count
     assert rows["whole run: lost on the way, by gaps in the numbers"] == 2 * count
@@ -62,9 +63,12 @@ def test_goals_that_ended_wrongly_are_not_counted_as_right() -> None:
         "fastest": 1.0,
     }
     rows = [
-        goal | {"right": True}, goal | {"right": False, "off": 0.2}, {"kind": "cancel", "right": True, "drift": 0.0},
-        {"kind": "preempt", "right": True, "off": 0.0}, {"kind": "end", "sent": 5, "known": 1, "s": 60.0},
-    ]  # fmt: skip
+        goal | {"right": True},
+        goal | {"right": False, "off": 0.2},
+        {"kind": "cancel", "right": True, "drift": 0.0},
+        {"kind": "preempt", "right": True, "off": 0.0},
+        {"kind": "end", "sent": 5, "known": 1, "s": 60.0},
+    ]
     found = {row.case: row for row in action_rows(rows)}
     assert found["goals: right codes"].value == 1
     assert found["goals: right codes"].ratio == 0.5
@@ -78,7 +82,8 @@ def test_velocities_are_compared_where_the_joints_are_not_when() -> None:
     pytest.importorskip("rclpy")
     from vinesim.bench.goal_sender import Plan
 
-    times, positions = np.array([1.0, 2.5]), np.array([[0.4, -0.2], [0.1, 0.3]])
+    times = np.array([1.0, 2.5])
+    positions = np.array([[0.4, -0.2], [0.1, 0.3]])
     plan = Plan("head_controller", ["a", "b"], times, positions, np.array([[0.3, -0.1], [0.0, 0.0]]))
     begin = np.array([0.0, 0.1])
     for time in (0.0, 0.313, 1.0, 2.2, 2.5):

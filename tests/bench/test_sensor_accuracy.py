@@ -23,7 +23,8 @@ def test_noise_on_a_plane_is_that_of_the_formula(monkeypatch) -> None:
 
 
 def test_depth_statistics_need_enough_pixels() -> None:
-    depths, exact = DepthStatistics(), np.full(1000, 2.0)
+    depths = DepthStatistics()
+    exact = np.full(1000, 2.0)
     measured = exact + 0.01 * np.random.default_rng(1).standard_normal(1000)
     measured[:100] = np.nan
     depths.add(2.0, exact, measured)

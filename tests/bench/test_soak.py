@@ -43,11 +43,14 @@ def test_handles_that_pile_up_are_seen() -> None:
 
 def test_processes_that_end_or_get_another_name_while_memory_settles_are_no_error() -> None:
     """An hour's figures are not lost for a process that was there for its first minutes only."""
-    steady, brief = history([50.0] * 30), history([50.0] * 3)
+    steady = history([50.0] * 30)
+    brief = history([50.0] * 3)
     found, ended = settle(
         {("client", 1): steady, ("python", 2): brief, ("standby", 2): steady, ("helper", 3): brief},
-        100.0, 700.0, 1840.0,
-    )  # fmt: skip
+        100.0,
+        700.0,
+        1840.0,
+    )
     assert list(found) == [("client", 1), ("standby", 2)]
     assert ended == {"helper 3 ended": 1}
     assert len(list(measurements(SoakResult(found, ended, 100.0)))) == 10
@@ -107,14 +110,17 @@ def test_a_client_that_ends_badly_does_not_cost_the_figures(tmp_path: pathlib.Pa
             raise ProcessFailed("ended with exit code -9")
 
     run = _Run.__new__(_Run)
-    run._folder, run._figures = tmp_path, {"malformed": 0, "refused": 1}
+    run._folder = tmp_path
+    run._figures = {"malformed": 0, "refused": 1}
     run.clients = {"robot_1": cast(Process, Killed())}
     run._newest = {"robot_1": {"faults": {"messages_refused": 3}, "sensor_restarts": 2}}
     counts = run.end()
     assert counts.pop("robot_1 without a report (ended with exit code -9)") == 1
     assert {name: count for name, count in counts.items() if count} == {
-        "refused, server": 1, "messages_refused, clients": 3, "sensor_restarts, clients": 2,
-    }  # fmt: skip
+        "refused, server": 1,
+        "messages_refused, clients": 3,
+        "sensor_restarts, clients": 2,
+    }
 
 
 @pytest.mark.long

@@ -32,6 +32,7 @@ def test_the_rod_swings_as_the_cane_does() -> None:
     case = draw_case(0)
     quarter = dataclasses.replace(case.experiment, duration=0.1, hold=0.0, noise=0.0, rate=100.0)
     case = dataclasses.replace(case, experiment=quarter)
-    rod, cane = tuning_rods.rod_track(case), measure(case.truth, quarter, exact=True)
+    rod = tuning_rods.rod_track(case)
+    cane = measure(case.truth, quarter, exact=True)
     np.testing.assert_allclose(rod.position, cane.position, atol=0.004)
     assert np.abs(np.diff(rod.position[:, 0, 2])).max() > 0.01

@@ -7,13 +7,15 @@ import pytest
 
 from benchmarks.two_pullers import Seen, outcome
 
-BEGIN, SECONDS = 100.0, 27.0
+BEGIN = 100.0
+SECONDS = 27.0
 
 
 def seen(way, owner: str, *, phase: float = 0.0, held: bool = True) -> Seen:
     """A client at 100 Hz whose bunch has the way ``way(seconds)`` [m]."""
     clock = BEGIN - 5.0 + phase + np.arange(0.0, SECONDS + 5.0, 0.01)
-    names, flags = np.full(len(clock), owner), np.zeros(len(clock), bool)
+    names = np.full(len(clock), owner)
+    flags = np.zeros(len(clock), bool)
     return Seen(clock, way(clock - BEGIN), names, flags | held, flags)
 
 

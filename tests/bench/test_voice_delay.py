@@ -8,7 +8,8 @@ from benchmarks.voice_delay import STAGES, _stages
 def test_the_stages_of_a_burst_are_those_of_its_first_frame_and_add_up_to_its_way():
     """Frames of 20 ms; those of silence are not sent, some are still on their way when a burst
     begins, and some are the same as others before."""
-    said, took = np.array([85.0, 145.0, 185.0]), np.array([80.0, 90.0, np.nan])
+    said = np.array([85.0, 145.0, 185.0])
+    took = np.array([80.0, 90.0, np.nan])
     full = 20.0 * np.arange(1, 11)
     sent = np.delete(np.arange(10), 4)  # the fifth was silence
     times = {

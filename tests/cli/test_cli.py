@@ -185,9 +185,11 @@ def test_a_second_actor_of_one_name_is_refused():
 def running_server(*arguments):
     """A server process and its first line."""
     process = programs.Popen(
-        [sys.executable, "-m", "vinesim", "server", *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+        [sys.executable, "-m", "vinesim", "server", *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
         text=True,
-    )  # fmt: skip
+    )
     try:
         yield process, process.stdout.readline()
     finally:

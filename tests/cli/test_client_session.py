@@ -28,7 +28,8 @@ def session(monkeypatch: pytest.MonkeyPatch) -> ClientSession:
     one.options = SimpleNamespace(
         device="cuda:0", status="none", seconds=None, tick_log=None, connect=None, real_time_factor=1.0
     )
-    one._stop, one._stack = threading.Event(), contextlib.ExitStack()
+    one._stop = threading.Event()
+    one._stack = contextlib.ExitStack()
     return one
 
 

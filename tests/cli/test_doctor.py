@@ -20,9 +20,19 @@ def test_every_check_gives_one_line_and_json_says_the_same():
     done = programs.run([sys.executable, "-m", "vinesim", "doctor", "--json"])
     report = json.loads(done.stdout)
     assert [each["check"] for each in report["checks"]] == [
-        "python", "packages", "cpu", "gpu", "ros", "page", "certificates", "ports", "shared memory", "datagrams",
-        "clock", "caches",
-    ]  # fmt: skip
+        "python",
+        "packages",
+        "cpu",
+        "gpu",
+        "ros",
+        "page",
+        "certificates",
+        "ports",
+        "shared memory",
+        "datagrams",
+        "clock",
+        "caches",
+    ]
     errors = [each for each in report["checks"] if each["state"] == ERROR]
     assert errors == []  # where the tests run, a client can run
     assert (done.returncode, report["ready"]) == (0, True)

@@ -5,7 +5,8 @@ from vinesim.client.recording.bunch_trace import Rows, remote_error, touch_to_mo
 
 
 def rows(clock, x, force, is_remote=True):
-    x, force = np.asarray(x, float), np.asarray(force, float)
+    x = np.asarray(x, float)
+    force = np.asarray(force, float)
     zero = np.zeros_like(x)
     clock = np.asarray(clock, float)
     return Rows(

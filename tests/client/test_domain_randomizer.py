@@ -31,7 +31,8 @@ def test_placed_objects_do_not_overlap() -> None:
 
 
 def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
-    model, results = sensor_scenes.demo(), []
+    model = sensor_scenes.demo()
+    results = []
     for seed in (1, 1, 2):
         randomised = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert randomised is not None
@@ -44,7 +45,8 @@ def test_the_same_seed_gives_the_same_scene_and_another_seed_another() -> None:
 def test_wind_moves_the_plants() -> None:
     """Some leaves move by centimetres in wind, and none without."""
     model = sensor_scenes.demo()
-    rest, moved = State.at_rest(model).body_q[:, :3], {True: [], False: []}
+    rest = State.at_rest(model).body_q[:, :3]
+    moved = {True: [], False: []}
     for seed in range(8):
         randomised = SceneRandomizer(1.0).snapshot(model, np.random.default_rng(seed))
         assert randomised is not None
@@ -59,7 +61,8 @@ def test_wind_moves_the_plants() -> None:
 @pytest.mark.long
 def test_the_parameters_of_the_scene_are_used() -> None:
     """The same number of steps of wind lasts twice as long with steps twice as long."""
-    model, seconds = sensor_scenes.demo(), []
+    model = sensor_scenes.demo()
+    seconds = []
     for dt in (0.01, 0.02):
         source = SceneRandomizer(1.0, PhysicsParameters(dt=dt))
         records = [source.snapshot(model, np.random.default_rng(seed)) for seed in (1, 2)]

@@ -144,7 +144,8 @@ def test_a_client_of_a_shared_world_changes_nothing():
     client = shared.join("anna", -4.0, 0.0)
     shared.join("bert", -4.0, 3.0)
     shared.until(lambda: client.remote_actors)
-    editor, alone = WorldEditor(client), Alone()
+    editor = WorldEditor(client)
+    alone = Alone()
     box = EntityArguments("crate", frames.pose([3.0, 0.0, 0.0]), None, "vinesim:box")
     moved = EntityArguments("bert", frames.pose([3.0, 0.0, 0.0]))
     for work, given in ((editor.spawn, box), (editor.delete, "box_0"), (editor.set_state, moved)):
@@ -160,7 +161,8 @@ def test_objects_and_robots_are_put_where_a_state_says(world):
     assert world.entity("box_1").velocity == pytest.approx(throw)
     world.run(10)
     x = world.entity("box_1").pose[:3]
-    t, g = 0.1, world.client.physics.parameters.gravity
+    t = 0.1
+    g = world.client.physics.parameters.gravity
     assert x == pytest.approx([3.0 + t, -2.0, 1.0 + 2.0 * t - 0.5 * g * t * t], abs=0.01)
     world.editor.set_state(EntityArguments("cart", frames.pose([-6.0, -1.0, 0.4], frames.from_yaw(2.0))))
     world.run(5)
@@ -236,7 +238,8 @@ def test_a_reset_of_the_state_keeps_what_was_spawned_where_it_was_spawned(world)
 @pytest.mark.long
 def test_resets_leave_nothing_behind(world):
     """Neither the physics before nor threads; counts of faults go on."""
-    physics, threads = [], threading.active_count()
+    physics = []
+    threads = threading.active_count()
     world.client.physics.grasp_manager.refused_grasps = 3
     for _ in range(3):
         physics.append(weakref.ref(world.client.physics))

@@ -27,11 +27,10 @@ from vinesim.scene.spec import load_scene
 
 @pytest.fixture
 def client() -> Client:
-    scene, hub = load_scene("demo"), MemoryHub()
+    scene = load_scene("demo")
+    hub = MemoryHub()
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
-    return Client(
-        scene, model, load_description("vinebot"), hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0)
-    )  # fmt: skip
+    return Client(scene, model, load_description("vinebot"), hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0))
 
 
 def test_a_client_without_faults_has_none(client) -> None:
@@ -61,13 +60,18 @@ def test_a_tree_that_is_stopped_is_counted_shown_and_logged_once(client, caplog)
 
 def test_diagnostics_warn_of_what_occurred_lately_and_always_count_it(client, monkeypatch) -> None:
     loop = RateLoop(0.01)
-    status, now = Status(client, loop), 1.0
+    status = Status(client, loop)
+    now = 1.0
     monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
     client.replicator.counters.malformed = 3
     for now, malformed, trouble in (
-        (1.0, 3, "messages refused"), (60.0, 3, "messages refused"), (61.0, 3, ""), (1000.0, 3, ""),
-        (1001.0, 4, "messages refused"), (1061.0, 4, ""),
-    ):  # fmt: skip
+        (1.0, 3, "messages refused"),
+        (60.0, 3, "messages refused"),
+        (61.0, 3, ""),
+        (1000.0, 3, ""),
+        (1001.0, 4, "messages refused"),
+        (1061.0, 4, ""),
+    ):
         client.replicator.counters.malformed = malformed
         loop.ticks = round(now / loop.dt)  # no step was missed
         shown = loop_status(status.current())
@@ -77,7 +81,8 @@ def test_diagnostics_warn_of_what_occurred_lately_and_always_count_it(client, mo
 
 def test_diagnostics_warn_while_a_loop_is_behind_and_no_longer(client, monkeypatch) -> None:
     loop = RateLoop(0.01)
-    status, now = Status(client, loop), 1.0
+    status = Status(client, loop)
+    now = 1.0
     monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
     for now, loop.ticks, message in ((1.0, 100, "well"), (2.0, 150, "behind"), (3.0, 250, "well")):  # noqa: B007
         assert loop_status(status.current()).message == message
@@ -85,8 +90,10 @@ def test_diagnostics_warn_while_a_loop_is_behind_and_no_longer(client, monkeypat
 
 def test_a_loop_that_was_asked_to_run_slowly_is_not_behind(client, monkeypatch) -> None:
     """At a fifth of real time 20 steps are due in a second."""
-    loop, pace = RateLoop(0.01, RealTime(0.2)), "0.20 of real time"
-    status, now = Status(client, loop), 1.0
+    loop = RateLoop(0.01, RealTime(0.2))
+    pace = "0.20 of real time"
+    status = Status(client, loop)
+    now = 1.0
     monkeypatch.setattr(RateLoop, "elapsed", property(lambda _: now))
     for now, loop.ticks, message in ((1.0, 20, pace), (2.0, 30, f"behind, {pace}"), (3.0, 50, pace)):  # noqa: B007
         assert loop_status(status.current()).message == message
@@ -111,7 +118,9 @@ def test_what_the_parts_of_a_client_count_is_added_up(client) -> None:
 
 def test_what_the_network_lost_refused_or_came_under_a_false_name_is_counted(client) -> None:
     counters = client.replicator.counters
-    counters.lost, counters.foreign, counters.network_failures = 1, 2, 3
+    counters.lost = 1
+    counters.foreign = 2
+    counters.network_failures = 3
     values = Status(client, RateLoop(0.01)).current()
     assert values["faults"] == {"messages_lost": 1, "messages_foreign": 2, "network_failures": 3}
     assert set(values["faults"]) <= set(DESCRIPTIONS)
@@ -120,7 +129,8 @@ def test_what_the_network_lost_refused_or_came_under_a_false_name_is_counted(cli
 
 def test_a_server_that_is_gone_is_told_while_it_is_gone(client) -> None:
     """By status line, status and diagnostics; not only by a line of the log when it went."""
-    status, hub = Status(client, RateLoop(0.01)), client.replicator.bus.hub
+    status = Status(client, RateLoop(0.01))
+    hub = client.replicator.bus.hub
     for hub.down, text in ((False, ""), (True, "the hub is down"), (False, "")):
         client.tick()
         values = status.current()
@@ -142,11 +152,16 @@ def test_the_round_trip_to_the_server_is_shown(client) -> None:
 def test_the_report_of_several_robots_has_the_losses_of_each() -> None:
     lost = {"picker_1": {}, "picker_2": {"/picker_2/tf": 3}}
     processes = {
-        name: types.SimpleNamespace(report=lambda dropped=dropped: {
-            "frames": {}, "ros_dropped": dropped, "sensor_restarts": len(dropped), "ros_restarts": 1,
-        })
+        name: types.SimpleNamespace(
+            report=lambda dropped=dropped: {
+                "frames": {},
+                "ros_dropped": dropped,
+                "sensor_restarts": len(dropped),
+                "ros_restarts": 1,
+            }
+        )
         for name, dropped in lost.items()
-    }  # fmt: skip
+    }
     report = complete_report({"faults": {}, "sensor_restarts": 0, "ros_restarts": 0}, processes)
     assert (report["sensor_restarts"], report["ros_restarts"], report["ros_dropped"]) == (1, 2, {})
     assert {name: one["ros_dropped"] for name, one in report["robots"].items()} == lost

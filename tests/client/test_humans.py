@@ -56,14 +56,22 @@ class World:
     def __init__(self, delay: float = 0.02) -> None:
         self.now = 100.0
         self.hub = MemoryHub(delay=delay)
-        self.scene, self.model = load_scene("demo"), assemble([cane((0.0, 30.0, 2.0), bunch=0.5)])
+        self.scene = load_scene("demo")
+        self.model = assemble([cane((0.0, 30.0, 2.0), bunch=0.5)])
         self.clients: list[Client] = []
 
     def join(self, name: str, description: RobotDescription | None, pose: np.ndarray, source=None, **options) -> Client:
         client = Client(
-            self.scene, self.model, description, self.hub.bus(name), name=name, pose=pose, source=source,
-            clock=lambda: self.now, **options,
-        )  # fmt: skip
+            self.scene,
+            self.model,
+            description,
+            self.hub.bus(name),
+            name=name,
+            pose=pose,
+            source=source,
+            clock=lambda: self.now,
+            **options,
+        )
         self.clients.append(client)
         return client
 
@@ -121,7 +129,8 @@ def test_a_standing_human_is_equal_on_all_clients():
     world.join("eva", None, SIDE, lambda _: pose, height=1.8)
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
     world.run(4.0)
-    remote_parts, here = parts_of(ida, "eva"), parts_of(world.clients[0], "eva")
+    remote_parts = parts_of(ida, "eva")
+    here = parts_of(world.clients[0], "eva")
     np.testing.assert_allclose(remote_parts, here, atol=1e-12)
     turned = ida.physics.rigid.human("eva").hand("left")
     np.testing.assert_allclose(ida.physics.hand("eva", turned.side).pose, pose.left, atol=1e-9)
@@ -257,7 +266,8 @@ def test_a_bunch_that_a_person_cuts_with_shears_is_cut_on_all_clients():
 
 def test_a_teleported_human_is_placed_at_once():
     world = World()
-    here, there = standing_pose(SIDE), standing_pose(frames.pose(np.array([6.0, 1.2, 0.0])))
+    here = standing_pose(SIDE)
+    there = standing_pose(frames.pose(np.array([6.0, 1.2, 0.0])))
     place = [here]
     world.join("eva", None, SIDE, lambda _: place[0])
     ida = world.join("ida", None, frames.pose(np.array([4.0, 0.0, 0.0])))
@@ -298,7 +308,8 @@ def test_lidar_and_camera_render_humans_and_robots_of_other_clients(vinebot):
         assert np.linalg.norm(points[:, :2] - at[:2], axis=1).max() < 0.8
         here = remote_parts == actor_label
         assert here.sum() > 30, name
-        info, depth = frame.info, frame.depth[here].astype(float)
+        info = frame.info
+        depth = frame.depth[here].astype(float)
         rays = np.stack([(columns[here] - info.cx) / info.fx, (rows[here] - info.cy) / info.fy, np.ones(len(depth))], 1)
         found = camera_pose[:3] + frames.rotate(camera_pose[3:], rays * depth[:, None])
         assert np.linalg.norm(found[:, :2] - at[:2], axis=1).max() < 0.8
@@ -453,9 +464,12 @@ def test_a_bunch_pulled_by_a_human_moves_on_the_robots_client(vinebot):
     world.run(0.6)
     middle = np.array([0.5 * float(world.model.bunch_length[bunch]), 0.0, 0.0])
     walker.do(
-        walker.face(tuple(centre[:2])), walker.reach("right", lambda: centre), walker.wait(0.3),
-        walker.withdraw("right", 0.4), walker.wait(0.5),
-    )  # fmt: skip
+        walker.face(tuple(centre[:2])),
+        walker.reach("right", lambda: centre),
+        walker.wait(0.3),
+        walker.withdraw("right", 0.4),
+        walker.wait(0.5),
+    )
     for _ in range(400):
         world.run(DT)
         if eva.physics.hand("eva", "right").held is not None:

@@ -37,7 +37,9 @@ OPENED: list[str] = []
 """Names of the files that Python opened since the list was cleared."""
 sys.addaudithook(lambda event, arguments: OPENED.append(str(arguments[0])) if event == "open" else None)
 
-BOTTOM, TOP, CRATE = 0.1, 1.1, 0.3
+BOTTOM = 0.1
+TOP = 1.1
+CRATE = 0.3
 """Heights of the pyramid's base and tip, and the edge of the crate [m]."""
 PYRAMID = trimesh.Trimesh(
     [[-0.5, -0.5, BOTTOM], [0.5, -0.5, BOTTOM], [0.5, 0.5, BOTTOM], [-0.5, 0.5, BOTTOM], [0, 0, TOP]],
@@ -137,7 +139,8 @@ def until(condition: Callable[[], object], description: str, *clients: Client) -
 
 def test_a_robot_is_seen_and_felt_where_its_files_do_not_exist(tmp_path, empty_cache, server):
     """One client has the package, the other none: first boxes, then the same triangles in its pictures and contacts."""
-    description, scene = package(tmp_path / "workspace"), load_scene("demo")
+    description = package(tmp_path / "workspace")
+    scene = load_scene("demo")
     far = frames.pose([60.0, 60.0, 0.0])
     with HeldBus("anna", server.endpoint) as hers, ZenohBus("bert", connect=server.endpoint) as his:
         anna = Client(scene, model(), description, hers, name="anna", pose=frames.pose(np.zeros(3)))
@@ -169,7 +172,8 @@ def test_a_robot_is_seen_and_felt_where_its_files_do_not_exist(tmp_path, empty_c
 
 def test_a_mesh_that_is_in_the_cache_is_not_sent_again(tmp_path, empty_cache, server):
     """Here of another file format: what is sent, seen and touched does not depend on it."""
-    description, scene = package(tmp_path, "obj"), load_scene("demo")
+    description = package(tmp_path, "obj")
+    scene = load_scene("demo")
     served = []
     with ZenohBus("anna", connect=server.endpoint) as hers:
         anna = Client(scene, model(), description, hers, name="anna", pose=frames.pose(np.zeros(3)))
@@ -178,8 +182,10 @@ def test_a_mesh_that_is_in_the_cache_is_not_sent_again(tmp_path, empty_cache, se
                 client = Client(scene, model(), None, bus, name=name, pose=frames.pose([60.0, 60.0, 0.0]))
                 until(
                     lambda client=client: "anna" in client.remote_actors and seen(client, "anna") == seen(anna, "anna"),
-                    "the mesh", anna, client,
-                )  # fmt: skip
+                    "the mesh",
+                    anna,
+                    client,
+                )
                 np.testing.assert_allclose(touched(client, "anna")[1], touched(anna, "anna")[1], atol=2e-6)
                 client.leave()
             served.append(server.meshes.counters.served)
@@ -193,7 +199,8 @@ def test_a_mesh_that_is_in_the_cache_is_not_sent_again(tmp_path, empty_cache, se
 class LyingBus:
     """A bus whose server replies with what ``reply(key, payload)`` makes."""
 
-    name, admissions = "bert", 1
+    name = "bert"
+    admissions = 1
 
     def __init__(self, reply: Callable[[str, bytes], list[bytes]]) -> None:
         self.fetch = reply
@@ -298,8 +305,13 @@ def test_what_a_text_asks_for_is_bounded():
     assert len(list_meshes(text_of(*many))) == MAX_MESHES
     assert len(list_meshes(text_of(*many, faces=MAX_FACES))) == (64 << 20) // (36 * MAX_FACES)
     for text in (
-        text_of(many[0], faces=MAX_FACES + 1), text_of(many[0], faces=0), text_of(many[0], faces=-1),
+        text_of(many[0], faces=MAX_FACES + 1),
+        text_of(many[0], faces=0),
+        text_of(many[0], faces=-1),
         text_of("../../x"),
-        text_of(many[0].upper()), text_of(many[0] + "0"), "no xml", '<!DOCTYPE r [<!ENTITY e SYSTEM "x">]><r>&e;</r>',
-    ):  # fmt: skip
+        text_of(many[0].upper()),
+        text_of(many[0] + "0"),
+        "no xml",
+        '<!DOCTYPE r [<!ENTITY e SYSTEM "x">]><r>&e;</r>',
+    ):
         assert not list_meshes(text)

@@ -23,9 +23,13 @@ FIRST, SECOND = (object_id(ObjectKind.BOX, i) for i in range(2))
 def client() -> Client:
     scene = load_scene("demo")
     return Client(
-        scene, generate(scene), load_description("vinebot"), MemoryHub().bus("robot"), name="robot",
+        scene,
+        generate(scene),
+        load_description("vinebot"),
+        MemoryHub().bus("robot"),
+        name="robot",
         pose=spawn_pose(scene, 0),
-    )  # fmt: skip
+    )
 
 
 def at_rest(box: int, parent: str, author: str) -> tuple[RetainedRecord, bool]:
@@ -55,7 +59,8 @@ def test_a_box_in_a_box_is_moved_by_whoever_carries_the_lower_one(client, monkey
 
 def test_records_that_each_local_actor_receives_are_applied_once(client) -> None:
     """All actors of a client receive the same records: more than there are trees, of a bunch twice, and late ones."""
-    objects, model = client.objects, client.model
+    objects = client.objects
+    model = client.model
     trees = [tree_at_rest(client, tree, authority=2, turn=0.1) for tree in range(len(model.tree_first))]
     late = tree_at_rest(client, 0, authority=1, turn=0.2)
     bunch = object_id(ObjectKind.BUNCH, 0)
@@ -73,9 +78,15 @@ def tree_at_rest(client: Client, tree: int, *, authority: int, turn: float) -> t
     size = client.model.tree_size[tree]
     q = turned(client, tree, turn)
     states = TreeStates(
-        0.0, np.array([tree]), np.array([1]), np.array([authority]), np.array([RESTING]), np.array([size]), q,
+        0.0,
+        np.array([tree]),
+        np.array([1]),
+        np.array([authority]),
+        np.array([RESTING]),
+        np.array([size]),
+        q,
         np.zeros((size, 3)),
-    )  # fmt: skip
+    )
     (payload,), _ = encode_trees(states)
     return RetainedRecord(tree, 1, authority, "ada", trees=payload), True
 

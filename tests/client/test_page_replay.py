@@ -8,7 +8,8 @@ from tests.web.test_page_world import OnePage
 from vinesim.web.array_message import decode
 from vinesim.web.page_input import ReplayCommand
 
-BEFORE, AFTER = PICKED_AT - 0.6, PICKED_AT + 0.6
+BEFORE = PICKED_AT - 0.6
+AFTER = PICKED_AT + 0.6
 
 
 @pytest.fixture(scope="module")

@@ -47,7 +47,9 @@ def test_planned_tasks_are_geometrically_feasible(seed: int):
 
 def test_a_path_avoids_static_objects_and_is_short():
     model = generate(harvest(7, boxes=()))
-    start, goal = np.array([5.0, 1.4]), np.array([5.0, -1.4])  # a vine stands between
+    # a vine stands between
+    start = np.array([5.0, 1.4])
+    goal = np.array([5.0, -1.4])
     points = path_planning.find_path(model, start, goal, pick_planning.BASE_CLEARANCE)
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     assert 2.8 < length < 5.0

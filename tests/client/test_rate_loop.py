@@ -91,11 +91,15 @@ def test_steps_of_a_long_stall_are_skipped_and_counted(clock):
 class AskedClock:
     """A world's clock that is known only since its last answer, and told again ``answer_after`` s after a stop."""
 
-    cause, factor = "", 1.0
+    cause = ""
+    factor = 1.0
 
     def __init__(self, fake, answer_after):
-        self.fake, self.answer_after = fake, answer_after
-        self.kept, self.stopped_at, self.slower = fake.now, None, 0.0
+        self.fake = fake
+        self.answer_after = answer_after
+        self.kept = fake.now
+        self.stopped_at = None
+        self.slower = 0.0
 
     def time(self, now):
         return now - (self.slower if self.is_current(now) else 0.0)
@@ -105,7 +109,8 @@ class AskedClock:
 
     def keep(self, now):
         if now - self.kept > 1.0:
-            self.stopped_at, self.slower = now, 2.5
+            self.stopped_at = now
+            self.slower = 2.5
         self.kept = now
 
 
@@ -149,7 +154,8 @@ def test_its_time_rises_again_slowly_and_does_not_swing(clock):
 
 def test_what_holds_a_step_slows_time_and_is_its_cause(clock):
     """A part that lets a step begin only every 50 ms: time passes at a fifth, whatever the steps themselves take."""
-    loop, free = own_pace(clock), [clock.now]
+    loop = own_pace(clock)
+    free = [clock.now]
     loop.hold = lambda: "" if clock.now >= free[0] else "sensors"
     for _ in range(200):
         run(loop, clock, [0.001])
@@ -198,7 +204,8 @@ def test_percentiles_are_those_of_the_work_time(clock):
 def test_steps_run_at_100_hz_by_the_real_clock():
     """F91: never faster, and again on time whenever the machine lets it; deadlines that are dropped are counted."""
     loop = RateLoop(0.01)
-    start, late = time.monotonic(), []
+    start = time.monotonic()
+    late = []
 
     def step() -> bool:
         loop.begin()
@@ -217,7 +224,8 @@ def test_a_log_gives_the_statistics_of_a_part_of_the_run(clock, tmp_path):
     loop.log().save(tmp_path / "ticks.npz")
     log = module.TickLog.load(tmp_path / "ticks.npz")
     start = log.begins[0]
-    early, late = log.between(start, start + 0.4), log.between(start + 0.6, np.inf)
+    early = log.between(start, start + 0.4)
+    late = log.between(start + 0.6, np.inf)
     assert early["tick_p99_ms"] == pytest.approx(2.0, rel=1e-3)
     assert late["tick_p50_ms"] == pytest.approx(4.0, rel=1e-3)
     assert late["tick_hz"] == pytest.approx(100.0)

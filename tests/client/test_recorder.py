@@ -88,8 +88,10 @@ def test_all_messages_are_recorded(tmp_path):
     }
     assert recorded.metadata.items() >= about.items()
     assert [(e.key, bool(e.payload)) for e in recorded.messages if e.key.startswith("live")] == [
-        ("live/ada", True), ("live/bob", True), ("live/bob", False),
-    ]  # fmt: skip
+        ("live/ada", True),
+        ("live/bob", True),
+        ("live/bob", False),
+    ]
     assert {messages.decode_hello(e.payload).name for e in recorded.messages if e.key.startswith("hello")} == {
         "ada",
         "bob",
@@ -183,9 +185,13 @@ def test_only_selected_families_are_recorded(tmp_path, only):
     world.run(0.5)
     world.touch()
     expected = {
-        "poses": {"a"}, "trees": {"tree", "near"}, "things": set(), "events": {"own"},
-        "facts": {"snap"}, "forces": set(),
-    }  # fmt: skip
+        "poses": {"a"},
+        "trees": {"tree", "near"},
+        "things": set(),
+        "events": {"own"},
+        "facts": {"snap"},
+        "forces": set(),
+    }
     assert families(world.recorded()) == {"live", "hello"} | expected[only]
 
 
@@ -231,8 +237,13 @@ def test_the_official_reader_reads_the_json(tmp_path):
     assert stamp == message.publish_time <= message.log_time
     assert messages_of["tree/0/0/ada"][0][2]["trees"][0]["tree"] == 0
     assert messages_of["own/0/0/ada"][0][2]["claims"][0] == {
-        "kind": "tree", "index": 0, "ownership": 0, "authority": 1, "owner": "ada", "touched": True,
-    }  # fmt: skip
+        "kind": "tree",
+        "index": 0,
+        "ownership": 0,
+        "authority": 1,
+        "owner": "ada",
+        "touched": True,
+    }
     assert messages_of["snap/0/0"][0][2]["facts"][0]["kind"] == "bunch"
     assert messages_of["hello/ada"][0][2]["scene"] == "rows"
 

@@ -39,7 +39,8 @@ def watch(original: Recording, **span: float) -> tuple[MinimalClient, list[bytes
     """A viewer beside the tree during a replay: the viewer, its states, and the updates it received, tick by tick."""
     bus = ReplayBus(original, "viewer", **span)
     viewer = MinimalClient(bus, 1.5, kind="spectator", joints=0)
-    states, updates = [], []
+    states = []
+    updates = []
     while not bus.ended:
         bus.play(TICK)
         viewer.tick(bus.time)
@@ -76,7 +77,8 @@ def test_a_viewer_receives_what_was_recorded(original):
 
 
 def test_two_replays_are_bitwise_equal(original):
-    first, second = watch(original), watch(original)
+    first = watch(original)
+    second = watch(original)
     assert first[1] == second[1]
     assert first[2] == second[2]
     assert len(set(first[1])) > 50  # the tree moved
@@ -110,7 +112,8 @@ def test_a_part_of_a_recording_is_replayed(original):
 
 def test_queries_for_retained_records_are_answered(original):
     bus = ReplayBus(original, "viewer")
-    before, later = object_id(ObjectKind.BUNCH, 3), object_id(ObjectKind.BUNCH, 4)
+    before = object_id(ObjectKind.BUNCH, 3)
+    later = object_id(ObjectKind.BUNCH, 4)
 
     def recorded_objects() -> set[int]:
         bus.query("snap/0/0")
@@ -150,7 +153,7 @@ class ReplayNetwork:
         server = self.hub.bus("server", live=False)
         server.declare_queryable(
             "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 5e8 + self.hub.time)
-        )  # fmt: skip
+        )
         self.kept: list[RetainedRecord] = []
         self.server = server
         server.subscribe("fact/**", KEEP_ALL)

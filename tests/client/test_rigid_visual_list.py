@@ -19,7 +19,8 @@ def body(name: str, shapes: tuple = ()) -> RigidVisual:
 @pytest.fixture
 def link():
     """Both ends of the way, and what takes a message over it."""
-    sender, receiver = VisualListSender(), VisualListReceiver()
+    sender = VisualListSender()
+    receiver = VisualListReceiver()
 
     def pass_on(visuals: tuple[RigidVisual, ...]):
         message = sender.update(visuals)
@@ -45,7 +46,9 @@ def test_a_list_that_was_only_made_anew_keeps_its_version(link):
 
 def test_only_new_bodies_are_sent_and_the_order_is_kept(link):
     _, receiver, pass_on = link
-    a, b, c = body("a"), body("b"), body("c")
+    a = body("a")
+    b = body("b")
+    c = body("c")
     pass_on((a, b))
     assert [v.name for v in pass_on((c, a, b)).new.values()] == ["c"]
     assert receiver.visuals == (c, a, b)

@@ -34,7 +34,8 @@ def filled() -> Physics:
 
 def test_bunches_fill_a_crate(filled: Physics) -> None:
     """The requested mass of bunches, at rest, above the bottom and most of them within the walls."""
-    model, rigid = filled.model, filled.rigid
+    model = filled.model
+    rigid = filled.rigid
     picked = np.array(rigid.free_bunches)
     assert not filled.state.bunch_attached[picked].any()
     assert filled.state.bunch_attached.sum() == len(model.bunch_body) - len(picked)
@@ -61,7 +62,8 @@ def test_two_compositions_are_equal(filled: Physics) -> None:
 
 def test_the_parameters_of_the_scene_are_used() -> None:
     """Without weight no bunch falls into the crate: the heap stays at the height from which bunches are dropped."""
-    model, heights = sensor_scenes.demo(), []
+    model = sensor_scenes.demo()
+    heights = []
     composer = SceneComposer(crates=(CratePlacement(1.3, 1.25, 0.4, 0.05),))
     for gravity in (9.81, 0.0):
         snapshot = composer.compose(model, PhysicsParameters(gravity=gravity))

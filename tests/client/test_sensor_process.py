@@ -40,7 +40,8 @@ class Robot:
     """A client with one vinebot far from a single cane, and its sensor process."""
 
     def __init__(self, device: str = "cpu", *, standby: bool = False) -> None:
-        scene, vinebot = load_scene("demo"), load_description("vinebot")
+        scene = load_scene("demo")
+        vinebot = load_description("vinebot")
         model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
         self.hub = MemoryHub()
         self.sensors = SensorProcess(
@@ -208,7 +209,8 @@ def test_a_fault_in_the_process_does_not_end_the_loop(robot, caplog):
 
 
 def test_a_process_that_cannot_start_is_an_error_in_one_line(tmp_path):
-    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
     client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
     with SensorProcess("robot", scene, model, vinebot, ros=False, renderer="pencil") as sensors:
@@ -228,7 +230,8 @@ def test_without_waiting_the_client_steps_and_the_sensors_join_it():
 
 
 def test_without_waiting_the_error_of_a_process_that_cannot_start_ends_the_steps():
-    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
     client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
     with SensorProcess("robot", scene, model, vinebot, ros=False, renderer="pencil") as sensors:
@@ -246,7 +249,8 @@ def test_the_kept_picture_is_written(robot, tmp_path):
 @pytest.mark.long
 def test_without_subscribers_a_picture_is_rendered_only_where_it_would_be_kept(robot, tmp_path):
     """While the score rises by the camera's rate; afterwards none, and the one with the highest score is written."""
-    physics, counter = robot.client.physics, itertools.count(1)
+    physics = robot.client.physics
+    counter = itertools.count(1)
     robot.client.frame_score = lambda: float(next(counter))
     robot.run_for_pictures(5)
     robot.client.frame_score = lambda: 0.5
@@ -277,7 +281,8 @@ def blank_frame(time: float) -> CameraFrame:
 
 def test_a_list_of_bodies_that_comes_after_its_snapshot_does_not_stop_the_start(monkeypatch: pytest.MonkeyPatch):
     """The first snapshot is then skipped; a client that wrote no other would wait for ever."""
-    send, delayed = worker_process.Run.send, []
+    send = worker_process.Run.send
+    delayed = []
 
     def send_late(run: worker_process.Run, kind: str, value: object = None) -> None:
         if kind == "visuals" and not delayed:

@@ -26,7 +26,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraOutput, LidarScan
 
-STAND, CATCH_UP = 0.25, 3e-3
+STAND = 0.25
+CATCH_UP = 3e-3
 """How long the client stands once, and its steps while it catches up [s]."""
 SCAN_PERIOD = 0.1
 """Of the robot's lidar [s]."""
@@ -57,7 +58,8 @@ class OneProcess:
         self.node = Node()
         monkeypatch.setattr(SensorWorker, "_open_node", lambda *_: self.node)
         monkeypatch.setattr(sensor_process, "WorkerProcess", self._worker_process)
-        scene, vinebot = load_scene("demo"), load_description("vinebot")
+        scene = load_scene("demo")
+        vinebot = load_description("vinebot")
         self.client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
         self.sensors = stack.enter_context(SensorProcess("robot", scene, model, vinebot, ros=True))
         self.sensors.attach(self.client)
@@ -66,7 +68,8 @@ class OneProcess:
 
     def _worker_process(self, _name, _modules, _entry, config, open_channel, _receive, rehearsal):
         pipe, self.worker_pipe = multiprocessing.Pipe()
-        self.config, self.channel = config, open_channel(multiprocessing.get_context("spawn"))
+        self.config = config
+        self.channel = open_channel(multiprocessing.get_context("spawn"))
         run = types.SimpleNamespace(shared=self.channel, send=lambda kind, value: pipe.send((kind, value)))
         return types.SimpleNamespace(
             is_ready=True,
@@ -93,11 +96,13 @@ def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[OneProcess]:
 @pytest.mark.parametrize("turn", [2, 30], ids=["worker in time", "worker 0.3 s late"])
 def test_scans_are_stamped_when_they_began_while_a_client_catches_up(world: OneProcess, turn: int):
     """Stamps rise, and are those of steps that are whole revolutions apart."""
-    client, steps = world.client, 120
+    client = world.client
+    steps = 120
     passed = np.full(steps, client.physics.dt)
     passed[steps // 2] = STAND
     passed[steps // 2 + 1 :] = CATCH_UP
-    simulated, stamps = [], []
+    simulated = []
+    stamps = []
     for step, now in enumerate(itertools.accumulate(passed, initial=1000.0)):
         client.world_time.follow(client.physics.time, now)
         client.tick()
@@ -117,7 +122,8 @@ def test_wires_that_a_swinging_shoot_takes_along_are_read_as_they_are(monkeypatc
     tree = int(model.body_tree[model.tie_body[model.tie_wire >= 0]][0])
     with contextlib.ExitStack() as stack:
         world = OneProcess(monkeypatch, stack, model)
-        physics, seen = world.client.physics, 0
+        physics = world.client.physics
+        seen = 0
         physics.plants.wake(np.array([tree]))
         physics.state.joint_qd[model.bodies_of(tree)] = 0.3
         for _ in range(20):

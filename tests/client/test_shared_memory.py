@@ -38,7 +38,8 @@ def forward_snapshots(snapshot, pipe):
     while not numbers or numbers[-1] >= 0:
         if snapshot.wait(deadline(5.0)):
             with snapshot.reading() as arrays:
-                number, values = int(arrays["number"][0]), arrays["values"].copy()
+                number = int(arrays["number"][0])
+                values = arrays["values"].copy()
             assert (values == number).all()
             numbers.append(number)
     pipe.send(numbers)
@@ -100,7 +101,8 @@ def test_a_full_queue_never_waits_and_a_failed_record_takes_no_room(context):
 
 def test_a_reader_is_woken_when_the_writer_says_so(context):
     """Not in the middle of a step: several records and the newest snapshot are there at once."""
-    queue, snapshot = SharedQueue(RECORD, 4, context), SharedSnapshot(LAYOUT, context)
+    queue = SharedQueue(RECORD, 4, context)
+    snapshot = SharedSnapshot(LAYOUT, context)
     for number in range(2):
         with queue.put() as record, snapshot.writing() as arrays:
             record["number"] = arrays["number"][0] = number

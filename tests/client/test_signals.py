@@ -31,9 +31,11 @@ from vinesim.sensors.export.images import look_at
 @pytest.mark.parametrize(
     ("pattern", "band"),
     [
-        (LightPattern.NOTIFICATION, (0.4, 0.8)), (LightPattern.WARNING, (0.4, 0.8)), (LightPattern.ALARM, (1.4, 2.8)),
+        (LightPattern.NOTIFICATION, (0.4, 0.8)),
+        (LightPattern.WARNING, (0.4, 0.8)),
+        (LightPattern.ALARM, (1.4, 2.8)),
     ],
-)  # fmt: skip
+)
 def test_flashes_are_those_of_iec_60073(pattern, band):
     """Slow or normal, half of the time lit; equal for equal times of the world, and so the same on all clients."""
     lights = Lights(pattern, (1, 2, 3))
@@ -63,9 +65,12 @@ def test_a_robots_lights_flash_in_a_picture():
     off = picture().astype(int)
     tower = None
     for pattern, time, color in (
-        (LightPattern.WARNING, 0.1, None), (LightPattern.ALARM, 0.1, None), (LightPattern.NOTIFICATION, 0.1, (0, 0, 1)),
-    ):  # fmt: skip
-        lit, dark = show(pattern, time, color), show(pattern, time + 0.5 / {1: 0.4, 2: 0.8, 3: 2.0}[pattern], color)
+        (LightPattern.WARNING, 0.1, None),
+        (LightPattern.ALARM, 0.1, None),
+        (LightPattern.NOTIFICATION, 0.1, (0, 0, 1)),
+    ):
+        lit = show(pattern, time, color)
+        dark = show(pattern, time + 0.5 / {1: 0.4, 2: 0.8, 3: 2.0}[pattern], color)
         tower = (np.abs(lit - dark).max(-1) > 60) if tower is None else tower
         assert tower.sum() > 20
         red, green, blue = np.median(lit[tower], axis=0)
@@ -81,15 +86,23 @@ def test_a_robots_lights_flash_in_a_picture():
 
 
 def test_other_clients_see_the_lights_and_know_the_intentions():
-    hub, now = MemoryHub(delay=0.02), 100.0
-    scene, model = load_scene("demo"), assemble([cane((0.0, 30.0, 2.0))])
+    hub = MemoryHub(delay=0.02)
+    now = 100.0
+    scene = load_scene("demo")
+    model = assemble([cane((0.0, 30.0, 2.0))])
     at = {"bot": frames.pose(np.zeros(3)), "eva": frames.pose(np.array([3.0, 0.0, 0.0]))}
     bot, eva = (
         Client(
-            scene, model, description, hub.bus(name), name=name, pose=at[name], clock=lambda: now,
+            scene,
+            model,
+            description,
+            hub.bus(name),
+            name=name,
+            pose=at[name],
+            clock=lambda: now,
         )
         for name, description in (("bot", load_description("vinebot")), ("eva", None))
-    )  # fmt: skip
+    )
     bot.robot.command_lights(LightPattern.ALARM)
     eva.humans["eva"].indicate("pick")
     colors = set()

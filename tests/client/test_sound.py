@@ -27,15 +27,23 @@ class World:
 
     def __init__(self, *, delay=0.02, **actors):
         """``actors``: kind and x [m] of each, one a client."""
-        self.hub, self.now = MemoryHub(delay=delay), 100.0
-        scene, model = load_scene("demo"), assemble([cane((0.0, 30.0, 2.0))])
-        self.clients, self.ears = {}, {}
+        self.hub = MemoryHub(delay=delay)
+        self.now = 100.0
+        scene = load_scene("demo")
+        model = assemble([cane((0.0, 30.0, 2.0))])
+        self.clients = {}
+        self.ears = {}
         for name, (kind, x) in actors.items():
             description = load_description("vinebot") if kind == "robot" else None
             self.clients[name] = (Spectator if kind == "spectator" else Client)(
-                scene, model, description, self.hub.bus(name), name=name, pose=frames.pose(np.array([x, 0.0, 0.0])),
+                scene,
+                model,
+                description,
+                self.hub.bus(name),
+                name=name,
+                pose=frames.pose(np.array([x, 0.0, 0.0])),
                 clock=lambda: self.now,
-            )  # fmt: skip
+            )
             self.ears[name] = Ear(self.clients[name], name)
         self._phase = 0.0
         self.run(0.7)
@@ -136,7 +144,8 @@ def test_a_page_that_stood_still_is_not_heard_twice_at_once():
 
 def test_sound_that_a_loudspeaker_or_a_client_that_stands_still_has_no_room_for_is_counted():
     world = World(bot=("robot", 0.0))
-    exchange, second = world.clients["bot"].sound, bytes(2 * SAMPLE_RATE)
+    exchange = world.clients["bot"].sound
+    second = bytes(2 * SAMPLE_RATE)
     exchange.play("bot", 29 * second)
     assert exchange.dropped == 0
     exchange.play("bot", 2 * second)

@@ -33,7 +33,8 @@ def report(lock, words, pipe):
 
 def test_a_process_runs_what_it_receives_after_its_imports():
     """With a lock among the arguments; a module that cannot be imported is left to who needs it."""
-    lock, spawned = CONTEXT.Lock(), spawn("test", MODULES)
+    lock = CONTEXT.Lock()
+    spawned = spawn("test", MODULES)
     lock.acquire()
     spawned.run(report, lock, ["a", "b"])
     assert not spawned.pipe.poll(0.2)
@@ -45,7 +46,8 @@ def test_a_process_runs_what_it_receives_after_its_imports():
 
 def test_a_process_that_was_started_early_is_taken_once():
     start_early("test", MODULES)
-    first, second = spawn("test", MODULES), spawn("test", MODULES)
+    first = spawn("test", MODULES)
+    second = spawn("test", MODULES)
     assert first.process.pid != second.process.pid
     for spawned in (first, second):
         spawned.pipe.close()

@@ -51,9 +51,12 @@ def vinebot() -> RobotDescription:
 
 def hello(description: RobotDescription, name: str = "guest", **change) -> Hello:
     defaults = {
-        "robot": description.name, "urdf": description.urdf, "joints": len(description.joints), "index": 7,
+        "robot": description.name,
+        "urdf": description.urdf,
+        "joints": len(description.joints),
+        "index": 7,
         "sidecar": encode_sidecar(description.base_limits, description.groups),
-    }  # fmt: skip
+    }
     return Hello(name, **{**defaults, **change})
 
 
@@ -70,7 +73,8 @@ def world(description: RobotDescription) -> Physics:
 
 
 def test_no_tick_waits_for_a_robot_that_joins(vinebot):
-    physics, deferred = world(vinebot), DeferredExecutor()
+    physics = world(vinebot)
+    deferred = DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     for tick in range(5):
@@ -91,7 +95,8 @@ def test_no_tick_waits_for_a_robot_that_joins(vinebot):
 def test_no_tick_waits_for_a_robot_that_leaves(vinebot):
     """Its copy stays until the world without it is compiled; then the others have the bits of a removal at once. Who
     comes back under the name meanwhile gets a body of its own."""
-    waiting, at_once = world(vinebot), world(vinebot)
+    waiting = world(vinebot)
+    at_once = world(vinebot)
     deferred = DeferredExecutor()
     spawner = RemoteSpawner(waiting.rigid, vinebot, deferred)
     pose = frames.pose([0.0, 0.0, 0.0])
@@ -119,7 +124,8 @@ def test_no_tick_waits_for_a_robot_that_leaves(vinebot):
 
 
 def test_a_robot_that_comes_back_before_its_copy_was_removed_is_placed_anew(vinebot):
-    physics, deferred = world(vinebot), DeferredExecutor()
+    physics = world(vinebot)
+    deferred = DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     pose = frames.pose([0.0, -3.0, 0.0])
     physics.rigid.add_robot(vinebot.to_spec("guest", 7, pose))
@@ -158,7 +164,8 @@ def test_a_prepared_and_an_immediate_join_give_the_same_bits(vinebot):
 
 
 def test_a_world_that_changed_during_compilation_is_compiled_again(vinebot):
-    physics, deferred = world(vinebot), DeferredExecutor()
+    physics = world(vinebot)
+    deferred = DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     update = update_at(vinebot, 0.0)
@@ -174,7 +181,8 @@ def test_a_world_that_changed_during_compilation_is_compiled_again(vinebot):
 
 
 def test_an_actor_that_leaves_before_being_ready_is_not_spawned(vinebot):
-    physics, deferred = world(vinebot), DeferredExecutor()
+    physics = world(vinebot)
+    deferred = DeferredExecutor()
     spawner = RemoteSpawner(physics.rigid, vinebot, deferred)
     spawner.enqueue(hello(vinebot))
     spawner.spawn({"guest": update_at(vinebot, 0.0)}).get("guest")
@@ -242,12 +250,23 @@ def with_group(vinebot: RobotDescription, **change) -> str:
         (lambda _: "{", "truncated"),
         (lambda _: '{"cameras": [], "unknown": 1}', "unknown"),
         (lambda _: " " * (1 << 17), "B; send at most"),
-        (lambda robot: with_group(robot, joints=("no such joint",), stiffness=None, damping=None, armature=None,
-                                  series_stiffness=None, series_damping=None, home=None), "no drive moves"),
+        (
+            lambda robot: with_group(
+                robot,
+                joints=("no such joint",),
+                stiffness=None,
+                damping=None,
+                armature=None,
+                series_stiffness=None,
+                series_damping=None,
+                home=None,
+            ),
+            "no drive moves",
+        ),
         (lambda robot: with_group(robot, stiffness=(1e300,) * 9), "stiffness"),
         (lambda robot: with_group(robot, damping=(-1.0,) * 9), "damping"),
     ],
-)  # fmt: skip
+)
 def test_a_sidecar_that_no_robot_has_is_refused(vinebot, text, reason):
     with pytest.raises(DescriptionError, match=reason):
         resolve_description(hello(vinebot, sidecar=text(vinebot)), vinebot)

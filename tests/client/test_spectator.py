@@ -44,7 +44,8 @@ def watch(recording: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
     pose = standing_view(1.5, 0.0, np.pi)
     spectator = Spectator(load_scene("demo"), vineyard(), None, bus, name="viewer", pose=pose, clock=lambda: bus.time)
     bodies = vineyard().bodies_of(0)
-    states, tree = [], {}
+    states = []
+    tree = {}
     while not bus.ended:
         bus.play(TICK)
         spectator.tick()
@@ -56,7 +57,8 @@ def watch(recording: Recording) -> tuple[list[bytes], dict[int, np.ndarray]]:
 
 @pytest.mark.long
 def test_two_replays_move_the_trees_equally(bent):
-    (first, tree), (second, _) = watch(bent), watch(bent)
+    (first, tree) = watch(bent)
+    (second, _) = watch(bent)
     assert first == second
     assert len(set(first)) > 80
     # the displayed state follows the recorded one

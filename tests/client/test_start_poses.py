@@ -35,7 +35,8 @@ def test_a_vineyard_with_too_low_bunches_is_refused():
 
 def test_a_start_place_moves_back_along_its_heading():
     scene = load_scene("demo")
-    pose, behind = start_poses.spawn_pose(scene, 0), start_poses.spawn_pose(scene, 0, 3.0)
+    pose = start_poses.spawn_pose(scene, 0)
+    behind = start_poses.spawn_pose(scene, 0, 3.0)
     local = frames.rotate(frames.conjugate(pose[3:]), behind[:3] - pose[:3])
     assert local == pytest.approx([-3.0, 0.0, 0.0], abs=1e-9)
 

@@ -32,9 +32,14 @@ def client_with(job: str, robot: str, spawn: int) -> tuple[Client, Task]:
     start_task, start = plan_task(job, model, start_poses.spawn_pose(scene, spawn))
     now = iter(range(1_000_000))
     client = Client(
-        scene, model, load_robot(robot), MemoryHub().bus("worker"), name="worker", pose=start,
+        scene,
+        model,
+        load_robot(robot),
+        MemoryHub().bus("worker"),
+        name="worker",
+        pose=start,
         clock=lambda: 0.01 * next(now),
-    )  # fmt: skip
+    )
     task = start_task(client.physics, client.robot)
     client.pre_step += [task.control, LookAt(client.robot, task.focus)]
     return client, task
@@ -106,7 +111,8 @@ class CommandedRobot:
         self.joints = self.robot.joint_indices(JOINTS)
 
     def _take(self) -> list[Command]:
-        commands, self.queue = self.queue, []
+        commands = self.queue
+        self.queue = []
         return commands
 
     def run(self, seconds: float) -> np.ndarray:
@@ -130,7 +136,8 @@ def trajectory(
 def test_a_trajectory_is_linear_between_its_points():
     commanded = CommandedRobot()
     start = commanded.run(0.1)
-    first, last = start + np.array([0.3, -0.2]), start + np.array([0.1, 0.0])
+    first = start + np.array([0.3, -0.2])
+    last = start + np.array([0.1, 0.0])
     commanded.queue = [trajectory(first, last)]
     np.testing.assert_allclose(commanded.run(0.5), 0.5 * (start + first), atol=0.01)
     np.testing.assert_allclose(commanded.run(0.5), first, atol=0.01)
@@ -202,7 +209,8 @@ def test_a_robot_stands_until_it_may_start_and_then_drives_there() -> None:
     """It goes on when the reason to start is gone again."""
     robot = Robot(RigidWorld(assemble([])), load_robot("vinebot"), "anna")
     others: list[str] = []
-    drive, times = DriveTo(robot, frames.pose([2.0, 0.0, 0.0]), may_start=lambda: others), iter(range(100_000))
+    drive = DriveTo(robot, frames.pose([2.0, 0.0, 0.0]), may_start=lambda: others)
+    times = iter(range(100_000))
 
     def go(seconds: float) -> float:
         for _ in range(round(100 * seconds)):

@@ -18,9 +18,11 @@ class Pair:
 
     def __init__(self, period: float) -> None:
         model, self.body, self.rest = bunch_scene(0.5)
-        self.owner, self.other = Physics(model), Physics(model)
+        self.owner = Physics(model)
+        self.other = Physics(model)
         self.copies = TreeCopies(self.other, ObjectSync(self.other, {"other"}))
-        self.every, self.touched = round(period / self.owner.dt), False
+        self.every = round(period / self.owner.dt)
+        self.touched = False
 
     def run(self, seconds: float) -> np.ndarray:
         """Where the bunch is on both, from its rest [step, 2, 3] m."""
@@ -38,8 +40,10 @@ class Pair:
         return np.array(rows)
 
     def state(self) -> TreeUpdate:
-        here, state = self.owner.model.bodies_of(0), self.owner.state
-        q, qd = state.joint_q[here].astype(float), state.joint_qd[here].astype(float)
+        here = self.owner.model.bodies_of(0)
+        state = self.owner.state
+        q = state.joint_q[here].astype(float)
+        qd = state.joint_qd[here].astype(float)
         return TreeUpdate(0, "owner", 0, 0, self.other.time, False, self.touched, q, qd)
 
     def hold(self) -> int:

@@ -12,7 +12,8 @@ DT = 0.01
 
 def stamps(clock: np.ndarray) -> np.ndarray:
     """What a client stamps its steps with that begin at these times of the server's clock [step] s."""
-    world, found = WorldTime(DT), []
+    world = WorldTime(DT)
+    found = []
     for step, now in enumerate(clock):
         world.follow(step * DT, now)
         found.append(step * DT + world.offset)
@@ -25,7 +26,8 @@ def test_clients_agree_and_jitter_is_smoothed() -> None:
     begin = 1.7e9
     one = begin + np.arange(3000) * DT + random.exponential(2e-3, 3000).clip(0.0, 8e-3)
     other = begin + 7.0 + np.arange(2300) * DT + random.exponential(2e-3, 2300).clip(0.0, 8e-3)
-    first, second = stamps(one), stamps(other)
+    first = stamps(one)
+    second = stamps(other)
     apart = first[1200:] - second[500:2300]
     assert np.abs(apart).max() < 2e-3
     assert np.abs(np.diff(first[300:]) - DT).max() < 2e-4
@@ -72,7 +74,9 @@ def test_what_is_ready_late_is_stamped_as_its_step_was() -> None:
     """Also where the client stood for 250 ms and then caught up, so that its offset jumped up and fell since."""
     passed = np.full(400, DT)
     passed[200], passed[201:225] = 0.25, 3e-3
-    world, history, found = WorldTime(DT), OffsetHistory(len(passed)), []
+    world = WorldTime(DT)
+    history = OffsetHistory(len(passed))
+    found = []
     for step, now in enumerate(100.0 + np.cumsum(passed)):
         world.follow(step * DT, now)
         history.add(step * DT, world.offset)

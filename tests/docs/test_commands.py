@@ -70,7 +70,8 @@ def typer_command() -> typer.main.TyperCommand:
 def resolve(line: str) -> tuple[typer.main.TyperCommand, typer.Context, list[str]]:
     """The command that a line names, its context and the words that it is given; a usage error of click's if there is
     none."""
-    command, words = typer_command(), shlex.split(line)
+    command = typer_command()
+    words = shlex.split(line)
     context = command.context_class(command)
     while hasattr(command, "resolve_command") and words and not words[0].startswith("-"):
         name, command, words = command.resolve_command(context, words)
@@ -170,10 +171,11 @@ def test_a_wrong_option_would_be_found():
 
 def python_pages() -> list[pathlib.Path]:
     return [
-        page for page in PAGES
+        page
+        for page in PAGES
         if str(page.relative_to(ROOT)) not in ELSEWHERE
         and any(language == "python" for language, _ in BLOCK.findall(page.read_text()))
-    ]  # fmt: skip
+    ]
 
 
 @pytest.mark.long

@@ -22,8 +22,8 @@ from vinesim.core import disk_cache
 from vinesim.kernels import compilation
 from vinesim.kernels.compilation import CompiledModules, compile_kernels, module_names
 
-PACKAGE = "sensing"
-"""Small: four modules."""
+PACKAGE = "stereo"
+"""Small: three modules."""
 
 PROGRAM = f"""
 import logging, sys
@@ -39,11 +39,11 @@ for line in sys.stdin:
     name = line.strip().removeprefix("vinesim.kernels.")
     with open(log, "a") as file:
         print(name, os.getpid(), os.nice(0), file=file)
-    if name == "human_kinematics":
+    if name == "rigid.human_kinematics":
         os.kill(os.getpid(), 9)
     while name.startswith("raster") and not os.path.exists(log + ".go"):
         time.sleep(0.01)
-    fails = name == "joint_servos"
+    fails = name == "rigid.joint_servos"
     print('{"failure": "no"}' if fails else '{"folder": "."}', flush=True)
 """
 """Compiles nothing: logs each module, its process and its niceness; dies of one module and fails at another."""
@@ -79,13 +79,13 @@ def test_of_processes_that_start_together_one_compiles(tmp_path: pathlib.Path) -
     results = [compiled(process) for process in [start(tmp_path) for _ in range(2)]]
     wanted = len(module_names((PACKAGE,)))
     assert sorted(count for count, _ in results) == [0, wanted]
-    assert len(list((tmp_path / "warp").glob("*/wp_vinesim.kernels.sensing.*"))) == wanted
+    assert len(list((tmp_path / "warp").glob("*/wp_vinesim.kernels.stereo.*"))) == wanted
     for _, lines in results:
         assert all(line.startswith("compiling kernels, only once: ") for line in lines)
         assert all(line.endswith(f" of {wanted} done") for line in lines)
 
     assert compiled(start(tmp_path)) == (0, [])
-    lost = next((tmp_path / "warp").glob("*/wp_vinesim.kernels.sensing.lidar*"))
+    lost = next((tmp_path / "warp").glob("*/wp_vinesim.kernels.stereo.stereo_input*"))
     shutil.rmtree(lost)
     assert compiled(start(tmp_path))[0] == 1
     assert lost.is_dir()
@@ -111,11 +111,11 @@ def test_compilers_end_with_the_process_that_started_them_and_another_goes_on(
 def test_a_cache_that_cannot_be_made_is_replaced_for_this_time(tmp_path: pathlib.Path) -> None:
     (tmp_path / "warp").write_text("not a folder")
     environment = os.environ | {"WARP_CACHE_PATH": str(tmp_path / "warp"), "TMPDIR": str(tmp_path)}
-    program = PROGRAM.replace(f"({PACKAGE!r},)", "('human_kinematics',)")
+    program = PROGRAM.replace(f"({PACKAGE!r},)", "('rigid.human_kinematics',)")
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
     assert "compiled 1" in done.stdout
     assert (done.stdout + done.stderr).count("set WARP_CACHE_PATH") == 1
-    assert list(tmp_path.glob("vinesim-kernels-*/*/wp_vinesim.kernels.human_kinematics*"))
+    assert list(tmp_path.glob("vinesim-kernels-*/*/wp_vinesim.kernels.rigid.human_kinematics*"))
 
 
 def test_every_module_that_defines_kernels_is_known() -> None:
@@ -168,40 +168,40 @@ def fake(tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Fa
 
 @pytest.mark.skipif(not hasattr(os, "setpriority"), reason="has no niceness")
 def test_what_comes_later_is_not_waited_for_and_is_compiled_nicer(fake: Fake) -> None:
-    assert compile_kernels(("sensing", "shading"), then=("raster",)) == len(module_names(("sensing", "shading")))
+    assert compile_kernels(("stereo", "shading"), then=("raster",)) == len(module_names(("stereo", "shading")))
     compiled = CompiledModules()
-    assert not compiled.missing(module_names(("sensing", "shading")))
+    assert not compiled.missing(module_names(("stereo", "shading")))
     assert compiled.missing(module_names(("raster",)))
     fake.go_on()
     wait(lambda: not compiled.missing(module_names(("raster",))), "the other modules")
     names = [name for name, _, _ in fake.rows()]
-    assert sorted(names) == sorted(module_names(("sensing", "shading", "raster")))  # each once
+    assert sorted(names) == sorted(module_names(("stereo", "shading", "raster")))  # each once
     niceness = {niceness for name, _, niceness in fake.rows() if name.startswith("raster")}
     assert niceness == {compilation.NICENESS}
     assert {niceness for name, _, niceness in fake.rows() if not name.startswith("raster")} == {os.nice(0)}
 
 
 def test_of_what_another_compiles_only_the_own_part_is_waited_for(fake: Fake) -> None:
-    first = threading.Thread(target=compile_kernels, args=(("shading", "sensing"),), kwargs={"then": ("raster",)})
+    first = threading.Thread(target=compile_kernels, args=(("shading", "stereo"),), kwargs={"then": ("raster",)})
     first.start()
     wait(is_locked, "the first to begin")
-    assert compile_kernels(("sensing",)) == 0
+    assert compile_kernels(("stereo",)) == 0
     assert CompiledModules().missing(module_names(("raster",)))
     fake.go_on()
     assert compile_kernels(("raster",)) == 0
     first.join()
     names = [name for name, _, _ in fake.rows()]
-    assert sorted(names) == sorted(module_names(("shading", "sensing", "raster")))  # each once
+    assert sorted(names) == sorted(module_names(("shading", "stereo", "raster")))  # each once
 
 
 def test_a_module_of_which_compilers_die_costs_the_others_nothing(fake: Fake, caplog: pytest.LogCaptureFixture) -> None:
-    packages = ("human_kinematics", "inverse_kinematics", "shared_launch")
+    packages = ("rigid.human_kinematics", "robot.inverse_kinematics", "shared_launch")
     assert compile_kernels(packages) == 2
-    assert CompiledModules().missing(module_names(packages)) == ["human_kinematics"]
-    assert "human_kinematics was not compiled beforehand: the compiler ended with exit code -9" in caplog.text
-    assert [name for name, _, _ in fake.rows()].count("human_kinematics") == compilation.ATTEMPTS
+    assert CompiledModules().missing(module_names(packages)) == ["rigid.human_kinematics"]
+    assert "rigid.human_kinematics was not compiled beforehand: the compiler ended with exit code -9" in caplog.text
+    assert [name for name, _, _ in fake.rows()].count("rigid.human_kinematics") == compilation.ATTEMPTS
 
 
 def test_a_module_that_cannot_be_compiled_is_logged(fake: Fake, caplog: pytest.LogCaptureFixture) -> None:
-    assert compile_kernels(("joint_servos", "shared_launch")) == 1
-    assert "joint_servos was not compiled beforehand: no" in caplog.text
+    assert compile_kernels(("rigid.joint_servos", "shared_launch")) == 1
+    assert "rigid.joint_servos was not compiled beforehand: no" in caplog.text

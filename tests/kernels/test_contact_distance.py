@@ -67,7 +67,8 @@ def test_distance_of_segments_is_mujocos(kind, length):
     mine = closest(kind, middle - axis, middle + axis)
     compared = 0
     for i in range(len(middle)):
-        data.mocap_pos[0], data.mocap_quat[0] = middle[i], frames.to_wxyz(turn[i])
+        data.mocap_pos[0] = middle[i]
+        data.mocap_quat[0] = frames.to_wxyz(turn[i])
         mujoco.mj_forward(world, data)
         gap = mujoco.mj_geomDistance(world, data, 0, 1, 10.0, None)
         if gap > 0.0:
@@ -78,10 +79,8 @@ def test_distance_of_segments_is_mujocos(kind, length):
 
 
 def test_the_lowest_point_of_a_segment_is_closest_to_a_plane():
-    start, end = (
-        np.array([[0, 0, 0.2], [0, 0, 0.1], [0.3, 0, 0.1]]),
-        np.array([[1, 0, 0.1], [1, 0, 0.3], [0.9, 0, 0.1]]),
-    )
+    start = np.array([[0, 0, 0.2], [0, 0, 0.1], [0.3, 0, 0.1]])
+    end = np.array([[1, 0, 0.1], [1, 0, 0.3], [0.9, 0, 0.1]])
     found = closest("plane", start, end)
     np.testing.assert_allclose(found[:, 3], 0.1, atol=1e-15)
     np.testing.assert_array_equal(found[:, :3], [[0, 0, 1]] * 3)
@@ -91,11 +90,13 @@ def test_distance_of_segments_and_a_box_equals_dense_sampling():
     """Against sampling, as MuJoCo's distance of a box to a capsule that pierces it is positive."""
     rng = np.random.default_rng(5)
     size = np.array(KINDS["box"][1])
-    middle, turn = rng.normal(size=(200, 3)) * 0.15, frames.normalize(rng.normal(size=(200, 4)))
+    middle = rng.normal(size=(200, 3)) * 0.15
+    turn = frames.normalize(rng.normal(size=(200, 4)))
     axis = frames.rotate(turn, np.array([0.0, 0.0, 0.15]))
     points = middle[:, None] + np.linspace(-1.0, 1.0, 2001)[:, None] * axis[:, None]
     beyond = np.abs(points) - size
-    outside, inside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1), beyond.max(-1)
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1)
+    inside = beyond.max(-1)
     truth = np.where(inside < 0.0, inside, outside).min(1)
     mine = closest("box", middle - axis, middle + axis)[:, 3]
     assert (truth < 0.0).sum() > 20
@@ -134,14 +135,16 @@ def true_distance(kind: str, p: np.ndarray) -> np.ndarray:
     if kind == "box":
         beyond = np.abs(p) - size
         return np.where((beyond < 0).all(1), beyond.max(1), np.linalg.norm(np.maximum(beyond, 0), axis=1))
-    across, along = np.hypot(p[:, 0], p[:, 1]) - size[0], np.abs(p[:, 2]) - size[1]
+    across = np.hypot(p[:, 0], p[:, 1]) - size[0]
+    along = np.abs(p[:, 2]) - size[1]
     inside = (across < 0) & (along < 0)
     return np.where(inside, np.maximum(across, along), np.hypot(np.maximum(across, 0), np.maximum(along, 0)))
 
 
 @given(kind=st.sampled_from(["sphere", "capsule", "cylinder", "box"]), start=points, end=points)
 def test_distance_of_a_segment_is_the_minimum_over_its_points(kind, start, end):
-    a, b = np.array(start, float), np.array(end, float)
+    a = np.array(start, float)
+    b = np.array(end, float)
     along = np.linspace(0.0, 1.0, 2001)[:, None]
     truth = true_distance(kind, a + along * (b - a)).min()
     step = np.linalg.norm(b - a) / 2000
@@ -154,11 +157,13 @@ def ellipsoid_distance(p: np.ndarray) -> np.ndarray:
     """Distance of points [n, 3] outside of the ellipsoid, by bisection of the Lagrange multiplier of its closest
     point."""
     square = np.array(KINDS["ellipsoid"][1]) ** 2
-    low, high = np.zeros(len(p)), np.linalg.norm(p, axis=1) * np.sqrt(square.max())
+    low = np.zeros(len(p))
+    high = np.linalg.norm(p, axis=1) * np.sqrt(square.max())
     for _ in range(60):
         middle = 0.5 * (low + high)
         outside = (square * (p / (square + middle[:, None])) ** 2).sum(1) > 1.0
-        low, high = np.where(outside, middle, low), np.where(outside, high, middle)
+        low = np.where(outside, middle, low)
+        high = np.where(outside, high, middle)
     return np.linalg.norm(p - square * p / (square + low[:, None]), axis=1)
 
 
@@ -183,7 +188,8 @@ def test_distance_of_an_ellipsoid_is_exact_outside_and_of_first_order_inside():
 @given(start=points, end=points)
 def test_distance_of_a_segment_and_an_ellipsoid_has_the_right_sign_and_is_exact_outside(start, end):
     size = np.array(KINDS["ellipsoid"][1])
-    a, b = np.array(start, float), np.array(end, float)
+    a = np.array(start, float)
+    b = np.array(end, float)
     p = a + np.linspace(0.0, 1.0, 2001)[:, None] * (b - a)
     mine = closest("ellipsoid", a[None], b[None])[0]
     depth = (np.linalg.norm(p / size, axis=1) - 1.0).min()
@@ -227,7 +233,8 @@ def test_distance_of_two_segments_is_the_minimum_over_their_points(a, b, c, d):
 
 
 def test_a_segment_along_a_face_has_its_contact_in_the_middle():
-    start, end = np.array([[0.06, 0.0, -0.04]]), np.array([[0.06, 0.0, 0.04]])
+    start = np.array([[0.06, 0.0, -0.04]])
+    end = np.array([[0.06, 0.0, 0.04]])
 
     assert closest("box", start, end)[0] == pytest.approx([1.0, 0.0, 0.0, 0.01])
 
@@ -256,7 +263,8 @@ def _outside(
     ],
 )
 def test_what_is_outside_the_box_of_a_shape_is_out_of_reach(kind, half):
-    rng, reach = np.random.default_rng(8), 0.02
+    rng = np.random.default_rng(8)
+    reach = 0.02
     start, end = rng.normal(size=(2, 5000, 3)) * 0.12
     is_outside = np.zeros(len(start), np.bool_)
     ends = [wp.array(x, dtype=wp.vec3d, device="cpu") for x in (start, end)]

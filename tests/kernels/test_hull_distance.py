@@ -74,7 +74,8 @@ class Hull:
         depth = (places @ self.equations[:, :3].T + self.equations[:, 3]).max(1).min()
         if depth <= 0.0:
             return float(depth)
-        count, heavy = len(self.vertices), 1e3
+        count = len(self.vertices)
+        heavy = 1e3
         system = np.zeros((5, count + 2))
         system[:3, :count], system[:3, count], system[:3, count + 1] = self.vertices.T, -a, -b
         system[3, :count] = system[4, count:] = heavy
@@ -93,7 +94,8 @@ def random_hull(rng: np.random.Generator) -> Hull:
 
 
 def random_segments(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarray]:
-    middle, half = rng.normal(size=(count, 3)) * 0.15, rng.normal(size=(count, 3)) * 0.05
+    middle = rng.normal(size=(count, 3)) * 0.15
+    half = rng.normal(size=(count, 3)) * 0.05
     half[::5] = 0.0
     return middle - half, middle + half
 
@@ -125,8 +127,10 @@ def test_distance_of_segments_is_mujocos() -> None:
     data = mujoco.MjData(m)
     compared = 0
     for _ in range(100):
-        place, turn = rng.normal(size=3) * 0.2, frames.normalize(rng.normal(size=4))
-        data.mocap_pos[0], data.mocap_quat[0] = place, frames.to_wxyz(turn)
+        place = rng.normal(size=3) * 0.2
+        turn = frames.normalize(rng.normal(size=4))
+        data.mocap_pos[0] = place
+        data.mocap_quat[0] = frames.to_wxyz(turn)
         mujoco.mj_forward(m, data)
         gap = mujoco.mj_geomDistance(m, data, 0, 1, 10.0, None)
         axis = frames.rotate(turn, np.array([0.0, 0.0, 0.1]))
@@ -141,7 +145,8 @@ def test_beyond_its_reach_the_distance_is_a_lower_bound() -> None:
     rng = np.random.default_rng(3)
     hull = random_hull(rng)
     start, end = random_segments(rng, 200)
-    exact, bound = hull.closest(start, end)[0][:, 3], hull.closest(start, end, reach=0.05)[0][:, 3]
+    exact = hull.closest(start, end)[0][:, 3]
+    bound = hull.closest(start, end, reach=0.05)[0][:, 3]
     near = exact < 0.05
     assert near.sum() > 20
     assert (~near).sum() > 20

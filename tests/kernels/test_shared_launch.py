@@ -114,8 +114,10 @@ def test_a_launch_of_a_sequence_may_determine_the_number_of_threads_of_the_next(
 ) -> None:
     if not packed:
         monkeypatch.setattr("vinesim.kernels.launch.ctypes", None)
-    counted, following = Counted(pool, 3), Counted(pool, 64)
-    listed, given = np.zeros(1, np.int32), ctypes.c_int32()
+    counted = Counted(pool, 3)
+    following = Counted(pool, 64)
+    listed = np.zeros(1, np.int32)
+    given = ctypes.c_int32()
     number = wp.array(listed, dtype=wp.int32, device="cpu", copy=False)
     entries = wp.array(counted.entries, dtype=wp.int32, device="cpu")
     count = bind_launch(count_positive, [entries, counted.counts], [number])
@@ -126,7 +128,8 @@ def test_a_launch_of_a_sequence_may_determine_the_number_of_threads_of_the_next(
         counted.launch(2, 7)  # the next launch begins with the first entry again
         counted.counts.zero_()
         following.counts.zero_()
-        given.value, listed[0] = entry_count, 0
+        given.value = entry_count
+        listed[0] = 0
         run()
         assert listed[0] == entry_count
         for each in (counted, following):

@@ -29,15 +29,32 @@ from matplotlib import pyplot as plt
 ROOT = pathlib.Path(__file__).parents[2]
 PICTURES = ROOT / "docs" / "pictures"
 PAGE = ROOT / "docs" / "validation.md"
-BEGIN, END = "<!-- laws: written by make validation -->", "<!-- laws end -->"
-INK, GRAPE, LEAF, WOOD, GREY = "#2b2b2b", "#6a2c70", "#4f7942", "#b5651d", "#9a9a9a"
+BEGIN = "<!-- laws: written by make validation -->"
+END = "<!-- laws end -->"
+INK = "#2b2b2b"
+GRAPE = "#6a2c70"
+LEAF = "#4f7942"
+WOOD = "#b5651d"
+GREY = "#9a9a9a"
 COLOURS = (GRAPE, LEAF, WOOD, "#2a6f97")
 
 plt.rcParams |= {
-    "font.size": 10, "axes.spines.top": False, "axes.spines.right": False, "axes.edgecolor": GREY, "axes.titlesize": 11,
-    "axes.titlelocation": "left", "axes.labelcolor": INK, "text.color": INK, "xtick.color": INK, "ytick.color": INK,
-    "legend.frameon": False, "lines.linewidth": 1.6, "savefig.dpi": 130, "axes.grid": True, "grid.color": "#ececec",
-}  # fmt: skip
+    "font.size": 10,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.edgecolor": GREY,
+    "axes.titlesize": 11,
+    "axes.titlelocation": "left",
+    "axes.labelcolor": INK,
+    "text.color": INK,
+    "xtick.color": INK,
+    "ytick.color": INK,
+    "legend.frameon": False,
+    "lines.linewidth": 1.6,
+    "savefig.dpi": 130,
+    "axes.grid": True,
+    "grid.color": "#ececec",
+}
 
 Table = list[str]
 
@@ -105,7 +122,8 @@ def convergence() -> Table:
     pieces.set_title("resting tip against the elastica: order")
     pieces.legend(fontsize=7, loc="lower left")
 
-    over_dt, dt = beam_theory.errors_over_dt(), 1e3 * np.array(beam_theory.STEPS)
+    over_dt = beam_theory.errors_over_dt()
+    dt = 1e3 * np.array(beam_theory.STEPS)
     slope = beam_theory.order(beam_theory.STEPS, over_dt["frequency"])
     steps.loglog(dt, 100 * over_dt["frequency"], "o", color=GRAPE, label=f"frequency, % (order {slope:.2f})")
     steps.loglog(dt, 100 * over_dt["theory"], color=GRAPE, lw=1, ls="--", label="(ω dt)² / 12, the trapezoidal rule's")
@@ -118,10 +136,16 @@ def convergence() -> Table:
     save(figure, "convergence")
     lines = table(("tip off [mm] with so many bodies", *map(str, beam_theory.PIECES), "order"), rows)
     head = ("phi 1/2, dt [ms]", *(f"{x:g}" for x in dt), "order")
-    lines += ["", *table(head, [
-        ("frequency off [%]", *(f"{100 * e:.3g}" for e in over_dt["frequency"]), f"{slope:.2f}"),
-        ("tip off after 0.5 s [mm]", *(f"{1e3 * e:.3g}" for e in over_dt["tip"]), f"{slope_tip:.2f}"),
-    ])]  # fmt: skip
+    lines += [
+        "",
+        *table(
+            head,
+            [
+                ("frequency off [%]", *(f"{100 * e:.3g}" for e in over_dt["frequency"]), f"{slope:.2f}"),
+                ("tip off after 0.5 s [mm]", *(f"{1e3 * e:.3g}" for e in over_dt["tip"]), f"{slope_tip:.2f}"),
+            ],
+        ),
+    ]
     return lines
 
 
@@ -165,9 +189,11 @@ def first_modes() -> Table:
 def grasped() -> Table:
     """A bunch grasped, lifted, moved, pulled, released: vinesim, and the same scene entirely in MuJoCo."""
     model, body, middle = bunch_scene()
-    ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
+    ours = Physics(model)
+    reference = MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
-    place, force = np.zeros((2, 800, 3)), np.zeros((2, 800))
+    place = np.zeros((2, 800, 3))
+    force = np.zeros((2, 800))
     for tick in range(800):
         target, pull = grasp(0.01 * tick)
         for rigid in (ours.rigid, reference.rigid):
@@ -192,9 +218,10 @@ def grasped() -> Table:
     off = np.linalg.norm(place[0] - place[1], axis=1)[:640].max()
     held = slice(250, 590)
     ratio = force[0, held].mean() / force[1, held].mean() - 1
-    return table(("grasp against all in MuJoCo", ""), [
-        ("bunch while held, at worst", f"{1e3 * off:.2f} mm"), ("mean finger force", f"{100 * ratio:+.2f} %")
-    ])  # fmt: skip
+    return table(
+        ("grasp against all in MuJoCo", ""),
+        [("bunch while held, at worst", f"{1e3 * off:.2f} mm"), ("mean finger force", f"{100 * ratio:+.2f} %")],
+    )
 
 
 def energy() -> Table:
@@ -242,9 +269,10 @@ def main() -> None:
     sections = (
         ("elastica", elastica, "canes at rest over alpha"),
         ("convergence", convergence, "convergence in bodies and dt"),
-        ("damping", damping, "damping ratio asked against seen"), ("energy", energy, "energy over a minute"),
+        ("damping", damping, "damping ratio asked against seen"),
+        ("energy", energy, "energy over a minute"),
         ("grasp", grasped, "a grasp against the same scene in MuJoCo"),
-    )  # fmt: skip
+    )
     for name, draw, text in sections:
         print(name, flush=True)
         lines += ["", f"![{text}](pictures/laws-{name}.png)", "", *draw()]

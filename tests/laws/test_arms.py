@@ -18,33 +18,49 @@ from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
-SHOOT, MASS = 0.5, 0.05
+SHOOT = 0.5
+MASS = 0.05
 """A shoot here: a rod [m] of a mass [kg] that stands on a joint with a spring; far up a tie holds it to a post."""
 STIFFNESS = np.array([15.0, 20.0, 20.0])
 """[N m/rad] of that spring, about the shoot and across."""
 TIE = 20.0
 """[N/m] across, at the tip."""
-LENGTH, RADIUS, MODULUS = 1.0, (0.016, 0.008), 1e9
+LENGTH = 1.0
+RADIUS = (0.016, 0.008)
+MODULUS = 1e9
 """[m], [m] at the trunk and at the end, [Pa]: of the arm, which lies along x."""
 ALONG = (0.2, 0.5, 0.55, 0.9)
 """[m] where four shoots stand on it."""
 
 
 def cordon(
-    along: tuple[float, ...] = ALONG, *, modulus: float = MODULUS, beta: float = 0.02, lean: float = 0.0,
-    tie: float = TIE, weight: bool = False, others: int = 0,
-) -> Model:  # fmt: skip
+    along: tuple[float, ...] = ALONG,
+    *,
+    modulus: float = MODULUS,
+    beta: float = 0.02,
+    lean: float = 0.0,
+    tie: float = TIE,
+    weight: bool = False,
+    others: int = 0,
+) -> Model:
     """Shoots that ``lean`` [rad] along the arm; ``others`` stand on another arm beside it. ``weight``: in equilibrium
     with it as drawn."""
-    trees, places = [], [(x, 0.0) for x in along] + [(x, 0.3) for x in np.linspace(0.2, 0.8, others)]
+    trees = []
+    places = [(x, 0.0) for x in along] + [(x, 0.3) for x in np.linspace(0.2, 0.8, others)]
     for x, y in places:
         tree = TreeBuilder(
             frames.pose(np.array([x, y, 1.0]), frames.from_x_axis([np.sin(lean), 0.0, np.cos(lean)], [0.6, 0.8, 0.0]))
         )
         tree.add_body(
-            -1, mass=MASS, com=(SHOOT / 2, 0, 0), length=SHOOT, radius=(0.004, 0.004),
-            inertia=np.full(3, MASS * SHOOT**2 / 12), stiffness=STIFFNESS, damping=beta * STIFFNESS,
-        )  # fmt: skip
+            -1,
+            mass=MASS,
+            com=(SHOOT / 2, 0, 0),
+            length=SHOOT,
+            radius=(0.004, 0.004),
+            inertia=np.full(3, MASS * SHOOT**2 / 12),
+            stiffness=STIFFNESS,
+            damping=beta * STIFFNESS,
+        )
         trees.append(tree)
     count = len(trees)
     edges = np.linspace(0.0, LENGTH, 4)
@@ -52,13 +68,20 @@ def cordon(
     piece = [np.searchsorted(edges, x, side="right") - 1 + (3 if y else 0) for x, y in places]
     tip = [tree.pose[:3] + SHOOT * np.array([np.sin(lean), 0.0, np.cos(lean)]) for tree in trees]
     model = assemble(
-        trees, tree_piece=piece, tie_body=np.arange(count), tie_point=np.tile([SHOOT, 0.0, 0.0], (count, 1)),
-        tie_anchor=tip, tie_stiffness=np.full(count, tie), tie_damping=np.full(count, 0.5 * beta * tie),
+        trees,
+        tree_piece=piece,
+        tie_body=np.arange(count),
+        tie_point=np.tile([SHOOT, 0.0, 0.0], (count, 1)),
+        tie_anchor=tip,
+        tie_stiffness=np.full(count, tie),
+        tie_damping=np.full(count, 0.5 * beta * tie),
         fixed_start=[[x, y, 1.0] for y in (0.0, 0.3) for x in edges[:-1]],
         fixed_end=[[x, y, 1.0] for y in (0.0, 0.3) for x in edges[1:]],
-        fixed_radius=np.tile(np.stack([radius[:-1], radius[1:]], -1), (2, 1)), fixed_organ=[int(Organ.ARM)] * 6,
-        fixed_index=np.repeat([0, 1], 3), fixed_shear_modulus=[modulus] * 6,
-    )  # fmt: skip
+        fixed_radius=np.tile(np.stack([radius[:-1], radius[1:]], -1), (2, 1)),
+        fixed_organ=[int(Organ.ARM)] * 6,
+        fixed_index=np.repeat([0, 1], 3),
+        fixed_shear_modulus=[modulus] * 6,
+    )
     return solve_rest_pose(model) if weight else model
 
 
@@ -138,7 +161,8 @@ def test_what_one_leaning_shoot_does_to_another_that_does_to_it() -> None:
 def test_modes_of_two_shoots_on_an_arm(modulus: float, sign: float) -> None:
     """In step and opposed two equal shoots swing as joints and arm say, beside what the trapezoidal rule does to any
     oscillator: tan(w dt / 2) = dt/2 sqrt(K / M). M has (dt/2)^2 (k - S) beside the shoots' own."""
-    along, dt = (0.9, 0.9006), 0.01
+    along = (0.9, 0.9006)
+    dt = 0.01
     physics = world(cordon(along, modulus=modulus, beta=0.0, tie=0.0), phi=0.5)
     physics.state.joint_qd[:] = frames.rotate(
         frames.conjugate(physics.model.tree_pose[:, 3:].astype(float)), np.array([0.05, 0.0, 0.0])

@@ -47,12 +47,17 @@ def test_elastica_of_random_canes() -> None:
     rng = np.random.default_rng(1)
     drawn = [
         beam_theory.of_load(
-            rng.uniform(0.1, 20.0), rng.uniform(0.0, 0.95), length=rng.uniform(0.2, 2.0), angle=rng.uniform(-1.2, 1.0),
-            radius=rng.uniform(0.002, 0.02), density=rng.uniform(400.0, 1200.0),
+            rng.uniform(0.1, 20.0),
+            rng.uniform(0.0, 0.95),
+            length=rng.uniform(0.2, 2.0),
+            angle=rng.uniform(-1.2, 1.0),
+            radius=rng.uniform(0.002, 0.02),
+            density=rng.uniform(400.0, 1200.0),
         )
         for _ in range(40)
-    ]  # fmt: skip
-    expected, measured = np.array([beam_theory.elastica(beam) for beam in drawn]), beam_theory.resting_tips(drawn)
+    ]
+    expected = np.array([beam_theory.elastica(beam) for beam in drawn])
+    measured = beam_theory.resting_tips(drawn)
     straight = np.array([[np.cos(b.angle), np.sin(b.angle)] * np.array(b.length) for b in drawn])
     error = np.linalg.norm(measured - expected, axis=1) / np.linalg.norm(expected - straight, axis=1)
     assert error.max() < 0.005, drawn[int(error.argmax())]
@@ -66,7 +71,8 @@ def test_a_tapered_cane() -> None:
         for share in (0.0, 0.3)
         for taper in (0.85, 0.6, 0.4)
     ]
-    expected, measured = np.array([beam_theory.elastica(beam) for beam in drawn]), beam_theory.resting_tips(drawn)
+    expected = np.array([beam_theory.elastica(beam) for beam in drawn])
+    measured = beam_theory.resting_tips(drawn)
     error = np.linalg.norm(measured - expected, axis=1) / np.linalg.norm(expected - [1.0, 0.0], axis=1)
     assert error.max() < 0.005, (drawn[int(error.argmax())], error.max())
 
@@ -125,7 +131,8 @@ def test_measured_damping_is_the_requested_one() -> None:
 @pytest.mark.parametrize("stiff_first", [True, False])
 def test_a_cane_of_two_woods_bends_as_two(stiff_first: bool) -> None:
     """A side load on the tip: P/3E1I (L^3 - l^3) + P l^3 / 3E2I, each joint with its own spring."""
-    load, half = 0.002, 0.5
+    load = 0.002
+    half = 0.5
     tree = beam_theory.two_woods(stiff_first, density=8.0)  # its weight is negligible
     tree.solve_rest_pose()
     for body in tree.bodies:
@@ -150,11 +157,19 @@ def test_a_cane_of_two_thicknesses_twists_as_two(pieces: int) -> None:
     tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, beam_theory.HEIGHT])))
     thick = tree.add_rod(-1, 0.4, (0.005, 0.005), RodMaterial(5e9, 8.0, 0.3), pieces)
     thin = tree.add_rod(thick[-1], 0.6, (0.003, 0.003), RodMaterial(2e9, 8.0, 0.3, shear_modulus=1e9), pieces)
-    mass, beside, half = 0.002, 0.05, tree.bodies[thin[-1]]["far"]
+    mass = 0.002
+    beside = 0.05
+    half = tree.bodies[thin[-1]]["far"]
     tree.add_body(
-        thin[-1], offset=(0.6 / pieces, 0, 0), mass=mass, com=(0, beside, 0), inertia=[mass * 1e-4] * 3, length=1e-3,
-        stiffness=half, damping=0.3 * half,
-    )  # fmt: skip
+        thin[-1],
+        offset=(0.6 / pieces, 0, 0),
+        mass=mass,
+        com=(0, beside, 0),
+        inertia=[mass * 1e-4] * 3,
+        length=1e-3,
+        stiffness=half,
+        damping=0.3 * half,
+    )
     plants = beam_theory.settle([tree])
     side = frames.rotate(plants.state.body_q[-1, 3:].astype(float), np.array([0.0, 1.0, 0.0]))
     polar = np.pi / 2 * np.array([0.005, 0.003]) ** 4

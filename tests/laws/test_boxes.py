@@ -69,7 +69,8 @@ def test_a_box_starts_to_slide_at_mu_times_its_load(which, fraction):
     for _ in range(150):
         physics.step()
     start = poses(physics)
-    data, body = physics.rigid.mj_data, physics.rigid.mj_model.body(f"box/{which}").id
+    data = physics.rigid.mj_data
+    body = physics.rigid.mj_model.body(f"box/{which}").id
     force = fraction * PhysicsParameters().friction * WEIGHT * sum(MASSES[which:2])
     data.xfrc_applied[body, 0] = force
     data.xfrc_applied[body, 4] = -force * (
@@ -96,7 +97,8 @@ def test_a_box_of_bunches_is_lifted_moved_and_set_down(clusters):
     )
     fork = robot("fork", [0.0, 0.0, 0.03], "0 0 1", "0.5 0.3 0.06", 10.0, (2e4, 2e3, 1000.0))
     physics.add_robot(fork)
-    rigid, rng = physics.rigid, np.random.default_rng(1)
+    rigid = physics.rigid
+    rng = np.random.default_rng(1)
     pick_all(physics)
     for bunch in range(3):
         at = np.array([-0.15 + 0.1 * bunch, 0.02 * bunch - 0.02, 0.25 + 0.15 * bunch])
@@ -153,16 +155,19 @@ def airborne(clusters: bool = False) -> Physics:
 
 def momentum(physics: Physics) -> np.ndarray:
     """Total momentum of all free bodies [3] kg m/s; of a ram, along its axis."""
-    rigid, model = physics.rigid, physics.model
+    rigid = physics.rigid
+    model = physics.model
     rigid.update_kinematics()
-    total, J = np.zeros(3), np.zeros((3, rigid.mj_model.nv))
+    total = np.zeros(3)
+    J = np.zeros((3, rigid.mj_model.nv))
     names = ["box/0", "box/1", *(f"free_bunch/{slot}" for slot in rigid._bunch_slot.values())]
     for name in (*names, "ram0/tool", "ram1/tool"):
         body = rigid.mj_model.body(name).id
         mujoco.mj_jacBodyCom(rigid.mj_model, rigid.mj_data, J, None, body)
         total += rigid.mj_model.body_mass[body] * (J @ rigid.mj_data.qvel)
     physics.update_kinematics()
-    q, v = physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
+    q = physics.state.body_q.astype(float)
+    v = physics.state.body_qd.astype(float)
     free = model.body_tree >= 2
     velocity = v[:, :3] + np.cross(v[:, 3:], frames.rotate(q[:, 3:], model.body_com.astype(float)))
     return total + model.body_mass[free].astype(float) @ velocity[free]
@@ -184,9 +189,14 @@ def throw(physics: Physics, kind: str, index: int, x: float, speed: float) -> No
 
 
 PAIRS = [
-    ("box", "box"), ("box", "bunch"), ("bunch", "box"), ("bunch", "bunch"), ("ram", "box"), ("ram", "bunch"),
+    ("box", "box"),
+    ("box", "bunch"),
+    ("bunch", "box"),
+    ("bunch", "bunch"),
+    ("ram", "box"),
+    ("ram", "bunch"),
     ("ram", "ram"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(
@@ -201,7 +211,8 @@ def test_colliding_pairs_conserve_momentum(one, other, clusters):
     rigid.mj_model.opt.gravity[:] = 0.0
     throw(physics, one, 0, -0.5, 1.5)
     throw(physics, other, 1, 0.5, -1.0)
-    start, exchanged = momentum(physics), np.zeros(2)
+    start = momentum(physics)
+    exchanged = np.zeros(2)
     for _ in range(60):
         physics.step()
         acceleration = rigid.mj_data.qacc - rigid.mj_data.qacc_smooth  # of contacts, at the poses of the step's start
@@ -220,7 +231,8 @@ def momentum_rate_x(physics: Physics, kind: str, index: int, rates: np.ndarray) 
     """Mass times the rate of an object's centre of mass along x, at MuJoCo's current poses."""
     rigid = physics.rigid
     name = {"box": f"box/{index}", "bunch": f"free_bunch/{rigid._bunch_slot[index]}", "ram": f"ram{index}/tool"}[kind]
-    body, J = rigid.mj_model.body(name).id, np.zeros((3, rigid.mj_model.nv))
+    body = rigid.mj_model.body(name).id
+    J = np.zeros((3, rigid.mj_model.nv))
     mujoco.mj_jacBodyCom(rigid.mj_model, rigid.mj_data, J, None, body)
     return float(rigid.mj_model.body_mass[body] * (J @ rates)[0])
 
@@ -242,7 +254,8 @@ def test_a_collision_with_a_cut_cane_conserves_momentum(other):
         joint.qvel[1] = 1.0
     else:
         rigid.place_bunch(0, frames.pose([middle[0] - 0.085, 59.85, HIGH]), np.array([0, 1.0, 0, 0, 0, 0]))
-    start, contact_count = momentum(physics), 0
+    start = momentum(physics)
+    contact_count = 0
     for _ in range(50):
         physics.step()
         contact_count += len(physics.contacts)
@@ -263,7 +276,8 @@ def test_a_crate_that_falls_on_another_comes_to_rest_on_its_rim(mass, fall):
     physics = Physics(assemble([cane((0.0, 50.0, 2.0))], box_pose=at, box_size=[SIZE] * 2, box_mass=[2.0, mass]))
     for _ in range(200):
         physics.step()
-    (lower, upper), data = poses(physics), physics.rigid.mj_data
+    (lower, upper) = poses(physics)
+    data = physics.rigid.mj_data
     assert upper[2] == pytest.approx(0.3, abs=2e-3)
     assert lower[2] == pytest.approx(0.0, abs=2e-3)
     assert np.abs(data.qvel).max() < 1e-3

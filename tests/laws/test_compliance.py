@@ -81,7 +81,8 @@ class Stand:
 
     def lever(self, link: str) -> np.ndarray:
         """[3, joint] Jacobian of a link's centre of mass, by differences of the description's own kinematics."""
-        robot, step = self.robot, 1e-6
+        robot = self.robot
+        step = 1e-6
         position = self.rigid.joint_measurements("anna")[0].copy()
         centre = next(
             np.array(measured.find("inertial/origin").get("xyz").split(), float)
@@ -103,13 +104,15 @@ class Stand:
 
 def weight_beyond(stand: Stand, joint: str) -> float:
     """Moment [N m] about a joint's axis of the weight that it carries: the effort of its drive."""
-    description, position = stand.robot.description, stand.rigid.joint_measurements("anna")[0]
+    description = stand.robot.description
+    position = stand.rigid.joint_measurements("anna")[0]
     i = description.joints.index(joint)
     height = []
     for sign in (-1.0, 1.0):
         moved = position.copy()
         moved[i] += sign * 1e-6
-        poses, energy = description.link_poses(moved), 0.0
+        poses = description.link_poses(moved)
+        energy = 0.0
         for link in ElementTree.fromstring(description.urdf).iterfind("link"):
             if (mass := link.find("inertial/mass")) is not None:
                 origin = link.find("inertial/origin")
@@ -122,7 +125,8 @@ def weight_beyond(stand: Stand, joint: str) -> float:
 
 def decrement(position: np.ndarray) -> tuple[float, float]:
     """Log-decrement over a whole period, and the period [s], of a decaying swing about zero [tick]."""
-    peaks, times = [], []
+    peaks = []
+    times = []
     for k in range(1, len(position) - 1):
         before, here, after = position[k - 1 : k + 2]
         if (here - before) * (after - here) <= 0.0:
@@ -157,7 +161,8 @@ def test_log_decrement_is_that_of_the_commanded_damping(gate: RobotDescription, 
     stand.robot.command_impedance([stiffness], [damping])
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.3]))
     swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, 0]
-    measured, desired = decrement(swing), expected(stiffness, damping, inertia)
+    measured = decrement(swing)
+    desired = expected(stiffness, damping, inertia)
     assert measured[0] == pytest.approx(desired[0], rel=0.02)
     assert measured[1] == pytest.approx(desired[1], rel=0.02)
 
@@ -223,7 +228,8 @@ def test_a_joint_of_an_arm_oscillates_as_commanded(
     vinebot: RobotDescription, joint: int, stiffness: float, zeta: float
 ) -> None:
     """The robot's own hinge friction (URDF) adds to the commanded damping; inertia from the URDF and the rotor."""
-    stand, name = Stand(vinebot), ARM[joint]
+    stand = Stand(vinebot)
+    name = ARM[joint]
     inertia = inertia_about(vinebot, name) + next(d.armature for d in vinebot.drives if d.joint == name)
     friction = next(
         float(measured.find("dynamics").get("damping"))
@@ -232,18 +238,21 @@ def test_a_joint_of_an_arm_oscillates_as_commanded(
     )
     total = 2.0 * zeta * np.sqrt(stiffness * inertia)
     stand.robot.command_impedance([stiffness], [total - friction], [name])
-    i, start = stand.robot.joint_indices([name])[0], vinebot.home.copy()
+    i = stand.robot.joint_indices([name])[0]
+    start = vinebot.home.copy()
     start[i] += 0.05
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), start)
     swing = stand.run(14.0 * np.sqrt(inertia / stiffness))[:, i] - vinebot.home[i]
-    measured, desired = decrement(swing), expected(stiffness, total, inertia)
+    measured = decrement(swing)
+    desired = expected(stiffness, total, inertia)
     assert measured[0] == pytest.approx(desired[0], rel=0.02)
     assert measured[1] == pytest.approx(desired[1], rel=0.02)
 
 
 def inertia_about(description: RobotDescription, joint: str) -> float:
     """[kg m2] of all that a joint carries at home, about its axis, from the URDF's text."""
-    root, poses = ElementTree.fromstring(description.urdf), description.link_poses(description.home)
+    root = ElementTree.fromstring(description.urdf)
+    poses = description.link_poses(description.home)
     joints = {measured.get("name"): measured for measured in root.iterfind("joint")}
     carried = {joints[joint].find("child").get("link")}
     while (
@@ -262,7 +271,8 @@ def inertia_about(description: RobotDescription, joint: str) -> float:
         inertial = link.find("inertial")
         if link.get("name") not in carried or inertial is None:
             continue
-        mass, tensor = float(inertial.find("mass").get("value")), inertial.find("inertia")
+        mass = float(inertial.find("mass").get("value"))
+        tensor = inertial.find("inertia")
         at = poses[link.get("name")]
         centre = at[:3] + frames.rotate(at[3:], np.array(inertial.find("origin").get("xyz").split(), float))
         xx, yy, zz, xy, xz, yz = (float(tensor.get(key)) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
@@ -277,11 +287,13 @@ def inertia_about(description: RobotDescription, joint: str) -> float:
 
 
 def test_behind_a_locked_motor_the_gate_oscillates_on_its_spring(gate: RobotDescription) -> None:
-    stand, inertia = Stand(gate), GATE_INERTIA + ROTOR
+    stand = Stand(gate)
+    inertia = GATE_INERTIA + ROTOR
     stand.robot.command_motor_position([0.0])
     stand.rigid.place_robot("anna", np.array([0, 0, 0, 0, 0, 0, 1.0]), np.array([0.2]))
     swing = stand.run(3.0)[:, 0]
-    measured, desired = decrement(swing), expected(150.0, 3.0, inertia)
+    measured = decrement(swing)
+    desired = expected(150.0, 3.0, inertia)
     assert measured[0] == pytest.approx(desired[0], rel=0.02)
     assert measured[1] == pytest.approx(desired[1], rel=0.02)
 
@@ -317,7 +329,8 @@ def test_motor_command_is_followed_by_the_link(gate: RobotDescription) -> None:
     assert elements.motor[0] == pytest.approx(0.4, abs=1e-5)
     stand.push("leaf", np.array([0.0, 20.0, 0.0]))  # rotated by 0.4 rad: its lever is 0.5 cos
     stand.run(12.0)
-    elements, angle = stand.robot.sample(stand.time).elements, stand.rigid.joint_measurements("anna")[0][0]
+    elements = stand.robot.sample(stand.time).elements
+    angle = stand.rigid.joint_measurements("anna")[0][0]
     assert elements.torque[0] == pytest.approx(-20.0 * 0.5 * np.cos(angle), rel=1e-5)
     assert angle - 0.4 == pytest.approx(20.0 * 0.5 * np.cos(angle) / 150.0, rel=1e-5)
 
@@ -341,8 +354,10 @@ def test_effort_is_weight_less_j_transposed_f(vinebot: RobotDescription) -> None
 def test_pose_is_held_against_50_newtons(vinebot: RobotDescription, direction: tuple[int, int, int]) -> None:
     """F17: at rest every servo's stiffness times its deflection is J^T F, that of the base included; and back after
     it."""
-    stand, link = Stand(vinebot), "arm_left_7_link"
-    start, base = stand.run(0.2)[-1], stand.rigid.base_state("anna")[0]
+    stand = Stand(vinebot)
+    link = "arm_left_7_link"
+    start = stand.run(0.2)[-1]
+    base = stand.rigid.base_state("anna")[0]
     place = stand.robot.frame_pose(link)[:3]
     force = 50.0 * np.array(direction, float)
     stand.push(link, force)

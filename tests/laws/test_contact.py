@@ -20,7 +20,8 @@ FINGERS = ("left", "right")
 
 def realised(physics: Physics, start: np.ndarray) -> np.ndarray:
     """Body velocities [body, 6] of the new joint rates, at the poses ``start`` of the step's start."""
-    model, velocity = physics.model, np.zeros((len(physics.model.body_mass), 6))
+    model = physics.model
+    velocity = np.zeros((len(physics.model.body_mass), 6))
     for b, parent in enumerate(model.body_parent):
         above = model.tree_pose[model.body_tree[b]] if parent < 0 else start[parent]
         motion = np.zeros(6) if parent < 0 else velocity[parent]
@@ -39,7 +40,8 @@ CLUSTERS = pytest.mark.parametrize("clusters", [False, True], ids=["plain", "clu
 def held(request):
     """Close, lift, move, pull, release: bunch, finger forces and efforts of vinesim and MuJoCo, tick by tick."""
     model, body, middle = bunch_scene(clusters=request.param)
-    ours, reference = Physics(model), MujocoScene(model, [gripper(middle)])
+    ours = Physics(model)
+    reference = MujocoScene(model, [gripper(middle)])
     ours.add_robot(gripper(middle))
     rows = {key: [] for key in ("ours", "reference", "force", "reference_force", "effort", "reference_effort")}
     for tick in range(800):
@@ -80,12 +82,14 @@ def test_finger_forces_and_efforts_of_a_grasp_are_mujocos(held):
 
 
 def test_held_bunch_does_not_creep(held):
-    before, after = held["ours"][560], held["ours"][595]
+    before = held["ours"][560]
+    after = held["ours"][595]
     assert np.linalg.norm(after - before) < 5e-5
 
 
 def test_a_released_bunch_returns_to_rest(held):
-    physics, body = held["physics"], held["body"]
+    physics = held["physics"]
+    body = held["body"]
     physics.rigid.command("grip", np.zeros(4))
     for _ in range(2500):
         physics.step()
@@ -119,7 +123,8 @@ def test_predicted_velocities_are_realised_and_action_is_reaction(clusters):
     model, _, middle = bunch_scene(clusters=clusters)
     physics = Physics(model)
     physics.add_robot(gripper(middle))
-    rigid, solver = physics.rigid, physics.contact_solver
+    rigid = physics.rigid
+    solver = physics.contact_solver
     plant_error = rigid_error = 0.0
     pressed = 0
     for tick in range(400):
@@ -137,10 +142,8 @@ def test_predicted_velocities_are_realised_and_action_is_reaction(clusters):
             pushed = np.einsum("uitj,tj->ui", response[rows], solver.wrenches) * physics.dt
             predicted = physics.plants.velocity_free[solver.bodies] + pushed
             free = free + rigid.impulse_response(solver.rigid_force[None])[:, 0] * physics.dt
-            on_plants, on_robot = (
-                solver.wrenches[:, :3].sum(0),
-                sum((c.force for c in solver.contacts), np.zeros(3)),
-            )
+            on_plants = solver.wrenches[:, :3].sum(0)
+            on_robot = sum((c.force for c in solver.contacts), np.zeros(3))
             np.testing.assert_allclose(on_plants, -on_robot, atol=1e-9)
             base = rigid.robot("grip").base_v[:2]
             np.testing.assert_allclose(solver.rigid_force[base], on_robot[:2], atol=1e-9)
@@ -161,20 +164,20 @@ def sweep(speed: float, seconds: float, damping: float, *, substeps: int = 10, t
     """
     model = assemble([cane((0.0, 0.15 * i, 1.0), radius=0.005) for i in range(5)])
     spec = bar((0.7, -0.08, 0.95), damping=damping)
-    ours, reference = (
-        Physics(model),
-        MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=time_constant),
-    )
+    ours = Physics(model)
+    reference = MujocoScene(model, [spec], dt=0.01 / substeps, contact_time_constant=time_constant)
     ours.contact_solver.plant_plant_contacts = False  # in the reference canes pass through each other
     ours.add_robot(spec)
     for rigid in (ours.rigid, reference.rigid):
         rigid.command("bar", np.zeros(1), np.array([speed]))
         rigid.mj_data.qvel[rigid.robot("bar").v] = speed
-    force, touched = [], set()
+    force = []
+    touched = set()
     base = ours.rigid.robot("bar").base_v[:2]
     for _ in range(round(seconds / ours.dt)):
         ours.step()
-        on_bar, mujoco = force_on(ours, "bar"), np.zeros(3)
+        on_bar = force_on(ours, "bar")
+        mujoco = np.zeros(3)
         for _ in range(substeps):
             reference.step()
             mujoco += reference.contact_force_on("bar") / substeps
@@ -193,7 +196,8 @@ def peaks(force: np.ndarray) -> np.ndarray:
 
 def test_rebound_of_a_coasting_bar_is_mujocos():
     _, force, _ = sweep(0.5, 3.0, 0.0)
-    impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
+    impulse = 0.01 * force.sum(0)
+    peak = np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
 
@@ -207,7 +211,8 @@ def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
     with 0.25 ms and contacts ten times as stiff its impulse changes by 1.7 % at 3 m/s, by 0.4 % at 0.5 m/s.
     """
     ours, force, touched = sweep(speed, 2.0 / speed, 200.0)
-    impulse, peak = 0.01 * force.sum(0), peaks(force)
+    impulse = 0.01 * force.sum(0)
+    peak = peaks(force)
     assert touched == {0, 1, 2, 3, 4}
     assert ours.rigid.joint_measurements("bar")[0][0] > 1.2
     assert impulse[0] == pytest.approx(impulse[1], rel=0.02)
@@ -220,7 +225,8 @@ def test_a_driven_bar_passes_five_canes_and_loses_none(speed):
 
 def test_a_fast_sweep_agrees_with_mujoco_at_a_quarter_of_a_millisecond():
     _, force, _ = sweep(3.0, 0.66, 200.0, substeps=40, time_constant=0.002)
-    impulse, peak = 0.01 * force.sum(0), np.abs(force).max(0)
+    impulse = 0.01 * force.sum(0)
+    peak = np.abs(force).max(0)
     assert impulse[0] == pytest.approx(impulse[1], rel=0.01)
     assert peak[0] == pytest.approx(peak[1], rel=0.05)
 
@@ -230,9 +236,12 @@ def test_a_fast_sweep_agrees_with_mujoco_at_a_quarter_of_a_millisecond():
 def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort, clusters):
     model, body, middle = bunch_scene(clusters=clusters)
     spec = gripper(middle, effort=effort)
-    ours, reference = Physics(model, detachment=False), MujocoScene(model, [spec])
+    ours = Physics(model, detachment=False)
+    reference = MujocoScene(model, [spec])
     ours.add_robot(spec)
-    held, force, error = [], [], 0.0
+    held = []
+    force = []
+    error = 0.0
     for tick in range(450):
         t = 0.01 * tick
         grip = 0.05 * ramp(t, 0.3, 0.8)
@@ -243,10 +252,15 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort, cluste
         reference.step()
         vinesim = held_point(model, ours.snapshot().body_q[body], body)
         held.append(vinesim - ours.rigid.link_pose("grip", "left")[:3])
-        force.append([[world.contact_force_on(f) if world is reference else force_on(ours, f) for f in FINGERS]
-                      for world in (ours, reference)])  # fmt: skip
+        force.append(
+            [
+                [world.contact_force_on(f) if world is reference else force_on(ours, f) for f in FINGERS]
+                for world in (ours, reference)
+            ]
+        )
         error = max(error, float(np.linalg.norm(vinesim - held_point(model, reference.body_pose(body), body))))
-    held, force = np.array(held), np.array(force)
+    held = np.array(held)
+    force = np.array(force)
     assert np.linalg.norm(held[440:].mean(0) - held[240:250].mean(0)) < 5e-5
     assert error < 1e-3
     np.testing.assert_allclose(force[400:, 0, :, 1].mean(0), force[400:, 1, :, 1].mean(0), rtol=0.01)
@@ -262,9 +276,11 @@ def test_a_held_bunch_does_not_slip_when_the_hand_is_pulled(pull, effort, cluste
 def test_a_mimicking_finger_presses_like_the_driven_one(clusters):
     model, body, middle = bunch_scene(clusters=clusters)
     spec = gripper(middle, mimic=True)
-    ours, reference = Physics(model), MujocoScene(model, [spec])
+    ours = Physics(model)
+    reference = MujocoScene(model, [spec])
     ours.add_robot(spec)
-    force, error = [], 0.0
+    force = []
+    error = 0.0
     for tick in range(450):
         t = 0.01 * tick
         for rigid in (ours.rigid, reference.rigid):
@@ -299,7 +315,8 @@ def test_two_fingers_grasp_lift_pull_and_release_a_cane():
     spec = gripper(at)
     ours = Physics(model)
     ours.add_robot(spec)
-    held, force = [], []
+    held = []
+    force = []
     for tick in range(500):
         t = 0.01 * tick
         grip = 0.074 * ramp(t, 0.3, 0.8)
@@ -308,7 +325,8 @@ def test_two_fingers_grasp_lift_pull_and_release_a_cane():
         ours.step()
         held.append(ours.snapshot().body_q[body, :3] - ours.rigid.link_pose("grip", "left")[:3])
         force.append([force_on(ours, finger) for finger in FINGERS])
-    held, force = np.array(held), np.array(force)
+    held = np.array(held)
+    force = np.array(force)
     closed = 4000.0 * (0.074 - (0.085 - 0.01 - 0.006))
     expected = closed / (1.0 + 4000.0 / (2.0 * ours.parameters.contact_stiffness))
     np.testing.assert_allclose(force[110:119, 0, 1], expected, rtol=0.01)
@@ -329,8 +347,10 @@ def test_two_fingers_grasp_lift_pull_and_release_a_cane():
 @pytest.mark.long
 def test_friction_along_a_cane_is_mujocos():
     """Mean force over three pieces within 1 %; from tick to tick it is smooth but for the corners between pieces."""
-    model, spec = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)]), probe((0.5, 0.0, 1.03))
-    ours, reference = Physics(model), MujocoScene(model, [spec], dt=0.0005, contact_time_constant=0.004)
+    model = assemble([cane((0.0, 0.0, 1.0), radius=0.005, beta=0.1)])
+    spec = probe((0.5, 0.0, 1.03))
+    ours = Physics(model)
+    reference = MujocoScene(model, [spec], dt=0.0005, contact_time_constant=0.004)
     ours.add_robot(spec)
     force = []
     for tick in range(1000):

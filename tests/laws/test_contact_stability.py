@@ -21,7 +21,9 @@ pytestmark = pytest.mark.slow
 def energy(physics: Physics) -> float:
     """Kinetic energy, weight and springs of all plants [J]."""
     physics.update_kinematics()
-    model, q, v = physics.model, physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
+    model = physics.model
+    q = physics.state.body_q.astype(float)
+    v = physics.state.body_qd.astype(float)
     com = frames.rotate(q[:, 3:], model.body_com.astype(float))
     velocity = v[:, :3] + np.cross(v[:, 3:], com)
     angular = frames.rotate(frames.conjugate(q[:, 3:]), v[:, 3:])
@@ -63,7 +65,8 @@ def test_undamped_contact_adds_no_energy(stiffness, speed):
     drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = speed
     start = energy(physics) + 1.5 * speed**2
-    gain, touched = -np.inf, set()
+    gain = -np.inf
+    touched = set()
     for _ in range(round(2.0 / speed * 100)):
         physics.step()
         gain = max(gain, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
@@ -79,7 +82,8 @@ def test_contact_of_branches_adds_no_energy():
     drive = physics.rigid.robot("bar").v
     physics.rigid.mj_data.qvel[drive] = 0.5
     start = energy(physics) + 1.5 * 0.5**2
-    gain, pushed = -np.inf, 0
+    gain = -np.inf
+    pushed = 0
     for _ in range(400):
         physics.step()
         gain = max(gain, energy(physics) + 1.5 * float(physics.rigid.mj_data.qvel[drive][0]) ** 2 - start)
@@ -114,7 +118,8 @@ def test_a_bar_and_a_floating_cane_conserve_momentum():
     for _ in range(40):
         physics.step()
         physics.update_kinematics()
-        q, v = physics.state.body_q.astype(float), physics.state.body_qd.astype(float)
+        q = physics.state.body_q.astype(float)
+        v = physics.state.body_qd.astype(float)
         com = frames.rotate(q[:, 3:], model.body_com.astype(float))
         plants = model.body_mass @ (v[:, :3] + np.cross(v[:, 3:], com))
         total.append((plants[1], 3.0 * float(physics.rigid.mj_data.qvel[drive][0])))
@@ -127,7 +132,9 @@ def test_a_cut_cane_falls_presses_on_the_ground_with_its_weight_and_sleeps():
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.005)])
     physics = Physics(model)
     physics.plants.cut(4)
-    weight, ground_forces, ticks = 9.81 * model.body_mass[4:].sum(), [], 0
+    weight = 9.81 * model.body_mass[4:].sum()
+    ground_forces = []
+    ticks = 0
     while len(physics.plants.awake) and ticks < 2000:
         physics.step()
         ticks += 1
@@ -149,7 +156,8 @@ def test_a_cut_cane_comes_to_rest_on_a_pole_and_on_a_branch():
     model = assemble([cane((0.0, 0.0, 1.0), radius=0.006)], **poles, fixed_organ=[int(Organ.POLE)], fixed_index=[0])
     physics = Physics(model)
     physics.plants.cut(0)
-    touched, lowest = set(), np.inf
+    touched = set()
+    lowest = np.inf
     for _ in range(60):
         physics.step()
         touched |= {c.link for c in physics.contacts}
@@ -164,7 +172,8 @@ def test_a_cut_cane_comes_to_rest_on_a_pole_and_on_a_branch():
     physics = Physics(model)
     cut = int(model.tree_first[1])
     physics.plants.cut(cut)
-    touched, lowest_offset = 0, 0.0
+    touched = 0
+    lowest_offset = 0.0
     for _ in range(60):
         physics.step()
         touched += any(c.actor == "plants" for c in physics.contacts)
@@ -178,8 +187,10 @@ def test_plants_that_overlap_when_drawn_stay_at_rest():
     standing = {"fixed_start": [[0.5, -0.5, 1.0]], "fixed_end": [[0.5, 0.5, 1.0]], "fixed_radius": [[0.03, 0.03]]}
     model = assemble(
         [cane((0.0, 0.0, 1.0)), cane((0.4, -0.4, 1.003), heading=np.pi / 2), cane((3.0, 0.0, 0.004))],
-        **standing, fixed_organ=[int(Organ.POLE)], fixed_index=[0],
-    )  # fmt: skip
+        **standing,
+        fixed_organ=[int(Organ.POLE)],
+        fixed_index=[0],
+    )
     physics = Physics(model)
     physics.plants.wake([0, 1, 2])
     fastest = 0.0
@@ -200,10 +211,13 @@ def upright(x: float, y: float, radius: float) -> TreeBuilder:
 
 def energy_of_box(physics: Physics) -> float:
     """Kinetic energy and weight of the first box [J]."""
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
-    body, motion = world.body("box/0").id, data.joint("box/0").qvel
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
+    body = world.body("box/0").id
+    motion = data.joint("box/0").qvel
     weight = 9.81 * world.body_mass[body] * data.xipos[body, 2]
-    linear, angular = world.body_mass[body] * motion[:3] @ motion[:3], motion[3:] ** 2 @ world.body_inertia[body]
+    linear = world.body_mass[body] * motion[:3] @ motion[:3]
+    angular = motion[3:] ** 2 @ world.body_inertia[body]
     return float(weight + (linear + angular) / 2.0)
 
 
@@ -211,7 +225,8 @@ def energy_of_box(physics: Physics) -> float:
 @pytest.mark.parametrize("seeds", [range(4), *long(range(4, 12))])
 def test_a_crate_that_falls_beside_the_bases_of_canes_gains_no_energy(radius, mass, seeds):
     """The ground lets go of a light crate that canes push, and the crate slides on it: neither holds it in place."""
-    bases, gain = ((0.12, 0.0), (-0.1, 0.1), (0.0, -0.12)), []
+    bases = ((0.12, 0.0), (-0.1, 0.1), (0.0, -0.12))
+    gain = []
     for seed in seeds:
         rng = np.random.default_rng(seed)
         canes = [upright(x + 0.01 * rng.normal(), y + 0.01 * rng.normal(), radius) for x, y in bases]
@@ -219,7 +234,8 @@ def test_a_crate_that_falls_beside_the_bases_of_canes_gains_no_energy(radius, ma
         physics = Physics(assemble(canes, box_pose=[at], box_size=[(0.4, 0.3, 0.25)], box_mass=[mass]))
         physics.rigid.mj_data.joint("box/0").qvel[:3] = [*(0.5 * rng.normal(size=2)), -2.4]
         physics.step()
-        start, highest = energy(physics) + energy_of_box(physics), -np.inf
+        start = energy(physics) + energy_of_box(physics)
+        highest = -np.inf
         for _ in range(100):
             physics.step()
             highest = max(highest, energy(physics) + energy_of_box(physics))

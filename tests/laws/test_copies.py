@@ -21,7 +21,8 @@ from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 
 pytestmark = pytest.mark.slow
 
-STIFFNESS, DAMPING = 4000.0, 400.0
+STIFFNESS = 4000.0
+DAMPING = 400.0
 INERTIA = '<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/>'
 RAM = f"""<robot name="ram"><link name="base_footprint"><inertial><mass value="500"/>{INERTIA}</inertial></link>
 <link name="head"><inertial><mass value="5"/>{INERTIA}</inertial>
@@ -49,7 +50,8 @@ def step(rigid: RigidWorld, ticks: int = 1) -> None:
 
 def contact_point(rigid: RigidWorld) -> float:
     """Contact point of the heads along the left ram's axis [m]; 0 is the middle."""
-    left, right = rigid.joint_measurements("left")[0][0], rigid.joint_measurements("right")[0][0]
+    left = rigid.joint_measurements("left")[0][0]
+    right = rigid.joint_measurements("right")[0][0]
     assert left + right == pytest.approx(0.0, abs=2e-3), "the heads touch"
     return 0.5 * (left - right)
 
@@ -114,10 +116,13 @@ def vinebot() -> RobotDescription:
 @pytest.mark.parametrize("latency", [0, 2, 5, 10, 20])
 def test_a_copy_lags_by_speed_times_latency(vinebot, latency):
     """F81, F85: springs and dampers pull to position and velocity, so the copy itself adds hardly any lag."""
-    here, there = RigidWorld(assemble([])), RigidWorld(assemble([]))
-    robot, copy = Robot(here, vinebot, "anna"), RemoteRobot(there, vinebot, "anna")
+    here = RigidWorld(assemble([]))
+    there = RigidWorld(assemble([]))
+    robot = Robot(here, vinebot, "anna")
+    copy = RemoteRobot(there, vinebot, "anna")
     arm = robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint"])
-    queue, rows = deque(), []
+    queue = deque()
+    rows = []
     for tick in range(400):
         time = 0.01 * tick
         robot.command_position(vinebot.home[arm] + 0.3 * np.sin(2.0 * time) * np.array([1, -1]), arm)
@@ -163,9 +168,13 @@ def test_a_light_joint_that_catches_up_with_all_its_effort_is_not_thrown(vinebot
     rigid = RigidWorld(assemble([]))
     copy = RemoteRobot(rigid, vinebot, "anna")
     wrist = vinebot.joints.index("arm_left_7_joint")
-    drive, rate, ahead = vinebot.drives[wrist], 2.0, 0.03
+    drive = vinebot.drives[wrist]
+    rate = 2.0
+    ahead = 0.03
     assert drive.stiffness * (ahead + 0.01 * rate) > drive.effort
-    goal, velocity, speeds = vinebot.home.copy(), np.zeros(len(vinebot.home)), []
+    goal = vinebot.home.copy()
+    velocity = np.zeros(len(vinebot.home))
+    speeds = []
     step(rigid)
     velocity[wrist] = rate
     for tick in range(40):

@@ -89,9 +89,13 @@ def test_two_runs_in_two_processes() -> None:
     """With other hash seeds and addresses."""
     path = os.pathsep.join([str(HERE.parents[2]), os.environ.get("PYTHONPATH", "")])
     other = subprocess.run(
-        [sys.executable, str(HERE)], capture_output=True, text=True, check=True, timeout=deadline(120.0),
+        [sys.executable, str(HERE)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=deadline(120.0),
         env=os.environ | {"PYTHONHASHSEED": "1", "PYTHONPATH": path},
-    )  # fmt: skip
+    )
     assert other.stdout.splitlines()[-1] == f"{eventful_run()[0]} {vineyard_run()}"
 
 

@@ -24,11 +24,18 @@ def add_rod(
     """A rod on a tree, with a sphere of ``tip`` kg at its end."""
     last = tree.add_rod(-1, length, radii, wood, pieces)[-1]
     if tip > 0.0:
-        far, radius = np.asarray(tree.bodies[last]["far"]), (tip / 4190.0) ** (1.0 / 3.0)
+        far = np.asarray(tree.bodies[last]["far"])
+        radius = (tip / 4190.0) ** (1.0 / 3.0)
         tree.add_body(
-            last, offset=(length / pieces, 0, 0), mass=tip, inertia=[0.4 * tip * radius**2] * 3, length=2.0 * radius,
-            com=(radius, 0, 0), stiffness=far, damping=wood.damping * far,
-        )  # fmt: skip
+            last,
+            offset=(length / pieces, 0, 0),
+            mass=tip,
+            inertia=[0.4 * tip * radius**2] * 3,
+            length=2.0 * radius,
+            com=(radius, 0, 0),
+            stiffness=far,
+            damping=wood.damping * far,
+        )
 
 
 def random_rods(count: int, seed: int, damping: float = 0.0) -> tuple[Model, np.ndarray]:
@@ -38,18 +45,22 @@ def random_rods(count: int, seed: int, damping: float = 0.0) -> tuple[Model, np.
     to be bent and twisted before release.
     """
     rng = np.random.default_rng(seed)
-    trees, bends = [], []
+    trees = []
+    bends = []
     for i in range(count):
         clamp = rng.normal(size=4)
         tree = TreeBuilder(np.array([3.0 * i, 0.0, 2.0, *(clamp / np.linalg.norm(clamp))]))
-        length, radius, modulus = rng.uniform(0.3, 1.5), rng.uniform(0.002, 0.005), 10.0 ** rng.uniform(8.5, 9.9)
+        length = rng.uniform(0.3, 1.5)
+        radius = rng.uniform(0.002, 0.005)
+        modulus = 10.0 ** rng.uniform(8.5, 9.9)
         wood = RodMaterial(modulus, 950.0, damping, shear_modulus=rng.uniform(0.15, 0.75) * modulus)
         tip = rng.uniform(0.1, 3.0) * 950.0 * np.pi * radius**2 * length if rng.random() < 0.6 else 0.0
         add_rod(tree, length, (radius, radius * rng.uniform(0.5, 1.0)), wood, int(rng.integers(4, 17)), tip)
         if rng.random() < 0.5:
             tree.solve_rest_pose()
         axis = rng.normal(size=3) * ([0, 1, 1], [1, 1, 1], [1, 0, 0])[rng.choice(3, p=(0.4, 0.4, 0.2))]
-        bodies, angle = len(tree.bodies), np.exp(rng.uniform(np.log(0.02), np.log(0.6)))
+        bodies = len(tree.bodies)
+        angle = np.exp(rng.uniform(np.log(0.02), np.log(0.6)))
         trees.append(tree)
         bends.append(np.tile(angle / bodies * axis / np.linalg.norm(axis), (bodies, 1)))
     return assemble(trees), np.concatenate(bends)
@@ -65,9 +76,12 @@ def released(model: Model, bends: np.ndarray, phi: float) -> ArticulationSolver:
 
 def energies(plants: ArticulationSolver) -> np.ndarray:
     """Kinetic, elastic and potential energy of each tree together [tree] J, between steps."""
-    model, state = plants.model, plants.state
+    model = plants.model
+    state = plants.state
     plants.forward_kinematics()
-    pose, motion, mass = state.body_q.astype(float), state.body_qd.astype(float), plants.body_mass.astype(float)
+    pose = state.body_q.astype(float)
+    motion = state.body_qd.astype(float)
+    mass = plants.body_mass.astype(float)
     com = frames.rotate(pose[:, 3:], plants.body_com.astype(float))
     velocity = motion[:, :3] + np.cross(motion[:, 3:], com)
     spin = frames.rotate(frames.conjugate(pose[:, 3:]), motion[:, 3:])
@@ -156,7 +170,8 @@ def test_work_from_outside_is_kept(how: str) -> None:
     What is taken for a gain of energy would be taken off within a step. The new pose bends all joints alike, which
     excites modes that phi 0.55 damps.
     """
-    plants, rest = loaded_cane(0.55, 1e-3), energies(loaded_cane(0.55, 0.0))
+    plants = loaded_cane(0.55, 1e-3)
+    rest = energies(loaded_cane(0.55, 0.0))
     for _ in range(20):
         plants.predict()
         plants.integrate()

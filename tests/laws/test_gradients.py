@@ -41,7 +41,8 @@ def squares(track: Trajectory) -> tuple[float, np.ndarray, np.ndarray]:
     """A loss of poses and velocities of unlike weights, and its derivatives by both."""
     weight_q = np.array([3.0, 1.0, 2.0, 0.3, 0.2, 0.1, 0.0])
     weight_qd = np.array([0.1, 0.2, 0.05, 0.01, 0.0, 0.02])
-    q, qd = track.body_q.astype(float), track.body_qd.astype(float)
+    q = track.body_q.astype(float)
+    qd = track.body_qd.astype(float)
     loss = 0.5 * (weight_q * q * q).sum() + 0.5 * (weight_qd * qd * qd).sum()
     return loss, weight_q * q, weight_qd * qd
 
@@ -66,10 +67,14 @@ def test_gradient_is_the_slope_of_the_loss(ticks: int, checkpoint: int) -> None:
     gradient = rollout.gradient(*by)
     all_bodies = np.arange(len(model.body_mass))
     cases = [
-        ("stiffness", model.joint_stiffness, all_bodies), ("stiffness", model.joint_stiffness, [0]),
-        ("damping", model.joint_damping, all_bodies), ("damping", model.joint_damping, [3]),
-        ("mass", model.body_mass, all_bodies), ("mass", model.body_mass, [14]), ("joint_qd", rates, all_bodies),
-    ]  # fmt: skip
+        ("stiffness", model.joint_stiffness, all_bodies),
+        ("stiffness", model.joint_stiffness, [0]),
+        ("damping", model.joint_damping, all_bodies),
+        ("damping", model.joint_damping, [3]),
+        ("mass", model.body_mass, all_bodies),
+        ("mass", model.body_mass, [14]),
+        ("joint_qd", rates, all_bodies),
+    ]
     for name, value, bodies in cases:
 
         def loss(scale: float, name: str = name, value: np.ndarray = value, bodies: object = bodies) -> float:

@@ -27,19 +27,24 @@ def tied_piece(pieces: int, tied: tuple[int, ...], stiffness: float = 2000.0) ->
     tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 2.0])))
     tree.add_rod(-1, 0.15, (0.004, 0.004), RodMaterial(3e9, 900.0, 0.008), pieces)
     return assemble(
-        [tree], tie_body=np.array(tied), tie_point=np.zeros((len(tied), 3)),
+        [tree],
+        tie_body=np.array(tied),
+        tie_point=np.zeros((len(tied), 3)),
         tie_anchor=np.array([[0.15 * body / pieces, 0.0, 2.0] for body in tied]),
-        tie_stiffness=np.full(len(tied), stiffness), tie_damping=np.full(len(tied), 0.01 * stiffness),
-    )  # fmt: skip
+        tie_stiffness=np.full(len(tied), stiffness),
+        tie_damping=np.full(len(tied), 0.01 * stiffness),
+    )
 
 
 @pytest.mark.parametrize(
     ("where", "stiffness", "spin", "grip"),
     each_once(
-        [(1, (0,)), (3, (0,)), (3, (1,)), (3, (2,)), (3, (0, 1))], [20.0, 2000.0],
-        [(0.0, 0.0, 0.0), (1.0, 2.0, 1.0)], [True, False],
+        [(1, (0,)), (3, (0,)), (3, (1,)), (3, (2,)), (3, (0, 1))],
+        [20.0, 2000.0],
+        [(0.0, 0.0, 0.0), (1.0, 2.0, 1.0)],
+        [True, False],
     ),
-)  # fmt: skip
+)
 def test_what_hangs_from_a_tie_gains_no_energy(
     where: tuple[int, tuple[int, ...]], stiffness: float, spin: tuple, grip: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -55,14 +60,16 @@ def test_what_hangs_from_a_tie_gains_no_energy(
     plants.state.joint_qd[0] = spin
     plants.forward_kinematics()
     start = energy(plants, G)
-    most, kinetic = start.total, start.kinetic
+    most = start.total
+    kinetic = start.kinetic
     for _ in range(200):
         for _ in range(10):
             plants.predict()
             plants.integrate()
         plants.forward_kinematics()
         now = energy(plants, G)
-        most, kinetic = max(most, now.total), max(kinetic, now.kinetic)
+        most = max(most, now.total)
+        kinetic = max(kinetic, now.kinetic)
     assert most < start.total + 0.01 * kinetic + 1e-6
     assert now.total < start.total
 
@@ -84,7 +91,9 @@ def test_cut_shoots_of_the_demo_that_hang_from_ties_calm_down() -> None:
     """64 of its shoots are cut at a random joint: 30 s later nothing that hangs turns faster than ``sleep_rate``, and
     three in five of what hangs are asleep."""
     physics = Simulation("demo").physics
-    model, plants, rng = physics.model, physics.plants, np.random.default_rng(0)
+    model = physics.model
+    plants = physics.plants
+    rng = np.random.default_rng(0)
     for tree in rng.permutation(len(model.tree_first))[:64]:
         bodies = model.tree_first[tree] + np.arange(int(model.tree_core[tree]))
         physics.cut(int(rng.choice(bodies[model.body_organ[bodies] == int(Organ.CANE)])))

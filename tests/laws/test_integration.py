@@ -28,9 +28,14 @@ def twisted_ring(pieces: int, ratio: float, twist: float) -> ArticulationSolver:
     last = tree.add_rod(-1, 1.0, (0.004, 0.004), wood, pieces)[-1]
     half = np.asarray(tree.bodies[last]["far"])
     end = tree.add_body(
-        last, offset=(1.0 / pieces, 0, 0), mass=1e-3, inertia=[1e-6] * 3, length=1e-3, stiffness=half,
+        last,
+        offset=(1.0 / pieces, 0, 0),
+        mass=1e-3,
+        inertia=[1e-6] * 3,
+        length=1e-3,
+        stiffness=half,
         damping=0.02 * half,
-    )  # fmt: skip
+    )
     model = assemble([tree])
     plants = ArticulationSolver(model, State.at_rest(model), PhysicsParameters(gravity=0.0))
     clamp = 0.1 * np.array([[0.0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
@@ -73,7 +78,9 @@ def swinging_canes(
 
     The solver, the first frequency [Hz] of each chain by its eigenvalues, and the tips [tick, cane, 3] m of 1.2 s.
     """
-    trees, shapes, frequencies = [], [], []
+    trees = []
+    shapes = []
+    frequencies = []
     for side, length in enumerate(lengths):
         beam = Beam(modulus=5.89e9, radius=0.00435, density=950.0, length=length)
         frequency = beam_theory.chain_modes(beam.tree())[0][0]

@@ -53,11 +53,13 @@ def command(physics: Physics, tick: int) -> None:
 
 def state_of(physics: Physics) -> dict[str, bytes]:
     """The state from which the next step starts, by the name of joint or array."""
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
     found = {"plants": physics.state.joint_q.tobytes() + physics.state.joint_qd.tobytes()}
     for i in range(world.njnt):
         joint = world.joint(i)
-        first, last = world.jnt_dofadr[i], world.jnt_dofadr[i] + len(data.joint(i).qvel)
+        first = world.jnt_dofadr[i]
+        last = world.jnt_dofadr[i] + len(data.joint(i).qvel)
         q = data.joint(i)
         found[joint.name] = b"".join(
             np.ascontiguousarray(x).tobytes()
@@ -111,7 +113,8 @@ def test_removing_the_first_robot_changes_no_bit_of_the_others():
     distant = bar((30.0, 30.0, 1.0), "newcomer", 1000.0, 100.0)
 
     def run_until(leaves: int) -> list[dict[str, bytes]]:
-        physics, states = busy_scene(distant), []
+        physics = busy_scene(distant)
+        states = []
         for tick in range(TICKS):
             if tick == leaves:
                 physics.remove_robot("newcomer")

@@ -20,7 +20,8 @@ from vinesim.scene.values import RobotUpdate
 pytestmark = pytest.mark.slow
 
 TICK = 0.01
-DELAY, JITTER = 0.03, 0.02
+DELAY = 0.03
+JITTER = 0.02
 RTT = 2.0 * (DELAY + JITTER)
 OBJECTS = (0, BOX(0), BUNCH(0), BUNCH(1))
 NAMES = ("ada", "bob", "cleo")
@@ -39,7 +40,9 @@ class MinimalClient:
     """A minimal client with rigid objects: it moves what it touches, in a direction of its own."""
 
     def __init__(self, hub: MemoryHub, name: str, start: Claim) -> None:
-        self.hub, self.name, self.model = hub, name, vineyard()
+        self.hub = hub
+        self.name = name
+        self.model = vineyard()
         self.bus = hub.bus(name)
         self.replicator = Replicator(self.bus, Hello(name, scene="rows", digest="same", joints=0), self.model)
         for object_id in OBJECTS:
@@ -65,11 +68,18 @@ class MinimalClient:
         active = {object_id for object_id in self.touched if object_id in self.picked or object_id in (0, BOX(0))}
         for object_id in active - {0}:
             self.pose[object_id] = self.pose[object_id] + [0.002 * self.x, 0.001, 0, 0, 0, 0, 0]
-        grabbed, self.newly_grabbed = self.newly_grabbed, set()
+        grabbed = self.newly_grabbed
+        self.newly_grabbed = set()
         self.replicator.send(
-            now, self.robot, touched=active, moving=active, read=self.read, grabbed=grabbed,
-            detached=grabbed & self.picked, pose_on_support=lambda object_id: ("", self.pose[object_id]),
-        )  # fmt: skip
+            now,
+            self.robot,
+            touched=active,
+            moving=active,
+            read=self.read,
+            grabbed=grabbed,
+            detached=grabbed & self.picked,
+            pose_on_support=lambda object_id: ("", self.pose[object_id]),
+        )
 
     def read(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
         if is_tree(object_id):
@@ -98,11 +108,14 @@ def run(hub: MemoryHub, server: Server, clients: dict[str, MinimalClient], secon
 
 actions = st.lists(
     st.tuples(
-        st.sampled_from(NAMES), st.sampled_from(["touch", "touch", "let", "grab", "leave"]), st.sampled_from(OBJECTS),
+        st.sampled_from(NAMES),
+        st.sampled_from(["touch", "touch", "let", "grab", "leave"]),
+        st.sampled_from(OBJECTS),
         st.integers(1, 12),
     ),
-    min_size=1, max_size=20,
-)  # fmt: skip
+    min_size=1,
+    max_size=20,
+)
 
 
 def play(

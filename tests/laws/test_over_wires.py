@@ -23,9 +23,12 @@ def wires(places: list[tuple[float, float]]) -> dict:
     """Level wires of 2 m along y at (x, z) m, for :func:`assemble`."""
     ends = [np.array([(x, y, z) for x, z in places]) for y in (-1.0, 1.0)]
     return {
-        "fixed_start": ends[0], "fixed_end": ends[1], "fixed_radius": np.full((len(places), 2), RADIUS),
-        "fixed_organ": [int(Organ.WIRE)] * len(places), "fixed_index": np.arange(len(places)),
-    }  # fmt: skip
+        "fixed_start": ends[0],
+        "fixed_end": ends[1],
+        "fixed_radius": np.full((len(places), 2), RADIUS),
+        "fixed_organ": [int(Organ.WIRE)] * len(places),
+        "fixed_index": np.arange(len(places)),
+    }
 
 
 class Crossings:
@@ -34,7 +37,9 @@ class Crossings:
 
     def __init__(self, physics: Physics, wire: tuple[float, float], first: int = 0) -> None:
         """``wire``: (x, z) m; ``first``: the first body of the cane."""
-        self._physics, self._wire, self._first = physics, np.array(wire), first
+        self._physics = physics
+        self._wire = np.array(wire)
+        self._first = first
         self._angle = self._ends()[:2]
         self._turns = self.turns()
 
@@ -69,7 +74,8 @@ def borne(physics: Physics) -> np.ndarray:
 
 def force_at_rest(physics: Physics, places: list[tuple[float, float]]) -> np.ndarray:
     """What the wires bear [3] N when the plants fall asleep; nothing passes them until then."""
-    crossings, force = [Crossings(physics, place) for place in places], np.zeros(3)
+    crossings = [Crossings(physics, place) for place in places]
+    force = np.zeros(3)
     for _ in range(2500):
         physics.step()
         assert [c.count for c in crossings] == [0] * len(places)
@@ -106,12 +112,20 @@ def test_what_was_cut_off_above_its_tie_bears_on_the_wire() -> None:
     """Tied to a wire by the end of its eighth piece and cut behind it: the ninth no longer passes through the wire."""
     place = (0.53, 0.99)
     model = assemble(
-        [cane((0.0, 0.0, 1.0))], tie_body=[7], tie_point=[[0.0625, 0.0, 0.0]], tie_anchor=[[0.5, 0.0, 1.0]],
-        tie_stiffness=[2000.0], tie_damping=[20.0], tie_wire=[0], fixed_tension=[900.0], **wires([place]),
-    )  # fmt: skip
+        [cane((0.0, 0.0, 1.0))],
+        tie_body=[7],
+        tie_point=[[0.0625, 0.0, 0.0]],
+        tie_anchor=[[0.5, 0.0, 1.0]],
+        tie_stiffness=[2000.0],
+        tie_damping=[20.0],
+        tie_wire=[0],
+        fixed_tension=[900.0],
+        **wires([place]),
+    )
     physics = Physics(model)
     physics.cut(8)
-    crossings, touched = Crossings(physics, place, first=8), set()
+    crossings = Crossings(physics, place, first=8)
+    touched = set()
     for _ in range(60):
         physics.step()
         assert crossings.count == 0
@@ -127,7 +141,8 @@ def test_a_cut_cane_that_a_hand_drags_over_a_wire_does_not_pass_it(direction: tu
     place = (0.5, 0.97)
     physics = Physics(assemble([cane((0.0, 0.0, 1.0))], **wires([place])))
     physics.cut(0)
-    plants, crossings = physics.plants, Crossings(physics, place)
+    plants = physics.plants
+    crossings = Crossings(physics, place)
     tie = plants.add_tie(held, np.zeros(3), 100.0, 10.0)
     start = plants.tie_anchor[tie].copy()
     for step in range(120):

@@ -100,9 +100,11 @@ def test_it_swings_as_mass_and_string_say() -> None:
     for _ in range(40):
         physics.step()
         height.append(rod(physics))
-    stiffness, mass = 4.0 * TENSION / LENGTH, 5.0 + WIRE_MASS
+    stiffness = 4.0 * TENSION / LENGTH
+    mass = 5.0 + WIRE_MASS
     decay = 0.5 * (WIRE_DAMPING_TIME + physics.dt) * stiffness / mass
-    turning, t = np.sqrt(stiffness / mass - decay**2), physics.dt * np.arange(1, 41)
+    turning = np.sqrt(stiffness / mass - decay**2)
+    t = physics.dt * np.arange(1, 41)
     swing = np.exp(-decay * t) * (np.cos(turning * t) + decay / turning * np.sin(turning * t))
     expected = 1.0 - THICK + (40.0 + 20.0 * swing) / stiffness
     np.testing.assert_allclose(height, expected, rtol=0.0, atol=0.07 * 20.0 / stiffness)
@@ -114,16 +116,21 @@ def test_a_crate_rests_on_two_wires(mass: float) -> None:
     without force, until it sleeps."""
     y = 0.3
     model = level_wires(
-        [(-0.1, 1.0), (0.1, 1.0)], box_pose=[[0, y, 1.0 + THICK, 0, 0, 0, 1]], box_size=[[0.4, 0.3, 0.2]],
+        [(-0.1, 1.0), (0.1, 1.0)],
+        box_pose=[[0, y, 1.0 + THICK, 0, 0, 0, 1]],
+        box_size=[[0.4, 0.3, 0.2]],
         box_mass=[mass],
-    )  # fmt: skip
-    physics, forces = Physics(model), []
+    )
+    physics = Physics(model)
+    forces = []
     for step in range(1500):
         physics.step()
         if step > 300 and physics.rigid.mj_data.tree_asleep[0] < 0:
             forces.append(physics.rigid.contact_force[2])
     assert physics.rigid.mj_data.tree_asleep[0] >= 0
-    a, b = 1.0 + y - 0.15, 1.0 + y + 0.15  # from the wires' starts
+    # from the wires' starts
+    a = 1.0 + y - 0.15
+    b = 1.0 + y + 0.15
     deflection = compliance((a, b)) @ np.full(2, 0.25 * mass * G)
     assert 1.0 + THICK - physics.rigid.mj_data.qpos[2] == pytest.approx(deflection.mean(), rel=0.01)
     if forces:
@@ -135,7 +142,8 @@ def test_a_cut_cane_lies_on_wires_that_give(drop: float, tension: float) -> None
     """It passes none, they bear its weight within 0.1 %, and each gives by the string law and what the contact does."""
     places = [(0.2, 0.99 - drop), (0.8, 0.99 - drop)]
     model = assemble([cane((0.0, 0.0, 1.0))], fixed_tension=[tension] * 2, **wires(places))
-    physics, force = Physics(model), np.zeros(3)
+    physics = Physics(model)
+    force = np.zeros(3)
     physics.cut(0)
     crossings = [Crossings(physics, place) for place in places]
     for _ in range(2500):
@@ -171,7 +179,8 @@ def test_a_cane_that_sleeps_on_wires_holds_them_down_until_it_is_put_elsewhere()
 
 def test_what_presses_on_a_wire_moves_the_shoots_tied_to_it() -> None:
     """10 N between two of four shoots: all tips within 1 % of the dense solve of joints, ties and wire."""
-    at, force = 1.0, 10.0
+    at = 1.0
+    force = 10.0
     physics = world(row_of_shoots(beyond=BEYOND))
     press(physics, at, force)
     run(physics, 800)
@@ -210,7 +219,8 @@ def test_sleeping_shoots_wake_when_something_presses_on_their_wire() -> None:
 
 def test_two_that_press_on_one_wire_feel_each_other() -> None:
     """Each finds the wire where both deflect it to within 0.2 %, whether their forces are equal or not."""
-    places, law = (0.6, 1.4), compliance((0.6, 1.4))
+    places = (0.6, 1.4)
+    law = compliance((0.6, 1.4))
     for first, second in ((15.0, 15.0), (15.0, 5.0)):
         physics = world(row_of_shoots((), beyond=BEYOND))
         press(physics, places[0], first, "first")
@@ -253,7 +263,8 @@ def test_a_cane_on_a_wire_and_a_robot_under_it(below: float) -> None:
     physics.add_robot(spec)
     physics.rigid.set_gains("probe", np.array([5000.0, 0.0]), np.array([300.0, 2.0]), np.array([0.0, 12.0]))
     run(physics, 1000)
-    height, force = [], []
+    height = []
+    force = []
     for _ in range(50):
         physics.step()
         height.append(rod(physics))
@@ -273,7 +284,8 @@ def test_a_crate_that_falls_on_wires_stays_on_them(height: float, mass: float) -
     where it has both its edges, and comes to rest on them."""
     pose = [0.0, 0.0, 1.0 + THICK + height, 0.0, 0.0, 0.0, 1.0]
     model = level_wires([(-0.1, 1.0), (0.1, 1.0)], box_pose=[pose], box_size=[[0.4, 0.3, 0.2]], box_mass=[mass])
-    physics, lowest = Physics(model), 1.0 + height
+    physics = Physics(model)
+    lowest = 1.0 + height
     for _ in range(300):
         physics.step()
         lowest = min(lowest, physics.rigid.mj_data.qpos[2])
@@ -288,14 +300,16 @@ def test_falling_on_wires_gains_no_energy(seed: int) -> None:
     """Crates of 0.05 to 20 kg, flat or tilted, on wires of 100 to 10,000 N, wherever they go from there: less energy
     than at the start, always."""
     rng = np.random.default_rng(seed)
-    tension, mass = 10 ** rng.uniform(2.0, 4.0), 10 ** rng.uniform(-1.3, 1.3)
+    tension = 10 ** rng.uniform(2.0, 4.0)
+    mass = 10 ** rng.uniform(-1.3, 1.3)
     turn = frames.exp(rng.normal(0.0, 0.1, 3) if seed % 2 else np.zeros(3))
     pose = [0, rng.uniform(-0.5, 0.5), 1.05 + rng.uniform(0.0, 0.03), *turn]
     model = level_wires(
         [(-0.1, 1.0), (0.1, 1.0)], tension, box_pose=[pose], box_size=[[0.4, 0.3, 0.2]], box_mass=[mass]
     )
     physics = Physics(model)
-    m, d = physics.rigid.mj_model, physics.rigid.mj_data
+    m = physics.rigid.mj_model
+    d = physics.rigid.mj_data
     mujoco.mj_forward(m, d)
     before = energy_of(physics)
     for step in range(400):
@@ -305,9 +319,11 @@ def test_falling_on_wires_gains_no_energy(seed: int) -> None:
 
 def energy_of(physics: Physics) -> float:
     """[J] kinetic and potential, of rigid bodies."""
-    m, d = physics.rigid.mj_model, physics.rigid.mj_data
+    m = physics.rigid.mj_model
+    d = physics.rigid.mj_data
     copy = mujoco.MjData(m)
-    copy.qpos[:], copy.qvel[:] = d.qpos, d.qvel
+    copy.qpos[:] = d.qpos
+    copy.qvel[:] = d.qvel
     m.opt.enableflags |= int(mujoco.mjtEnableBit.mjENBL_ENERGY)
     mujoco.mj_forward(m, copy)
     m.opt.enableflags &= ~int(mujoco.mjtEnableBit.mjENBL_ENERGY)
@@ -323,7 +339,8 @@ def wire_in_pictures(physics: Physics, primitives: Primitives, piece: int = 0) -
 
 def test_cameras_and_lidars_see_a_pressed_wire_where_the_string_law_says() -> None:
     """To 2e-5 m at the ends of its segments, which hang together; let go, it is seen where it was drawn."""
-    at, force = 0.5, 20.0
+    at = 0.5
+    force = 20.0
     physics = world(row_of_shoots((), beyond=BEYOND))
     primitives = Primitives(physics.model, grass=0.0)
     drawn = wire_in_pictures(physics, primitives)
@@ -349,7 +366,8 @@ def test_a_wire_is_seen_to_pass_its_ties_where_the_shoots_hold_it() -> None:
     press(physics, 0.75, 30.0)
     run(physics, 200)
     start, end = wire_in_pictures(physics, primitives)
-    line, ties = np.concatenate([start, end[-1:]]), physics.plants.ties
+    line = np.concatenate([start, end[-1:]])
+    ties = physics.plants.ties
     seen = np.stack([np.interp(places, line[:, 0], line[:, k]) for k in range(3)], axis=1)
     moved = ties.anchor[ties.on_wire].astype(float) - physics.model.tie_anchor[ties.on_wire]
     assert moved[:, 2].max() > 0.01

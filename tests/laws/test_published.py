@@ -57,7 +57,10 @@ def test_measured_cylinders_become_a_tree_of_the_same_shape() -> None:
 def test_a_pole_of_measured_cylinders_sways_at_the_frequency_of_theory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beam theory, with the part of the stiffness that the pole's own weight takes (Greenhill's length)."""
     monkeypatch.setattr(published_trees, "SWAY_DURATION", 12.0)
-    count, radius, length, wood = 24, 0.04, 6.0, dataclasses.replace(published_trees.WOOD, damping=0.002)
+    count = 24
+    radius = 0.04
+    length = 6.0
+    wood = dataclasses.replace(published_trees.WOOD, damping=0.002)
     cylinders = np.zeros((count, 9))
     cylinders[:, 0], cylinders[:, 1], cylinders[:, 7], cylinders[:, 8] = radius, length / count, 1.0, np.arange(count)
     cylinders[:, 4] = np.arange(count) * length / count

@@ -34,19 +34,29 @@ def rod(turn: float, weight: float, beside: float, *, modulus: float = 5e9, shea
         tree.bodies[last]["stiffness"]
     )  # half an element lies between the last joint and the weight
     tree.add_body(
-        last, offset=(1 / PIECES, 0, 0), rest=frames.from_yaw(np.array(turn / PIECES / 2)), mass=mass,
+        last,
+        offset=(1 / PIECES, 0, 0),
+        rest=frames.from_yaw(np.array(turn / PIECES / 2)),
+        mass=mass,
         com=(0, beside, 0),
-        inertia=[mass * 1e-4] * 3, length=1e-3, stiffness=half, damping=0.3 * half,
-    )  # fmt: skip
+        inertia=[mass * 1e-4] * 3,
+        length=1e-3,
+        stiffness=half,
+        damping=0.3 * half,
+    )
     return tree
 
 
 def theory(turn: float, weight: float, beside: float, modulus: float = 5e9, shear: float | None = None) -> Rod:
     shear = modulus / 2.6 if shear is None else shear
     return Rod(
-        bend=modulus * SECOND_MOMENT, twist=shear * 2 * SECOND_MOMENT, turn=turn, weight=weight, beside=beside,
+        bend=modulus * SECOND_MOMENT,
+        twist=shear * 2 * SECOND_MOMENT,
+        turn=turn,
+        weight=weight,
+        beside=beside,
         line_weight=8.0 * np.pi * 0.004**2 * beam_theory.G,
-    )  # fmt: skip
+    )
 
 
 def test_twist_of_an_offset_weight_is_moment_times_length_over_GJ() -> None:
@@ -126,7 +136,8 @@ def drift(tree: TreeBuilder, kick: np.ndarray, *, phi: float = 0.5, seconds: flo
     rest, plants = (beam_theory.standing([tree], phi=phi) for _ in range(2))
     rest.predict()
     plants.state.joint_qd[:] = kick
-    measured, fastest = [], 0.0
+    measured = []
+    fastest = 0.0
     for tick in range(int(seconds / plants.dt)):
         plants.predict()
         if tick % 5 == 0:
@@ -218,13 +229,26 @@ def thread(piece: float, stiffness: float, beta: float) -> TreeBuilder:
     last = -1
     for i in range(16):
         last = tree.add_body(
-            last, offset=(0.04 * (i > 0), 0, 0), mass=piece, com=(0.02, 0, 0), length=0.04, radius=(0.001, 0.001),
-            inertia=piece * np.array([1e-6, 1.3e-4, 1.3e-4]), stiffness=[stiffness] * 3, damping=[beta * stiffness] * 3,
-        )  # fmt: skip
+            last,
+            offset=(0.04 * (i > 0), 0, 0),
+            mass=piece,
+            com=(0.02, 0, 0),
+            length=0.04,
+            radius=(0.001, 0.001),
+            inertia=piece * np.array([1e-6, 1.3e-4, 1.3e-4]),
+            stiffness=[stiffness] * 3,
+            damping=[beta * stiffness] * 3,
+        )
     tree.add_body(
-        last, offset=(0.04, 0, 0), mass=0.5, com=(0.05, 0, 0), length=0.1, inertia=[2e-4, 3e-4, 3e-4],
-        stiffness=[stiffness] * 3, damping=[beta * stiffness] * 3,
-    )  # fmt: skip
+        last,
+        offset=(0.04, 0, 0),
+        mass=0.5,
+        com=(0.05, 0, 0),
+        length=0.1,
+        inertia=[2e-4, 3e-4, 3e-4],
+        stiffness=[stiffness] * 3,
+        damping=[beta * stiffness] * 3,
+    )
     return tree
 
 
@@ -242,7 +266,8 @@ def test_limp_threads_slow_down(beta: float) -> None:
     rest.predict()
     rng = np.random.default_rng(31)
     plants.state.joint_qd[:] = 20.0 * frames.normalize(rng.normal(size=plants.state.joint_qd.shape))
-    rates, measured = np.zeros((2000, len(trees))), np.zeros(2000)
+    rates = np.zeros((2000, len(trees)))
+    measured = np.zeros(2000)
     for tick in range(2000):
         plants.predict()
         measured[tick] = energy(plants) - energy(rest)
@@ -262,12 +287,14 @@ def test_a_fast_tree_keeps_phi_1_until_it_has_been_slow_for_a_second() -> None:
     thrown, slow, touched = (plants.model.bodies_of(i) for i in range(3))
     plants.state.joint_qd[thrown, 2] = 8.0
     plants.state.joint_qd[slow, 2] = plants.state.joint_qd[touched, 2] = 0.2
-    phi, rate = np.zeros((400, 3), np.float32), np.zeros((400, 3))
+    phi = np.zeros((400, 3), np.float32)
+    rate = np.zeros((400, 3))
     for tick in range(400):
         plants.predict()
         push = np.array([[0.0, 0.1, 0.0, 0.0, 0.0, 0.0]]) * (50 <= tick < 60)
         plants.integrate(np.array([touched.start + 12]), push) if push.any() else plants.integrate()
-        phi[tick], rate[tick] = plants.phi_used, plants.tree_rate
+        phi[tick] = plants.phi_used
+        rate[tick] = plants.tree_rate
     fast = np.flatnonzero(rate[:, 0] > 0.06 * plants.max_rate)
     assert (phi[: fast[-1] + 101, 0] == 1.0).all()
     assert (phi[fast[-1] + 102 :, 0] == np.float32(0.55)).all()

@@ -112,11 +112,14 @@ def test_a_bunch_that_was_picked_and_lies_on_canes_is_borne_in_every_step() -> N
 def drag(physics: Physics, body: int, way: np.ndarray, steps: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pull a body along ``way`` [3] m within a second: positions [step, body, 3], the force [step, 3] of the pull, and
     how many trees were awake [step]."""
-    plants, stiffness = physics.plants, 2000.0
+    plants = physics.plants
+    stiffness = 2000.0
     physics.wake(physics.model.body_tree[[body]])
     tie = plants.add_tie(body, np.zeros(3), stiffness, 20.0)
     start = plants.tie_anchor[tie].copy()
-    positions, forces, awake = [], [], []
+    positions = []
+    forces = []
+    awake = []
     for step in range(steps):
         plants.tie_anchor[tie] = start + min(0.01 * step, 1.0) * way
         physics.step()
@@ -172,7 +175,8 @@ def test_what_was_clear_of_sleepers_and_hardly_moved_need_not_be_compared_again(
     bodies = model.tree_first[[2, 9]] + rng.integers(6, 15, 2)
     ties = [[physics.plants.add_tie(int(body), np.zeros(3), 1000.0, 10.0) for body in bodies] for physics in worlds]
     anchor = worlds[0].plants.tie_anchor[ties[0]].copy()
-    velocity, most = np.zeros((2, 3)), 0
+    velocity = np.zeros((2, 3))
+    most = 0
     for physics in worlds:
         physics.wake(np.array([2, 9]))
     for step in range(250):
@@ -198,7 +202,8 @@ def test_a_cane_that_came_to_rest_on_another_sleeps_and_wakes_with_it() -> None:
     """A slack cane sags onto one that sleeps. Whichever is woken then, both are, and the contact bears what it bore."""
     physics = Physics(assemble([settled((0.0, 0.0, 1.0)), rod((0.5, -0.8, 1.021), heading=np.pi / 2, beta=0.03)]))
     physics.wake(np.array([1]))
-    awake, borne = [], 0.0
+    awake = []
+    borne = 0.0
     while len(physics.plants.awake):
         borne = pressure(physics)
         physics.step()

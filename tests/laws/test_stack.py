@@ -44,8 +44,11 @@ def drop_bunches(into_crate: bool, clusters: bool = False) -> Physics:
 
 def on_the_ground(physics: Physics) -> tuple[float, float]:
     """Vertical force of all contacts with the ground [N], and the deepest penetration of any contact [m]."""
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
-    force, wrench, deepest = 0.0, np.zeros(6), 0.0
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
+    force = 0.0
+    wrench = np.zeros(6)
+    deepest = 0.0
     for c in range(data.ncon):
         contact = data.contact[c]
         deepest = min(deepest, float(contact.dist))
@@ -109,7 +112,8 @@ def test_a_full_crate_slides_at_mu_m_g(fraction, moves):
     """F34: the force that starts a loaded crate is the friction coefficient times its total weight."""
     physics = drop_bunches(into_crate=True)
     settle(physics)
-    box, data = physics.rigid.mj_model.body("box/0").id, physics.rigid.mj_data
+    box = physics.rigid.mj_model.body("box/0").id
+    data = physics.rigid.mj_data
     start = data.joint("box/0").qpos[:3].copy()
     data.xfrc_applied[box, 0] = -fraction * PhysicsParameters().friction * GRAVITY[2] * (MASSES.sum() + CRATE)
     # at the height of the ground, so that it does not tip the crate
@@ -126,7 +130,8 @@ def test_contacts_add_no_speed(seed):
     trees = [cane((0.0, 5.0 + i, 2.0), bunch=0.4) for i in range(6)]
     box = {"box_pose": [[0.0, 0.0, 0.001, 0, 0, 0, 1]], "box_size": [[0.6, 0.4, 0.3]], "box_mass": [[CRATE]]}
     physics = Physics(assemble(trees, **box))
-    rigid, rng = physics.rigid, np.random.default_rng(seed)
+    rigid = physics.rigid
+    rng = np.random.default_rng(seed)
     for bunch in range(6):
         physics.pick(bunch)
         at = np.array([rng.uniform(-0.15, 0.15), rng.uniform(-0.05, 0.05), 0.6 + 0.25 * bunch])

@@ -18,17 +18,16 @@ from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
-WIRE, ARM = (
-    {"fixed_organ": [int(Organ.WIRE)], "fixed_index": [0]},
-    {"fixed_organ": [int(Organ.ARM)], "fixed_index": [0]},
-)
+WIRE = {"fixed_organ": [int(Organ.WIRE)], "fixed_index": [0]}
+ARM = {"fixed_organ": [int(Organ.ARM)], "fixed_index": [0]}
 RADIUS = {int(Organ.WIRE): 0.0015, int(Organ.ARM): 0.02}
 
 
 def piece(organ: dict, at: tuple[float, float, float], half: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> dict:
     """A level wire or arm about ``at`` [3] m, with ends at +-``half`` [3] m."""
     radius = RADIUS[organ["fixed_organ"][0]]
-    start, end = np.subtract(at, half), np.add(at, half)
+    start = np.subtract(at, half)
+    end = np.add(at, half)
     return organ | {"fixed_start": [start], "fixed_end": [end], "fixed_radius": [[radius, radius]]}
 
 

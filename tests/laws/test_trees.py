@@ -32,10 +32,16 @@ def forked(rng: np.random.Generator, *, beta: float = 0.012, isotropic: bool = T
             mass = rng.uniform(0.01, 0.05)
             stiffness = soft * rng.uniform(2.0, 20.0, 1 if isotropic else 3) * np.ones(3)
             parent = tree.add_body(
-                parent, offset=(0.06, *rng.normal(size=2) * 0.004), rest=frames.exp(rng.normal(size=3) * 0.4),
-                mass=mass, com=(0.03, 0.004, -0.003), inertia=mass * rng.uniform(5e-4, 9e-4, 3), length=0.06,
-                stiffness=stiffness, damping=beta * stiffness,
-            )  # fmt: skip
+                parent,
+                offset=(0.06, *rng.normal(size=2) * 0.004),
+                rest=frames.exp(rng.normal(size=3) * 0.4),
+                mass=mass,
+                com=(0.03, 0.004, -0.003),
+                inertia=mass * rng.uniform(5e-4, 9e-4, 3),
+                length=0.06,
+                stiffness=stiffness,
+                damping=beta * stiffness,
+            )
             grown.append(parent)
         return grown
 
@@ -89,7 +95,8 @@ def test_response_is_mujocos_inverse_inertia(phi: float) -> None:
     rng = np.random.default_rng(5)
     model = assemble([forked(rng, isotropic=False), forked(rng, isotropic=False)])
     plants = awake(model, random_state(model, rng, 1.0), phi=phi, geometric_stiffness=False)
-    state, size = plants.state, int(model.tree_size[0])
+    state = plants.state
+    size = int(model.tree_size[0])
     touched = np.array([4, size + 12, 9, size + 3], np.int32)
     plants.predict()
     measured = plants.impulse_response(touched)
@@ -142,8 +149,10 @@ def test_predicted_velocity_is_realised() -> None:
 
 def energy(plants: ArticulationSolver) -> float:
     """Kinetic, potential and elastic energy [J], right after ``predict()``."""
-    model, state = plants.model, plants.state
-    pose, speed = state.body_q.astype(float), state.body_qd.astype(float)
+    model = plants.model
+    state = plants.state
+    pose = state.body_q.astype(float)
+    speed = state.body_qd.astype(float)
     com = frames.rotate(pose[:, 3:], model.body_com.astype(float))
     linear = speed[:, :3] + np.cross(speed[:, 3:], com)
     angular = frames.rotate(frames.conjugate(pose[:, 3:]), speed[:, 3:])
@@ -206,9 +215,15 @@ def test_a_heavy_bunch_on_a_thin_peduncle_is_stable(mass: float, radius: float) 
     last = tree.add_rod(-1, 0.06, (radius, radius), RodMaterial(0.5e9, 900.0, 0.02), 3)[-1]
     spring = tree.bodies[last]
     bunch = tree.add_body(
-        last, offset=(0.02, 0, 0), mass=mass, com=(0.08, 0, 0), inertia=np.array([1, 2, 2]) * 1e-3 * mass, length=0.16,
-        stiffness=spring["stiffness"], damping=spring["damping"],
-    )  # fmt: skip
+        last,
+        offset=(0.02, 0, 0),
+        mass=mass,
+        com=(0.08, 0, 0),
+        inertia=np.array([1, 2, 2]) * 1e-3 * mass,
+        length=0.16,
+        stiffness=spring["stiffness"],
+        damping=spring["damping"],
+    )
     model = assemble([tree])
     state = State.at_rest(model)
     state.joint_q[0] = frames.exp(np.array([0.0, 0.3, 0.0]))
@@ -353,7 +368,8 @@ def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
     plants = spinning_cut_tree(
         forked(rng, isotropic=False), rng, 0, phi=phi, geometric_stiffness=False, fast_rate=np.inf
     )
-    model, state = plants.model, plants.state
+    model = plants.model
+    state = plants.state
     plants.cut(6)
     plants.predict()
     touched = np.array([5, 0, 9, 6], np.int32)
@@ -365,9 +381,13 @@ def test_response_of_a_cut_tree_is_that_of_a_free_joint(phi: float) -> None:
         parent = int(plants._parent[body])
         pose = state.body_q[body] if parent < 0 else frames.pose(model.body_offset[body], model.body_rest[body])
         child = (spec.worldbody if parent < 0 else mj_bodies[parent]).add_body(
-            pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(model.body_mass[body]), ipos=model.body_com[body],
-            inertia=model.body_inertia[body], explicitinertial=True,
-        )  # fmt: skip
+            pos=pose[:3],
+            quat=frames.to_wxyz(pose[3:]),
+            mass=float(model.body_mass[body]),
+            ipos=model.body_com[body],
+            inertia=model.body_inertia[body],
+            explicitinertial=True,
+        )
         child.add_joint(type=mujoco.mjtJoint.mjJNT_FREE if parent < 0 else mujoco.mjtJoint.mjJNT_BALL)
         mj_bodies.append(child)
     mj_model = spec.compile()
@@ -412,7 +432,8 @@ def test_a_force_on_a_cut_cane_moves_it_as_predicted() -> None:
     plants.forward_kinematics()
     linear, angular, center, _ = momenta(plants, cut_bodies, np.zeros(3))
     plants.predict()
-    touched, wrench = np.array([6, 4, 10]), rng.normal(size=(3, 6)) * [0.1, 0.1, 0.1, 1e-5, 1e-5, 1e-5]
+    touched = np.array([6, 4, 10])
+    wrench = rng.normal(size=(3, 6)) * [0.1, 0.1, 0.1, 1e-5, 1e-5, 1e-5]
     at = plants.state.body_q[touched, :3].astype(float)
     predicted = plants.velocity_free[touched] + np.einsum("uitj,tj->ui", plants.impulse_response(touched), wrench * DT)
     plants.integrate(touched, wrench)
@@ -472,7 +493,9 @@ def test_a_tied_cane_bends_like_a_propped_beam(stiffness: float) -> None:
     """Side load P at the tip, spring support at a: w(x) by superposition of two cantilevers (Euler-Bernoulli)."""
     model = tied(flat(beta=0.05), 9, stiffness, point=(1 / 16, 0.0, 0.0))
     plants = awake(model, State.at_rest(model), phi=1.0)
-    load, bend, a = 0.01, 5e9 * np.pi / 4 * 0.004**4, 10 / 16
+    load = 0.01
+    bend = 5e9 * np.pi / 4 * 0.004**4
+    a = 10 / 16
     plants.body_load[15] = [0.0, load, 0.0, 0.0, 0.0, load / 16]
     for _ in range(1500):
         plants.predict()
@@ -517,7 +540,9 @@ def test_a_tied_cane_gains_no_energy(stiffness: float, loaded: tuple[float, floa
 @pytest.mark.parametrize("zeta", [0.03, 0.1, 0.2])
 def test_a_tie_has_the_given_damping_ratio(zeta: float) -> None:
     """A balanced wheel of 0.02 kg m^2 on a spring of 50 N/m at a lever of 0.2 m: 10 rad/s."""
-    inertia, lever, stiffness = 0.02, 0.2, 50.0
+    inertia = 0.02
+    lever = 0.2
+    stiffness = 50.0
     tree = TreeBuilder(frames.pose(np.zeros(3)))
     tree.add_body(-1, mass=1.0, inertia=[inertia] * 3, length=0.2)
     damping = 2.0 * zeta * np.sqrt(stiffness * inertia) / lever
@@ -659,7 +684,8 @@ def test_sag_of_an_arm_on_its_trunk() -> None:
         plants.integrate()
     plants.forward_kinematics()
     w = 900.0 * np.pi * 0.02**2 * 9.81
-    arm_bend, trunk_bend = 8e9 * np.pi / 4 * 0.02**4, 10e9 * np.pi / 4 * 0.035**4
+    arm_bend = 8e9 * np.pi / 4 * 0.02**4
+    trunk_bend = 10e9 * np.pi / 4 * 0.035**4
     pose = plants.state.body_q[arm[-1]].astype(float)
     tip = frames.compose(pose, frames.pose([1 / 12, 0, 0]))[2]
     sag = w / (8.0 * arm_bend) + 0.5 * w * 1.5 / trunk_bend

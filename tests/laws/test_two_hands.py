@@ -32,7 +32,8 @@ class TwoHands:
     """A person on either side of a hanging bunch, each of a client of its own; the first is at the side of -y."""
 
     def __init__(self, delay: float, *, jitter: float = 0.0, loss: float = 0.0) -> None:
-        self.now, self.hub = 100.0, MemoryHub(delay=delay, jitter=jitter, loss=loss, seed=3)
+        self.now = 100.0
+        self.hub = MemoryHub(delay=delay, jitter=jitter, loss=loss, seed=3)
         self.hub.bus("server").declare_queryable(
             "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
         )

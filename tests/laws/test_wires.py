@@ -20,9 +20,12 @@ from vinesim.world import Physics
 
 pytestmark = pytest.mark.slow
 
-ARM, MASS, SPRING = 0.5, 0.05, 4.0
+ARM = 0.5
+MASS = 0.05
+SPRING = 4.0
 """A shoot here: a rod [m] of a mass [kg] that leans on a joint [N m/rad]; its tip is tied to the wire."""
-LENGTH, TENSION = 2.0, 900.0
+LENGTH = 2.0
+TENSION = 900.0
 """[m], [N] of the wire."""
 ALONG = (0.3, 0.7, 0.85, 1.6)
 """[m] where four shoots are tied to it."""
@@ -30,9 +33,15 @@ INERTIA = MASS * ARM**2 / 3.0
 
 
 def row_of_shoots(
-    along: tuple[float, ...] = ALONG, *, tie: float = 2000.0, tension: float = TENSION, beta: float = 0.02,
-    spring: float = SPRING, others: int = 0, beyond: float = 0.1,
-) -> Model:  # fmt: skip
+    along: tuple[float, ...] = ALONG,
+    *,
+    tie: float = 2000.0,
+    tension: float = TENSION,
+    beta: float = 0.02,
+    spring: float = SPRING,
+    others: int = 0,
+    beyond: float = 0.1,
+) -> Model:
     """Level rods along y whose tips are tied to a wire along x; ``others`` are tied to another wire behind it.
 
     The geoms of both wires are ``beyond`` [m] the tips, out of reach; the ties are what this is about.
@@ -41,21 +50,33 @@ def row_of_shoots(
     for x in (*along, *np.linspace(0.2, 1.8, others)):
         tree = TreeBuilder(frames.pose(np.array([x, 0.0, 1.0]), frames.from_yaw(np.pi / 2)))
         tree.add_body(
-            -1, mass=MASS, com=(ARM / 2, 0, 0), length=ARM, radius=(0.004, 0.004),
-            inertia=np.full(3, MASS * ARM**2 / 12), stiffness=np.full(3, spring), damping=np.full(3, beta * spring),
-        )  # fmt: skip
+            -1,
+            mass=MASS,
+            com=(ARM / 2, 0, 0),
+            length=ARM,
+            radius=(0.004, 0.004),
+            inertia=np.full(3, MASS * ARM**2 / 12),
+            stiffness=np.full(3, spring),
+            damping=np.full(3, beta * spring),
+        )
         trees.append(tree)
     count = len(trees)
     there = ARM + beyond
     return assemble(
-        trees, tie_body=np.arange(count), tie_point=np.tile([ARM, 0.0, 0.0], (count, 1)),
-        tie_anchor=[[tree.pose[0], tree.pose[1] + ARM, 1.0] for tree in trees], tie_stiffness=np.full(count, tie),
-        tie_damping=np.full(count, 0.5 * beta * tie), tie_wire=np.repeat([0, 1], [len(along), others]),
+        trees,
+        tie_body=np.arange(count),
+        tie_point=np.tile([ARM, 0.0, 0.0], (count, 1)),
+        tie_anchor=[[tree.pose[0], tree.pose[1] + ARM, 1.0] for tree in trees],
+        tie_stiffness=np.full(count, tie),
+        tie_damping=np.full(count, 0.5 * beta * tie),
+        tie_wire=np.repeat([0, 1], [len(along), others]),
         fixed_start=[[0.0, there, 1.0], [0.0, there + 0.5, 1.0]],
         fixed_end=[[LENGTH, there, 1.0], [LENGTH, there + 0.5, 1.0]],
-        fixed_radius=np.full((2, 2), 0.0014), fixed_organ=[int(Organ.WIRE)] * 2, fixed_index=[0, 1],
+        fixed_radius=np.full((2, 2), 0.0014),
+        fixed_organ=[int(Organ.WIRE)] * 2,
+        fixed_index=[0, 1],
         fixed_tension=[tension] * 2,
-    )  # fmt: skip
+    )
 
 
 def world(model: Model, **parameters: Any) -> Physics:
@@ -85,7 +106,8 @@ def tips(physics: Physics) -> np.ndarray:
 
 def compliance(along: tuple[float, ...], tension: float = TENSION) -> np.ndarray:
     """Deflections of a string by unit forces across it [node, node] m/N: a (L - b) / (T L), a <= b."""
-    a, b = np.minimum.outer(along, along), np.maximum.outer(along, along)
+    a = np.minimum.outer(along, along)
+    b = np.maximum.outer(along, along)
     return a * (LENGTH - b) / (tension * LENGTH)
 
 
@@ -101,7 +123,8 @@ def test_a_wire_gives_by_the_string_law(at: float) -> None:
     push(physics, 0, np.array([0.0, 0.0, 2.0]))
     for _ in range(500):
         physics.step()
-    tip, deflection = tips(physics)[0], physics.elastic_supports.deflection[0]
+    tip = tips(physics)[0]
+    deflection = physics.elastic_supports.deflection[0]
     held = 2000.0 * (tip[2] - deflection[2])
     assert deflection[2] == pytest.approx(held * at * (LENGTH - at) / (TENSION * LENGTH), rel=1e-4)
     assert held + SPRING / ARM**2 * tip[2] == pytest.approx(2.0, rel=2e-3)
@@ -134,7 +157,8 @@ def test_shoots_of_one_wire_move_each_other_as_a_dense_solve_says() -> None:
 def test_modes_of_two_shoots_on_a_wire(springs: tuple[float, float], sign: float) -> None:
     """In step and against each other two equal shoots swing as joint, ties and wire say, beside what the trapezoidal
     rule does to any oscillator: tan(w dt / 2) = dt/2 sqrt(K / M). M has (dt/2)^2 (k - S) beside the shoots' own."""
-    along, dt = (0.8, 1.2), 0.01
+    along = (0.8, 1.2)
+    dt = 0.01
     tie, tension = springs
     physics = world(row_of_shoots(along, tie=tie, tension=tension, beta=0.0), phi=0.5)
     set_turning(physics, [-0.05, -0.05 * sign])
@@ -271,7 +295,8 @@ def test_pulled_shoots_of_the_demo_gain_no_energy_at_the_shipped_phi() -> None:
     at_rest = energy(physics.plants, 9.81).total
     physics.state.joint_q[:] = bent.state.joint_q
     physics.wake(np.arange(len(model.tree_first)))
-    seen, nothing = [], (np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
+    seen = []
+    nothing = (np.zeros(0, np.int32), np.zeros((0, 6), np.float32))
     for step in range(1000):
         physics.plants.forward_kinematics()
         physics.elastic_supports.update()

@@ -113,9 +113,12 @@ def test_an_actor_writes_under_its_own_name_and_no_other(server, certs):
     own = [f"vs/1/vineyard/{key.format('ada')}" for key in WRITTEN]
     others = [f"vs/1/vineyard/{key.format('bob')}" for key in WRITTEN if key != "force/bob/{}"]
     invalid = [
-        "vs/1/vineyard/anything", "vs/1/vineyard/c/0/0/0/ada", "vs/1/vineyard/force/ada/bob",
-        "vs/1/vineyard/clock/ada", "vs/1/vineyard/hello/bob",
-    ]  # fmt: skip
+        "vs/1/vineyard/anything",
+        "vs/1/vineyard/c/0/0/0/ada",
+        "vs/1/vineyard/force/ada/bob",
+        "vs/1/vineyard/clock/ada",
+        "vs/1/vineyard/hello/bob",
+    ]
     assert keys_received(certs, server, "ada", [*others, *own, *invalid]) == own
 
 
@@ -157,8 +160,10 @@ def test_connecting_needs_a_certificate_of_the_servers_authority(server, certs, 
         ZenohBus("ada", connect=f"tcp/{address}")
     bare = {"transport__link__tls": {"root_ca_certificate": str(certs / "ca.pem")}}
     tries = {
-        "connect__endpoints": [f"tls/{address}"], "connect__timeout_ms": 700, "connect__exit_on_failure": True,
-    }  # fmt: skip
+        "connect__endpoints": [f"tls/{address}"],
+        "connect__timeout_ms": 700,
+        "connect__exit_on_failure": True,
+    }
     with pytest.raises(zenoh.ZError):
         close_session(open_session(config("client", **tries, **bare)))
     create(tmp_path, "ada")  # of another authority
@@ -175,7 +180,8 @@ def test_all_bus_functions_work_under_access_control(server, certs):
         wait(
             lambda: all(each.alive() == {"ada", "bob", "guest"} for each in (ada, bob, guest)), "all to see each other"
         )
-        pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
+        pose = ada.publisher("a/ada")
+        event = ada.publisher("own/0/0/ada", reliable=True)
         alone = ada.publisher("c/0/0/ada")
         for each in (bob, guest):
             each.subscribe("a/*")
@@ -274,8 +280,10 @@ def test_over_quic_poses_use_datagrams_and_events_a_stream(server, certs):
         ZenohBus("bob", connect=f"quic/127.0.0.1:{port}", certificates=certs) as bob,
     ):
         assert [link.split()[0].partition("/")[0] + link.partition(" ")[2] for link in ada.links] == [
-            "quicbest effort", "quicreliable", "tlsreliable",
-        ]  # fmt: skip
+            "quicbest effort",
+            "quicreliable",
+            "tlsreliable",
+        ]
         ada.join(hello("ada"))
         bob.subscribe("a/*")
         pose = ada.publisher("a/ada")
@@ -329,11 +337,17 @@ def test_linked_servers_check_names_of_their_own_actors(certs, protocol):
 
 def test_key_files_are_private_and_roles_are_read(tmp_path):
     written = create(tmp_path / "pki", "guest", Role.SPECTATOR)
-    authority, pki = "pki-authority", "pki"
+    authority = "pki-authority"
+    pki = "pki"
     assert [f"{path.parent.name}/{path.name}" for path in written] == [
-        f"{authority}/ca.key", f"{authority}/ca.pem", f"{pki}/ca.pem", f"{pki}/server.key", f"{pki}/server.pem",
-        f"{pki}/guest.key", f"{pki}/guest.pem",
-    ]  # fmt: skip
+        f"{authority}/ca.key",
+        f"{authority}/ca.pem",
+        f"{pki}/ca.pem",
+        f"{pki}/server.key",
+        f"{pki}/server.pem",
+        f"{pki}/guest.key",
+        f"{pki}/guest.pem",
+    ]
     for path in written:
         assert stat.S_IMODE(path.stat().st_mode) == (0o600 if path.suffix == ".key" else 0o644), path
     assert [path.name for path in create(tmp_path / "pki", "ada")] == ["ada.key", "ada.pem"]

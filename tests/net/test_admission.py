@@ -106,7 +106,8 @@ def test_an_admitted_actor_that_never_joins_loses_its_place():
 
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.sampled_from(["D1", "D2"]), st.booleans()), max_size=40))
 def test_all_actors_of_a_world_share_one_scene(events):
-    admission, members = AdmissionControl(max_actors=2), {}
+    admission = AdmissionControl(max_actors=2)
+    members = {}
     for name, digest, leaves in events:
         if leaves:
             admission.on_leave("w", name, name)
@@ -122,7 +123,8 @@ class _SlowlyRouted:
     """A Zenoh session with a server that is announced, and to which the first queries are not routed."""
 
     def __init__(self, lost: int) -> None:
-        self.lost, self.queries = lost, 0
+        self.lost = lost
+        self.queries = 0
         self.matching_status = types.SimpleNamespace(matching=True)
         self.info = types.SimpleNamespace(routers_zid=list)
 

@@ -44,7 +44,8 @@ def test_winning_is_transitive(many):
 
 @given(close, st.data())
 def test_any_order_and_any_repetition_end_with_the_same_owner(many, data):
-    first, rest = many[0], many[1:]
+    first = many[0]
+    rest = many[1:]
     shuffled = data.draw(st.permutations(rest))
     repeated = shuffled + data.draw(st.lists(st.sampled_from(many), max_size=6))
     assert winner(rest, first) == winner(repeated, first)
@@ -53,7 +54,8 @@ def test_any_order_and_any_repetition_end_with_the_same_owner(many, data):
 @given(close, st.data())
 def test_a_client_that_lost_messages_agrees_after_receiving_the_winning_claim(many, data):
     """Loss, then resync: any part is lost, and the greatest claim arrives later."""
-    first, rest = many[0], many[1:]
+    first = many[0]
+    rest = many[1:]
     received = [claim for claim in rest if data.draw(st.booleans())]
     everything = winner(rest, first)
     assert winner([everything], winner(received, first)) == everything

@@ -59,7 +59,8 @@ def test_samples_beyond_the_depth_are_dropped_and_counted():
 
 
 def test_the_bytes_that_wait_to_be_polled_are_bounded():
-    store, payload = SampleStore(), bytes(1 << 20)
+    store = SampleStore()
+    payload = bytes(1 << 20)
     for _ in range(100):
         store.put(KEEP_ALL, "e", payload)
     kept = len(store.take())
@@ -71,7 +72,8 @@ def test_the_bytes_that_wait_to_be_polled_are_bounded():
 
 def test_without_a_subscriber_nothing_is_sent_or_counted():
     hub = MemoryHub()
-    ada, bob = hub.bus("ada"), hub.bus("bob")
+    ada = hub.bus("ada")
+    bob = hub.bus("bob")
     publisher = ada.publisher("c/0/0/ada")
     ada.subscribe("c/0/0/*")
     assert not publisher.matching
@@ -93,10 +95,12 @@ def test_a_publisher_needs_an_exact_key():
 
 def test_reliable_samples_all_arrive_in_order_despite_loss():
     hub = MemoryHub(delay=0.05, jitter=0.05, loss=0.5, seed=3)
-    ada, bob = hub.bus("ada"), hub.bus("bob")
+    ada = hub.bus("ada")
+    bob = hub.bus("bob")
     bob.subscribe("own/**", KEEP_ALL)
     bob.subscribe("c/**", KEEP_LAST_64)
-    events, stream = ada.publisher("own/x/ada", reliable=True), ada.publisher("c/x/ada")
+    events = ada.publisher("own/x/ada", reliable=True)
+    stream = ada.publisher("c/x/ada")
     for number in range(60):
         events.put(bytes([number]))
         stream.put(bytes([number]))
@@ -112,9 +116,11 @@ def test_reliable_samples_all_arrive_in_order_despite_loss():
 def test_the_same_seed_gives_the_same_network():
     def run() -> list:
         hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=11)
-        ada, bob = hub.bus("ada"), hub.bus("bob")
+        ada = hub.bus("ada")
+        bob = hub.bus("bob")
         bob.subscribe("**", KEEP_ALL)
-        publisher, received = ada.publisher("x"), []
+        publisher = ada.publisher("x")
+        received = []
         for number in range(100):
             publisher.put(bytes([number]))
             hub.advance(0.004)
@@ -126,7 +132,8 @@ def test_the_same_seed_gives_the_same_network():
 
 def test_nothing_arrives_before_its_time():
     hub = MemoryHub(delay=0.05)
-    ada, bob = hub.bus("ada"), hub.bus("bob")
+    ada = hub.bus("ada")
+    bob = hub.bus("bob")
     bob.subscribe("x")
     ada.publisher("x").put(b"1")
     hub.advance(0.049)
@@ -137,7 +144,8 @@ def test_nothing_arrives_before_its_time():
 
 def test_replies_have_their_age():
     hub = MemoryHub(delay=0.01)
-    ada, bob = hub.bus("ada"), hub.bus("bob")
+    ada = hub.bus("ada")
+    bob = hub.bus("bob")
     bob.declare_queryable("hello/bob", lambda query: query + b"!")
     ada.query("hello/*", b"hi")
     ada.query("unknown", b"hi")
@@ -167,7 +175,8 @@ def test_a_name_is_live_once():
 
 def test_a_hub_that_is_down_is_reported_and_recovers():
     hub = MemoryHub()
-    ada, bob = hub.bus("ada"), hub.bus("bob")
+    ada = hub.bus("ada")
+    bob = hub.bus("bob")
     bob.subscribe("x")
     publisher = ada.publisher("x")
     hub.down = True

@@ -106,7 +106,8 @@ def test_clients_with_datagrams_come_back_to_both_ports(tmp_path):
 
 
 def test_a_new_authority_for_all_is_used_by_servers_and_by_clients_that_come_back(tmp_path):
-    certs, new = tmp_path / "certs", tmp_path / "new"
+    certs = tmp_path / "certs"
+    new = tmp_path / "new"
     create(certs, "ada")
     create(new, "ada")
     with Server("tls/127.0.0.1:0", certificates=certs) as server:
@@ -172,7 +173,8 @@ def test_no_folder_with_the_key_of_the_authority_is_taken(tmp_path):
 
 
 def test_the_authority_may_lie_anywhere_but_in_the_folder_and_is_not_mistaken(tmp_path):
-    certs, stick = tmp_path / "certs", tmp_path / "stick"
+    certs = tmp_path / "certs"
+    stick = tmp_path / "stick"
     create(certs, "ada", authority=stick)
     assert sorted(path.name for path in stick.iterdir()) == ["ca.key", "ca.pem"]
     with pytest.raises(CertificateError, match="--authority"):

@@ -21,7 +21,8 @@ class World:
     """Two clients beside one tree, and a server whose clock can be set."""
 
     def __init__(self) -> None:
-        self.hub, self.server_offset = MemoryHub(delay=0.02), 1e6
+        self.hub = MemoryHub(delay=0.02)
+        self.server_offset = 1e6
         self.hub.bus("server").declare_queryable(
             "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.server_time)
         )

@@ -44,10 +44,12 @@ def test_network_time_increases_while_it_is_slewed(seed):
     state = ClockEstimate()
     for k in range(8):
         state = state.with_ping(Ping(k, k + 5.0 + rng.uniform(0, 0.02), k + 0.02))
-    last, now = -1.0, 8.0
+    last = -1.0
+    now = 8.0
     for _ in range(200):
         if rng.random() < 0.1:
-            there, back = rng.uniform(0, 0.1), rng.uniform(0, 0.1)
+            there = rng.uniform(0, 0.1)
+            back = rng.uniform(0, 0.1)
             state = state.with_ping(Ping(now, now + there + 5.0 + rng.uniform(-0.05, 0.05), now + there + back))
         state = state.advanced(0.01)
         now += 0.01

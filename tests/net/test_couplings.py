@@ -65,10 +65,14 @@ def test_any_bytes_are_decoded_or_refused(tail, cut):
 @pytest.mark.parametrize(
     "wrong",
     [
-        (coupling(x=np.nan),), (coupling(x=np.inf),), (coupling(x=1e9),), (coupling(5), coupling(5)),
-        (coupling(5), coupling(4)), tuple(coupling(body) for body in range(MAX_COUPLINGS + 1)),
+        (coupling(x=np.nan),),
+        (coupling(x=np.inf),),
+        (coupling(x=1e9),),
+        (coupling(5), coupling(5)),
+        (coupling(5), coupling(4)),
+        tuple(coupling(body) for body in range(MAX_COUPLINGS + 1)),
     ],
-)  # fmt: skip
+)
 def test_what_no_client_sends_is_refused(wrong):
     with pytest.raises(MessageError):
         message(*wrong)
@@ -90,10 +94,14 @@ def test_it_holds_for_a_tenth_of_a_second_and_old_messages_count_as_dropped():
 @pytest.mark.parametrize(
     ("where", "owner", "is_used"),
     [
-        (pose(), "anna", True), (pose(), "eva", True), (pose(), "ida", False), (pose(), None, False),
-        (pose(0.5 + ARM_REACH + 0.1), "anna", False), (None, "anna", False),
+        (pose(), "anna", True),
+        (pose(), "eva", True),
+        (pose(), "ida", False),
+        (pose(), None, False),
+        (pose(0.5 + ARM_REACH + 0.1), "anna", False),
+        (None, "anna", False),
     ],
-)  # fmt: skip
+)
 def test_only_trees_of_either_side_within_reach(where, owner, is_used):
     counters = Counters()
     anna = sync(counters)
@@ -112,7 +120,8 @@ def test_spectators_and_bodies_that_there_are_not_are_malformed(sender, body):
 
 def test_it_is_sent_at_60_hz_while_there_is_one_and_its_end_once():
     hub = MemoryHub()
-    eva, anna = hub.bus("eva"), hub.bus("anna")
+    eva = hub.bus("eva")
+    anna = hub.bus("anna")
     anna.subscribe("force/anna/*")
     mine = CouplingSync(eva, "eva", MODEL, Counters())
     sent = []

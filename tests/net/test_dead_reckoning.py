@@ -15,7 +15,8 @@ vectors = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 
 @given(vectors, vectors)
 def test_quaternion_rate_is_the_derivative_of_rotation(turn, omega):
-    q, h = frames.exp(turn), 1e-5
+    q = frames.exp(turn)
+    h = 1e-5
     after, before = (frames.multiply(frames.exp(s * h * omega), q) for s in (1.0, -1.0))
     np.testing.assert_allclose(dead_reckoning.quaternion_rate(q, omega), (after - before) / (2 * h), atol=1e-8)
 

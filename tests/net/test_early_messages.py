@@ -36,7 +36,8 @@ def test_bytes_messages_and_senders_are_bounded_and_every_message_is_kept_or_cou
     before = {name: getattr(early_messages, name) for name in bounds}
     vars(early_messages).update(bounds)
     try:
-        early, discarded = EarlyMessages(), 0
+        early = EarlyMessages()
+        discarded = 0
         for sender, size in puts:
             discarded += early.put(f"{sender}", "key", bytes(size), lambda name: int(name) < 3)
             assert len(early) <= 4

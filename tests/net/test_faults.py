@@ -35,7 +35,8 @@ class FakeClients:
     """Fake clients that have joined, each in its own process with its own clock."""
 
     def __init__(self, server: ServerProcess, processes: dict[str, FakeClientProcess]) -> None:
-        self.server, self.processes = server, processes
+        self.server = server
+        self.processes = processes
 
     def __getitem__(self, name: str) -> FakeClientProcess:
         return self.processes[name]
@@ -59,9 +60,11 @@ def clients() -> Iterator[FakeClients]:
 
         def start(name: str) -> FakeClientProcess:
             return FakeClientProcess(
-                server.endpoint, [{"name": name, "place": [PLACES[name], 0.0]}], skew=SKEWS.get(name, 0.0),
+                server.endpoint,
+                [{"name": name, "place": [PLACES[name], 0.0]}],
+                skew=SKEWS.get(name, 0.0),
                 start=programs.Popen,
-            )  # fmt: skip
+            )
 
         with ThreadPoolExecutor() as pool:
             processes = dict(zip(PLACES, pool.map(start, PLACES), strict=True))
@@ -120,7 +123,8 @@ def test_a_killed_client_leaves_and_its_trees_get_a_new_owner_or_rest(clients, r
 
 @pytest.mark.long
 def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_property):
-    ada, bob = clients["ada"], clients["bob"]
+    ada = clients["ada"]
+    bob = clients["bob"]
     missed: list[float] = []
     while len(missed) < ATTEMPTS and not any(after < deadline(LEAVE_TIMEOUT) for after in missed):
         since = bob.command()["now"]
@@ -146,12 +150,15 @@ def test_a_frozen_client_leaves_within_2_5_s_and_rejoins(clients, record_propert
 @pytest.mark.long
 def test_what_a_frozen_client_owned_before_is_not_believed_when_it_comes_back(clients):
     """Another one has grasped its tree meanwhile; the others have gone on."""
-    ada, bob, cleo = clients["ada"], clients["bob"], clients["cleo"]
+    ada = clients["ada"]
+    bob = clients["bob"]
+    cleo = clients["cleo"]
     ada.command(touch=[2])
     wait(lambda: clients.owners(2) == {"ada"}, "ada to own the tree")
     ada.process.send_signal(signal.SIGSTOP)
     wait(lambda: "ada" not in bob.command()["others"] and "ada" not in cleo.command()["others"], "ada to leave")
-    since, ticks = bob.command(grab=[2], touch=[2])["now"], cleo.command()["ticks"]
+    since = bob.command(grab=[2], touch=[2])["now"]
+    ticks = cleo.command()["ticks"]
     wait(lambda: cleo.command()["owner"]["2"] == "bob", "bob to own the tree")
     wait(lambda: cleo.command()["ticks"] > ticks + 60, "the others to go on")
     ada.process.send_signal(signal.SIGCONT)
@@ -163,7 +170,8 @@ def test_what_a_frozen_client_owned_before_is_not_believed_when_it_comes_back(cl
 
 
 def test_streams_resume_within_a_second_of_a_server_restart(clients, record_property):
-    ada, bob = clients["ada"], clients["bob"]
+    ada = clients["ada"]
+    bob = clients["bob"]
     ada.command(touch=[6])
     wait(lambda: clients.has_received("bob", 6, -math.inf), "bob to receive the tree")
     took: list[float] = []

@@ -73,7 +73,8 @@ def test_a_flood_from_a_stranger_changes_nothing():
 
 def _assert_possible(fake_client: FakeClient) -> None:
     """Nothing is believed that the model forbids."""
-    replicator, model = fake_client.replicator, fake_client.model
+    replicator = fake_client.replicator
+    model = fake_client.model
     counts = object_counts(model)
     for number in replicator.known:
         messages.check_object_id(number, counts)
@@ -130,19 +131,20 @@ def robot_client(hub: MemoryHub, now: list[float]) -> tuple[Client, np.ndarray]:
     pose = spawn_pose(scene, 0)
     client = Client(
         scene, generate(scene), load_robot("vinebot"), hub.bus("ada"), name="ada", pose=pose, clock=lambda: now[0]
-    )  # fmt: skip
+    )
     return client, pose
 
 
 @pytest.mark.parametrize("kind", ["human", *long("robot")])
 def test_a_client_with_physics_survives_malformed_messages(kind):
     """Valid messages may still be absurd (trees turned inside out, boxes in the sky): the state stays finite."""
-    hub, now = MemoryHub(), [10.0]
+    hub = MemoryHub()
+    now = [10.0]
     client, pose = robot_client(hub, now)
     model = client.model
     attacker = FakeClient(
         hub.bus(ATTACKER), model, (float(pose[0]) + 0.7, float(pose[1])), digest=model.digest(), kind=kind
-    )  # fmt: skip
+    )
 
     def tick() -> None:
         hub.advance(0.01)
@@ -175,12 +177,16 @@ def test_a_client_with_physics_survives_malformed_messages(kind):
 @pytest.mark.long
 def test_jumps_of_a_remote_person_do_not_push_a_robot_on_its_wheels():
     """Poses of human size that jump in and about the robot, and corrupted ones of a seed that once pushed it 9 m."""
-    hub, now = MemoryHub(), [10.0]
+    hub = MemoryHub()
+    now = [10.0]
     client, pose = robot_client(hub, now)
     attacker = FakeClient(
-        hub.bus(ATTACKER), client.model, (float(pose[0]) + 0.7, float(pose[1])), digest=client.model.digest(),
+        hub.bus(ATTACKER),
+        client.model,
+        (float(pose[0]) + 0.7, float(pose[1])),
+        digest=client.model.digest(),
         kind="human",
-    )  # fmt: skip
+    )
 
     def tick() -> float:
         hub.advance(0.01)
@@ -192,8 +198,10 @@ def test_jumps_of_a_remote_person_do_not_push_a_robot_on_its_wheels():
         tick()
         attacker.tick(now[0])
     assert ATTACKER in client.remote_actors
-    chance, publisher = np.random.default_rng(5), attacker.bus.publisher(f"a/{ATTACKER}")
-    moved, arrived = [], client.replicator.counters.actor.messages_in
+    chance = np.random.default_rng(5)
+    publisher = attacker.bus.publisher(f"a/{ATTACKER}")
+    moved = []
+    arrived = client.replicator.counters.actor.messages_in
     for _ in range(120):
         update = attacker.pose(now[0])
         points = update.pose.points.copy()
@@ -211,7 +219,8 @@ def test_jumps_of_a_remote_person_do_not_push_a_robot_on_its_wheels():
 
 def test_a_hanging_bunch_that_is_claimed_by_an_actor_who_leaves_goes_on_hanging():
     """Its claim passes to the nearest actor, in whose simulation the bunch is part of its tree."""
-    hub, now = MemoryHub(), [10.0]
+    hub = MemoryHub()
+    now = [10.0]
     client, pose = robot_client(hub, now)
     model = client.model
     other = FakeClient(hub.bus("bob"), model, (float(pose[0]) + 1.0, float(pose[1])), digest=model.digest())
@@ -254,7 +263,8 @@ def test_zenoh_sessions_and_the_server_survive_malformed_messages():
                 return ATTACKER in ada.command()["others"] and "ada" in attacker.robots
 
             wait(joined, "the two to join")
-            before, ticks = ada.command()["counters"], ada.command()["ticks"]
+            before = ada.command()["counters"]
+            ticks = ada.command()["ticks"]
             publishers: dict = {}
             for number, (key, payload) in enumerate(itertools.islice(storm(model, attacker, 7), 1_500)):
                 publisher = publishers.get(key) or publishers.setdefault(key, bus.publisher(key, reliable=True))

@@ -23,27 +23,49 @@ from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.net.transport.zenoh_session import close_session, config, open_session
 
 KEYS = (
-    "{key}", "*/{key}", "vineyard/**", "vineyard/*/*/*/" + ATTACKER, "other/{key}", "vineyard", "vineyard/fact",
-    "vineyard/fact/*/*/" + ATTACKER, "vineyard/fact/0", "vineyard/own/0/0/ada", "vineyard/fact/0/0/ada",
+    "{key}",
+    "*/{key}",
+    "vineyard/**",
+    "vineyard/*/*/*/" + ATTACKER,
+    "other/{key}",
+    "vineyard",
+    "vineyard/fact",
+    "vineyard/fact/*/*/" + ATTACKER,
+    "vineyard/fact/0",
+    "vineyard/own/0/0/ada",
+    "vineyard/fact/0/0/ada",
     "vineyard/a/ada",
-    "vineyard/live/ada/1", "vineyard/join/ada/1", "vineyard/hello/ada", "vineyard/clock/ada", "vineyard/snap/0/0",
-    "vineyard/snap/*/x", "vineyard/" + "n/" * 500 + "n", "vineyard/" + "n" * 5000, "vineyard/fact/x/" + ATTACKER,
-    "vineyard/force/ada/ada", "vineyard/voice/ada", "vineyard/mesh/0", "vineyard/offer/0",
-)  # fmt: skip
+    "vineyard/live/ada/1",
+    "vineyard/join/ada/1",
+    "vineyard/hello/ada",
+    "vineyard/clock/ada",
+    "vineyard/snap/0/0",
+    "vineyard/snap/*/x",
+    "vineyard/" + "n/" * 500 + "n",
+    "vineyard/" + "n" * 5000,
+    "vineyard/fact/x/" + ATTACKER,
+    "vineyard/force/ada/ada",
+    "vineyard/voice/ada",
+    "vineyard/mesh/0",
+    "vineyard/offer/0",
+)
 """Patterns of keys below the root; ``{key}``: as the storm chose it."""
 
 
 def test_over_tls_no_message_of_any_kind_or_key_stops_a_thread_or_is_believed_against_the_model(tmp_path):
-    certs, other = tmp_path / "certs", tmp_path / "other"
+    certs = tmp_path / "certs"
+    other = tmp_path / "other"
     for folder, name in ((certs, "ada"), (certs, ATTACKER), (other, ATTACKER)):
         create(folder, name)
-    model, chance = tree_row(), random.Random(4)
+    model = tree_row()
+    chance = random.Random(4)
     with (
         Server("tls/127.0.0.1:0", certificates=certs) as server,
         ZenohBus("ada", connect=server.endpoint, certificates=certs) as bus,
         ZenohBus(ATTACKER, connect=server.endpoint, certificates=certs) as let_in,
     ):
-        ada, evil = FakeClient(bus, model, (1.0, 0.0)), FakeClient(let_in, model, (2.0, 0.0))
+        ada = FakeClient(bus, model, (1.0, 0.0))
+        evil = FakeClient(let_in, model, (2.0, 0.0))
 
         def both_see_each_other() -> bool:
             now = time.monotonic()

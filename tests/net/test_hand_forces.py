@@ -91,7 +91,9 @@ def test_a_contact_wrench_is_sent_at_60_hz_and_its_end_once():
 
 def test_the_received_impulse_equals_the_applied_one():
     """Messages hold mean wrenches: a force that changes every tick gives the robot the same impulse."""
-    pair, applied, received = Pair(), 0.0, 0.0
+    pair = Pair()
+    applied = 0.0
+    received = 0.0
     rng = np.random.default_rng(1)
     for tick in range(600):
         force = float(rng.uniform(0.0, 100.0)) if tick < 500 else 0.0

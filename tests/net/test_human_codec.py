@@ -17,7 +17,7 @@ from vinesim.net.codec.human import (
     encode_human,
     encode_pose,
     quantise_pose,
-)  # fmt: skip
+)
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.rigid.human_posture import standing_pose
@@ -51,7 +51,8 @@ def test_a_human_pose_is_root_three_inputs_hips_and_feet_in_162_bytes():
     assert isinstance(received, HumanUpdate)
     assert (received.actor, received.time) == ("eva", 12.5)
     for name in ("root", "head", "left", "right", "hips", "left_foot", "right_foot"):
-        one, other = getattr(sent.pose, name), getattr(received.pose, name)
+        one = getattr(sent.pose, name)
+        other = getattr(received.pose, name)
         np.testing.assert_allclose(other[:3], one[:3], atol=1.01e-4)
         assert rotation_cosine(one[3:], other[3:]) > np.cos(0.5 * np.radians(0.006))
     fastest = np.abs(sent.velocity.reshape(7, 2, 3)).max(axis=(0, 2))
@@ -155,7 +156,8 @@ def test_a_pose_of_no_human_size_or_speed_is_refused(point):
     sent = random_human()
     at = POINT_NAMES.index(point)
     for size, speed, is_human in ((1.5, 20.0, True), (2.6, 0.0, False), (1.0, 60.0, False)):
-        points, velocity = sent.pose.points.copy(), np.zeros((len(POINT_NAMES), 6))
+        points = sent.pose.points.copy()
+        velocity = np.zeros((len(POINT_NAMES), 6))
         points[at, :3] = points[POINT_NAMES.index("hips"), :3] + [0.0, size, 0.0]
         velocity[at, 2] = speed
         payload = encode_human(HumanUpdate("eva", 1.0, sent.pose.with_points(points), velocity))

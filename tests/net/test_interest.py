@@ -80,7 +80,8 @@ def test_the_rate_of_poses_falls_with_the_distance(distance):
 @given(st.integers(1, 4), st.lists(st.integers(1, 30), min_size=5, max_size=200))
 def test_a_receiver_of_some_layers_gets_their_rate_at_any_rate_of_steps(layers, gaps):
     """Of ``gaps`` poses from step to step: less than ``every`` poses and one step lie between two that are received."""
-    before, received = 0, [0]
+    before = 0
+    received = [0]
     for gap in gaps:
         number = before + gap
         if interest.pose_layer(before, number) < layers:

@@ -39,14 +39,16 @@ def filled(delay: float, order: list[float]) -> JitterBuffer:
 def test_order_and_repetition_of_samples_do_not_matter(sent, data):
     shuffled = data.draw(st.permutations(sent))
     again = data.draw(st.lists(st.sampled_from(sent), max_size=10))
-    one, other = filled(0.1, sorted(sent)), filled(0.1, shuffled + again)
+    one = filled(0.1, sorted(sent))
+    other = filled(0.1, shuffled + again)
     for now in np.linspace(-0.5, 3.0, 30):
         np.testing.assert_array_equal(one.sample(now), other.sample(now))
 
 
 @given(times, st.floats(0.0, MAX_DELAY))
 def test_output_interpolates_the_samples(sent, delay):
-    buffer, sent = filled(delay, sent), sorted(sent)
+    buffer = filled(delay, sent)
+    sent = sorted(sent)
     for time in sent:
         np.testing.assert_allclose(buffer.sample(time + delay), sample(time)[1], atol=1e-9)
     for a, b in itertools.pairwise(sent):
@@ -64,9 +66,7 @@ def test_jitter_below_the_delay_does_not_change_the_output(seed, delay):
     # the output is interpolated from samples sent before and after now - delay: the later one needs a period more
     arrivals = [sent + rng.uniform(0.0, max(delay - 1.0 / 60.0, 0.0), len(sent)) for _ in range(2)]
     for now in np.linspace(delay, 0.95, 40):
-        output = [
-            filled(delay, [float(t) for t in sent[arrival <= now + 1e-12]]).sample(now) for arrival in arrivals
-        ]  # fmt: skip
+        output = [filled(delay, [float(t) for t in sent[arrival <= now + 1e-12]]).sample(now) for arrival in arrivals]
         np.testing.assert_allclose(output[0], output[1], atol=1e-12)
 
 
@@ -115,6 +115,7 @@ def test_a_buffered_robot_is_delayed_and_accurate():
                 assert np.abs(output.velocity - then.velocity).max() < 0.2
         return np.array(differences)
 
-    buffered, extrapolated = errors(0.12), errors(0.0)
+    buffered = errors(0.12)
+    extrapolated = errors(0.0)
     assert np.median(buffered) < 0.01
     assert buffered.max() < extrapolated.max()

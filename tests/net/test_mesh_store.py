@@ -17,7 +17,8 @@ from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.scene.triangles import FACE_BYTES, MAX_BYTES, MAX_FACES, digest_of, encode_triangles
 
-ANNA, BERT = ("vineyard", "anna"), ("vineyard", "bert")
+ANNA = ("vineyard", "anna")
+BERT = ("vineyard", "bert")
 
 
 def mesh(faces: int, seed: int = 0) -> bytes:
@@ -42,7 +43,8 @@ def download(store: MeshStore, digest: str) -> bytes:
 
 
 def test_a_mesh_comes_back_as_it_was_and_is_sent_once() -> None:
-    store, payload = MeshStore(), mesh(5000)
+    store = MeshStore()
+    payload = mesh(5000)
     assert len(payload) > 2 * MAX_PART
     assert upload(store, ANNA, payload) == MeshWanted(len(payload))
     assert download(store, digest_of(payload)) == payload
@@ -52,8 +54,11 @@ def test_a_mesh_comes_back_as_it_was_and_is_sent_once() -> None:
 
 def test_lost_repeated_and_reordered_parts_do_no_harm() -> None:
     """Each reply tells what is missing, whatever has arrived."""
-    store, payload, random = MeshStore(), mesh(8000), np.random.default_rng(1)
-    digest, wanted = digest_of(payload), MeshWanted(0)
+    store = MeshStore()
+    payload = mesh(8000)
+    random = np.random.default_rng(1)
+    digest = digest_of(payload)
+    wanted = MeshWanted(0)
     for _ in range(1000):
         offset = wanted.offset if random.random() < 0.5 else int(random.integers(len(payload)))
         part = MeshPart(digest, len(payload), offset, payload[offset : offset + MAX_PART])
@@ -72,7 +77,8 @@ def test_what_is_no_mesh_is_not_kept(payload: bytes) -> None:
 
 def test_a_mesh_of_another_digest_is_not_kept() -> None:
     """So no actor can put its triangles in the place of another's."""
-    store, payload = MeshStore(), mesh(5)
+    store = MeshStore()
+    payload = mesh(5)
     assert "corrupt" in upload(store, ANNA, mesh(5, seed=1), digest_of(payload)).refused
     assert store.part(digest_of(payload), 0).size == 0
     assert not upload(store, BERT, payload).refused
@@ -113,7 +119,8 @@ def test_incomplete_meshes_count_and_end_with_their_actor() -> None:
 
 
 def test_a_shared_mesh_stays_until_the_last_of_its_actors_has_left() -> None:
-    store, payload = MeshStore(MeshLimits(count=1)), mesh(5)
+    store = MeshStore(MeshLimits(count=1))
+    payload = mesh(5)
     for actor in (ANNA, BERT):
         assert not upload(store, actor, payload).refused
     store.release(ANNA)
@@ -129,11 +136,16 @@ DIGEST = digest_of(b"")
 @pytest.mark.parametrize(
     "part",
     [
-        MeshPart("../../etc/passwd", 36), MeshPart(DIGEST.upper(), 36), MeshPart(DIGEST, -1), MeshPart(DIGEST, 36, -1),
-        MeshPart(DIGEST, 36, 1, b"x" * 36), MeshPart(DIGEST, MAX_BYTES + 1), MeshPart(DIGEST, 1 << 62, 1 << 61),
+        MeshPart("../../etc/passwd", 36),
+        MeshPart(DIGEST.upper(), 36),
+        MeshPart(DIGEST, -1),
+        MeshPart(DIGEST, 36, -1),
+        MeshPart(DIGEST, 36, 1, b"x" * 36),
+        MeshPart(DIGEST, MAX_BYTES + 1),
+        MeshPart(DIGEST, 1 << 62, 1 << 61),
         MeshPart(DIGEST, MAX_BYTES, 0, bytes(MAX_PART + 1)),
     ],
-)  # fmt: skip
+)
 def test_impossible_parts_are_malformed(part: MeshPart) -> None:
     with pytest.raises(MessageError):
         messages.decode_part(messages.encode_part(part))
@@ -159,7 +171,8 @@ def test_random_bytes_are_malformed(decode) -> None:
 
 def test_only_an_actor_that_has_joined_offers_and_only_right_keys_are_answered() -> None:
     payload = mesh(2 * MAX_PART // FACE_BYTES)
-    digest, begin = digest_of(payload), messages.encode_part(MeshPart(digest_of(payload), len(payload)))
+    digest = digest_of(payload)
+    begin = messages.encode_part(MeshPart(digest_of(payload), len(payload)))
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("anna", connect=server.endpoint) as anna:
         assert anna.fetch("offer/anna", begin) == []  # it has not joined
         anna.join(messages.encode_hello(Hello("anna", digest="D", scene="demo")))
@@ -168,10 +181,16 @@ def test_only_an_actor_that_has_joined_offers_and_only_right_keys_are_answered()
         assert messages.decode_wanted(reply) == MeshWanted(0)
         request = messages.encode_request(0)
         for key, question in (
-            ("offer/bert", begin), ("offer/*", begin), ("offer/anna", b"x"), ("offer/anna", request),
-            ("mesh/*", request), ("mesh/nothing", request), (f"mesh/{digest}", begin), (f"mesh/{digest}", b""),
+            ("offer/bert", begin),
+            ("offer/*", begin),
+            ("offer/anna", b"x"),
+            ("offer/anna", request),
+            ("mesh/*", request),
+            ("mesh/nothing", request),
+            (f"mesh/{digest}", begin),
+            (f"mesh/{digest}", b""),
             (f"mesh/{digest}/a", request),
-        ):  # fmt: skip
+        ):
             assert anna.fetch(key, question) == [], key
         assert server.malformed >= 8
         (reply,) = anna.fetch(f"mesh/{digest}", request)
@@ -191,6 +210,7 @@ def test_only_an_actor_that_has_joined_offers_and_only_right_keys_are_answered()
 
 
 def test_the_largest_mesh_fits() -> None:
-    store, payload = MeshStore(), np.zeros((MAX_FACES, 3, 3), "<f4").tobytes()
+    store = MeshStore()
+    payload = np.zeros((MAX_FACES, 3, 3), "<f4").tobytes()
     assert not upload(store, ANNA, payload).refused
     assert store.bytes == MAX_BYTES

@@ -28,7 +28,8 @@ def robot(rng: np.random.Generator, joints: int = 14) -> RobotUpdate:
 
 
 def trees(rng: np.random.Generator, sizes: list[int], rate: float = 5.0) -> TreeStates:
-    count, bodies = len(sizes), sum(sizes)
+    count = len(sizes)
+    bodies = sum(sizes)
     q = frames.exp(rng.uniform(-1.7, 1.7, (bodies, 3)))
     ids = np.sort(rng.choice(1000, count, replace=False))
     sequences = rng.integers(0, 65536, (2, count))
@@ -39,7 +40,8 @@ def trees(rng: np.random.Generator, sizes: list[int], rate: float = 5.0) -> Tree
 def cut(batch: TreeStates, roots: list[int], rng: np.random.Generator) -> TreeStates:
     """The same trees with some bodies cut off each."""
     where = [np.sort(rng.choice(size, k, replace=False)) for size, k in zip(batch.bodies, roots, strict=True)]
-    x, xd = rng.uniform(-50, 50, (sum(roots), 3)), rng.uniform(-5, 5, (sum(roots), 3))
+    x = rng.uniform(-50, 50, (sum(roots), 3))
+    xd = rng.uniform(-5, 5, (sum(roots), 3))
     return dataclasses.replace(batch, roots=np.array(roots), root=np.concatenate(where), root_x=x, root_xd=xd)
 
 
@@ -187,7 +189,8 @@ def test_invalid_trees_are_not_encoded():
 @pytest.mark.parametrize("cut", [0, 3, 4, 13, 14, 30, -1])
 def test_truncated_messages_are_refused(cut):
     rng = np.random.default_rng(0)
-    pose, batch = messages.encode_robot(robot(rng)), one_message(trees(rng, [4, 4]))
+    pose = messages.encode_robot(robot(rng))
+    batch = one_message(trees(rng, [4, 4]))
     with pytest.raises(MessageError):
         messages.decode_robot(pose[:cut], "tiago")
     with pytest.raises(MessageError):
@@ -243,7 +246,8 @@ def test_a_hello_is_decoded_and_invalid_ones_are_refused():
         messages.encode_hello(Hello("a", urdf="x" * messages.MAX_MESSAGE))
 
 
-_NAN, _INF = float("nan"), float("inf")
+_NAN = float("nan")
+_INF = float("inf")
 
 
 @pytest.mark.parametrize(
@@ -346,7 +350,8 @@ def test_damaged_messages_raise_only_message_errors(data):
 
 @given(st.integers(0, 2**32 - 1), st.integers(1, 100), st.integers(-9, 9), st.sampled_from([0.0, 1e-3, 0.3, 4.0, 60.0]))
 def test_objects_are_decoded_within_quantisation(seed, count, where, speed):
-    sent, cell = objects(np.random.default_rng(seed), count, (where, -where), speed), (where, -where)
+    sent = objects(np.random.default_rng(seed), count, (where, -where), speed)
+    cell = (where, -where)
     payloads, received = messages.encode_objects(sent, cell)
     assert max(len(payload) for payload in payloads) <= messages.MAX_DATAGRAM
     assert sum(len(payload) - 14 for payload in payloads) == 26 * count

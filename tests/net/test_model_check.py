@@ -29,9 +29,16 @@ def state_of(tree: int, **others) -> bytes:
     size = int(model.tree_size[tree])
     here = model.bodies_of(tree)
     states = TreeStates(
-        1.0, np.array([tree]), np.array([1]), np.array([1]), np.array([0]), np.array([size]),
-        model.joint_settled[here].astype(float), np.zeros((size, 3)), **others,
-    )  # fmt: skip
+        1.0,
+        np.array([tree]),
+        np.array([1]),
+        np.array([1]),
+        np.array([0]),
+        np.array([size]),
+        model.joint_settled[here].astype(float),
+        np.zeros((size, 3)),
+        **others,
+    )
     return messages.encode_trees(states)[0][0]
 
 
@@ -74,13 +81,22 @@ def test_a_record_that_may_be_true_is_accepted(truth: RetainedRecord) -> None:
 def test_a_berry_cluster_cannot_be_cut_off_alone() -> None:
     model = generate(load_scene("demo"))
     tree = int(np.flatnonzero(model.tree_size > model.tree_core)[0])
-    core, first = int(model.tree_core[tree]), int(model.tree_first[tree])
+    core = int(model.tree_core[tree])
+    first = int(model.tree_first[tree])
     with pytest.raises(MessageError, match="it has wood from"):
         check_record(RetainedRecord(tree, 1, 1, "ada", cut=(first + core,)), model, COUNTS)
     states = TreeStates(
-        1.0, np.array([tree]), *(np.array([1]) for _ in range(3)), np.array([model.tree_size[tree]]), np.zeros((0, 4)),
-        np.zeros((0, 3)), np.array([1]), np.array([core]), np.zeros((1, 3)), np.zeros((1, 3)),
-    )  # fmt: skip
+        1.0,
+        np.array([tree]),
+        *(np.array([1]) for _ in range(3)),
+        np.array([model.tree_size[tree]]),
+        np.zeros((0, 4)),
+        np.zeros((0, 3)),
+        np.array([1]),
+        np.array([core]),
+        np.zeros((1, 3)),
+        np.zeros((1, 3)),
+    )
     with pytest.raises(MessageError, match="berry cluster"):
         check_tree_states(states, model)
 
@@ -105,8 +121,9 @@ def test_what_moves_beyond_the_range_of_positions_is_still_published() -> None:
 
 
 def test_a_body_beyond_the_range_of_positions_is_still_published() -> None:
-    far = state_of(TREE, roots=np.array([1]), root=np.array([3]), root_x=np.array([[1e9, 0.0, -1e5]]),
-                   root_xd=np.zeros((1, 3)))  # fmt: skip
+    far = state_of(
+        TREE, roots=np.array([1]), root=np.array([3]), root_x=np.array([[1e9, 0.0, -1e5]]), root_xd=np.zeros((1, 3))
+    )
     check_record(record(trees=far), vineyard(), COUNTS)
     assert messages.decode_trees(far).root_x.tolist() == [[99_999.0, 0.0, -99_999.0]]
 
@@ -114,7 +131,8 @@ def test_a_body_beyond_the_range_of_positions_is_still_published() -> None:
 def test_the_other_records_of_a_message_are_received() -> None:
     """A peer says two lies and a truth about trees in one message: the lies never reach the client."""
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
     body = int(vineyard().tree_first[TREE]) + 3
     truth = record(object=TREE, cut=(body,))

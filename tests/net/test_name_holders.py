@@ -24,9 +24,17 @@ from vinesim.net.transport.zenoh_session import close_session, config, open_sess
 from vinesim.scene.ids import ObjectKind, object_id
 
 KEYS = (
-    "a/ada", "a/ada/far", "c/0/-1/ada", "tree/0/-1/ada", "near/0/-1/ada", "own/0/0/ada", "fact/3/4/ada",
-    "force/bob/ada", "voice/ada", "voice/ada/pcm",
-)  # fmt: skip
+    "a/ada",
+    "a/ada/far",
+    "c/0/-1/ada",
+    "tree/0/-1/ada",
+    "near/0/-1/ada",
+    "own/0/0/ada",
+    "fact/3/4/ada",
+    "force/bob/ada",
+    "voice/ada",
+    "voice/ada/pcm",
+)
 
 
 def hello(name: str, kind: str = "robot") -> bytes:
@@ -135,7 +143,8 @@ def test_only_the_server_answers_what_is_asked_of_it_and_an_actor_for_itself(ser
 
 
 def test_a_spectator_moves_nothing_on_clients():
-    hub, model = MemoryHub(), tree_row()
+    hub = MemoryHub()
+    model = tree_row()
     ada = FakeClient(hub.bus("ada"), model, (1.0, 0.0))
     guest = FakeClient(hub.bus("guest"), model, (2.0, 0.0), kind="spectator", joints=0)
 
@@ -173,7 +182,8 @@ def test_the_network_in_memory_binds_names_alike():
 
 
 def test_those_who_saw_the_first_session_keep_to_it_and_others_believe_neither():
-    first, later = NameHolders(), NameHolders()
+    first = NameHolders()
+    later = NameHolders()
     for session in ("1", "2"):
         first.update("ada", session, True)
     later.start([("ada", "2"), ("ada", "1")])
@@ -189,7 +199,8 @@ def test_those_who_saw_the_first_session_keep_to_it_and_others_believe_neither()
 
 @given(st.lists(st.tuples(st.sampled_from("123"), st.booleans()), max_size=30))
 def test_no_session_takes_a_name_while_its_holder_is_live(changes):
-    names, live = NameHolders(), set()
+    names = NameHolders()
+    live = set()
     for session, is_live in changes:
         before = names.holder("ada")
         was_live = before in live

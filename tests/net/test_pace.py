@@ -15,7 +15,9 @@ class Client:
     """Steps as fast as its machine lets it, and reports nine tenths of that."""
 
     def __init__(self, name: str, capacity: float) -> None:
-        self.name, self.capacity, self.time = name, capacity, 0.0
+        self.name = name
+        self.capacity = capacity
+        self.time = 0.0
         self.is_stopped = False
 
     def run(self, clock: WorldClock, now: float) -> None:
@@ -26,7 +28,8 @@ class Client:
 
 def run(clock: WorldClock, clients: list[Client], begin: float, seconds: float) -> tuple[np.ndarray, np.ndarray]:
     """Factors, and how far the last client was behind at most [s], after each report."""
-    factors, behind = [], []
+    factors = []
+    behind = []
     for now in begin + PERIOD * np.arange(1, round(seconds / PERIOD) + 1):
         clock.advance(now)
         for client in clients:
@@ -38,7 +41,8 @@ def run(clock: WorldClock, clients: list[Client], begin: float, seconds: float) 
 
 @pytest.mark.parametrize("capacity", [0.7, 0.3, 0.05])
 def test_time_falls_within_two_seconds_to_what_the_slowest_can_follow(capacity: float) -> None:
-    clock, clients = WorldClock(0.0), [Client("quick", 3.0), Client("slow", capacity)]
+    clock = WorldClock(0.0)
+    clients = [Client("quick", 3.0), Client("slow", capacity)]
     factors, behind = run(clock, clients, 0.0, 20.0)
     assert (factors[10:] < 0.95 * capacity).all()
     assert factors[-1] == pytest.approx(0.9 * capacity, rel=0.01)
@@ -48,7 +52,8 @@ def test_time_falls_within_two_seconds_to_what_the_slowest_can_follow(capacity: 
 
 
 def test_time_rises_slowly_and_does_not_swing() -> None:
-    clock, client = WorldClock(0.0), Client("ada", 0.3)
+    clock = WorldClock(0.0)
+    client = Client("ada", 0.3)
     run(clock, [client], 0.0, 10.0)
     client.capacity = 3.0
     factors, _ = run(clock, [client], 10.0, 20.0)
@@ -60,14 +65,17 @@ def test_time_rises_slowly_and_does_not_swing() -> None:
 
 def test_time_that_is_real_time_stays_so() -> None:
     """A client that needs most of its time, and is late now and then by what messages take."""
-    clock, client = WorldClock(0.0), Client("ada", 1.15)
+    clock = WorldClock(0.0)
+    client = Client("ada", 1.15)
     factors, _ = run(clock, [client], 0.0, 10.0)
     assert (factors == 1.0).all()
     assert clock.time(10.0) == pytest.approx(10.0, abs=1e-6)
 
 
 def test_a_client_that_stops_slows_the_others_for_three_seconds_at_most() -> None:
-    clock, ada, bob = WorldClock(0.0), Client("ada", 2.0), Client("bob", 2.0)
+    clock = WorldClock(0.0)
+    ada = Client("ada", 2.0)
+    bob = Client("bob", 2.0)
     run(clock, [ada, bob], 0.0, 5.0)
     bob.is_stopped = True
     factors, _ = run(clock, [ada], 5.0, 10.0)
@@ -85,7 +93,8 @@ def test_a_client_that_stops_slows_the_others_for_three_seconds_at_most() -> Non
 
 def test_a_clock_that_was_starved_itself_leaves_nobody_behind() -> None:
     """It got a processor once in two seconds only: so may its clients, which are not stopped."""
-    clock, ada = WorldClock(0.0), Client("ada", 2.0)
+    clock = WorldClock(0.0)
+    ada = Client("ada", 2.0)
     run(clock, [ada], 0.0, 5.0)
     for now in (7.0, 9.0, 11.0):
         clock.advance(now)
@@ -94,7 +103,9 @@ def test_a_clock_that_was_starved_itself_leaves_nobody_behind() -> None:
 
 
 def test_a_client_that_comes_back_far_behind_is_not_waited_for() -> None:
-    clock, ada, bob = WorldClock(0.0), Client("ada", 2.0), Client("bob", 2.0)
+    clock = WorldClock(0.0)
+    ada = Client("ada", 2.0)
+    bob = Client("bob", 2.0)
     run(clock, [ada, bob], 0.0, 5.0)
     run(clock, [ada], 5.0, 10.0)
     bob.capacity = 0.5
@@ -112,7 +123,8 @@ def test_a_client_that_is_late_although_it_says_otherwise_brakes_the_clock() -> 
 
 
 def test_those_who_leave_are_not_waited_for() -> None:
-    clock, client = WorldClock(0.0), Client("ada", 0.1)
+    clock = WorldClock(0.0)
+    client = Client("ada", 0.1)
     run(clock, [client], 0.0, 5.0)
     clock.forget("ada")
     factors, _ = run(clock, [], 5.0, 20.0)
@@ -120,7 +132,8 @@ def test_those_who_leave_are_not_waited_for() -> None:
 
 
 def test_time_never_stands_nor_runs_back() -> None:
-    clock, random = WorldClock(0.0, 1e6), np.random.default_rng(4)
+    clock = WorldClock(0.0, 1e6)
+    random = np.random.default_rng(4)
     before = 1e6
     for number in range(1, 400):
         now = 0.1 * number

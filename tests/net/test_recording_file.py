@@ -38,10 +38,19 @@ def write(path: pathlib.Path, entries: list[tuple[int, str, bytes]], **about: st
     return path
 
 
-KEYS = st.sampled_from([
-    "a/ada", "a/ada/far", "c/-1/2/ada", "tree/-1/2/ada", "near/-1/2/ada", "own/0/0/bob", "fact/0/0/bob", "live/ada",
-    "new/thing",
-])  # fmt: skip
+KEYS = st.sampled_from(
+    [
+        "a/ada",
+        "a/ada/far",
+        "c/-1/2/ada",
+        "tree/-1/2/ada",
+        "near/-1/2/ada",
+        "own/0/0/bob",
+        "fact/0/0/bob",
+        "live/ada",
+        "new/thing",
+    ]
+)
 
 
 @given(st.lists(st.tuples(st.integers(0, 2**62), KEYS, st.binary(max_size=200)), max_size=30))
@@ -68,9 +77,14 @@ def test_messages_are_described_as_json():
     pose = np.array([13.0, -3.5, 0.2, 0.0, 0.0, 0.6, 0.8])
     box = object_id(ObjectKind.BOX, 2)
     objects = messages.ObjectStates(
-        1e9 + 0.5, np.array([box]), np.array([3]), np.array([4]), np.array([messages.TOUCHED]), pose[None],
+        1e9 + 0.5,
+        np.array([box]),
+        np.array([3]),
+        np.array([4]),
+        np.array([messages.TOUCHED]),
+        pose[None],
         np.array([[0.5, 0.0, 0.0, 0.0, 0.0, 1.0]]),
-    )  # fmt: skip
+    )
     (payload,), quantised = messages.encode_objects(objects, (2, -1))
     description = describe_message("c/2/-1/ada", payload)
     assert base64.b64decode(description["raw"]) == payload
@@ -237,7 +251,8 @@ class FullDisk:
     """A file on a disk with ``room`` free bytes."""
 
     def __init__(self, file, room: int) -> None:
-        self._file, self._room = file, room
+        self._file = file
+        self._room = room
 
     def write(self, data: bytes) -> int:
         if self._file.tell() + len(data) > self._room:

@@ -142,7 +142,8 @@ def test_a_conflict_is_resolved_within_a_round_trip_and_two_ticks(delay, apart, 
     """Two take the same object at once, or so close in time that neither can have received the other's claim."""
     world = World("ada", "bob", "cleo", delay=delay)
     world.run(1.0 + 4.0 * delay)
-    ada, bob = world.clients["ada"], world.clients["bob"]
+    ada = world.clients["ada"]
+    bob = world.clients["bob"]
     for fake_client, action, pause in ((ada, first, apart), (bob, second, 0)):
         fake_client.touching.add(1)
         if action == "grab":
@@ -160,8 +161,10 @@ def test_a_conflict_is_resolved_within_a_round_trip_and_two_ticks(delay, apart, 
 
 
 @given(
-    st.lists(st.floats(0.0, 20.0), min_size=3, max_size=3), st.integers(0, 5), st.floats(0.5, 5.0),
-)  # fmt: skip
+    st.lists(st.floats(0.0, 20.0), min_size=3, max_size=3),
+    st.integers(0, 5),
+    st.floats(0.5, 5.0),
+)
 @settings(max_examples=share(0.3))
 def test_bytes_are_sent_exactly_when_a_peer_is_near(positions, tree, near):
     """Interest, for any positions, any tree and any interest radius."""

@@ -46,7 +46,8 @@ class Client:
     """A minimal client: a robot at ``x`` that touches trees and applies the updates it receives."""
 
     def __init__(self, hub: MemoryHub, name: str, x: float, *, digest: str = "same", **hello) -> None:
-        self.hub, self.name = hub, name
+        self.hub = hub
+        self.name = name
         self.model = vineyard()
         self.bus: MemoryBus = hub.bus(name)
         self.replicator = Replicator(self.bus, Hello(name, scene="rows", digest=digest, joints=2, **hello), self.model)
@@ -114,7 +115,8 @@ def owners(clients: list[Client], tree: int) -> set[str | None]:
 
 def test_actors_join_receive_poses_and_leave():
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0, urdf="<robot/>", index=4)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0, urdf="<robot/>", index=4)
     run(hub, [ada, bob], 0.5)
     assert (ada.joined, bob.joined) == (["bob"], ["ada"])
     assert ada.replicator.peers["bob"].urdf == "<robot/>"
@@ -133,7 +135,8 @@ def test_actors_join_receive_poses_and_leave():
 def test_poses_arrive_at_a_rate_that_falls_with_the_distance(x, low, high):
     """60, 30, 15 and 5 Hz at 2, 4, 9 and 59 m; none arrives twice."""
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", x)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", x)
     run(hub, [ada, bob], 1.0)
     before = ada.replicator.counters.actor.messages_in
     run(hub, [ada, bob], 2.0)
@@ -142,7 +145,8 @@ def test_poses_arrive_at_a_rate_that_falls_with_the_distance(x, low, high):
 
 def test_a_driving_robot_is_extrapolated_to_the_current_time():
     hub = MemoryHub(delay=0.08)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     bob.robot = dataclasses.replace(bob.robot, base_qd=np.array([1.0, 0, 0, 0, 0, 0.5]), velocity=np.array([0.3, 0.0]))
     for _ in range(100):
         t = hub.time + TICK
@@ -168,7 +172,8 @@ def test_a_driving_robot_is_extrapolated_to_the_current_time():
 
 def test_a_pose_correction_is_blended_and_its_velocity_applied_at_once():
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
     bob.goto(2.5)
     bob.robot = dataclasses.replace(bob.robot, base_qd=np.array([0.2, 0, 0, 0, 0, 0]))
@@ -214,13 +219,16 @@ def test_a_protocol_mismatch_names_both_versions():
 
 def test_far_from_all_peers_no_environment_byte_is_sent():
     hub = MemoryHub(delay=0.02)
-    ada, bob, cleo = Client(hub, "ada", 1.0), Client(hub, "bob", 60.0), Client(hub, "cleo", -40.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 60.0)
+    cleo = Client(hub, "cleo", -40.0)
     run(hub, [ada, bob, cleo], 1.0)
     ada.touched = {0, 1}
     for k in range(200):
         ada.bend(0, 0.3 * np.sin(0.2 * k), 6.0 * np.cos(0.2 * k))
         run(hub, [ada, bob, cleo], TICK)
-    ada.touched, ada.swinging = set(), {0}
+    ada.touched = set()
+    ada.swinging = {0}
     run(hub, [ada, bob, cleo], 0.5)
     ada.swinging = set()
     run(hub, [ada, bob, cleo], 0.5)
@@ -231,7 +239,8 @@ def test_far_from_all_peers_no_environment_byte_is_sent():
 
 def test_within_the_cell_window_but_beyond_the_radius_no_byte_is_sent():
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 7.5)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 7.5)
     run(hub, [ada, bob], 1.0)
     ada.touched = {0}
     run(hub, [ada, bob], 1.0)
@@ -241,7 +250,8 @@ def test_within_the_cell_window_but_beyond_the_radius_no_byte_is_sent():
 
 def test_only_trees_near_a_peer_are_sent():
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 7.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 7.0)
     run(hub, [ada, bob], 0.5)
     ada.touched = {0, 3}
     run(hub, [ada, bob], 1.5)
@@ -253,7 +263,8 @@ def test_only_trees_near_a_peer_are_sent():
 
 def test_tree_state_arrives_within_quantisation():
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
     ada.touched = {0, 2}
     ada.bend(0, 0.4)
@@ -271,7 +282,8 @@ def test_tree_state_arrives_within_quantisation():
 
 def test_a_steady_touch_sends_heartbeats_and_a_moving_one_when_extrapolation_fails():
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
     ada.touched = {0}
     ada.bend(0, 0.2)
@@ -305,11 +317,13 @@ def test_copies_of_a_tree_are_as_wrong_as_their_distance_allows_and_rest_exactly
     ada, bob, cleo = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 2.0), Client(hub, "cleo", -3.6)]
     ada.touched = {0}
     run(hub, clients, 1.0)
-    bodies, worst = ada.model.bodies_of(0), [0.0, 0.0]
+    bodies = ada.model.bodies_of(0)
+    worst = [0.0, 0.0]
     for k in range(300):
         ada.bend(0, 0.2 + 0.15 * np.sin(0.06 * k), 0.15 * 0.06 / TICK * np.cos(0.06 * k))
         run(hub, clients, TICK)
-        stream, entry = ada.replicator._state.tree_stream, ada.replicator._state.ownership[0]
+        stream = ada.replicator._state.tree_stream
+        entry = ada.replicator._state.ownership[0]
         for layer, sent in enumerate((entry.published_to_all_at, entry.published_at)):
             position, _ = stream.prediction_error(layer, np.array([hub.time - sent]))
             worst[layer] = max(worst[layer], float(position[0]))
@@ -336,7 +350,8 @@ def test_a_copy_that_received_more_states_than_its_distance_asks_for_is_no_more_
     ada, bob, cleo = clients = [Client(hub, "ada", 1.0), Client(hub, "bob", 2.0), Client(hub, "cleo", 4.6)]
     ada.touched = {0}
     run(hub, clients, 1.0)
-    stream, entry = ada.replicator._state.tree_stream, ada.replicator._state.ownership[0]
+    stream = ada.replicator._state.tree_stream
+    entry = ada.replicator._state.ownership[0]
     # a twitch too small for those far away, with a rate that would carry it on, while the only one near it leaves
     bob.goto(60.0)
     run(hub, clients, TICK)
@@ -355,7 +370,8 @@ def test_a_copy_that_received_more_states_than_its_distance_asks_for_is_no_more_
 
 def test_trees_of_one_cell_share_a_message():
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 2.0), Client(hub, "bob", 3.0)
+    ada = Client(hub, "ada", 2.0)
+    bob = Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 0.5)
     ada.touched = {0, 1}
     run(hub, [ada, bob], TICK)
@@ -366,7 +382,8 @@ def test_trees_of_one_cell_share_a_message():
 
 def test_a_peer_that_comes_near_receives_at_once_and_one_that_leaves_costs_nothing():
     hub = MemoryHub(delay=0.01)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 30.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 30.0)
     ada.touched = {0}
     run(hub, [ada, bob], 1.5)
     assert ada.environment_bytes() == 0
@@ -385,12 +402,14 @@ def test_a_peer_that_comes_near_receives_at_once_and_one_that_leaves_costs_nothi
 
 def test_rest_is_sent_once_reliably_and_nothing_after_it():
     hub = MemoryHub(delay=0.02, jitter=0.02, loss=0.3, seed=1)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 3.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 3.0)
     run(hub, [ada, bob], 1.0)
     ada.touched = {0}
     ada.bend(0, 0.5)
     run(hub, [ada, bob], 0.5)
-    ada.touched, ada.swinging = set(), {0}
+    ada.touched = set()
+    ada.swinging = {0}
     ada.bend(0, 0.1, -0.5)
     run(hub, [ada, bob], 0.3)
     assert owners([ada, bob], 0) == {"ada"}
@@ -435,7 +454,8 @@ def test_two_that_touch_agree_on_one_owner():
 
 def test_a_late_joiner_receives_the_current_claim_and_can_take_ownership():
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
     for _ in range(3):
         for client in (ada, bob):
@@ -499,7 +519,8 @@ def test_an_owner_is_followed_again_after_a_long_loss_of_its_messages():
 
 def test_a_restarted_owner_receives_the_current_sequence_numbers():
     hub = MemoryHub(delay=0.02)
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.5)
     for _ in range(4):
         ada.touched = {0}
@@ -543,12 +564,14 @@ def test_all_agree_again_after_a_server_outage():
 
 actions = st.lists(
     st.tuples(
-        st.sampled_from(["ada", "bob", "cleo"]), st.sampled_from(["touch", "let", "grab"]), st.integers(0, 2),
+        st.sampled_from(["ada", "bob", "cleo"]),
+        st.sampled_from(["touch", "let", "grab"]),
+        st.integers(0, 2),
         st.integers(1, 12),
     ),
     min_size=1,
     max_size=25,
-)  # fmt: skip
+)
 
 
 @settings(max_examples=share(0.3))
@@ -580,7 +603,8 @@ def test_any_sequence_of_actions_on_any_network_ends_with_one_owner(scenario, se
 
 def test_malformed_messages_are_counted_logged_once_and_do_not_stop_the_tick(caplog):
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.3)
     publishers = [bob.bus.publisher(key, reliable=True) for key in ("a/bob", "c/0/0/bob", "own/0/0/bob")]
     for k in range(20):
@@ -594,7 +618,8 @@ def test_malformed_messages_are_counted_logged_once_and_do_not_stop_the_tick(cap
 
 def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.3)
     unknown = hub.bus("unknown")
     unknown.publisher("own/0/0/unknown", True).put(messages.encode_claims([(0, Claim(5, 5, "unknown"), True)]))
@@ -611,7 +636,8 @@ def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
     (key, recorded), *_ = eavesdropper.poll()
     bob.bend(0, -0.3)
     run(hub, [ada, bob], 0.1)
-    held, received = ada.state.joint_q.copy(), len(ada.received)
+    held = ada.state.joint_q.copy()
+    received = len(ada.received)
     bob.bus.publisher(key).put(recorded)
     run(hub, [ada, bob], 0.1)
     assert len(ada.received) == received
@@ -620,7 +646,8 @@ def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
 
 def test_a_pose_with_another_number_of_joints_is_malformed():
     hub = MemoryHub()
-    ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
+    ada = Client(hub, "ada", 1.0)
+    bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.3)
     bob.robot = dataclasses.replace(bob.robot, position=np.zeros(3), velocity=np.zeros(3))
     run(hub, [ada, bob], 0.1)
@@ -651,8 +678,10 @@ def test_the_actor_name_must_match_the_bus_and_the_radius_is_bounded():
 def test_two_runs_are_identical():
     def scenario() -> bytes:
         hub = MemoryHub(delay=0.03, jitter=0.02, loss=0.1, seed=5)
-        ada, bob = Client(hub, "ada", 1.0), Client(hub, "bob", 2.0)
-        ada.touched, bob.touched = {0, 1}, {1, 2}
+        ada = Client(hub, "ada", 1.0)
+        bob = Client(hub, "bob", 2.0)
+        ada.touched = {0, 1}
+        bob.touched = {1, 2}
         for k in range(100):
             ada.bend(0, 0.2 * np.sin(0.3 * k), 6.0 * np.cos(0.3 * k))
             run(hub, [ada, bob], TICK)

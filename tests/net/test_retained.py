@@ -9,7 +9,9 @@ from vinesim.net.codec.messages import RetainedRecord
 from vinesim.net.replication.retained import RetainedState
 from vinesim.scene.ids import ObjectKind, object_id
 
-BOX, BUNCH, TREE = object_id(ObjectKind.BOX, 1), object_id(ObjectKind.BUNCH, 7), object_id(ObjectKind.TREE, 3)
+BOX = object_id(ObjectKind.BOX, 1)
+BUNCH = object_id(ObjectKind.BUNCH, 7)
+TREE = object_id(ObjectKind.TREE, 3)
 
 
 def at(x: float) -> tuple[float, ...]:
@@ -54,18 +56,24 @@ submissions = st.builds(
     lambda cell, number, sequences, author: (
         (cell[0], cell[1]),
         RetainedRecord(
-            number, *sequences, author, at(float(sequences[0] % 7 + 10 * (sequences[1] % 7) + 100 * (author == "bob"))),
+            number,
+            *sequences,
+            author,
+            at(float(sequences[0] % 7 + 10 * (sequences[1] % 7) + 100 * (author == "bob"))),
             cut=(sequences[0] % 5,) if number == TREE else (),
         ),
     ),
-    st.tuples(st.integers(-1, 1), st.integers(-1, 1)), st.sampled_from([BOX, BUNCH, TREE]),
-    st.tuples(st.sampled_from([65534, 65535, 0, 1]), st.sampled_from([65535, 0, 1])), st.sampled_from(["ada", "bob"]),
-)  # fmt: skip
+    st.tuples(st.integers(-1, 1), st.integers(-1, 1)),
+    st.sampled_from([BOX, BUNCH, TREE]),
+    st.tuples(st.sampled_from([65534, 65535, 0, 1]), st.sampled_from([65535, 0, 1])),
+    st.sampled_from(["ada", "bob"]),
+)
 
 
 @given(st.lists(submissions, max_size=12, unique_by=lambda one: (one[1].object, one[1].claim)), st.data())
 def test_order_and_repetition_do_not_matter(records, data):
-    one, other = RetainedState(), RetainedState()
+    one = RetainedState()
+    other = RetainedState()
     for cell, record in records:
         one.merge(cell, record)
     for cell, record in data.draw(st.permutations(records + records[:3])):

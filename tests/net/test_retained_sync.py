@@ -10,7 +10,8 @@ from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 
-HERE, THERE = (0, 0), (7, 7)
+HERE = (0, 0)
+THERE = (7, 7)
 
 
 def record(box: int, x: float = 0.0, author: str = "ada", authority: int = 1) -> RetainedRecord:
@@ -48,7 +49,8 @@ def test_a_record_waits_for_a_subscriber_and_is_sent_once():
 
 def test_many_records_share_messages_below_the_datagram_size():
     hub = MemoryHub()
-    ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
+    ada = RetainedSync(hub.bus("ada"), Counters())
+    server = hub.bus("server")
     server.subscribe("fact/**", KEEP_ALL)
     for box in range(40):
         ada.publish(HERE, record(box))
@@ -61,7 +63,8 @@ def test_many_records_share_messages_below_the_datagram_size():
 
 def test_own_latest_records_are_sent_again_after_a_server_outage():
     hub = MemoryHub()
-    ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
+    ada = RetainedSync(hub.bus("ada"), Counters())
+    server = hub.bus("server")
     server.subscribe("fact/**", KEEP_ALL)
     ada.publish(HERE, record(0))
     ada.publish(HERE, record(1))
@@ -80,8 +83,10 @@ def test_own_latest_records_are_sent_again_after_a_server_outage():
 
 
 def test_each_cell_is_queried_once_and_again_when_it_is_entered_again():
-    hub, queries = MemoryHub(), []
-    ada, server = RetainedSync(hub.bus("ada"), Counters()), hub.bus("server")
+    hub = MemoryHub()
+    queries = []
+    ada = RetainedSync(hub.bus("ada"), Counters())
+    server = hub.bus("server")
     server.declare_queryable(
         "snap/0/0", lambda _: queries.append(hub.time) or messages.encode_records([record(3, 1.0, "bob")])
     )

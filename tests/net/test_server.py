@@ -86,7 +86,8 @@ def test_a_step_of_the_time_of_day_does_not_move_the_network_time(monkeypatch, s
         return messages.decode_time(answers[0].payload)[1] - asked
 
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
-        before, time_of_day = server_minus_own_time(ada), time.time
+        before = server_minus_own_time(ada)
+        time_of_day = time.time
         monkeypatch.setattr(time, "time", lambda: time_of_day() + step)
         assert abs(server_minus_own_time(ada) - before) < 60.0
 
@@ -213,7 +214,8 @@ def box(index=0, ownership=1, author="ada", x=0.0):
 
 def snapshot(bus, cell, count):
     """The retained records of a cell, as soon as there are ``count``."""
-    found, answered = {}, False
+    found = {}
+    answered = False
 
     def complete():
         nonlocal answered
@@ -337,9 +339,7 @@ with Server(sys.argv[1], state_folder=pathlib.Path(sys.argv[2])) as server:
 
 @contextlib.contextmanager
 def serving(endpoint, folder):
-    process = programs.Popen(
-        [sys.executable, "-c", SERVE, endpoint, str(folder)], stdout=subprocess.PIPE, text=True
-    )  # fmt: skip
+    process = programs.Popen([sys.executable, "-c", SERVE, endpoint, str(folder)], stdout=subprocess.PIPE, text=True)
     try:
         yield process, process.stdout.readline().strip()
     finally:

@@ -22,12 +22,14 @@ class Shared:
     """A client whose actors stand along x; it ticks their replicators in turn, as :class:`Client` does."""
 
     def __init__(self, hub: MemoryHub, places: dict[str, float]) -> None:
-        self.hub, self.model = hub, tree_row(3)
+        self.hub = hub
+        self.model = tree_row(3)
         self.replicators = {
             name: Replicator(hub.bus(name), Hello(name, scene="rows", digest="same", joints=0), self.model)
             for name in places
         }
-        self.places, self.moving = places, set()
+        self.places = places
+        self.moving = set()
         self.present = list(places)
         self._share()
 
@@ -70,7 +72,8 @@ def run(clients: list[Shared], seconds: float, *actions: dict) -> None:
 
 def test_what_moves_is_not_adopted_from_an_actor_of_the_same_client_until_that_has_left():
     hub = MemoryHub(delay=0.02)
-    farm, visitor = Shared(hub, {"ada": 0.0, "ann": 1.5, "eva": 4.0}), Shared(hub, {"bob": 3.0})
+    farm = Shared(hub, {"ada": 0.0, "ann": 1.5, "eva": 4.0})
+    visitor = Shared(hub, {"bob": 3.0})
     run([farm, visitor], 0.5)
     farm.moving = {BOX, TREE}
     run([farm, visitor], TICK, {"ada": {"grabbed": {BOX}, "touched": {TREE}}}, {})
@@ -91,7 +94,8 @@ def test_what_moves_is_not_adopted_from_an_actor_of_the_same_client_until_that_h
 
 def test_a_touch_does_not_take_what_an_actor_of_the_same_client_touches_but_a_grab_does():
     hub = MemoryHub(delay=0.02)
-    farm, visitor = Shared(hub, {"ada": 0.0, "ann": 1.5}), Shared(hub, {"bob": 3.0})
+    farm = Shared(hub, {"ada": 0.0, "ann": 1.5})
+    visitor = Shared(hub, {"bob": 3.0})
     run([farm, visitor], 0.5)
     farm.moving = {TREE}
     both = {name: {"touched": {TREE}} for name in ("ada", "ann")}

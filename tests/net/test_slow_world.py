@@ -21,7 +21,8 @@ from vinesim.scene.values import POINT_NAMES, HumanUpdate
 DT = 0.01
 START = 1e6
 """Of the worlds' time [s]."""
-SWING, RATE = 0.3, 4.0
+SWING = 0.3
+RATE = 4.0
 """Of a hand: amplitude [m] and angular frequency [rad/s]; 1.2 m/s at most."""
 
 
@@ -49,7 +50,10 @@ class World:
     """Two people, and a server whose time passes ``factor`` times as fast as real time."""
 
     def __init__(self, factor: float) -> None:
-        self.hub, self.factor, self._begun, self._time = MemoryHub(delay=0.02), factor, 0.0, START
+        self.hub = MemoryHub(delay=0.02)
+        self.factor = factor
+        self._begun = 0.0
+        self._time = START
         self.hub.bus("server").declare_queryable(
             "clock/*",
             lambda asked: messages.encode_time(
@@ -67,7 +71,9 @@ class World:
 
     def change(self, factor: float) -> None:
         """As by a server that is started again with another factor."""
-        self._time, self._begun, self.factor = self.time, self.hub.time, factor
+        self._time = self.time
+        self._begun = self.hub.time
+        self.factor = factor
 
     def run(self, steps: int) -> float:
         """Step both clients at the factor; how far bob's copy of ada's hand was from it at most [m]."""
@@ -141,7 +147,8 @@ def test_a_client_learns_the_factor_of_its_server() -> None:
 
         wait(knows, "the clock of the server")
         assert client.replicator.real_time_factor == 0.25
-        before, now = server.time, time.monotonic()
+        before = server.time
+        now = time.monotonic()
         away = client.replicator.network_time(now) - before
         assert abs(away) < 0.25 * (client.replicator.round_trip or 0.0) + (server.time - before) + 0.05
 

@@ -89,7 +89,7 @@ class NetworkTestbed:
                 owner is None for client in self.clients.values() for owner in client.command()["owner"].values()
             ),
             "all trees to rest",
-        )  # fmt: skip
+        )
         self.wait_until_quiet()
 
     def wait_until_quiet(self) -> None:
@@ -120,7 +120,9 @@ class NetworkTestbed:
         def payload(counters: dict, way: str) -> int:
             return counters["environment"][way] + counters["event"][way]
 
-        found, before, start = Window(), now(), time.monotonic()
+        found = Window()
+        before = now()
+        start = time.monotonic()
         time.sleep(WINDOW)
         after = now()
         found.seconds = time.monotonic() - start
@@ -217,7 +219,8 @@ def test_branch_touched_far_from_all_peers_costs_nothing(world):
     world.settle()
     world.command("ada", place=[55.0, 0.0])  # 25 m from cleo, 53 m from bob
     world.wait_until_quiet()
-    idle, reads = world.count_idle(), world.command("ada")["reads"]
+    idle = world.count_idle()
+    reads = world.command("ada")["reads"]
     world.command("ada", touch=list(range(50, 60)), swing=[49])
     wait(lambda: world.command("ada")["owner"].get("54") == "ada", "ada to own the tree")
     world.check_idle(idle, *world.clients)
@@ -305,7 +308,8 @@ def test_poses_are_received_at_60_hz_near_and_at_5_hz_far(world):
     pytest.fail(f"ticks a second, and poses a second: {found}")
 
 
-BUNCH, BOX = object_id(ObjectKind.BUNCH, 1), object_id(ObjectKind.BOX, 1)
+BUNCH = object_id(ObjectKind.BUNCH, 1)
+BOX = object_id(ObjectKind.BOX, 1)
 
 
 def retained_count(before: dict, after: dict, way: str) -> int:
@@ -383,7 +387,8 @@ def test_a_carried_box_is_one_stream_and_a_box_on_a_robot_is_none(world):
 @pytest.mark.long
 def test_one_owner_again_after_five_seconds_without_a_link(world, record_property):
     world.settle()
-    ada, bob = world.clients["ada"], world.clients["bob"]
+    ada = world.clients["ada"]
+    bob = world.clients["bob"]
     world.command("ada", touch=[1])
     wait(lambda: bob.command()["owner"].get("1") == "ada", "bob to receive the tree")
     start = bob.command()["now"]

@@ -82,7 +82,8 @@ def test_samples_arrive_with_the_depth_of_their_subscription(server):
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
         bob.subscribe("c/0/0/*")
         bob.subscribe("own/0/0/*", KEEP_ALL)
-        pose, event = ada.publisher("c/0/0/ada"), ada.publisher("own/0/0/ada", reliable=True)
+        pose = ada.publisher("c/0/0/ada")
+        event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: pose.matching and event.matching, "bob's subscriptions")
         for number in range(100):
             assert pose.put(bytes([number]))
@@ -116,13 +117,15 @@ def test_without_a_subscriber_zenoh_sends_no_byte(server):
         # both subscribe to a neighbouring cell, ada also to her own: neither may make her send
         bob.subscribe("c/1/0/*")
         ada.subscribe("c/0/0/*")
-        here, there = ada.publisher("c/0/0/ada"), ada.publisher("c/1/0/ada")
+        here = ada.publisher("c/0/0/ada")
+        there = ada.publisher("c/1/0/ada")
         wait(lambda: there.matching, "bob's subscription")
         assert not here.matching
         payload = bytes(200)
 
         def cost(publisher, count: int) -> int:
-            before, received = relay.up, bob.bytes_in
+            before = relay.up
+            received = bob.bytes_in
             for _ in range(count):
                 # bypasses the bus's check of matching: Zenoh itself must not send
                 publisher._publisher.put(payload)
@@ -242,7 +245,8 @@ def test_an_oversized_sample_is_dropped(server):
 def test_the_end_of_a_callback_runs_no_python_code():
     """Else the interpreter may end between its mark, which the exit waits for, and the end of the thread of Zenoh,
     which aborts the program ("FATAL: exception not rethrown")."""
-    others, seen = set(zenoh_session._direct), []
+    others = set(zenoh_session._direct)
+    seen = []
     callback = zenoh_session.called_directly(lambda _: None)
     (mark,) = zenoh_session._direct - others
     sys.setprofile(lambda frame, event, _: seen.append((event, frame.f_code.co_name)))
@@ -315,7 +319,8 @@ def test_touched_trees_are_exchanged_near_and_not_far(server):
         ZenohBus("ada", connect=relay.endpoint) as a,
         ZenohBus("bob", connect=server.endpoint) as b,
     ):
-        ada, bob = Client(a, 1.0), Client(b, 60.0)
+        ada = Client(a, 1.0)
+        bob = Client(b, 60.0)
         ticking = ticking_all(ada, bob)
         wait(ticking(lambda: "bob" in ada.robots and "ada" in bob.robots), "both to see each other")
         wait(ticking(lambda: abs(ada.replicator.offset + time.monotonic() - time.time()) < 0.1), "the server's clock")
@@ -357,7 +362,8 @@ def test_replication_resumes_after_a_router_restart():
     router = start()
     try:
         with ZenohBus("ada", connect=endpoint) as a, ZenohBus("bob", connect=endpoint) as b:
-            ada, bob = Client(a, 1.0), Client(b, 2.0)
+            ada = Client(a, 1.0)
+            bob = Client(b, 2.0)
             ticking = ticking_all(ada, bob)
             ada.touched = {1}
             wait(ticking(lambda: bob.replicator.owner(1) == "ada"), "the first touch")
@@ -414,7 +420,8 @@ def test_poses_use_datagrams_and_events_the_stream(server):
             assert len(bob.links) == 1
             bob.subscribe("a/ada", KEEP_ALL)
             bob.subscribe("own/0/0/ada", KEEP_ALL)
-            pose, event = ada.publisher("a/ada"), ada.publisher("own/0/0/ada", reliable=True)
+            pose = ada.publisher("a/ada")
+            event = ada.publisher("own/0/0/ada", reliable=True)
             wait(lambda: pose.matching and event.matching, "bob's subscriptions")
             before = relay.up
             wait(lambda: (pose.put(bytes(1000)) and time.sleep(0.001)) or bob.bytes_in >= 50_000, "fifty poses")
@@ -474,7 +481,8 @@ def test_poses_move_to_the_stream_when_datagrams_stop(caplog, monkeypatch):
         datagrams = DatagramRelay(port, server.endpoints[1].port)
         with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
             assert len(ada.links) == 3
-            there, back = PoseAndEvent(ada, bob), PoseAndEvent(bob, ada)
+            there = PoseAndEvent(ada, bob)
+            back = PoseAndEvent(bob, ada)
             wait(lambda: there() and back(), "poses each way")
             datagrams.close()
             wait(lambda: "udp/" in ada.status_message, "ada to notice the lost datagrams")
@@ -493,7 +501,8 @@ def test_poses_return_to_datagrams_when_they_pass_again(monkeypatch):
         port = int(relay.endpoint.rpartition(":")[2])
         datagrams = DatagramRelay(port, server.endpoints[1].port)
         with ZenohBus("ada", connect=f"udp/127.0.0.1:{port}") as ada, ZenohBus("bob", connect=server.endpoint) as bob:
-            there, back = PoseAndEvent(ada, bob), PoseAndEvent(bob, ada)
+            there = PoseAndEvent(ada, bob)
+            back = PoseAndEvent(bob, ada)
             wait(lambda: there() and back(), "poses each way")
             datagrams.close()
             wait(lambda: len(ada.links) == 1, "ada to give up datagrams")
@@ -519,7 +528,8 @@ def test_a_session_that_closes_under_the_real_time_loop_raises_nothing(server):
     """Puts, matching, new publishers, subscriptions and queries on a closed session are counted."""
     with ZenohBus("ada", connect=server.endpoint) as ada, ZenohBus("bob", connect=server.endpoint) as bob:
         bob.subscribe("own/0/0/ada", KEEP_ALL)
-        event, pose = ada.publisher("own/0/0/ada", reliable=True), ada.publisher("a/ada")
+        event = ada.publisher("own/0/0/ada", reliable=True)
+        pose = ada.publisher("a/ada")
         wait(lambda: event.matching, "bob's subscription")
         close_session(ada.session_for(reliable=True))
         for publisher in (event, pose, ada.publisher("a/ada/far"), ada.publisher("own/0/1/ada", reliable=True)):

@@ -50,7 +50,8 @@ def test_the_drawn_pose_is_an_equilibrium(plants: ArticulationSolver) -> None:
 
 
 def test_kinematics_follow_writes_to_the_state(plants: ArticulationSolver) -> None:
-    state, rng = plants.state, np.random.default_rng(1)
+    state = plants.state
+    rng = np.random.default_rng(1)
     state.joint_q[:] = frames.exp(rng.normal(size=(20, 3)))
     state.joint_qd[:] = rng.normal(size=(20, 3))
     plants.forward_kinematics(np.arange(4))
@@ -172,7 +173,8 @@ def test_phi_is_1_after_contact_begins_and_in_fast_motion(plants: ArticulationSo
 
 def test_blend_towards_moves_by_the_blend_weight(plants: ArticulationSolver) -> None:
     rng = np.random.default_rng(2)
-    state, bodies = plants.state, plants.model.bodies_of(2)
+    state = plants.state
+    bodies = plants.model.bodies_of(2)
     start = state.joint_q[bodies].copy()
     goal = frames.exp(rng.normal(size=(5, 3)) * 0.5)
     rates = rng.normal(size=(5, 3))
@@ -256,7 +258,8 @@ def carried_bodies(plants: ArticulationSolver, joint: int) -> np.ndarray:
 
 def excite(plants: ArticulationSolver, rate: float = 2.0) -> None:
     """Random rates in every joint that moves."""
-    rng, state = np.random.default_rng(3), plants.state
+    rng = np.random.default_rng(3)
+    state = plants.state
     plants.wake(np.arange(len(plants.model.tree_first)))
     bodies = moving(plants, np.arange(len(plants.model.tree_first)))
     state.joint_q[bodies] = frames.multiply(frames.exp(rng.normal(size=(len(bodies), 3)) * 0.1), state.joint_q[bodies])
@@ -265,7 +268,8 @@ def excite(plants: ArticulationSolver, rate: float = 2.0) -> None:
 
 
 def test_clusters_of_a_coarse_tree_move_with_their_bunch(clustered_plants: ArticulationSolver) -> None:
-    model, state = clustered_plants.model, clustered_plants.state
+    model = clustered_plants.model
+    state = clustered_plants.state
     excite(clustered_plants)
     joint_q_before = state.joint_q.copy()
     step(clustered_plants, 20)
@@ -274,18 +278,21 @@ def test_clusters_of_a_coarse_tree_move_with_their_bunch(clustered_plants: Artic
     assert len(clusters) == 15
     np.testing.assert_array_equal(state.joint_q[clusters], joint_q_before[clusters])
     np.testing.assert_allclose(state.body_q, model.forward_kinematics(state.joint_q), atol=3e-6)
-    cluster, bunch = model.bunch_cluster[1], model.bunch_body[1]
+    cluster = model.bunch_cluster[1]
+    bunch = model.bunch_body[1]
     offset = state.body_q[cluster, :3] - state.body_q[bunch, :3]
     velocity = state.body_qd[bunch, :3] + np.cross(state.body_qd[bunch, 3:], offset)
     np.testing.assert_allclose(state.body_qd[cluster], [*velocity, *state.body_qd[bunch, 3:]], atol=1e-5)
 
 
 def test_refining_keeps_pose_velocity_and_momentum(clustered_plants: ArticulationSolver) -> None:
-    state, model = clustered_plants.state, clustered_plants.model
+    state = clustered_plants.state
+    model = clustered_plants.model
     excite(clustered_plants)
     step(clustered_plants, 5)
     clustered_plants.forward_kinematics()
-    pose, speed = state.body_q.copy(), state.body_qd.copy()
+    pose = state.body_q.copy()
+    speed = state.body_qd.copy()
     joints = np.arange(*model.bodies_of(1).indices(99))[:-5]
     before = [momenta(clustered_plants, carried_bodies(clustered_plants, j), pose[j, :3].astype(float)) for j in joints]
     clustered_plants.refine(np.array([1, 2]))
@@ -303,10 +310,12 @@ def test_refining_keeps_pose_velocity_and_momentum(clustered_plants: Articulatio
 
 def test_coarsening_keeps_pose_and_momentum_and_never_adds_energy(clustered_plants: ArticulationSolver) -> None:
     """A bunch keeps its angular momentum about its origin; other trees are unchanged."""
-    state, model = clustered_plants.state, clustered_plants.model
+    state = clustered_plants.state
+    model = clustered_plants.model
     clustered_plants.refine(np.arange(3))
     excite(clustered_plants, 4.0)
-    pose, joint_q = state.body_q.copy(), state.joint_q.copy()
+    pose = state.body_q.copy()
+    joint_q = state.joint_q.copy()
     bunches = model.bunch_body[1:]
     before = [
         momenta(clustered_plants, carried_bodies(clustered_plants, j), pose[j, :3].astype(float)) for j in bunches
@@ -436,7 +445,8 @@ def test_cutting_keeps_pose_velocity_and_indices(plants: ArticulationSolver) -> 
     excite(plants)
     state = plants.state
     plants.put_to_sleep(1)
-    pose, speed = state.body_q.copy(), state.body_qd.copy()
+    pose = state.body_q.copy()
+    speed = state.body_qd.copy()
     plants.cut(7)
     assert plants.awake.tolist() == [0, 1, 2, 3]
     assert np.flatnonzero(state.body_cut).tolist() == [7]
@@ -455,7 +465,8 @@ def test_cutting_keeps_pose_velocity_and_indices(plants: ArticulationSolver) -> 
 
 def test_a_stump_moves_like_a_shorter_cane() -> None:
     """The stump after a cut is bitwise equal to a cane built without the cut part."""
-    total, short = canes(1), canes(1)
+    total = canes(1)
+    short = canes(1)
     plants = ArticulationSolver(total, State.at_rest(total))
     plants.wake(0)
     plants.state.joint_qd[:, 1] = 1.0
@@ -477,11 +488,13 @@ def test_a_stump_moves_like_a_shorter_cane() -> None:
 
 
 def test_cuts_of_cuts_of_roots_and_of_bunches(clustered_plants: ArticulationSolver) -> None:
-    state, model = clustered_plants.state, clustered_plants.model
+    state = clustered_plants.state
+    model = clustered_plants.model
     clustered_plants.wake(np.arange(3))
     clustered_plants.cut(4)
     clustered_plants.cut(2)  # nearer to the root than the cut before
-    bunch, size = int(model.bunch_body[1]), int(model.tree_size[0])
+    bunch = int(model.bunch_body[1])
+    size = int(model.tree_size[0])
     clustered_plants.cut(bunch)
     clustered_plants.cut(2 * size)  # a whole tree
     step(clustered_plants, 30)
@@ -561,7 +574,8 @@ def run_with_events(**options: object) -> tuple[list[bytes], np.ndarray]:
     rng = np.random.default_rng(5)
     model = trees_of_different_size(rng)
     plants = ArticulationSolver(model, State.at_rest(model), **options)
-    state, first = plants.state, model.tree_first
+    state = plants.state
+    first = model.tree_first
     plants.wake(np.array([0, 2, 3, 5, 6]))
     state.joint_qd[:] = rng.normal(size=state.joint_qd.shape)
     plants.body_load[first[2]] = [0.0, 0.3, 0.0, 0.0, 0.0, 0.0]

@@ -31,13 +31,15 @@ def test_spheres_of_a_bunch_fill_its_spheroid():
     of_bunch = (shapes.bunch == 0) & (model.body_organ[shapes.body] == Organ.BUNCH)
     assert (shapes.body[of_bunch] == body).all()
     assert (np.diff(shapes.body) >= 0).all()
-    x, r = shapes.start[of_bunch, 0], shapes.radius[of_bunch]
+    x = shapes.start[of_bunch, 0]
+    r = shapes.radius[of_bunch]
     assert (x - r).min() == pytest.approx(0.0, abs=1e-6)
     assert (x + r).max() == pytest.approx(0.17, abs=1e-6)
     assert r.max() == pytest.approx(0.045)
     angle = np.linspace(0, np.pi, 181)
     for center, radius in zip(x, r, strict=True):
-        along, across = (center - 0.085 + radius * np.cos(angle)) / 0.085, radius * np.sin(angle) / 0.045
+        along = (center - 0.085 + radius * np.cos(angle)) / 0.085
+        across = radius * np.sin(angle) / 0.045
         assert (along**2 + across**2).max() < 1.0 + 1e-5
 
 
@@ -187,7 +189,8 @@ def converged(newton_contacts: int) -> PhysicsParameters:
 
 def test_newton_steps_of_blocks_find_the_forces_of_sweeps():
     """The first step in which 24 canes press on 4 bars, from the same state: a block for each cane."""
-    forces, sweeps = [], []
+    forces = []
+    sweeps = []
     for newton_contacts in (0, 16):
         physics = Physics(scenes.cane_row(24), parameters=converged(newton_contacts))
         physics.add_robot(scenes.combs("combs", 4, 24))
@@ -278,11 +281,22 @@ def test_rigid_islands_join_bodies_coupled_by_a_constraint():
 def test_a_step_is_a_list_of_stages_and_trees_fall_asleep():
     physics = Physics(rows_of_canes(3))
     assert [name.split(":")[0] for name, _ in physics.stages] == [
-        "wind", "grasps", "rigid", "contacts", "detail", "elastic supports", "plants", "contacts", "plants",
-            "rigid", "wires", "faults",
+        "wind",
+        "grasps",
+        "rigid",
+        "contacts",
+        "detail",
+        "elastic supports",
+        "plants",
+        "contacts",
+        "plants",
+        "rigid",
+        "wires",
+        "faults",
         "detachment",
-        "grasps", "sleep",
-    ]  # fmt: skip
+        "grasps",
+        "sleep",
+    ]
     physics.plants.wake(1)
     physics.state.joint_qd[physics.model.bodies_of(1).start, 1] = 0.5
     for _ in range(3000):
@@ -344,9 +358,13 @@ def test_static_geoms_for_which_there_is_no_room_are_counted(room, skipped):
     """Five poles pass through the box of one cane: those beyond the room for them and for a bar are left out."""
     start = np.array([[0.2 * i, 0.0, 0.0] for i in range(1, 6)])
     model = assemble(
-        [cane((0.0, 0.0, 1.0))], fixed_start=start, fixed_end=start + np.array([0.0, 0.0, 2.0]),
-        fixed_radius=[[0.03, 0.03]] * 5, fixed_organ=[int(Organ.POLE)] * 5, fixed_index=np.arange(5),
-    )  # fmt: skip
+        [cane((0.0, 0.0, 1.0))],
+        fixed_start=start,
+        fixed_end=start + np.array([0.0, 0.0, 2.0]),
+        fixed_radius=[[0.03, 0.03]] * 5,
+        fixed_organ=[int(Organ.POLE)] * 5,
+        fixed_index=np.arange(5),
+    )
     physics = Physics(model, parameters=PhysicsParameters(max_static_geoms_per_tree=room))
     physics.add_robot(bar((9.0, 9.0, 0.0)))
     physics.plants.wake(0)
@@ -403,21 +421,40 @@ def clustered() -> Model:
     last = tree.add_rod(-1, 0.4, (0.006, 0.006), RodMaterial(5e9, 800.0, 0.02), 4)[-1]
     down = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
     bunch = tree.add_body(
-        last, offset=(0.1, 0, 0), rest=down, organ=int(Organ.BUNCH), mass=0.3, com=(0.08, 0, 0), length=0.16,
-        radius=(0.04, 0.04), inertia=(3e-4, 8e-4, 8e-4), stiffness=np.full(3, 0.3), damping=np.full(3, 0.02),
-    )  # fmt: skip
+        last,
+        offset=(0.1, 0, 0),
+        rest=down,
+        organ=int(Organ.BUNCH),
+        mass=0.3,
+        com=(0.08, 0, 0),
+        length=0.16,
+        radius=(0.04, 0.04),
+        inertia=(3e-4, 8e-4, 8e-4),
+        stiffness=np.full(3, 0.3),
+        damping=np.full(3, 0.02),
+    )
     parts = [
         tree.add_body(
-            bunch, offset=(0.02 + 0.07 * i, 0, 0), organ=int(Organ.BUNCH), mass=0.14, com=(0.035, 0, 0), length=0.07,
-            radius=(0.03, 0.03), inertia=(1e-4, 1e-4, 1e-4), stiffness=np.full(3, 0.1), damping=np.full(3, 0.01),
+            bunch,
+            offset=(0.02 + 0.07 * i, 0, 0),
+            organ=int(Organ.BUNCH),
+            mass=0.14,
+            com=(0.035, 0, 0),
+            length=0.07,
+            radius=(0.03, 0.03),
+            inertia=(1e-4, 1e-4, 1e-4),
+            stiffness=np.full(3, 0.1),
+            damping=np.full(3, 0.01),
         )
         for i in range(2)
-    ]  # fmt: skip
+    ]
     tree.bunches.append({"body": bunch, "length": 0.16, "radius": 0.04, "berries": 60})
     model = assemble([tree])
     model.tree_core[0] -= len(parts)
     model.bunch_cluster[0], model.bunch_clusters[0] = parts[0], len(parts)
-    model.bunch_head_mass[0], model.bunch_head_com[0], model.bunch_head_inertia[0] = 0.02, (0.01, 0, 0), (1e-5,) * 3
+    model.bunch_head_mass[0] = 0.02
+    model.bunch_head_com[0] = (0.01, 0, 0)
+    model.bunch_head_inertia[0] = (1e-5,) * 3
     moment = 0.02 * 0.01 + 0.14 * (0.055 + 0.125)
     model.bunch_head_com[0] = (0.01, 0.0, 0.0)
     model.body_com[bunch] = (moment / 0.3, 0.0, 0.0)
@@ -426,7 +463,8 @@ def clustered() -> Model:
 
 def test_contacts_are_on_the_bunch_while_coarse_and_on_clusters_while_fine():
     model = clustered()
-    shapes, bunch = plant_capsules(model), int(model.bunch_body[0])
+    shapes = plant_capsules(model)
+    bunch = int(model.bunch_body[0])
     assert (shapes.bunch == 0).sum() == (shapes.level > 0).sum()
     assert set(shapes.body[shapes.level == 1]) == {bunch}
     assert set(shapes.body[shapes.level == 2]) == {bunch + 1, bunch + 2}
@@ -467,12 +505,14 @@ def random_scene(seed: int) -> tuple[Physics, list[str]]:
     rng = np.random.default_rng(seed)
     trees = [
         cane(
-            (rng.uniform(-0.2, 0.2), 0.15 * i, rng.uniform(0.8, 1.2)), radius=float(rng.uniform(0.003, 0.008)),
-            beta=float(rng.uniform(0.0, 0.03)), heading=float(rng.uniform(-0.5, 0.5)),
+            (rng.uniform(-0.2, 0.2), 0.15 * i, rng.uniform(0.8, 1.2)),
+            radius=float(rng.uniform(0.003, 0.008)),
+            beta=float(rng.uniform(0.0, 0.03)),
+            heading=float(rng.uniform(-0.5, 0.5)),
             bunch=float(rng.choice([0.0, 0.4])),
         )
         for i in range(4)
-    ]  # fmt: skip
+    ]
     physics = Physics(assemble(trees), detachment=False)
     physics.add_robot(bar((rng.uniform(0.3, 0.9), -0.2, 1.0), damping=float(rng.choice([0.0, 300.0]))))
     physics.add_robot(probe((rng.uniform(0.3, 0.9), rng.uniform(0.0, 0.4), 1.4)))
@@ -487,7 +527,8 @@ def random_scene(seed: int) -> tuple[Physics, list[str]]:
 @given(seed=st.integers(0, 2**31))
 def test_contacts_satisfy_signorini_coulomb_and_action_is_reaction(seed):
     physics, robots = random_scene(seed)
-    solver, rigid = physics.contact_solver, physics.rigid
+    solver = physics.contact_solver
+    rigid = physics.rigid
     pressed = 0
     for _ in range(60):
         physics.step()
@@ -514,7 +555,8 @@ def test_contacts_satisfy_signorini_coulomb_and_action_is_reaction(seed):
 
 def gaps(physics: Physics, name: str, link: str, radius: float, half: float, axis: np.ndarray) -> np.ndarray:
     """Least distance [tree] of the shapes of each tree and a capsule on a robot's link, from many points of both."""
-    solver, model = physics.contact_solver, physics.model
+    solver = physics.contact_solver
+    model = physics.model
     body_q = model.forward_kinematics(physics.state.joint_q)[solver.capsules.body]
     t = np.linspace(0.0, 1.0, 9)[:, None, None]
     along = solver.capsules.start + t * (solver.capsules.end - solver.capsules.start)
@@ -537,7 +579,9 @@ def test_waking_is_never_late(seed):
     model = assemble([cane((1.2 * (i % 3), 0.25 * (i // 3), 1.0), radius=0.005) for i in range(24)])
     physics = Physics(model)
     physics.add_robot(bar((rng.uniform(0.0, 3.0), rng.uniform(-1.0, 1.0), rng.uniform(0.8, 1.2)), damping=2000.0))
-    speed, woken, touched = 0.0, set(), set()
+    speed = 0.0
+    woken = set()
+    touched = set()
     for tick in range(120):
         if tick % 20 == 0:
             speed = float(rng.uniform(-5.0, 5.0))
@@ -613,7 +657,8 @@ def test_two_hundred_contacts_of_one_island_converge_within_the_allowed_sweeps()
     """Combs that bend 40 canes by 5 mm: a body shared by all contacts."""
     physics = Physics(scenes.cane_row(40))
     physics.add_robot(scenes.combs("combs", 4, 40))
-    sweeps, contacts = [], 0
+    sweeps = []
+    contacts = 0
     for tick in range(40):
         physics.rigid.command("combs", np.full(2, 0.005 * min(1.0, tick / 20)))
         physics.step()

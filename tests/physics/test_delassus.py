@@ -20,8 +20,10 @@ from vinesim.world import Physics
 
 def assembled(physics: Physics) -> np.ndarray:
     """[row, row] 1/kg: the matrices of all blocks of the last solve, by contacts."""
-    solver, count = physics.contact_solver.impulses, physics.contact_solver.count
-    islands, matrix = solver.islands, np.zeros((3 * count, 3 * count))
+    solver = physics.contact_solver.impulses
+    count = physics.contact_solver.count
+    islands = solver.islands
+    matrix = np.zeros((3 * count, 3 * count))
     for block in range(physics.contact_solver.detection.counters[structs.BLOCKS]):
         contacts = islands.contact[islands.block_start[block] : islands.block_start[block + 1]]
         pitch = islands.row_start[block + 1] - islands.row_start[block]
@@ -34,7 +36,8 @@ def assembled(physics: Physics) -> np.ndarray:
 
 def dense(physics: Physics, response: np.ndarray) -> np.ndarray:
     """The same J Y J^T from the ``response`` Y [n, 6, n, 6] of the bodies in contact."""
-    solver, count = physics.contact_solver.impulses, physics.contact_solver.count
+    solver = physics.contact_solver.impulses
+    count = physics.contact_solver.count
     jacobian = np.zeros((3 * count, len(solver.bodies), 6))
     rows = solver.rows.plant_jacobian[: 3 * count]
     for contact in range(count):
@@ -52,9 +55,11 @@ def check(physics: Physics) -> int:
         stage()
         if name.endswith("solve all together"):
             response = physics.plants.impulse_response(physics.contact_solver.impulses.bodies)
-    expected, found = dense(physics, response), assembled(physics)
+    expected = dense(physics, response)
+    found = assembled(physics)
     np.testing.assert_allclose(found, expected, atol=2e-6 * np.abs(expected).max())
-    solver, count = physics.contact_solver, physics.contact_solver.count
+    solver = physics.contact_solver
+    count = physics.contact_solver.count
     sides = np.diff(solver.impulses.response.groups.start[: solver.detection.counters[structs.GROUPS] + 1])
     assert sides.max() <= MOST_SIDES
     return int(np.bincount(physics.model.body_tree[solver.impulses.contacts.body[:count]]).max())
@@ -106,7 +111,8 @@ def test_responses_are_those_of_bodies_wherever_kernels_find_them(interleave: in
     response.tree_end[: len(bodies)] = 3 * (sides // 3) + 3
     response.jacobian[:, :6] = rng.normal(size=(3 * len(bodies), 6))
     response.groups.side[: len(bodies)] = 2 * sides
-    response.groups.start[:6], response.groups.tree[:5] = 3 * np.arange(6), 3 * np.arange(5)
+    response.groups.start[:6] = 3 * np.arange(6)
+    response.groups.tree[:5] = 3 * np.arange(5)
     width = 16
     response.groups.response[:5] = 3 * 6 * width * np.arange(5)
     response.launch(5)

@@ -17,10 +17,12 @@ from vinesim.world import Physics
 
 def momentum(physics: Physics, name: str) -> np.ndarray:
     """Linear momentum [3] of one free body of the rigid world, kg m/s."""
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
     mujoco.mj_fwdPosition(world, data)
     mujoco.mj_comVel(world, data)
-    velocity, body = np.zeros(6), data.body(name).id
+    velocity = np.zeros(6)
+    body = data.body(name).id
     mujoco.mj_objectVelocity(world, data, mujoco.mjtObj.mjOBJ_XBODY, body, velocity, 0)
     lever = data.xipos[body] - data.xpos[body]
     return world.body_mass[body] * (velocity[3:] + np.cross(velocity[:3], lever))
@@ -35,7 +37,8 @@ def test_a_picked_bunch_keeps_its_momentum_and_falls():
     for _ in range(7):
         physics.step()
     physics.plants.forward_kinematics()
-    pose, velocity = physics.state.body_q[body].astype(float), physics.state.body_qd[body].astype(float)
+    pose = physics.state.body_q[body].astype(float)
+    velocity = physics.state.body_qd[body].astype(float)
     com = frames.rotate(pose[3:], model.body_com[body].astype(float))
     before = 0.5 * (velocity[:3] + np.cross(velocity[3:], com))
     physics.pick(0)
@@ -110,7 +113,8 @@ def pull_bunch(
 ) -> tuple[Physics, tuple[Detachment, ...], np.ndarray]:
     """A gripper closes on a bunch and moves down: the detachments, and the peduncle's wrench tick by tick."""
     model, _, middle = bunch_scene(clusters=clusters)
-    model.bunch_pull[0], model.bunch_bend[0] = pull, bend
+    model.bunch_pull[0] = pull
+    model.bunch_bend[0] = bend
     physics = Physics(model)
     physics.add_robot(gripper(middle, effort=80.0))
     wrenches: list[np.ndarray] = []
@@ -224,7 +228,8 @@ def test_a_bunch_dropped_over_a_crate_comes_to_rest_in_it():
     for _ in range(400):
         physics.step()
     links = {link.name: pose for link, pose in zip(physics.rigid.visuals(), physics.rigid.visual_q(), strict=True)}
-    bunch, crate = links["bunch/0"], links["box/0"]
+    bunch = links["bunch/0"]
+    crate = links["box/0"]
     assert 0.0 < bunch[2] - crate[2] < 0.25
     assert np.abs(bunch[:2] - crate[:2]).max() < 0.3
     assert np.abs(physics.rigid.mj_data.qvel).max() < 0.1
@@ -233,7 +238,8 @@ def test_a_bunch_dropped_over_a_crate_comes_to_rest_in_it():
 def loaded_cane(clusters: bool = True, side: bool = True) -> TreeBuilder:
     """A cane of 1 m with a bunch half way along, and a side shoot behind it that carries another."""
     tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 1.6])))
-    wood, green = RodMaterial(5e9, 900.0, 0.01), RodMaterial(3e8, 1000.0, 0.05)
+    wood = RodMaterial(5e9, 900.0, 0.01)
+    green = RodMaterial(3e8, 1000.0, 0.05)
     main = tree.add_rod(-1, 1.0, (0.006, 0.004), wood, 10)
     for at in (main[4], main[8]) if side else (main[4],):
         stalk = tree.add_rod(at, 0.06, (0.0022, 0.0022), green, 2, organ=Organ.PEDUNCLE, rest=DOWN)
@@ -310,13 +316,15 @@ def test_a_picked_fine_bunch_keeps_mass_pose_and_momentum():
     for _ in range(10):
         physics.step()
     assert physics.state.tree_fine[0]
-    q, qd = physics.snapshot().body_q[bunch_bodies].astype(float), physics.state.body_qd[bunch_bodies].astype(float)
+    q = physics.snapshot().body_q[bunch_bodies].astype(float)
+    qd = physics.state.body_qd[bunch_bodies].astype(float)
     com = frames.rotate(q[:, 3:], physics.plants.body_com[bunch_bodies].astype(float))
     mass = physics.plants.body_mass[bunch_bodies].astype(float)
     middle = mass @ (q[:, :3] + com) / mass.sum()
     before = mass @ (qd[:, :3] + np.cross(qd[:, 3:], com))
     physics.pick(0)
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
     after = momentum(physics, "free_bunch/0")
     body = world.body("free_bunch/0").id
     assert world.body_mass[body] == pytest.approx(0.5, rel=1e-6)
@@ -337,7 +345,8 @@ def test_a_picked_bunch_takes_its_momentum_along_and_nothing_of_its_neighbour():
     """Two bunches of swinging clusters on one shoot; one is cut off. Linear and angular momentum within 1e-4."""
     model = assemble([loaded_cane()])
     physics = Physics(model)
-    plants, state = physics.plants, physics.state
+    plants = physics.plants
+    state = physics.state
     physics.set_detail_focus(model.forward_kinematics(model.joint_settled)[model.bunch_body, :3], 0.2)
     plants.wake(0)
     physics.step()
@@ -353,17 +362,21 @@ def test_a_picked_bunch_takes_its_momentum_along_and_nothing_of_its_neighbour():
     origin = np.zeros(3)
     linear, angular, _, _ = momenta(plants, bodies[0], origin)
     others = np.setdiff1d(np.arange(len(model.body_mass)), bodies[0])
-    rates, velocities = state.joint_qd.copy(), state.body_qd.copy()
+    rates = state.joint_qd.copy()
+    velocities = state.body_qd.copy()
     physics.pick(0)
     assert np.array_equal(state.joint_qd, rates)
     plants.forward_kinematics()
     assert np.array_equal(state.body_qd[others], velocities[others])
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
     mujoco.mj_fwdPosition(world, data)
     mujoco.mj_comVel(world, data)
-    J, body = np.zeros((6, world.nv)), world.body("free_bunch/0").id
+    J = np.zeros((6, world.nv))
+    body = world.body("free_bunch/0").id
     mujoco.mj_jacBodyCom(world, data, J[:3], J[3:], body)
-    velocity, axes = J @ data.qvel, data.ximat[body].reshape(3, 3)
+    velocity = J @ data.qvel
+    axes = data.ximat[body].reshape(3, 3)
     after = world.body_mass[body] * velocity[:3]
     spin = axes @ np.diag(world.body_inertia[body]) @ axes.T @ velocity[3:]
     assert np.linalg.norm(linear) > 0.02
@@ -389,7 +402,8 @@ def test_a_fine_bunch_cut_in_a_grasp_stays_in_it():
     assert physics.state.tree_fine[0]
     squeeze = physics.rigid.joint_measurements("grip")[3][2:].copy()
     physics.pick(0)
-    fingers, place = [], []
+    fingers = []
+    place = []
     for _ in range(200):
         physics.step()
         fingers.append(physics.rigid.joint_measurements("grip")[3][2:].copy())

@@ -6,7 +6,8 @@ import warp as wp
 
 from vinesim.plants.device_buffers import DeviceBuffers
 
-FIRST, SIZE = np.array([0, 2, 3, 6], np.int32), np.array([2, 1, 3, 2], np.int32)
+FIRST = np.array([0, 2, 3, 6], np.int32)
+SIZE = np.array([2, 1, 3, 2], np.int32)
 
 
 @pytest.fixture(params=[1, 2, 3, 32])
@@ -35,7 +36,8 @@ def test_neighbouring_trees_are_interleaved() -> None:
 
 
 def test_rows_of_listed_trees_are_uploaded_and_downloaded(buffers: DeviceBuffers) -> None:
-    positions, numbers = np.arange(24, dtype=np.float32).reshape(8, 3), np.arange(8, dtype=np.int32)
+    positions = np.arange(24, dtype=np.float32).reshape(8, 3)
+    numbers = np.arange(8, dtype=np.int32)
     buffers.add_body_rows("place", positions, wp.vec3)
     buffers.add_body_rows("number", numbers, wp.int32)
     on_device = buffers.arrays["place"].numpy()[buffers.slots]
@@ -50,7 +52,8 @@ def test_rows_of_listed_trees_are_uploaded_and_downloaded(buffers: DeviceBuffers
         buffers.arrays["place"].numpy()[buffers.slots], np.where(listed[:, None], before + 100.0, before)
     )
     np.testing.assert_array_equal(buffers.arrays["number"].numpy()[buffers.slots], np.arange(8) + 100 * listed)
-    positions[:], numbers[:] = 0.0, 0
+    positions[:] = 0.0
+    numbers[:] = 0
     download(1)
     returned = np.array([0, 0, 0, 1, 1, 1, 0, 0], bool)
     np.testing.assert_array_equal(positions, np.where(returned[:, None], before + 100.0, 0.0))

@@ -32,7 +32,8 @@ def test_many_dormant_bunches_are_added_without_bodies():
 
 
 def test_an_activated_bunch_has_the_mass_of_a_picked_one():
-    physics, picked = Physics(vineyard(3)), Physics(vineyard(3))
+    physics = Physics(vineyard(3))
+    picked = Physics(vineyard(3))
     physics.dormant_bunches.add([0, 1, 2], [""] * 3, np.array([frames.pose([x, 0.0, 0.05]) for x in (0.0, 1.0, 9.0)]))
     assert physics.dormant_bunches.nearest(np.array([[0.2, 0.0, 0.0]]), 5) == [0, 1]
     assert physics.dormant_bunches.nearest(np.array([[0.2, 0.0, 0.0]]), 1) == [0]
@@ -43,7 +44,8 @@ def test_an_activated_bunch_has_the_mass_of_a_picked_one():
     assert physics.rigid.free_bunches == (0, 1)
     assert len(physics.dormant_bunches) == 1
     picked.pick(0)
-    world, other = physics.rigid.mj_model, picked.rigid.mj_model
+    world = physics.rigid.mj_model
+    other = picked.rigid.mj_model
     assert world.body("free_bunch/0").mass == pytest.approx(other.body("free_bunch/0").mass)
     np.testing.assert_allclose(world.body("free_bunch/0").inertia, other.body("free_bunch/0").inertia, rtol=1e-4)
     np.testing.assert_allclose(
@@ -56,7 +58,8 @@ def test_an_activated_bunch_has_the_mass_of_a_picked_one():
 
 
 def test_a_tree_moves_without_its_dormant_bunch():
-    physics, other = Physics(vineyard(1)), Physics(vineyard(1))
+    physics = Physics(vineyard(1))
+    other = Physics(vineyard(1))
     physics.dormant_bunches.add([0], [""], frames.pose([3.0, 0.0, 0.05])[None])
     other.pick(0)
     physics.plants.wake(0)
@@ -71,7 +74,8 @@ def test_a_tree_moves_without_its_dormant_bunch():
 
 
 def test_a_remote_rest_pose_is_applied_without_waking():
-    physics, other = Physics(vineyard(2)), Physics(vineyard(2))
+    physics = Physics(vineyard(2))
+    other = Physics(vineyard(2))
     other.pick(0)
     for _ in range(200):
         other.step()

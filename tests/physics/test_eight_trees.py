@@ -34,10 +34,12 @@ def model() -> Model:
     tied = np.arange(1, COUNT, 2)
     model = assemble(
         [bush(i) for i in range(COUNT)],
-        tie_body=9 * tied + 3, tie_point=np.full((len(tied), 3), 0.01),
+        tie_body=9 * tied + 3,
+        tie_point=np.full((len(tied), 3), 0.01),
         tie_anchor=np.tile([0.4, 1.0, 2.1], (len(tied), 1)),
-        tie_stiffness=50.0 * tied, tie_damping=np.full(len(tied), 0.5),
-    )  # fmt: skip
+        tie_stiffness=50.0 * tied,
+        tie_damping=np.full(len(tied), 0.5),
+    )
     model.body_drag[8::9] = 0.002 * (np.arange(COUNT) % 3)
     return model
 

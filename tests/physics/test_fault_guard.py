@@ -46,7 +46,8 @@ def test_a_tree_slowed_to_the_largest_rate_is_counted(force: float, slowed: int)
 def test_a_faulty_tree_is_rolled_back_and_the_others_continue(
     bad_value: float, caplog: pytest.LogCaptureFixture
 ) -> None:
-    plants, clean = row(3), row(3)
+    plants = row(3)
+    clean = row(3)
     guard = FaultGuard(plants)
     for each in (plants, clean):
         each.wake(np.arange(3))
@@ -63,7 +64,8 @@ def test_a_faulty_tree_is_rolled_back_and_the_others_continue(
         plants.integrate(np.array([8]), np.array([[bad_value, 0.0, 0.0, 0.0, 0.0, 0.0]]))
         assert guard.stop_faulty_trees().tolist() == [1]
         assert not caplog.records
-    bad, good = plants.model.bodies_of(1), np.delete(np.arange(18), plants.model.bodies_of(1))
+    bad = plants.model.bodies_of(1)
+    good = np.delete(np.arange(18), plants.model.bodies_of(1))
     np.testing.assert_array_equal(plants.state.joint_q[bad], before[bad])
     assert not plants.state.joint_qd[bad].any()
     assert plants.awake.tolist() == [0, 2]
@@ -195,12 +197,18 @@ def random_tree(rng: np.random.Generator) -> TreeBuilder:
         tapered = (radius, rng.uniform(0.2, 1.0) * radius)
         ends += tree.add_rod(int(rng.choice(ends)), length, tapered, wood, int(rng.integers(1, 9)), rest=turn)
     if rng.random() < 0.5:
-        mass, reach = 10 ** rng.uniform(-6.0, 3.0), 10 ** rng.uniform(-3.0, -0.5)
+        mass = 10 ** rng.uniform(-6.0, 3.0)
+        reach = 10 ** rng.uniform(-3.0, -0.5)
         tree.add_body(
-            int(rng.choice(ends[1:])), offset=(0.01, 0, 0), mass=mass, com=(reach, 0, 0), length=reach,
-            inertia=[0.4 * mass * reach**2] * 3, stiffness=[rng.choice([0.0, 10 ** rng.uniform(-4.0, 4.0)])] * 3,
+            int(rng.choice(ends[1:])),
+            offset=(0.01, 0, 0),
+            mass=mass,
+            com=(reach, 0, 0),
+            length=reach,
+            inertia=[0.4 * mass * reach**2] * 3,
+            stiffness=[rng.choice([0.0, 10 ** rng.uniform(-4.0, 4.0)])] * 3,
             damping=[rng.choice([0.0, 10 ** rng.uniform(-6.0, 2.0)])] * 3,
-        )  # fmt: skip
+        )
     for body in tree.bodies:
         scale = np.clip(body["mass"], 1e-6, 1e3) / body["mass"]
         body["mass"] *= scale
@@ -276,7 +284,8 @@ def test_a_vineyard_slows_down_after_any_load() -> None:
     rng = np.random.default_rng(1)
     model = generate(spec.load_scene("demo"))
     plants = ArticulationSolver(model, State.at_rest(model))
-    guard, sleep = FaultGuard(plants), SleepMonitor(plants)
+    guard = FaultGuard(plants)
+    sleep = SleepMonitor(plants)
     all_trees = np.arange(len(model.tree_first))
     size = 10 ** rng.uniform(0.0, 6.0, len(all_trees))[model.body_tree]
     for tick in range(60):

@@ -45,7 +45,8 @@ def slides(file: pathlib.Path, slope: float) -> bool:
     """Whether a crate slides on the tray when that has tilted to ``slope`` = tan(angle)."""
     model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=1)
     model.box_pose[0] = frames.pose([0.0, 0.0, 1.001])
-    model.box_size[:], model.box_mass[:] = (0.4, 0.3, 0.2), 2.0
+    model.box_size[:] = (0.4, 0.3, 0.2)
+    model.box_mass[:] = 2.0
     rigid = RigidWorld(model)
     rigid.add_robot(load_description(file).to_spec("anna"))
     angle = math.atan(slope)
@@ -98,8 +99,10 @@ def test_a_listed_pair_with_the_usual_coefficient_changes_no_bit(monkeypatch: py
     def run() -> list[np.ndarray]:
         model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, tie=0, box=2)
         model.box_pose[:] = frames.pose(np.array([[0.0, 0.0, 0.05], [0.05, 0.0, 0.3]]))
-        model.box_size[:], model.box_mass[:] = (0.4, 0.3, 0.2), 2.0
-        rigid, states = RigidWorld(model), []
+        model.box_size[:] = (0.4, 0.3, 0.2)
+        model.box_mass[:] = 2.0
+        rigid = RigidWorld(model)
+        states = []
         for step in range(150):
             rigid.mj_data.xfrc_applied[1, 0] = 12.0 if step > 100 else 0.0
             rigid.predict()
@@ -218,6 +221,7 @@ def rebound(dt: float, speed: float) -> float:
 @pytest.mark.parametrize("speed", [0.2, 1.0])
 def test_a_contact_gives_back_as_much_whatever_the_step_takes(speed: float) -> None:
     """With 5 and with 10 ms a bar leaves a cane at speeds within 5 %: a contact's damping is a time, not a step."""
-    short, normal = rebound(0.005, speed), rebound(0.01, speed)
+    short = rebound(0.005, speed)
+    normal = rebound(0.01, speed)
     assert -0.75 * speed < normal < -0.5 * speed
     assert short == pytest.approx(normal, rel=0.05)

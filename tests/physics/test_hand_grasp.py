@@ -30,7 +30,8 @@ def human_at_bunch(
 ) -> tuple[Physics, HumanSpec, int, np.ndarray]:
     """A human before a hanging bunch, the right palm 3 cm away; returns also the bunch's body and centre."""
     model, body, middle = bunch_scene(mass)
-    model.bunch_pull[0], model.bunch_bend[0] = pull, 1e3
+    model.bunch_pull[0] = pull
+    model.bunch_bend[0] = 1e3
     physics = Physics(model, parameters=parameters)
     spec = eva(middle[0], middle[1] - 0.6, 0.5 * np.pi)
     at = frames.pose(middle - np.array([0.0, 0.075 + HAND_HALF_THICKNESS, 0.0]), FORWARD)
@@ -99,14 +100,27 @@ def test_a_walking_body_pushes_canes():
 def test_an_added_tie_acts_beside_ties_of_the_model():
     """An added tie of 200 N/m at the tip of a tied cane acts like a tie of the model."""
     tree = cane((0.0, 0.0, 2.0))
-    model = assemble([tree], tie_body=[15], tie_point=np.zeros((1, 3)), tie_anchor=np.zeros((1, 3)),
-                     tie_stiffness=[500.0], tie_damping=[5.0])  # fmt: skip
+    model = assemble(
+        [tree],
+        tie_body=[15],
+        tie_point=np.zeros((1, 3)),
+        tie_anchor=np.zeros((1, 3)),
+        tie_stiffness=[500.0],
+        tie_damping=[5.0],
+    )
     model.tie_anchor[0] = model.forward_kinematics(model.joint_settled)[15, :3]
-    twin = assemble([tree], tie_body=[15, 15], tie_point=[[0.0, 0, 0], [0.05, 0, 0]], tie_anchor=np.zeros((2, 3)),
-                    tie_stiffness=[500.0, 200.0], tie_damping=[5.0, 10.0])  # fmt: skip
+    twin = assemble(
+        [tree],
+        tie_body=[15, 15],
+        tie_point=[[0.0, 0, 0], [0.05, 0, 0]],
+        tie_anchor=np.zeros((2, 3)),
+        tie_stiffness=[500.0, 200.0],
+        tie_damping=[5.0, 10.0],
+    )
     at = model.forward_kinematics(model.joint_settled)[15]
     twin.tie_anchor[:] = model.tie_anchor[0], at[:3] + frames.rotate(at[3:], np.array([0.05, 0.0, 0.0]))
-    held, modelled = ArticulationSolver(model, State.at_rest(model)), ArticulationSolver(twin, State.at_rest(twin))
+    held = ArticulationSolver(model, State.at_rest(model))
+    modelled = ArticulationSolver(twin, State.at_rest(twin))
     tie = held.add_tie(15, np.array([0.05, 0.0, 0.0]), 200.0, 10.0)
     np.testing.assert_allclose(held.tie_anchor[tie], twin.tie_anchor[1], atol=1e-6)
     modelled.tie_anchor[1] = held.tie_anchor[tie]
@@ -241,7 +255,8 @@ def test_a_robot_joins_while_a_hand_holds_a_plant():
 
 def test_a_cane_is_held():
     model = assemble([cane((-0.5, 0.0, 1.1))])
-    physics, spec = Physics(model), eva(0.2, -0.6, 0.5 * np.pi)
+    physics = Physics(model)
+    spec = eva(0.2, -0.6, 0.5 * np.pi)
     spec = dataclasses.replace(spec, pose=put(spec.pose, frames.pose(np.array([0.2, -0.1, 1.1]), FORWARD)))
     physics.add_human(spec)
     near = move(physics, spec, 0.0, 0.09, 0.0, ticks=60, wait=30)
@@ -255,9 +270,11 @@ def test_a_cane_is_held():
 
 def test_two_hands_carry_a_box():
     """F34: 10 kg on two hands, 49 cm each."""
-    model = assemble([cane((0.0, -5.0, 3.0))], box_pose=[[0, 0, 0.002, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.24]],
-                     box_mass=[10.0])  # fmt: skip
-    physics, spec = Physics(model), eva(-0.7, 0.0)
+    model = assemble(
+        [cane((0.0, -5.0, 3.0))], box_pose=[[0, 0, 0.002, 0, 0, 0, 1]], box_size=[[0.6, 0.4, 0.24]], box_mass=[10.0]
+    )
+    physics = Physics(model)
+    spec = eva(-0.7, 0.0)
     physics.add_human(spec)
 
     def hold(inside: float, height: float, *, closed: bool) -> None:
@@ -273,7 +290,8 @@ def test_two_hands_carry_a_box():
         hold(inside, 0.15, closed=False)
     for rise in np.append(np.linspace(0.0, 0.8, 200), np.full(1200, 0.8)):
         hold(0.1, 0.15 + rise, closed=True)
-    left, right = physics.hand("eva", "left"), physics.hand("eva", "right")
+    left = physics.hand("eva", "left")
+    right = physics.hand("eva", "right")
     assert left.held == right.held == ("box/0", "box")
     for hand in (left, right):
         assert hand.controller[2] - hand.pose[2] == pytest.approx(0.4905, rel=0.02)
@@ -283,7 +301,8 @@ def test_two_hands_carry_a_box():
 def test_a_robot_is_moved_by_a_holding_hand():
     """F14: a closing hand grasps the link it touches and moves the robot against its drive."""
     model = assemble([cane((0.0, -5.0, 3.0))])
-    physics, spec = Physics(model), eva(-1.0)
+    physics = Physics(model)
+    spec = eva(-1.0)
     physics.add_robot(probe((0.0, 0.0, 1.1), drives=SOFT))
     physics.add_human(spec)
 
@@ -331,7 +350,8 @@ def test_a_human_that_leaves_releases():
 def test_haptic_pulses_start_at_contact_and_follow_the_force():
     """F33"""
     physics, spec, _, _ = human_at_bunch()
-    feedback, pulses = HapticFeedback(physics, "eva"), []
+    feedback = HapticFeedback(physics, "eva")
+    pulses = []
     for fraction in np.concatenate([np.linspace(0.0, 1.0, 100), np.ones(200)]):
         physics.move_human("eva", with_right_hand(spec, 0.0, 0.15 * fraction, 0.0))
         physics.step()

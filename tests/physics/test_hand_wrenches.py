@@ -98,7 +98,8 @@ def test_a_hand_that_holds_a_link_reports_its_wrench():
 
 
 def test_hands_of_a_remote_human_touch_no_robot_and_hold_nothing():
-    rigid, spec = RigidWorld(yard()), eva(-1.0)
+    rigid = RigidWorld(yard())
+    spec = eva(-1.0)
     rigid.add_robot(arm())
     rigid.add_human(spec, is_remote=True)
     for x in np.linspace(-0.6, 0.0, 100):
@@ -115,7 +116,8 @@ def test_hands_of_a_remote_human_touch_no_robot_and_hold_nothing():
 
 def test_legs_of_a_remote_human_stop_a_base():
     """F27 on the robot's client: contact with legs is computed there, against the remote human."""
-    rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
+    rigid = RigidWorld(yard())
+    spec = eva(1.0, heading=np.pi)
     rigid.add_robot(arm(heading=np.pi))
     rigid.add_human(spec, is_remote=True)
     rigid.command_base("anna", (-0.5, 0.0, 0.0))
@@ -125,7 +127,8 @@ def test_legs_of_a_remote_human_stop_a_base():
 
 @pytest.mark.parametrize("busy", [False, True])
 def test_a_remote_hand_pushes_objects_unless_it_is_busy(busy):
-    rigid, spec = RigidWorld(yard(boxes=1)), eva(0.0, 4.0, heading=np.pi / 2)
+    rigid = RigidWorld(yard(boxes=1))
+    spec = eva(0.0, 4.0, heading=np.pi / 2)
     rigid.add_human(spec, is_remote=True)
     generation = rigid.generation
     for y in np.linspace(4.3, 5.0, 100):
@@ -145,7 +148,9 @@ def test_a_remote_hand_pushes_objects_unless_it_is_busy(busy):
 
 def test_a_local_and_a_remote_hand_push_each_other():
     """F14 between clients: each side has its own hand and the remote controller of the other."""
-    rigid, local, remote = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
+    rigid = RigidWorld(yard())
+    local = eva(-1.0)
+    remote = eva(1.0, name="ida", heading=np.pi)
     rigid.add_human(local)
     rigid.add_human(remote, is_remote=True)
     for x in np.linspace(-0.4, 0.0, 150):

@@ -28,7 +28,8 @@ def sweep(robot: RobotSpec, seconds: float = 0.6) -> tuple[np.ndarray, np.ndarra
     """Tip of a level cane [step, 3] m that the bar is driven against at 0.3 m/s, and in which steps it was touched."""
     physics = Physics(assemble([cane((0.0, 0.0, 1.0), pieces=8)]))
     physics.add_robot(robot)
-    tips, touched = [], []
+    tips = []
+    touched = []
     for step in range(round(seconds / physics.dt)):
         physics.rigid.command(robot.name, np.array([0.3 * step * physics.dt]), np.array([0.3]))
         physics.step()

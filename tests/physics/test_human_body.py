@@ -46,7 +46,8 @@ def put(pose: HumanPose, right: np.ndarray | None = None, **changes) -> HumanPos
 
 def pressing(offset: float, **settings) -> tuple[RigidWorld, HumanSpec]:
     """The palm against the pole, the controller ``offset`` m behind its surface, until all is at rest."""
-    rigid, spec = RigidWorld(yard()), eva(2.2, **settings)
+    rigid = RigidWorld(yard())
+    spec = eva(2.2, **settings)
     rigid.add_human(spec)
     for x in np.linspace(POLE - HAND_HALF_THICKNESS - 0.1, POLE - HAND_HALF_THICKNESS + offset, 100):
         rigid.move_human("eva", put(spec.pose, frames.pose(np.array([x, 0.0, 1.1]), PALM)))
@@ -57,7 +58,8 @@ def pressing(offset: float, **settings) -> tuple[RigidWorld, HumanSpec]:
 
 def contact_force(rigid: RigidWorld, body: str) -> np.ndarray:
     """[3] N of MuJoCo's contacts on one body."""
-    total, wrench = np.zeros(3), np.zeros(6)
+    total = np.zeros(3)
+    wrench = np.zeros(6)
     for i, contact in enumerate(rigid.mj_data.contact):
         mujoco.mj_contactForce(rigid.mj_model, rigid.mj_data, i, wrench)
         names = [rigid.mj_model.body(rigid.mj_model.geom_bodyid[geom]).name for geom in contact.geom]
@@ -80,7 +82,8 @@ def deepest(rigid: RigidWorld, body: str) -> float:
 
 def test_a_free_hand_is_where_its_controller_is():
     """F29: below 1 mm at 1 m/s; on a curve with rotation the hand is at its controller in every tick."""
-    rigid, spec = RigidWorld(yard()), eva()
+    rigid = RigidWorld(yard())
+    spec = eva()
     rigid.add_human(spec)
     for t in 0.01 * np.arange(1, 200):
         at = spec.pose.right[:3] + 0.5 * np.array([np.sin(2 * t), np.cos(2 * t) - 1.0, 0.0])
@@ -99,7 +102,8 @@ def test_a_free_hand_is_where_its_controller_is():
 
 def test_force_is_the_offset_times_100_newtons_per_metre():
     """F28, F31: measured at the pole, not read from the law."""
-    offset, force = [], []
+    offset = []
+    force = []
     for depth in (0.02, 0.05, 0.1, 0.25, 0.5, 0.75, 0.95):
         rigid, _ = pressing(depth)
         hand = rigid.hand_sample("eva", "right")
@@ -131,7 +135,8 @@ def test_stiffness_and_force_limit_can_be_set():
 
 def test_a_hand_stays_outside_when_its_controller_is_inside():
     """F30: 0.3 m inside a robot's chassis, which holds its place."""
-    rigid, spec = RigidWorld(yard()), eva(-1.0)
+    rigid = RigidWorld(yard())
+    spec = eva(-1.0)
     rigid.add_robot(arm())
     rigid.add_human(spec)
     for x in np.linspace(-0.6, 0.0, 100):
@@ -153,7 +158,8 @@ def test_a_hand_stays_outside_when_its_controller_is_inside():
 
 @pytest.mark.parametrize("speed", [1.0, 3.0, 8.0])
 def test_a_fast_hand_does_not_pass_through_a_thin_pole(speed):
-    rigid, spec = RigidWorld(yard()), eva(2.0)
+    rigid = RigidWorld(yard())
+    spec = eva(2.0)
     rigid.add_human(spec)
     for x in np.arange(2.3, 3.6, 0.01 * speed):
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 1.1)))
@@ -168,7 +174,8 @@ def test_a_fast_hand_does_not_pass_through_a_thin_pole(speed):
 
 def soft_arm() -> tuple[RigidWorld, HumanSpec]:
     """A rod of 3 kg on a drive of 400 N/m along x, and a human before it."""
-    rigid, spec = RigidWorld(yard()), eva(-1.0)
+    rigid = RigidWorld(yard())
+    spec = eva(-1.0)
     rigid.add_robot(probe((0.0, 0.0, 1.1), drives=(Drive("along", 400.0, 60.0, 1000.0, 5.0, -5.0, 5.0), PRESS)))
     rigid.add_human(spec)
     return rigid, spec
@@ -211,7 +218,9 @@ def test_a_robot_pushes_a_hand_and_its_effort_is_the_force():
 
 def test_hands_push_hands():
     """F14: both hands are displaced by the same force."""
-    rigid, one, other = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
+    rigid = RigidWorld(yard())
+    one = eva(-1.0)
+    other = eva(1.0, name="ida", heading=np.pi)
     rigid.add_human(one)
     rigid.add_human(other)
     reach = TIP - 0.005
@@ -220,7 +229,8 @@ def test_hands_push_hands():
         rigid.move_human("ida", put(other.pose, (-x + reach, 0.0, 1.1)))
         step(rigid)
     step(rigid, 300)
-    first, second = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")
+    first = rigid.hand_sample("eva", "right")
+    second = rigid.hand_sample("ida", "right")
     assert first.force[0] == pytest.approx(-second.force[0], rel=1e-4)
     assert first.force[0] > 5.0
     assert first.controller[0] - first.pose[0] == pytest.approx(0.01 * first.force[0], rel=0.01)
@@ -228,10 +238,12 @@ def test_hands_push_hands():
 
 def test_a_hand_and_a_box_conserve_momentum():
     """F24: a hand on its spring hits a floating box: the impulse is the box's momentum, to 1e-4."""
-    rigid, spec = RigidWorld(yard(boxes=1)), eva(0.0, 4.2, heading=np.pi / 2)
+    rigid = RigidWorld(yard(boxes=1))
+    spec = eva(0.0, 4.2, heading=np.pi / 2)
     rigid.add_human(spec)
     rigid.mj_model.body_gravcomp[rigid.mj_model.body("box/0").id] = 1.0
-    body, joint = rigid.mj_data.body("box/0"), rigid.mj_data.joint("box/0")
+    body = rigid.mj_data.body("box/0")
+    joint = rigid.mj_data.joint("box/0")
     joint.qpos[2] = 1.0
     impulse = 0.0
     for y in np.linspace(4.4, 4.75, 60):
@@ -272,7 +284,8 @@ def test_knees_bend_forward_and_limbs_keep_their_lengths():
 
 def test_nothing_moves_head_trunk_or_legs():
     """F25, F26: one arm pushes the head, one the left shin, and MuJoCo's bodies stay at the posture."""
-    rigid, spec = RigidWorld(yard()), eva(0.5, heading=np.pi)
+    rigid = RigidWorld(yard())
+    spec = eva(0.5, heading=np.pi)
     head = frames.pose(np.array([0.5, 0.0, 1.6]), frames.exp(np.array([0.1, 0.2, 3.0])))
     pose = dataclasses.replace(spec.pose, head=head)
     drives = (Drive("along", 2000.0, 100.0, 150.0, 5.0, -5.0, 5.0), PRESS)
@@ -281,8 +294,11 @@ def test_nothing_moves_head_trunk_or_legs():
     rigid.add_human(spec)
     rigid.move_human("eva", pose)
     expected = body_posture(spec.height, pose)
-    human, d = rigid.human("eva"), rigid.mj_data
-    own_measure, drift, peak_force = human.measure, 0.0, {"head": 0.0, "left_shank": 0.0}
+    human = rigid.human("eva")
+    d = rigid.mj_data
+    own_measure = human.measure
+    drift = 0.0
+    peak_force = {"head": 0.0, "left_shank": 0.0}
 
     def measure(data: mujoco.MjData) -> None:  # first the poses after MuJoCo's step
         nonlocal drift
@@ -299,7 +315,8 @@ def test_nothing_moves_head_trunk_or_legs():
         for part in peak_force:
             peak_force[part] = max(peak_force[part], float(np.linalg.norm(contact_force(rigid, f"eva/{part}"))))
         rigid.update_kinematics()
-        place, turn = d.xpos[human.part_bodies], frames.from_wxyz(d.xquat[human.part_bodies])
+        place = d.xpos[human.part_bodies]
+        turn = frames.from_wxyz(d.xquat[human.part_bodies])
         np.testing.assert_allclose(place, expected[:, :3], atol=1e-9)
         np.testing.assert_allclose(np.abs((turn * expected[:, 3:]).sum(1)), 1.0, atol=1e-9)
     np.testing.assert_array_equal(expected[BODY_PARTS.index("head")], head)
@@ -312,7 +329,8 @@ def test_nothing_moves_head_trunk_or_legs():
 
 def test_a_base_stops_at_legs():
     """F27: 800 N of tracks against legs: no motion, and at most 2 mm penetration after the first contact."""
-    rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
+    rigid = RigidWorld(yard())
+    spec = eva(1.0, heading=np.pi)
     rigid.add_robot(arm(heading=np.pi))
     rigid.add_human(spec)
     rigid.command_base("anna", (-0.5, 0.0, 0.0))
@@ -330,7 +348,8 @@ def test_a_base_stops_at_legs():
 
 @pytest.mark.parametrize("speed", [0.5, 1.4])
 def test_walking_legs_push_a_sleeping_box(speed):
-    rigid, spec = RigidWorld(crate_yard(1.6)), eva(-1.0, 5.0)
+    rigid = RigidWorld(crate_yard(1.6))
+    spec = eva(-1.0, 5.0)
     rigid.add_human(spec)
     step(rigid, 200)
     assert rigid.mj_data.body_awake[rigid.mj_model.body("box/0").id] == 0
@@ -347,7 +366,8 @@ def test_walking_legs_push_a_sleeping_box(speed):
 
 def test_a_teleported_human_pushes_nothing_on_the_way():
     """A user may teleport: no velocity results, and the hands are at the new place at once."""
-    rigid, spec = RigidWorld(yard(boxes=1)), eva(-1.0, 5.0)
+    rigid = RigidWorld(yard(boxes=1))
+    spec = eva(-1.0, 5.0)
     rigid.add_human(spec)
     step(rigid, 100)
     elsewhere = standing_pose(frames.pose(np.array([3.5, 0.0, 0.0])))  # behind the pole, beyond the box
@@ -388,7 +408,9 @@ def test_arms_reach_from_shoulders_to_wrists(posture: str):
     )
     _, at = link_poses(pose)
     for side, sign in (("left", 1.0), ("right", -1.0)):
-        upper, fore, hand = at[f"{side}_upper_arm"], at[f"{side}_forearm"], at[f"{side}_hand"]
+        upper = at[f"{side}_upper_arm"]
+        fore = at[f"{side}_forearm"]
+        hand = at[f"{side}_hand"]
         reach = upper[:3] + frames.rotate(upper[3:], np.array([human_model.limbs.upper_arm, 0, 0]))
         assert reach == pytest.approx(fore[:3], abs=1e-9)
         wrist = hand[:3] + frames.rotate(hand[3:], np.array(human_model.limbs.wrist) * [1, sign, 1])
@@ -403,7 +425,8 @@ def test_an_arm_that_is_too_short_points_to_its_hand():
     pose = standing_pose(frames.pose(np.zeros(3)))
     reaching = dataclasses.replace(pose, left=frames.pose(np.array([3.0, 0.2, 1.2])))
     _, at = link_poses(reaching)
-    upper, fore = at["left_upper_arm"], at["left_forearm"]
+    upper = at["left_upper_arm"]
+    fore = at["left_forearm"]
     assert frames.rotate(upper[3:], np.array([1.0, 0, 0])) == pytest.approx(
         frames.rotate(fore[3:], np.array([1.0, 0, 0])), abs=0.01
     )
@@ -475,7 +498,8 @@ def crate_yard(mass: float) -> Model:
 
 def lift_box(mass: float, height: float, stiffness: float = 100.0) -> tuple[RigidWorld, HumanSpec]:
     """A hand grasps a box at the centre of its bottom and rises by ``height`` [m], until all is at rest."""
-    rigid, spec = RigidWorld(crate_yard(mass)), eva(-0.7, 5.0, stiffness=stiffness, force=stiffness)
+    rigid = RigidWorld(crate_yard(mass))
+    spec = eva(-0.7, 5.0, stiffness=stiffness, force=stiffness)
     rigid.add_human(spec)
     step(rigid, 50)
     rigid.move_human("eva", put(spec.pose, (0.0, 5.0, 0.5)))
@@ -509,7 +533,8 @@ def test_a_box_slides_above_mu_m_g():
     """F34: 1.5 kg on the ground: 11.8 N."""
     threshold = PhysicsParameters().friction * 1.5 * 9.81 / 100.0
     for fraction, moves in ((0.9, False), (1.1, True)):
-        rigid, spec = RigidWorld(crate_yard(1.5)), eva(-1.0, 5.0)
+        rigid = RigidWorld(crate_yard(1.5))
+        spec = eva(-1.0, 5.0)
         rigid.add_human(spec)
         step(rigid, 50)
         edge = -0.3 - TIP
@@ -541,7 +566,8 @@ def test_a_robot_link_is_grasped_and_released():
         rigid.move_human("eva", put(spec.pose, (x, 0.0, 1.1)))
         step(rigid)
     step(rigid, 300)
-    hand, (position, _, effort, _) = rigid.hand_sample("eva", "right"), rigid.joint_measurements("probe")
+    hand = rigid.hand_sample("eva", "right")
+    (position, _, effort, _) = rigid.joint_measurements("probe")
     assert position[0] < -0.05
     assert hand.pose[0] - position[0] == pytest.approx(before, abs=1e-3)
     assert hand.force[0] == pytest.approx(400.0 * position[0], rel=1e-2)
@@ -557,7 +583,9 @@ def test_a_robot_link_is_grasped_and_released():
 
 
 def test_a_hand_holds_a_hand():
-    rigid, one, other = RigidWorld(yard()), eva(-1.0), eva(1.0, name="ida", heading=np.pi)
+    rigid = RigidWorld(yard())
+    one = eva(-1.0)
+    other = eva(1.0, name="ida", heading=np.pi)
     rigid.add_human(one)
     rigid.add_human(other)
     rigid.move_human("eva", put(one.pose, (0.0, 0.0, 1.1)))
@@ -569,7 +597,8 @@ def test_a_hand_holds_a_hand():
         rigid.move_human("ida", put(other.pose, (x, 0.0, 1.1 + 3 * HAND_HALF_THICKNESS)))
         step(rigid)
     step(rigid, 300)
-    first, second = rigid.hand_sample("eva", "right"), rigid.hand_sample("ida", "right")
+    first = rigid.hand_sample("eva", "right")
+    second = rigid.hand_sample("ida", "right")
     assert first.pose[0] - first.controller[0] == pytest.approx(0.2, abs=0.01)
     assert second.controller[0] - second.pose[0] == pytest.approx(0.2, abs=0.01)
 
@@ -617,7 +646,8 @@ def test_two_runs_are_bitwise_equal():
 
 
 def test_errors_are_one_line():
-    rigid, spec = RigidWorld(yard()), eva()
+    rigid = RigidWorld(yard())
+    spec = eva()
     rigid.add_human(spec)
     with pytest.raises(HumanError, match="human 'eva' is already here"):
         rigid.add_human(spec)
@@ -653,6 +683,7 @@ def test_more_than_twenty_five_actors_touch_each_other_and_never_themselves():
 def test_codes_of_actors_tell_each_from_all_others():
     codes = (*static_world.ROBOT_CODES, *static_world.HUMAN_CODES)
     assert len(set(codes)) == len(codes) >= 64
-    a, b = np.array(codes)[:, None], np.array(codes)[None, :]
+    a = np.array(codes)[:, None]
+    b = np.array(codes)[None, :]
     touches = (a & ~b & static_world.ALL_BITS) != 0
     assert (touches == ~np.eye(len(codes), dtype=bool)).all()

@@ -25,7 +25,7 @@ def loaded_canes(rows: int = 1) -> Model:
         cane = tree.add_rod(-1, 1.0, (0.006, 0.005), RodMaterial(5e9, 900.0, 0.01), 10)
         stalk = tree.add_rod(
             cane[7], 0.07, (0.0022, 0.0022), RodMaterial(3e8, 1000.0, 0.05), 2, organ=Organ.PEDUNCLE, rest=DOWN
-        )  # fmt: skip
+        )
         tree.add_bunch(stalk[-1], 0.6, count=100, seed=4 + row, pull=1e4, bend=1e4)
         tree.solve_rest_pose()
         trees.append(tree)
@@ -61,7 +61,8 @@ def push(physics: Physics, at: np.ndarray, depth: float = 0.05, hold_ticks: int 
 
 def momentum(physics: Physics, bodies: np.ndarray) -> np.ndarray:
     """Linear momentum [3] of bodies from forward kinematics, kg m/s."""
-    plants, state = physics.plants, physics.state
+    plants = physics.plants
+    state = physics.state
     com = frames.rotate(state.body_q[bodies, 3:].astype(float), plants.body_com[bodies].astype(float))
     velocity = state.body_qd[bodies, :3] + np.cross(state.body_qd[bodies, 3:].astype(float), com)
     return (plants.body_mass[bodies, None] * velocity).sum(0)
@@ -79,12 +80,15 @@ def test_switches_of_detail_keep_pose_and_momentum():
     """
     model = loaded_canes()
     physics = Physics(model)
-    detail, switches = physics.level_of_detail, []
-    refine, coarsen = physics.plants.refine, physics.plants.coarsen
+    detail = physics.level_of_detail
+    switches = []
+    refine = physics.plants.refine
+    coarsen = physics.plants.coarsen
 
     def checked(change, trees):
         physics.plants.forward_kinematics(np.array([0]))
-        pose, before = physics.state.body_q.copy(), momentum(physics, moving(physics))
+        pose = physics.state.body_q.copy()
+        before = momentum(physics, moving(physics))
         change(trees)
         physics.plants.forward_kinematics(np.array([0]))
         assert np.array_equal(pose, physics.state.body_q)
@@ -99,9 +103,11 @@ def test_switches_of_detail_keep_pose_and_momentum():
             first_touch = tick
         if first_touch is not None and left_at is None and not len(physics.contact_solver.near_trees):
             left_at = tick
-        turn = frames.log(frames.multiply(
-            frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]
-        ))  # fmt: skip
+        turn = frames.log(
+            frames.multiply(
+                frames.conjugate(model.joint_settled[clusters(model)]), physics.state.joint_q[clusters(model)]
+            )
+        )
         physics.plants.forward_kinematics(np.array([0]))
         largest = max(largest, float(np.linalg.norm(momentum(physics, moving(physics)))))
         max_bend = max(max_bend, float(np.linalg.norm(turn, axis=1).max()))
@@ -127,7 +133,8 @@ def test_the_level_of_detail_does_not_change_the_branch():
             physics.set_detail_focus(bunch_centre(model)[None], 0.3)
         physics.plants.wake(0)
         physics.state.joint_qd[0] = 0.0, 0.05, 0.05
-        at, fine = [], 0
+        at = []
+        fine = 0
         for tick in range(400):
             if tick == 100:
                 physics.set_detail_focus(np.zeros((0, 3)), 0.0)
@@ -175,7 +182,8 @@ def test_berries_keep_their_identity():
     model = loaded_canes()
     physics = Physics(model)
     primitives = Primitives(model, grass=0.0)
-    labels, kinds = primitives.label.copy(), primitives.shapes.kind.numpy().copy()
+    labels = primitives.label.copy()
+    kinds = primitives.shapes.kind.numpy().copy()
     radii = primitives.shapes.a.numpy()[kinds == 1, 3].copy()
     start = primitives.shapes.a.numpy()[kinds == 1, :3].copy()
     for tick in push(physics, bunch_centre(model)):

@@ -23,7 +23,8 @@ from vinesim.scene.physics_parameters import ParameterError, PhysicsParameters
 from vinesim.scene.state import State
 from vinesim.world import Physics
 
-NAN, INF = float("nan"), float("inf")
+NAN = float("nan")
+INF = float("inf")
 
 
 def one_cane() -> Model:

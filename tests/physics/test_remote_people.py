@@ -36,7 +36,8 @@ def test_a_person_of_another_client_pushes_a_braked_robot_with_a_bounded_force(p
     peak was 10,900 N at 1.5 m/s.
     """
     speed, peak = push
-    rigid, spec = RigidWorld(yard()), eva(-1.0)
+    rigid = RigidWorld(yard())
+    spec = eva(-1.0)
     urdf = ARM.replace('<mass value="60"/>', f'<mass value="{chassis_mass}"/>')
     assert urdf != ARM
     rigid.add_robot(dataclasses.replace(arm(x=0.3), urdf=urdf))
@@ -55,7 +56,8 @@ def test_a_person_of_another_client_pushes_a_braked_robot_with_a_bounded_force(p
 
 
 def test_a_person_of_another_client_who_stands_in_a_robot_does_not_push_it_away():
-    rigid, spec = RigidWorld(yard()), eva(0.1)
+    rigid = RigidWorld(yard())
+    spec = eva(0.1)
     rigid.add_human(spec, is_remote=True)
     rigid.add_robot(arm())
     force = []
@@ -69,7 +71,8 @@ def test_a_person_of_another_client_who_stands_in_a_robot_does_not_push_it_away(
 
 def test_a_person_of_another_client_who_stood_before_a_robot_pushes_it_with_no_more():
     """The legs that stopped the robot begin to walk against it at 1 m/s."""
-    rigid, spec = RigidWorld(yard()), eva(1.0, heading=np.pi)
+    rigid = RigidWorld(yard())
+    spec = eva(1.0, heading=np.pi)
     rigid.add_robot(arm())
     rigid.add_human(spec, is_remote=True)
     rigid.command_base("anna", (0.5, 0.0, 0.0))
@@ -89,7 +92,8 @@ def test_a_person_of_another_client_who_stood_before_a_robot_pushes_it_with_no_m
 
 
 def test_legs_of_a_person_of_another_client_still_push_a_box():
-    rigid, spec = RigidWorld(crate_yard(1.6)), eva(-1.0, 5.0)
+    rigid = RigidWorld(crate_yard(1.6))
+    spec = eva(-1.0, 5.0)
     rigid.add_human(spec, is_remote=True)
     step(rigid, 200)
     before = rigid.mj_data.body("box/0").xpos[0]
@@ -102,14 +106,16 @@ def test_legs_of_a_person_of_another_client_still_push_a_box():
 def test_people_are_awake_and_feel_what_falls_on_them_after_others_have_joined():
     """What MuJoCo has put to sleep keeps an old mass matrix: a part that had become heavy meanwhile was thrown up with
     the force that carries its new weight, and a bunch that fell on a foot flew off at 1,500 m/s."""
-    rigid, spec = RigidWorld(crate_yard(0.4)), eva(-1.0, 5.0)
+    rigid = RigidWorld(crate_yard(0.4))
+    spec = eva(-1.0, 5.0)
     rigid.add_human(spec, is_remote=True)
     for x in np.linspace(0.0, 0.5, 50):
         rigid.move_human("eva", moved(spec, x))
         step(rigid)
     rigid.add_robot(arm())
     step(rigid, 100)
-    m, d = rigid.mj_model, rigid.mj_data
+    m = rigid.mj_model
+    d = rigid.mj_data
     assert not [name for name in asleep(rigid) if name.startswith("eva/")]
     d.joint("box/0").qpos[:3] = d.body("eva/head").xpos + np.array([0.0, 0.0, 0.5])
     wake_body(m, d, m.body("box/0").id)

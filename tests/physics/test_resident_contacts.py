@@ -33,8 +33,11 @@ def canes(count: int, **others: np.ndarray) -> Model:
         if i == 0:
             tree.add_rod(bodies[3], 0.3, (0.003, 0.003), wood, 3, rest=frames.from_x_axis(np.array([0.8, 0.0, -0.6])))
         trees.append(tree)
-    bars = {"fixed_start": BARS, "fixed_end": BARS * np.array([1, -1, 1], np.float32),
-            "fixed_radius": np.full((len(BARS), 2), 0.012, np.float32)}  # fmt: skip
+    bars = {
+        "fixed_start": BARS,
+        "fixed_end": BARS * np.array([1, -1, 1], np.float32),
+        "fixed_radius": np.full((len(BARS), 2), 0.012, np.float32),
+    }
     return assemble(trees, **(bars | others))
 
 
@@ -60,7 +63,9 @@ def assert_as_in_a_scene(model: Model, interleave: int) -> set[str]:
     scene.wake(np.arange(3))
     plants, contacts = resident(model, interleave)
     plants.upload()
-    most, sweeps, pressed = 0, [], set()
+    most = 0
+    sweeps = []
+    pressed = set()
     for _ in range(4):
         for _ in range(15):
             scene.step()
@@ -112,9 +117,13 @@ def test_trees_press_on_a_geom_that_is_not_round_as_in_a_scene(
         if name == "wedge":
             spec.add_mesh(name=name, uservert=np.array(WEDGE, float).ravel().tolist())
         spec.worldbody.add_geom(
-            name=name, pos=[0.45, 0.0, 1.96], contype=static_world.FIXED, conaffinity=0,
-            userdata=static_world.geom_user(Material.BARK), **ANGULAR_GEOMS[name],
-        )  # fmt: skip
+            name=name,
+            pos=[0.45, 0.0, 1.96],
+            contype=static_world.FIXED,
+            conaffinity=0,
+            userdata=static_world.geom_user(Material.BARK),
+            **ANGULAR_GEOMS[name],
+        )
         return spec
 
     monkeypatch.setattr(static_world, "build_static_world", build_with_angular_geom)
@@ -124,8 +133,11 @@ def test_trees_press_on_a_geom_that_is_not_round_as_in_a_scene(
 def test_contacts_beyond_the_slots_are_counted() -> None:
     low = BARS - np.array([0, 0, 0.06], np.float32)  # a third and a fourth one right below
     start = np.concatenate([BARS, low])
-    bars = {"fixed_start": start, "fixed_end": start * np.array([1, -1, 1], np.float32),
-            "fixed_radius": np.full((len(start), 2), 0.028, np.float32)}  # fmt: skip
+    bars = {
+        "fixed_start": start,
+        "fixed_end": start * np.array([1, -1, 1], np.float32),
+        "fixed_radius": np.full((len(start), 2), 0.028, np.float32),
+    }
     plants, contacts = resident(canes(2, **bars), slots=1)
     plants.advance(100, contacts.solve)
     assert contacts.count.max() == 1
@@ -138,8 +150,11 @@ def test_what_cannot_stay_on_the_device_is_refused() -> None:
     asleep = ArticulationSolver(model, State.at_rest(model), PARAMETERS)
     with pytest.raises(ValueError, match="sleep"):
         ResidentContacts(asleep, PARAMETERS)
-    crate = {"box_pose": frames.pose(np.array([5.0, 0.0, 0.5]))[None].astype(np.float32),
-             "box_size": np.array([[0.6, 0.4, 0.3]], np.float32), "box_mass": np.ones(1, np.float32)}  # fmt: skip
+    crate = {
+        "box_pose": frames.pose(np.array([5.0, 0.0, 0.5]))[None].astype(np.float32),
+        "box_size": np.array([[0.6, 0.4, 0.3]], np.float32),
+        "box_mass": np.ones(1, np.float32),
+    }
     with pytest.raises(ValueError, match="crates"):
         resident(canes(1, **crate))
     plants, _ = resident(model)

@@ -34,7 +34,8 @@ def states(physics: Physics) -> list[bytes]:
 
 def test_rows_that_are_cleared_where_they_were_written_are_rows_of_zeros(monkeypatch: pytest.MonkeyPatch) -> None:
     """To the bit as with arrays that are cleared as a whole before every solve."""
-    solve, used = ImpulseSolver.solve, set()
+    solve = ImpulseSolver.solve
+    used = set()
 
     def solve_with_clear_rows(solver: ImpulseSolver, count: int) -> None:
         solver.rows.rigid_jacobian[:] = solver.rows.rigid_response[:] = 0.0

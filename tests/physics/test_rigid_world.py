@@ -64,12 +64,14 @@ def arm(name: str = "anna", index: int = 0, x: float = 0.0, y: float = 0.0, head
 
 def yard(boxes: int = 0, **counts: int) -> Model:
     model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=2, tie=0, box=boxes)
-    model.fixed_start[:], model.fixed_end[:] = [[3, 0, 0], [3, 2, 0]], [[3, 0, 2], [3, 2, 2]]
+    model.fixed_start[:] = [[3, 0, 0], [3, 2, 0]]
+    model.fixed_end[:] = [[3, 0, 2], [3, 2, 2]]
     model.fixed_radius[:] = 0.05
     model.fixed_organ[:] = Organ.POLE, Organ.WIRE
     for i in range(boxes):
         model.box_pose[i, :3] = 0.0, 5.0 + i, 0.002
-    model.box_size[:], model.box_mass[:] = (0.6, 0.4, 0.3), 2.0
+    model.box_size[:] = (0.6, 0.4, 0.3)
+    model.box_mass[:] = 2.0
     return model
 
 
@@ -138,8 +140,9 @@ def test_response_includes_the_stiffness_of_an_active_limit():
 
 def test_response_of_a_crate_that_slides_on_the_ground_is_that_of_its_friction_cones():
     """The prediction with a small force, less that without, is the response times the force: to 1 % of it."""
-    rigid = RigidWorld(assemble([cane((0.0, 9.0, 2.0))], box_pose=[frames.pose([0, 0, 0])], box_size=[(0.6, 0.4, 0.3)],
-                                box_mass=[2.0]))  # fmt: skip
+    rigid = RigidWorld(
+        assemble([cane((0.0, 9.0, 2.0))], box_pose=[frames.pose([0, 0, 0])], box_size=[(0.6, 0.4, 0.3)], box_mass=[2.0])
+    )
     rigid.mj_data.joint("box/0").qvel[:2] = 1.0, 0.3
     step(rigid, 3)
     rigid.predict()
@@ -147,7 +150,8 @@ def test_response_of_a_crate_that_slides_on_the_ground_is_that_of_its_friction_c
     first = int(rigid.mj_model.joint("box/0").dofadr[0])
     forces = 1e-3 * np.eye(rigid.mj_model.nv)[first : first + 6]
     response = rigid.impulse_response(forces).T * rigid.dt
-    without, rates = rigid.velocity_free, []
+    without = rigid.velocity_free
+    rates = []
     for force in forces:
         rigid.predict_with(force)
         rates.append(rigid.velocity_free - without)
@@ -311,7 +315,8 @@ def test_a_copy_follows_the_received_pose_and_velocity():
         base_q[1] += 2.0
         rigid.follow_remote("copy", base_q, base_qd, position, velocity)
         step(rigid)
-    (actual, _), (copy, _) = rigid.base_state("anna"), rigid.base_state("copy")
+    (actual, _) = rigid.base_state("anna")
+    (copy, _) = rigid.base_state("copy")
     np.testing.assert_allclose(copy[:2] - actual[:2], [0.0, 2.0], atol=5e-3)
     np.testing.assert_allclose(rigid.joint_measurements("copy")[0], rigid.joint_measurements("anna")[0], atol=1e-2)
 
@@ -333,7 +338,8 @@ def test_visuals_move_with_their_bodies():
     rigid = RigidWorld(yard(boxes=1))
     rigid.add_robot(arm("anna", 7, x=1.0, heading=0.5))
     step(rigid, 30)
-    links, poses = rigid.visuals(), rigid.visual_q()
+    links = rigid.visuals()
+    poses = rigid.visual_q()
     assert links is rigid.visuals()
     assert [link.name for link in links] == ["box/0", "anna/chassis", "anna/upper", "anna/lower", "anna/slider"]
     assert links[0].organ == Organ.BOX
@@ -395,7 +401,8 @@ def test_a_mimicking_finger_follows_the_driven_one():
 
 def test_a_mesh_collides_as_its_hull(tmp_path):
     """An STL of a brick, off its link's origin: contacts use its hull, sensors get the file."""
-    low, high = np.array([0.1, -0.05, 0.2]), np.array([0.16, 0.07, 0.5])
+    low = np.array([0.1, -0.05, 0.2])
+    high = np.array([0.16, 0.07, 0.5])
     corner = [np.where([i & 1, i & 2, i & 4], high, low) for i in range(8)]
     quads = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     triangles = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
@@ -454,7 +461,10 @@ def test_boxes_at_rest_sleep_until_they_are_pushed():
     assert rigid.mj_data.ncon == 0
     assert (rigid.velocity_free[:18] == 0.0).all()
     push = no_force.copy()
-    dof, steps, dt, mu = rigid.mj_model.joint("box/1").dofadr[0], 60, rigid.dt, rigid.parameters.friction
+    dof = rigid.mj_model.joint("box/1").dofadr[0]
+    steps = 60
+    dt = rigid.dt
+    mu = rigid.parameters.friction
     push[dof] = 30.0  # mu m g is 15.7 N
     impulse = np.zeros(3)  # of the ground on the box
     for _ in range(steps):
@@ -475,7 +485,8 @@ def test_boxes_at_rest_sleep_until_they_are_pushed():
 @pytest.mark.parametrize("rate", [np.nan, 1e6, -1e6])
 def test_a_faulty_robot_stops_and_the_others_continue(rate: float):
     """One of its joint rates is not finite, or beyond what any body reaches in a stable simulation [rad/s]."""
-    rigid, undisturbed = RigidWorld(yard()), RigidWorld(yard())
+    rigid = RigidWorld(yard())
+    undisturbed = RigidWorld(yard())
     for world in (rigid, undisturbed):
         world.add_robot(arm())
         world.add_robot(arm("bert", 1, y=3.0))
@@ -503,7 +514,8 @@ def free_bunch_of(shapes: int, mass: float = 0.6) -> free_bunch.FreeBunch:
     end = start.copy()
     end[-1, 0] += 0.03
     inertia = np.array([6e-4, 1.5e-3, 1.4e-3])
-    radius, product = 0.04 - 0.001 * np.arange(shapes), np.array([1e-5, -3e-5, 4e-5])
+    radius = 0.04 - 0.001 * np.arange(shapes)
+    product = np.array([1e-5, -3e-5, 4e-5])
     return free_bunch.FreeBunch(mass, np.array([0.07, 2e-3, 0.0]), inertia, product, start, end, radius)
 
 
@@ -516,15 +528,20 @@ def test_a_pooled_body_equals_a_compiled_one(shapes):
     rigid.add_bunch(3, bunch, frames.pose(np.array([0.0, 0.0, 1.0])), np.zeros(6))
     spec = static_world.build_static_world(model, rigid.parameters)
     free_bunch.add_free_bunch(spec, bunch, rigid.parameters)
-    pooled, compiled = rigid.mj_model, spec.compile()
-    a, b = pooled.body("free_bunch/0").id, compiled.nbody - 1
+    pooled = rigid.mj_model
+    compiled = spec.compile()
+    a = pooled.body("free_bunch/0").id
+    b = compiled.nbody - 1
     for name in free_bunch.BODY_ARRAYS:
         np.testing.assert_allclose(getattr(pooled, name)[a], getattr(compiled, name)[b], rtol=1e-12, err_msg=name)
-    at, there = pooled.body_geomadr[a], compiled.body_geomadr[b]
+    at = pooled.body_geomadr[a]
+    there = compiled.body_geomadr[b]
     for name in free_bunch.GEOM_ARRAYS:
-        actual, other = getattr(pooled, name)[at : at + shapes], getattr(compiled, name)[there : there + shapes]
+        actual = getattr(pooled, name)[at : at + shapes]
+        other = getattr(compiled, name)[there : there + shapes]
         np.testing.assert_allclose(actual, other, rtol=1e-12, err_msg=name)
-    actual, other = slice(pooled.body_dofadr[a], pooled.body_dofadr[a] + 6), slice(compiled.nv - 6, compiled.nv)
+    actual = slice(pooled.body_dofadr[a], pooled.body_dofadr[a] + 6)
+    other = slice(compiled.nv - 6, compiled.nv)
     for name in ("dof_M0", "dof_invweight0", "dof_length", "dof_simplenum"):
         np.testing.assert_allclose(
             getattr(pooled, name)[actual], getattr(compiled, name)[other], rtol=1e-12, err_msg=name
@@ -533,7 +550,8 @@ def test_a_pooled_body_equals_a_compiled_one(shapes):
     other = slice(compiled.body_bvhadr[b], compiled.body_bvhadr[b] + compiled.body_bvhnum[b])
     np.testing.assert_allclose(pooled.bvh_aabb[actual], compiled.bvh_aabb[other], rtol=1e-12)
     assert (pooled.bvh_child[actual] == compiled.bvh_child[other]).all()
-    nodes, compiled_nodes = pooled.bvh_nodeid[actual], compiled.bvh_nodeid[other]
+    nodes = pooled.bvh_nodeid[actual]
+    compiled_nodes = compiled.bvh_nodeid[other]
     assert (np.where(nodes < 0, -1, nodes - at) == np.where(compiled_nodes < 0, -1, compiled_nodes - there)).all()
 
 

@@ -15,7 +15,8 @@ from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 
 BOX = '<collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision>'
-TORSO_FACE, ARM_HALF = 0.2, 0.05
+TORSO_FACE = 0.2
+ARM_HALF = 0.05
 
 
 def _link(name: str, shape: str) -> str:
@@ -136,7 +137,8 @@ def test_an_arm_of_the_vinebot_does_not_pass_through_its_torso() -> None:
     inside[arm[2:4]] = -1.5, 2.3
     yard.robot.command_position(inside)
     yard.run(3.0)
-    m, d = yard.rigid.mj_model, yard.rigid.mj_data
+    m = yard.rigid.mj_model
+    d = yard.rigid.mj_data
     touching = {m.body(m.geom_bodyid[geom]).name for geom in d.contact.geom.ravel()}
     assert any("torso" in name for name in touching), touching
     assert d.contact.dist.min() > -2e-3

@@ -176,7 +176,8 @@ def test_copies_of_the_arrays_for_a_gpu_measure_the_same() -> None:
 @pytest.mark.parametrize(("length", "falls"), [(0.97, False), (1.03, True)])
 def test_what_stands_where_it_cannot_stay_does_not_sleep(length: float, falls: bool) -> None:
     """A column a little shorter and longer than Greenhill's (1881): L^3 = 7.8373 E I / (rho A g)."""
-    material, radius = RodMaterial(1e9, 1000.0, 0.3), 0.002
+    material = RodMaterial(1e9, 1000.0, 0.3)
+    radius = 0.002
     critical = (7.8373 * 1e9 * 0.25 * radius**2 / (1000.0 * 9.81)) ** (1.0 / 3.0)
     tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 0.1]), frames.from_x_axis(np.array([0.0, 0.0, 1.0]))))
     tree.add_rod(-1, length * critical, (radius, radius), material, 24)

@@ -137,9 +137,12 @@ def test_an_object_rests_after_half_a_second_or_at_once_by_a_record():
 
 def test_a_remote_object_is_blended_and_a_distant_one_placed():
     physics = Physics(vineyard())
-    tracker, start = physics.support_tracker, physics.support_tracker.object_state(BOX(0))[0]
-    offset, speed = np.array([0.1, 0.0, 0.2, 0, 0, 0, 0]), np.array([0.3, 0, 0, 0, 0, 0.1])
-    goal, far = start + offset, start + 20.0 * offset
+    tracker = physics.support_tracker
+    start = physics.support_tracker.object_state(BOX(0))[0]
+    offset = np.array([0.1, 0.0, 0.2, 0, 0, 0, 0])
+    speed = np.array([0.3, 0, 0, 0, 0, 0.1])
+    goal = start + offset
+    far = start + 20.0 * offset
     tracker.blend_towards([BOX(0)], goal[None], speed[None], np.array([0.2]))
     pose, velocity = tracker.object_state(BOX(0))
     np.testing.assert_allclose(pose[:3], start[:3] + 0.2 * (goal - start)[:3], atol=1e-12)

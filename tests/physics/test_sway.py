@@ -42,7 +42,8 @@ def simulated(model: Model, wind: Wind, steps: int, every: int = 1) -> np.ndarra
 
 def drawn(model: Model, wind: Wind, times: np.ndarray) -> np.ndarray:
     """Positions [n, body, 3] of the same trees asleep, as they are drawn."""
-    view, eyes = windblown(model, Physics(model).snapshot(), wind, 0.0), Sway(model)
+    view = windblown(model, Physics(model).snapshot(), wind, 0.0)
+    eyes = Sway(model)
     view = dataclasses.replace(view, body_q=State.at_rest(model).body_q)
     assert view.wind is not None
     at = [dataclasses.replace(view, wind=dataclasses.replace(view.wind, time=time)) for time in times]
@@ -91,7 +92,8 @@ def test_trees_upwind_shelter_those_behind_them() -> None:
 def test_steady_deflection_is_that_of_the_simulated_tree(speed: float) -> None:
     """Canes of three stiffnesses, up to a deflection of half their length."""
     for modulus in (3e8, 1e9, 3e9):
-        model, wind = leafy(2, modulus=modulus, damping=0.3), Wind([0.6 * speed, 0.8 * speed, 0.0])
+        model = leafy(2, modulus=modulus, damping=0.3)
+        wind = Wind([0.6 * speed, 0.8 * speed, 0.0])
         there = simulated(model, wind, 500)[-1] - rest(model)
         seen = drawn(model, wind, np.array([0.0]))[0] - rest(model)
         tip = tips(model, np.linalg.norm(there, axis=1))
@@ -101,17 +103,20 @@ def test_steady_deflection_is_that_of_the_simulated_tree(speed: float) -> None:
 
 def test_steady_deflection_in_a_vineyard() -> None:
     """All shoots of the demo with their leaves, bunches and ties: in the mean of the last two seconds within 10 %."""
-    model, wind = generate(load_scene("demo")), Wind([2.0, 1.0, 0.0])
+    model = generate(load_scene("demo"))
+    wind = Wind([2.0, 1.0, 0.0])
     there = simulated(model, wind, 500, every=10)[-20:].mean(0) - rest(model)
     seen = drawn(model, wind, np.array([0.0]))[0] - rest(model)
     tip = tips(model, np.linalg.norm(there, axis=1))
-    error, size = np.linalg.norm(seen - there, axis=1)[tip], np.linalg.norm(there, axis=1)[tip]
+    error = np.linalg.norm(seen - there, axis=1)[tip]
+    size = np.linalg.norm(there, axis=1)[tip]
     assert (error < 0.1 * size + 5e-4).all()
     assert np.percentile(error / size, 90) < 0.1
 
 
 def test_gusts_move_a_drawn_tree_as_far_and_when_they_move_a_simulated_one() -> None:
-    model, wind = leafy(4, modulus=1e9, damping=0.03), Wind([3.0, 1.0, 0.0], gusts=1.0, scale=2.0, seed=4)
+    model = leafy(4, modulus=1e9, damping=0.03)
+    wind = Wind([3.0, 1.0, 0.0], gusts=1.0, scale=2.0, seed=4)
     every = 5
     there = simulated(model, wind, 2400, every)[40:]
     seen = drawn(model, wind, 0.01 * every * np.arange(41, 2400 // every + 1))
@@ -126,8 +131,11 @@ def test_gusts_move_a_drawn_tree_as_far_and_when_they_move_a_simulated_one() -> 
 
 def test_what_is_drawn_depends_on_the_time_alone() -> None:
     """Two who have looked at other times and from elsewhere see the same to the bit."""
-    model, wind = leafy(5), Wind([3.0, 0.0, 0.0], gusts=1.0)
-    physics, first, second = Physics(model), Sway(model), Sway(model)
+    model = leafy(5)
+    wind = Wind([3.0, 0.0, 0.0], gusts=1.0)
+    physics = Physics(model)
+    first = Sway(model)
+    second = Sway(model)
     blown = windblown(model, physics.snapshot(), wind, 0.0).wind
     assert blown is not None
 
@@ -160,10 +168,12 @@ def test_nothing_jumps_when_trees_wake_fall_asleep_and_when_wind_begins_or_ends(
     """A robot comes and goes in gusts that begin and end: no drawn point moves by a millimetre more in a step than in
     the one before."""
     model = leafy(6, modulus=1e9, damping=0.05)
-    physics, eyes = Physics(model), Sway(model)
+    physics = Physics(model)
+    eyes = Sway(model)
     physics.add_robot(bar((30.0, 0.0, 0.2)))
     wind = Wind([2.0, 0.5, 0.0], gusts=0.4)
-    path, awake = [], []
+    path = []
+    awake = []
     for step in range(2600):
         if step == 50:
             physics.wind = wind
@@ -186,8 +196,10 @@ def test_nothing_jumps_when_trees_wake_fall_asleep_and_when_wind_begins_or_ends(
 
 def test_of_many_trees_those_are_drawn_whose_picture_is_most_out_of_date(monkeypatch) -> None:
     monkeypatch.setattr(sway, "MAX_TREES", 10)
-    model, wind = leafy(60), Wind([3.0, 0.0, 0.0], gusts=1.0)
-    physics, eyes = Physics(model), Sway(model)
+    model = leafy(60)
+    wind = Wind([3.0, 0.0, 0.0], gusts=1.0)
+    physics = Physics(model)
+    eyes = Sway(model)
     blown = windblown(model, physics.snapshot(), wind, 0.0).wind
     assert blown is not None
     times = np.zeros(60, int)

@@ -70,7 +70,8 @@ def test_gusts_have_the_given_strength_and_scale_and_no_divergence() -> None:
     wind = Wind([3.0, 0.0, 0.0], gusts=0.8, scale=2.0, seed=3)
     gust = wind.velocity_at(points, 0.0) - wind.mean
     np.testing.assert_allclose(gust.mean(0), 0.0, atol=0.03)
-    near, far = [], []
+    near = []
+    far = []
     power = np.zeros(3)
     for seed in range(40):
         wind = Wind([3.0, 0.0, 0.0], gusts=0.8, scale=2.0, seed=seed)
@@ -146,7 +147,8 @@ def test_a_falling_cane_reaches_its_terminal_velocity() -> None:
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.cut(0)
     step(plants, 500)
-    mass, area = model.body_mass.sum(), model.body_drag.sum()
+    mass = model.body_mass.sum()
+    area = model.body_drag.sum()
     terminal_speed = np.sqrt(2.0 * mass * 9.81 / AIR_DENSITY / area)
     np.testing.assert_allclose(plants.state.joint_xd[0], [0.0, 0.0, -terminal_speed], atol=2e-3 * terminal_speed)
     plants.tree_air[0] = [2.0, 0.0, 0.0]
@@ -162,7 +164,8 @@ def test_a_storm_is_stable(area: float) -> None:
     model = leafy(3, area=area, damping=0.004)
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(3))
-    wind, blown = Wind([32.0, 24.0, 0.0], gusts=16.0, seed=2), WindOnPlants(plants)
+    wind = Wind([32.0, 24.0, 0.0], gusts=16.0, seed=2)
+    blown = WindOnPlants(plants)
     for tick in range(1000):
         blown.update(wind, 0.01 * tick)
         step(plants, 1)
@@ -184,11 +187,13 @@ def test_wind_wakes_only_trees_that_it_moves() -> None:
     model = leafy(100)
     model.body_drag[model.bodies_of(7)] = 0.0
     plants = ArticulationSolver(model, State.at_rest(model))
-    breeze, blown = Wind([0.05, 0.0, 0.0]), WindOnPlants(plants)
+    breeze = Wind([0.05, 0.0, 0.0])
+    blown = WindOnPlants(plants)
     for tick in range(CHECK_STEPS):
         blown.update(breeze, 0.01 * tick)
     assert len(plants.awake) == 0
-    wind, blown = Wind([4.0, 0.0, 0.0], gusts=1.0), WindOnPlants(plants)
+    wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
+    blown = WindOnPlants(plants)
     for tick in range(CHECK_STEPS):
         blown.update(wind, 0.01 * tick)
     assert plants.awake.tolist() == [t for t in range(100) if t != 7]
@@ -204,7 +209,8 @@ def test_wind_wakes_only_trees_that_it_moves() -> None:
 def test_beyond_the_radius_there_is_no_simulated_wind() -> None:
     model = leafy(100)
     plants = ArticulationSolver(model, State.at_rest(model))
-    wind, blown = Wind([4.0, 0.0, 0.0], gusts=1.0), WindOnPlants(plants)
+    wind = Wind([4.0, 0.0, 0.0], gusts=1.0)
+    blown = WindOnPlants(plants)
     for tick in range(CHECK_STEPS):
         blown.update(wind, 0.01 * tick, (np.array([[0.0, 10.0, 0.0], [0.0, 40.0, 0.0]]), 2.5))
     assert plants.awake.tolist() == [8, 9, 10, 11, 12, 38, 39, 40, 41, 42]
@@ -217,7 +223,8 @@ def test_beyond_the_radius_there_is_no_simulated_wind() -> None:
 def test_a_tree_asleep_in_steady_wind_stays_asleep() -> None:
     model = leafy(1)
     plants = ArticulationSolver(model, State.at_rest(model))
-    wind, blown = Wind([2.0, 0.0, 0.0]), WindOnPlants(plants)
+    wind = Wind([2.0, 0.0, 0.0])
+    blown = WindOnPlants(plants)
     for tick in range(CHECK_STEPS + FADE_STEPS):
         blown.update(wind, 0.01 * tick)
     assert plants.awake.tolist() == [0]
@@ -256,7 +263,8 @@ def test_a_step_applies_wind_near_robots() -> None:
         physics.step()
     model = physics.model
     rest_pose = model.forward_kinematics(model.joint_settled)
-    first, last = model.bodies_of(0), model.bodies_of(9)
+    first = model.bodies_of(0)
+    last = model.bodies_of(9)
     assert 0 in physics.plants.awake
     assert 9 not in physics.plants.awake
     assert physics.snapshot().body_q[first.stop - 1, 1] > rest_pose[first.stop - 1, 1] + 0.01

@@ -77,7 +77,8 @@ def test_a_hand_without_the_sensor_stays() -> None:
 
 def test_weight_is_compensated_after_a_rotation_of_the_hand() -> None:
     yard = PushedHand(uses_sensor=True)
-    controller, yard.controller = yard.controller, None
+    controller = yard.controller
+    yard.controller = None
     joints = yard.robot.joint_indices(["arm_left_5_joint", "arm_left_7_joint"])
     yard.robot.command_position(yard.robot.setpoint[joints] + 0.8, joints)
     yard.run(2.0)

@@ -20,7 +20,8 @@ def moved(
     hand: CartesianController, goal: np.ndarray, ahead: np.ndarray, up: np.ndarray | None, seconds: float = 6.0
 ) -> np.ndarray:
     """Move a hand for ``seconds``; positions [tick, 3] m of its tip."""
-    robot, points = hand.robot, []
+    robot = hand.robot
+    points = []
     for tick in range(round(seconds / 0.01)):
         hand.move_towards(goal, ahead, up, speed=0.3, working_height=float(goal[2]))
         robot.control(0.01 * tick)
@@ -52,7 +53,8 @@ def test_a_hand_moves_on_a_line_within_its_speed():
     hand = CartesianController(robot, "left", tip_offset=0.03)
     moved(hand, np.array([0.6, 0.25, 1.3]), np.array([1.0, 0.0, 0.0]), UP)
     hand.reset()
-    start, goal = hand.tip_position, np.array([0.8, 0.15, 1.6])
+    start = hand.tip_position
+    goal = np.array([0.8, 0.15, 1.6])
     points = moved(hand, goal, np.array([1.0, 0.0, 0.0]), UP)
     along = frames.normalize(goal - start)
     deviation = (points - start) - ((points - start) @ along)[:, None] * along
@@ -71,7 +73,9 @@ def solve(
     ik = InverseKinematics(weights, [len(velocity) for _, velocity in tasks])
     ik.jacobian[:] = np.concatenate([jacobian for jacobian, _ in tasks])
     ik.velocity[:] = np.concatenate([velocity for _, velocity in tasks])
-    ik.posture_rates[:], ik.min_rates[:], ik.max_rates[:] = posture, least, most
+    ik.posture_rates[:] = posture
+    ik.min_rates[:] = least
+    ik.max_rates[:] = most
     return ik.solve().copy()
 
 
@@ -80,8 +84,10 @@ def test_inverse_kinematics_equals_the_svd_reference() -> None:
     rng = np.random.default_rng(1)
     at_bounds = 0
     for trial in range(300):
-        rows, joints = (3, int(rng.integers(1, 6))), int(rng.integers(5, 10))
-        jacobian, velocity = rng.normal(size=(sum(rows), joints)), rng.normal(size=sum(rows))
+        rows = (3, int(rng.integers(1, 6)))
+        joints = int(rng.integers(5, 10))
+        jacobian = rng.normal(size=(sum(rows), joints))
+        velocity = rng.normal(size=sum(rows))
         if trial % 3 == 0:
             jacobian[2] *= 10.0 ** rng.uniform(-6.0, -1.0)
         if trial % 5 == 0:
@@ -89,7 +95,8 @@ def test_inverse_kinematics_equals_the_svd_reference() -> None:
         if trial % 7 == 0:
             jacobian[3] = jacobian[0]
         tasks = [(jacobian[:3], velocity[:3]), (jacobian[3:], velocity[3:])]
-        weights, bound = rng.uniform(0.1, 1.0, joints), rng.uniform(0.1, 3.0, joints)
+        weights = rng.uniform(0.1, 1.0, joints)
+        bound = rng.uniform(0.1, 3.0, joints)
         given = (tasks, rng.normal(size=joints), -bound, bound, weights)
         expected = reference(*given)
         np.testing.assert_allclose(solve(*given), expected, atol=1e-8)
@@ -100,8 +107,11 @@ def test_inverse_kinematics_equals_the_svd_reference() -> None:
 def test_task_priorities_hold() -> None:
     """First task exact, second as far as it is free, bounds kept: against least squares on the null space."""
     rng = np.random.default_rng(5)
-    first, second = rng.normal(size=(3, 7)), rng.normal(size=(5, 7))
-    one, two, posture = rng.normal(size=3), rng.normal(size=5), rng.normal(size=7)
+    first = rng.normal(size=(3, 7))
+    second = rng.normal(size=(5, 7))
+    one = rng.normal(size=3)
+    two = rng.normal(size=5)
+    posture = rng.normal(size=7)
     far = np.full(7, 1e3)
     rates = solve([(first, one), (second, two)], posture, -far, far, np.ones(7))
     np.testing.assert_allclose(first @ rates, one, atol=1e-9)

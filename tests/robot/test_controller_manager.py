@@ -52,11 +52,15 @@ class ManagedRobot:
 def test_vinebot_has_the_controllers_of_a_ros2_control_robot() -> None:
     specs = {spec.name: spec for spec in load_description("vinebot").controllers}
     assert {name for name, spec in specs.items() if spec.kind is ControllerKind.JOINT_TRAJECTORY} == {
-        "arm_left_controller", "arm_right_controller", "torso_controller", "head_controller",
-    }  # fmt: skip
+        "arm_left_controller",
+        "arm_right_controller",
+        "torso_controller",
+        "head_controller",
+    }
     assert {name for name, spec in specs.items() if spec.kind is ControllerKind.GRIPPER} == {
-        "gripper_left_controller", "gripper_right_controller",
-    }  # fmt: skip
+        "gripper_left_controller",
+        "gripper_right_controller",
+    }
     assert specs["cutter_left_controller"].group == "gripper_left"
     assert specs["arm_left_impedance_controller"].joints == ARM
     assert specs["forward_velocity_controller"].joints == load_description("vinebot").joints
@@ -105,7 +109,8 @@ def test_a_newer_goal_ends_the_older_and_cancelling_holds() -> None:
 @pytest.mark.parametrize("how", ["cancel", "stop"])
 def test_after_a_trajectory_was_stopped_the_desired_state_is_that_the_joints_hold(how) -> None:
     managed = ManagedRobot()
-    manager, joints = managed.manager, managed.robot.joint_indices(ARM)
+    manager = managed.manager
+    joints = managed.robot.joint_indices(ARM)
     manager.start_trajectory("arm_left_controller", managed.swing(0.5), managed.time, b"a")
     managed.run(0.5)
     assert (manager.desired_velocity[joints] > 0.1).all()

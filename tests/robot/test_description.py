@@ -133,7 +133,8 @@ def test_bunches_are_within_reach(vinebot: RobotDescription) -> None:
     zero = vinebot.home.copy()
     zero[vinebot.joint_indices("arm_left")] = 0.0
     poses = vinebot.link_poses(zero)
-    shoulder, tool = poses["arm_left_2_link"][:3], poses["gripper_left_grasping_link"][:3]
+    shoulder = poses["arm_left_2_link"][:3]
+    tool = poses["gripper_left_grasping_link"][:3]
     length = np.linalg.norm(shoulder - tool)
     assert 0.85 < length < 1.05
     lift = vinebot.drives[vinebot.joints.index("torso_lift_joint")]
@@ -146,7 +147,8 @@ def test_bunches_are_within_reach(vinebot: RobotDescription) -> None:
 
 def test_sides_mirror_each_other(vinebot: RobotDescription) -> None:
     poses = vinebot.link_poses(vinebot.home)
-    left, right = poses["gripper_left_grasping_link"], poses["gripper_right_grasping_link"]
+    left = poses["gripper_left_grasping_link"]
+    right = poses["gripper_right_grasping_link"]
     np.testing.assert_allclose(left[:3] * [1, -1, 1], right[:3], atol=1e-12)
 
 
@@ -420,7 +422,8 @@ def test_a_missing_optional_package_is_named(monkeypatch: pytest.MonkeyPatch) ->
 def test_a_urdf_is_read_as_yourdfpy_reads_it(name: str) -> None:
     """Oracle: yourdfpy, to the last bit."""
     urdf = load_description(name).urdf
-    ours, oracle = parse_robot(etree.fromstring(urdf.encode())), parse(urdf)
+    ours = parse_robot(etree.fromstring(urdf.encode()))
+    oracle = parse(urdf)
     assert [link.name for link in ours.links] == [link.name for link in oracle.links]
     for link, other in zip(ours.links, oracle.links, strict=True):
         assert (link.inertial is None) == (other.inertial is None)

@@ -38,7 +38,8 @@ def test_home_is_held_without_sag(yard: Yard, vinebot: RobotDescription) -> None
 
 def test_step_command_ramps_at_the_speed_limit(yard: Yard) -> None:
     joint = yard.robot.joint_indices(["arm_left_4_joint"])[0]
-    limit, start = yard.robot.max_velocity[joint], yard.robot.setpoint[joint]
+    limit = yard.robot.max_velocity[joint]
+    start = yard.robot.setpoint[joint]
     yard.robot.command_position([start - 1.1], ["arm_left_4_joint"])
     position, velocity, _, setpoint = yard.run(1.0)[:, :, joint].T
     steps = np.abs(np.diff(setpoint, prepend=start))
@@ -168,7 +169,8 @@ def test_gripper_opens_by_the_given_width(yard: Yard) -> None:
 def test_base_speeds_up_within_its_limits_and_stops_without_commands(yard: Yard) -> None:
     limits = yard.robot.description.base_limits
     yard.robot.command_base(0.5, 0.4, yard.time)
-    speeds, turns = [], []
+    speeds = []
+    turns = []
     for _ in range(200):
         yard.run(yard.rigid.dt)
         _, velocity = yard.rigid.base_state("anna")
@@ -257,7 +259,8 @@ def test_a_remote_copy_follows_its_robot(vinebot: RobotDescription) -> None:
     copy = RemoteRobot(remote_world, vinebot, "anna", pose=frames.pose([50.0, 0.0, -10.0]))
     home = vinebot.home.copy()
     reach = local.robot.joint_indices(["arm_left_1_joint", "arm_left_4_joint", "torso_lift_joint"])
-    joints, bases = [], []
+    joints = []
+    bases = []
     for tick in range(300):
         local.robot.command_position(home[reach] + 0.15 * np.sin(1.5 * local.time) * np.array([1, -1, 0.5]), reach)
         local.robot.command_base(0.3, 0.2, local.time)
@@ -314,9 +317,12 @@ def test_a_robot_with_continuous_and_mimic_joints_moves(tmp_path) -> None:
 @pytest.mark.parametrize("interface", ["position", "velocity", "effort"])
 def test_each_interface_tracks_a_sine(vinebot: RobotDescription, interface: str) -> None:
     """0.3 rad at 0.4 Hz in shoulder and elbow; by effort a controller outside closes the loop at 100 Hz."""
-    yard, names = Yard(vinebot), ["arm_left_1_joint", "arm_left_4_joint"]
+    yard = Yard(vinebot)
+    names = ["arm_left_1_joint", "arm_left_4_joint"]
     joints = yard.robot.joint_indices(names)
-    start, w, worst = yard.robot.setpoint[joints].copy(), 2.0 * np.pi * 0.4, 0.0
+    start = yard.robot.setpoint[joints].copy()
+    w = 2.0 * np.pi * 0.4
+    worst = 0.0
     for _ in range(400):
         t = yard.time + yard.rigid.dt
         desired = start + 0.15 * (1.0 - np.cos(w * t)) * np.array([1, -1])

@@ -76,7 +76,8 @@ def test_covariance_of_the_pose_fits_its_error(vinebot: RobotDescription, ahead:
     """The share that is lost is one standard deviation of what is measured: the error is that of one deviation of
     each share, so its distance by the covariance (Mahalanobis) is the root of their number, to first order."""
     _, samples = _drive(vinebot, ahead, turning)
-    start, spread = samples[0].base_q, []
+    start = samples[0].base_q
+    spread = []
     for sample in samples[200::100]:
         way = frames.compose(frames.inverse(start), sample.base_q)
         error = np.append(sample.odom_q[:2] - way[:2], frames.to_yaw(sample.odom_q[3:]) - frames.to_yaw(way[3:]))
@@ -96,7 +97,8 @@ def test_fusion_of_odometry_and_gyroscope_drifts_as_the_slip_says(vinebot: Robot
     way, it is the actual one enlarged by 1 / (1 - slip). With truth in either it would be the actual one."""
     slip = 0.1
     yard, samples = _drive(vinebot, slip, 0.2)
-    place, yaw = np.zeros(2), 0.0
+    place = np.zeros(2)
+    yaw = 0.0
     for sample in samples[1:]:
         turn = yard.rigid.dt * sample.imus[0].angular_velocity[2]
         yaw += 0.5 * turn

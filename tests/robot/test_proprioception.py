@@ -49,7 +49,8 @@ def test_the_wrist_measures_the_inertia_of_a_falling_hand(yard: Yard, vinebot: R
     hand, _ = hand_of(vinebot)
     yard.run(0.2)
     yard.robot.command_effort([-400.0], ["torso_lift_joint"])
-    heights, forces = [], []
+    heights = []
+    forces = []
     for _ in range(8):
         yard.run(yard.rigid.dt)
         heights.append(centre_of_hand(yard)[2])

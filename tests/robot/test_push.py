@@ -39,7 +39,11 @@ class Run:
         robot.rigid.place_robot("anna", base, robot.description.home)
         robot.stop()
         self.reach = reach = PushBunch(robot, side, lambda: target, repeat=False, **options)
-        self.phases, self.tips, self.speeds, self.setpoints, self.errors = [], [], [], [robot.setpoint.copy()], {}
+        self.phases = []
+        self.tips = []
+        self.speeds = []
+        self.setpoints = [robot.setpoint.copy()]
+        self.errors = {}
         self.time = 0.0
         while reach.phase is not Phase.DONE and self.time < 40.0:
             before = reach.phase
@@ -96,7 +100,8 @@ def test_targets_are_in_world_coordinates(robot: Robot) -> None:
 def test_the_fingers_approach_from_below_and_touch_slowly(robot: Robot) -> None:
     target = np.array([0.65, 0.2, 1.55])
     run = Run(robot, "left", target, radius=0.05, clearance=0.10, depth=0.04)
-    tips, phases = np.array(run.tips), np.array([phase.value for phase in run.phases])
+    tips = np.array(run.tips)
+    phases = np.array([phase.value for phase in run.phases])
     gap = np.linalg.norm(tips - target, axis=1)
     approach, touch, push = (phases == phase.value for phase in (Phase.APPROACH, Phase.TOUCH, Phase.PUSH))
     assert gap[approach].min() > 0.14
@@ -123,7 +128,8 @@ def test_pushes_repeat_on_a_moving_target_and_a_rolling_base(vinebot: RobotDescr
     reach = PushBunch(robot, "left", lambda: np.array([0.70, 0.15, 1.5 + 0.02 * time]), hold_time=0.2)
     errors = []
     while reach.push_count < 2 and time < 30.0:
-        before, error = reach.phase, reach.error
+        before = reach.phase
+        error = reach.error
         robot.command_base(0.05 if time < 2.0 else 0.0, 0.0, time)
         reach.control(time)
         if reach.phase is not before and before is Phase.TOUCH:
@@ -157,7 +163,8 @@ def test_two_arms_of_one_robot_push_independently(vinebot: RobotDescription) -> 
     time = 0.0
     while any(arm.phase is not Phase.DONE for arm in arms) and time < 30.0:
         for arm in arms:
-            before, error = arm.phase, arm.error
+            before = arm.phase
+            error = arm.error
             arm.control(time)
             if before is Phase.TOUCH and arm.phase is Phase.PUSH:
                 touched[arm.tool] = error

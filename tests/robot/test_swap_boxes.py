@@ -74,10 +74,12 @@ def test_a_missing_box_is_reported_with_the_reason():
     joint.qpos[2] = 5.0  # the box is removed
     joint.qvel[:] = 0.0
     for _ in range(20):
-        joint.qpos[2], joint.qvel[2] = 5.0, 0.0
+        joint.qpos[2] = 5.0
+        joint.qvel[2] = 0.0
         tick(task)
     while not task.is_done:
-        joint.qpos[2], joint.qvel[2] = 5.0, 0.0
+        joint.qpos[2] = 5.0
+        joint.qvel[2] = 0.0
         tick(task)
     assert not task.succeeded
     assert task.reason.startswith("take the empty box: the rear paddles feel 0 N")

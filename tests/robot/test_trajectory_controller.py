@@ -203,9 +203,11 @@ def test_a_trajectory_may_start_later_but_not_be_over() -> None:
 
 def test_a_trajectory_that_starts_later_replaces_the_older_one_at_its_start() -> None:
     """Until then the joints follow the older one exactly; there they have its place and speed, and it is continuous."""
-    arm, alone = ControlledArm(), ControlledArm()
+    arm = ControlledArm()
+    alone = ControlledArm()
     older = swing(arm)
-    first, whole = arm.controller.start(older, 0.0), alone.controller.start(older, 0.0)
+    first = arm.controller.start(older, 0.0)
+    whole = alone.controller.start(older, 0.0)
     arm.run(0.5)
     there = arm.home[[0, 3]] + [0.1, -0.1]
     newer = Trajectory(TWO, np.array([1.2]), there[None], np.zeros((1, 2)), start_time=1.5)
@@ -216,7 +218,8 @@ def test_a_trajectory_that_starts_later_replaces_the_older_one_at_its_start() ->
     assert second.outcome is Outcome.SUCCESSFUL
     assert arm.time == pytest.approx(1.5 + 1.2, abs=0.03)
     np.testing.assert_allclose(arm.at(TWO), there, atol=3e-3)
-    same, rows = np.array(alone.rows), np.array(arm.rows)
+    same = np.array(alone.rows)
+    rows = np.array(arm.rows)
     assert rows[:149].tobytes() == same[:149].tobytes()
     assert np.abs(same[148, 1, 0]) > 0.05  # it is on its way then
     assert np.abs(rows[200:, 0, 0] - same[200 : len(rows), 0, 0]).max() > 0.1
@@ -224,7 +227,8 @@ def test_a_trajectory_that_starts_later_replaces_the_older_one_at_its_start() ->
 
 
 def test_joints_that_a_newer_trajectory_does_not_name_follow_the_older_one() -> None:
-    arm, alone = ControlledArm(), ControlledArm()
+    arm = ControlledArm()
+    alone = ControlledArm()
     plan = swing(arm)
     arm.controller.start(plan, 0.0)
     alone.controller.start(plan, 0.0)
@@ -247,7 +251,8 @@ def test_joints_that_a_newer_trajectory_does_not_name_follow_the_older_one() -> 
 def test_trajectories_that_wait_are_bounded() -> None:
     """Each of them replaces the one before only for the last part of its time, so that all are kept."""
     arm = ControlledArm()
-    one, here = np.array([1.0]), arm.at(TWO)[None]
+    one = np.array([1.0])
+    here = arm.at(TWO)[None]
     for i in range(MAX_SPLINES):
         arm.controller.start(Trajectory(TWO, one, here, start_time=1.0 + i), 0.0)
     with pytest.raises(TrajectoryError, match="32 trajectories are executed or wait"):
@@ -261,7 +266,8 @@ def test_trajectories_that_wait_are_bounded() -> None:
 def test_invalid_trajectories_are_refused_without_effect() -> None:
     arm = ControlledArm()
     run = arm.controller.start(swing(arm), 0.0)
-    here, one = arm.at(TWO), np.array([1.0])
+    here = arm.at(TWO)
+    one = np.array([1.0])
     for joints, times, positions, code, text in (
         (("head_1_joint",), one, np.zeros((1, 1)), Outcome.INVALID_JOINTS, "trajectory for head_1_joint"),
         ((TWO[0], TWO[0]), one, np.zeros((1, 2)), Outcome.INVALID_JOINTS, "once"),

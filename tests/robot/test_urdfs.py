@@ -100,13 +100,16 @@ def test_missing_limits_masses_and_mimic_sources_are_assumed_with_one_warning(
     tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     text = (
-        link("base"), "<link name='a'/>", link("b", moments=MOMENTS.replace("0.1", "0")), link("c"),
+        link("base"),
+        "<link name='a'/>",
+        link("b", moments=MOMENTS.replace("0.1", "0")),
+        link("c"),
         link("d", moments='ixx="1e-6" iyy="1e-6" izz="1e-6" ixy="1e-6" ixz="1e-6" iyz="1e-6"'),
         joint("ja", "base", "a", '<limit effort="0" velocity="0" lower="0" upper="1"/>'),
         joint("jb", "a", "b", ""),
         joint("jc", "b", "c", '<limit effort="5" velocity="1"/>', kind="continuous"),
         joint("jd", "c", "d", LIMIT + '<mimic joint="missing"/>'),
-    )  # fmt: skip
+    )
     description = load_description(write(tmp_path, *text))
     (warning,) = warnings_of(caplog)
     for words in ("'ja' (and 1 more)", "'jb' turns", "'a' (and 1 more) moves without", "'jd' mimics", "inertia of 'd'"):
@@ -192,11 +195,14 @@ def test_a_gripper_with_a_mimic_finger_opens_as_far_as_asked(
     light = MOMENTS.replace("0.1", "1e-4")
     description = load_description(
         write(
-            tmp_path, link("base", 9.0), link("left", 0.1, moments=light), link("right", 0.1, moments=light),
+            tmp_path,
+            link("base", 9.0),
+            link("left", 0.1, moments=light),
+            link("right", 0.1, moments=light),
             joint("gripper_left_1_joint", "base", "left", limit, "0 1 0", "prismatic"),
             joint("gripper_left_2_joint", "base", "right", limit + mimic, "0 -1 0", "prismatic"),
         )
-    )  # fmt: skip
+    )
     yard = Yard(description)
     yard.robot.command_gripper("gripper_left", 0.05)
     yard.run(1.0)

@@ -19,7 +19,8 @@ def heading(pose: np.ndarray) -> float:
 
 def drive(follower: WaypointFollower, seconds: float = 60.0) -> np.ndarray:
     """Poses of the base [tick, 7] until the path is done or the base is stuck."""
-    robot, poses = follower.robot, []
+    robot = follower.robot
+    poses = []
     while not follower.is_done and not follower.is_stuck and len(poses) < 100 * seconds:
         time = 0.01 * len(poses)
         follower.control(time)

@@ -193,7 +193,8 @@ def test_forward_controllers_move_joints_by_position_velocity_and_effort(world: 
     """F83 over ROS: one value a joint in the order of joint_states, NaN leaves the others alone; a joint obeys the
     controller that was commanded last."""
     robot = world.client.robot
-    count, head = len(robot.description.joints), robot.joint_indices(HEAD)[0]
+    count = len(robot.description.joints)
+    head = robot.joint_indices(HEAD)[0]
     publishers = {
         kind: world.peer.node.create_publisher(Float64MultiArray, f"/forward_{kind}_controller/commands", 10)
         for kind in ("position", "velocity", "effort")

@@ -50,8 +50,9 @@ def test_a_recording_holds_messages_definitions_and_qos_and_plays(tmp_path):
                 joints.publish(message)
             wait_until(
                 lambda: recorder.counts["/joint_states"] == 20 and recorder.counts["/robot_description"] == 1,
-                lambda: recorder.spin(0.01), "all messages",
-            )  # fmt: skip
+                lambda: recorder.spin(0.01),
+                "all messages",
+            )
     with path.open("rb") as stream:
         reader = make_reader(stream)
         assert reader.get_header().profile == "ros2"

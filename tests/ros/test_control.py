@@ -41,7 +41,8 @@ GOAL = 0.4
 @pytest.fixture
 def client() -> Client:
     """One vinebot far from a single cane."""
-    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
     return Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
 
@@ -126,7 +127,9 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         wait_until(lambda: node._commands.rejected == refused + 2, step, "a refusal")
         loudspeaker.publish(AudioData(data=bytes(range(8))))
         wait_until(lambda: played == [bytes(range(8))], step, "what is to be played")
-        plain, stamped, facts = [], [], []
+        plain = []
+        stamped = []
+        facts = []
         peer.node.create_subscription(AudioData, "/audio", plain.append, 10)
         peer.node.create_subscription(AudioDataStamped, "/audio_stamped", stamped.append, 10)
         peer.node.create_subscription(
@@ -148,8 +151,9 @@ def test_a_trajectory_moves_a_joint_and_a_velocity_the_base(client, monkeypatch,
         peer.node.create_subscription(String, "/human_gesture", shown.append, latched)
         wait_until(lambda: heard and shown, step, "the latched intention and gesture")
         assert json.loads(shown[0].data) == {
-            "time": 2.5, "people": [{"person": "anna", "left": "open_hand", "right": "point"}]
-        }  # fmt: skip
+            "time": 2.5,
+            "people": [{"person": "anna", "left": "open_hand", "right": "point"}],
+        }
         assert json.loads(heard[0].data) == {
             "people": [{"person": "anna", "intention": "pick", "start": 2.0, "end": None}]
         }

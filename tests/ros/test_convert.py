@@ -263,11 +263,20 @@ def test_joint_state_round_trip_is_exact():
 
 def test_odometry_is_what_was_measured_with_its_covariances():
     at, measured = (frames.pose(np.array([x, 2.0, 0.0]), frames.from_yaw(math.pi / 2)) for x in (1.0, 3.0))
-    actual, odom_qd = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3]), np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.4])
+    actual = np.array([0.0, 0.5, 0.0, 0.0, 0.0, 0.3])
+    odom_qd = np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.4])
     covariance = np.arange(18.0).reshape(2, 3, 3)
     sample = RobotSample(
-        "r", joint_sample(), at, actual, measured, odom_qd, covariance, (), np.zeros((0, 7)),
-    )  # fmt: skip
+        "r",
+        joint_sample(),
+        at,
+        actual,
+        measured,
+        odom_qd,
+        covariance,
+        (),
+        np.zeros((0, 7)),
+    )
     message = over_the_wire(convert.odometry(sample, "base_footprint", "odom"))
     assert (message.header.frame_id, message.child_frame_id) == ("odom", "base_footprint")
     assert message.pose.pose.position.x == 3.0
@@ -319,7 +328,8 @@ def test_messages_of_a_step_are_written_as_stock_serialisation_does():
         for one in (joints(names, 3.25), joints(names, 1234567.000000001)):
             check(write(one), convert.joint_state(one))
     write_odometry = serialized.odometry_writer(robot(0.0), "base_footprint", "odom")
-    write_wrench, write_imu = serialized.wrench_writer(wrench(0.0)), serialized.imu_writer(imu(0.0))
+    write_wrench = serialized.wrench_writer(wrench(0.0))
+    write_imu = serialized.imu_writer(imu(0.0))
     write_clock = serialized.stamp_writer(convert.clock)
     for time in (0.0, 7.75, 98765.4321):
         check(write_odometry(base := robot(time)), convert.odometry(base, "base_footprint", "odom"))
@@ -344,7 +354,8 @@ def test_transforms_equal_stock_serialisation_field_for_field():
         stock = TFMessage()
         for (parent, child), q in zip(pairs, poses, strict=True):
             transform = TransformStamped(header=convert.header(time, parent), child_frame_id=child)
-            v, r = transform.transform.translation, transform.transform.rotation
+            v = transform.transform.translation
+            r = transform.transform.rotation
             v.x, v.y, v.z = map(float, q[:3])
             r.x, r.y, r.z, r.w = map(float, q[3:])  # xyzw, as everywhere
             stock.transforms.append(transform)
@@ -361,7 +372,8 @@ def test_transforms_want_one_pose_per_frame():
 
 def test_base_velocity_comes_back():
     message = TwistStamped(header=convert.header(3.5, "base_footprint"))
-    message.twist.linear.x, message.twist.angular.z = 0.4, -0.2
+    message.twist.linear.x = 0.4
+    message.twist.angular.z = -0.2
     velocity = commands.base_velocity(over_the_wire(message))
     assert velocity.time == 3.5
     assert velocity.linear.tolist() == [0.4, 0.0, 0.0]
@@ -386,7 +398,8 @@ def trajectory(*points: tuple[float, list[float], list[float]]) -> JointTrajecto
     message = JointTrajectory(joint_names=["a", "b"])
     for time, positions, velocities in points:
         point = JointTrajectoryPoint(positions=positions, velocities=velocities)
-        point.time_from_start.sec, point.time_from_start.nanosec = math.floor(time), round(time % 1 * 1e9)
+        point.time_from_start.sec = math.floor(time)
+        point.time_from_start.nanosec = round(time % 1 * 1e9)
         message.points.append(point)
     return message
 
@@ -422,18 +435,29 @@ def test_bad_trajectories_are_refused_in_words(message, words):
 @pytest.mark.parametrize("dual", [False, True])
 def test_a_scan_equals_the_cloud_of_the_same_revolution(dual):
     """Each point of the level laser, at its bearing and its time as laser_geometry computes them; +Inf elsewhere."""
-    count, period, delay = 720, 1e-4, 2e-5
+    count = 720
+    period = 1e-4
+    delay = 2e-5
     level = LevelLaser(7, count, delay, period, -0.02, 0.5, 100.0)
     rng = np.random.default_rng(3)
     shot = np.sort(rng.choice(count, 500, replace=dual))
     ring = np.where(rng.uniform(size=500) < 0.7, 7, 3).astype(np.uint16)
-    bearing, reach = level.azimuth - 2.0 * np.pi * shot / count, rng.uniform(0.5, 90.0, 500)
+    bearing = level.azimuth - 2.0 * np.pi * shot / count
+    reach = rng.uniform(0.5, 90.0, 500)
     xyz = np.stack([reach * np.cos(bearing), reach * np.sin(bearing), 0.02 * reach], 1).astype(np.float32)
     offset = (delay + period * shot).astype(np.float32)
     scan = LidarScan(
-        2.0, "lidar", "lidar_link", frames.pose(np.zeros(3)), xyz, reach.astype(np.float32), ring, offset,
-        np.zeros(500, np.int32), level,
-    )  # fmt: skip
+        2.0,
+        "lidar",
+        "lidar_link",
+        frames.pose(np.zeros(3)),
+        xyz,
+        reach.astype(np.float32),
+        ring,
+        offset,
+        np.zeros(500, np.int32),
+        level,
+    )
     cloud = points(over_the_wire(convert.lidar_cloud(scan))).ravel()
     message = over_the_wire(convert.laser_scan(scan))
     assert message.header.frame_id == "lidar_link"

@@ -38,8 +38,10 @@ def segment(folder: pathlib.Path, name: str, size: int = SMALLEST, age: float = 
 
 
 def test_only_large_old_segments_that_are_not_locked_are_removed(tmp_path):
-    dead, held = segment(tmp_path, "dead"), segment(tmp_path, "held")
-    small, young = segment(tmp_path, "small", size=549_408), segment(tmp_path, "young", age=0.0)
+    dead = segment(tmp_path, "dead")
+    held = segment(tmp_path, "held")
+    small = segment(tmp_path, "small", size=549_408)
+    young = segment(tmp_path, "young", age=0.0)
     unlockable = segment(tmp_path, "port7410")
     unlockable.with_name("fastrtps_port7410_el").unlink()
     other = tmp_path / "psm_01234567"

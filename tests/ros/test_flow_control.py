@@ -42,7 +42,9 @@ class Robot:
     """A client with one vinebot and its ROS process, and a stock node that reads /clock."""
 
     def __init__(self, peer: StockNode, ros: RosProcess, client: Client) -> None:
-        self.peer, self.ros, self.client = peer, ros, client
+        self.peer = peer
+        self.ros = ros
+        self.client = client
         self.loop = RateLoop(client.physics.dt)
         self.clocks: list[int] = []
         """Stamps that came [ns]."""
@@ -73,7 +75,8 @@ def robot(monkeypatch, tmp_path) -> Iterator[Robot]:
     monkeypatch.setenv("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path))
-    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
     with StockNode() as peer, RosProcess("robot", model, vinebot) as ros:
         client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
@@ -84,7 +87,8 @@ def robot(monkeypatch, tmp_path) -> Iterator[Robot]:
 
 
 def test_the_loop_waits_for_a_process_that_gets_no_turn_and_every_step_arrives(robot):
-    pid, first = robot.ros.worker.pid, robot.clocks[-1]
+    pid = robot.ros.worker.pid
+    first = robot.clocks[-1]
     os.kill(pid, signal.SIGSTOP)
     waits = robot.ros.worker.current().shared.wanted["waits"]
     while waits[0]:  # stopped while it waited for its subscriber
@@ -106,7 +110,8 @@ def test_the_loop_waits_for_a_process_that_gets_no_turn_and_every_step_arrives(r
 
 
 def test_a_process_that_is_stopped_holds_the_loop_for_three_seconds_and_its_messages_are_counted(robot, caplog):
-    pid, first = robot.ros.worker.pid, robot.clocks[-1]
+    pid = robot.ros.worker.pid
+    first = robot.clocks[-1]
     os.kill(pid, signal.SIGSTOP)
     robot.run_until(robot.ros.held)
     begin = time.monotonic()
@@ -189,10 +194,13 @@ def test_a_subscriber_that_stops_holds_the_others_for_three_seconds_and_comes_ba
 class FakeTopic:
     """A topic that acknowledges as the test says."""
 
-    name, subscription_count = "/clock", 1
+    name = "/clock"
+    subscription_count = 1
 
     def __init__(self) -> None:
-        self.sent, self.acknowledged, self.is_local = 0, 0, True
+        self.sent = 0
+        self.acknowledged = 0
+        self.is_local = True
 
     def is_acknowledged(self) -> bool:
         return self.acknowledged == self.sent
@@ -200,7 +208,8 @@ class FakeTopic:
 
 def test_no_more_messages_are_on_their_way_than_a_subscriber_keeps(caplog):
     """Fewer than half of rclpy's ten: what is acknowledged may still wait for the program. Far more on a network."""
-    topic, flow = FakeTopic(), FlowControl()
+    topic = FakeTopic()
+    flow = FlowControl()
     while not flow.must_wait([topic], 0.0):
         topic.sent += 1
     assert FIRST_LOOK < topic.sent == WINDOW <= 5
@@ -217,7 +226,8 @@ def test_no_more_messages_are_on_their_way_than_a_subscriber_keeps(caplog):
         topic.sent += 1
         assert not flow.must_wait([topic], 10.0), "it is waited for no longer"
     assert len(caplog.messages) == 1
-    topic.is_local, topic.acknowledged = True, topic.sent
+    topic.is_local = True
+    topic.acknowledged = topic.sent
     assert not flow.must_wait([topic], 10.0)
     topic.sent += WINDOW
     assert flow.must_wait([topic], 10.0), "it is waited for again"
@@ -225,7 +235,8 @@ def test_no_more_messages_are_on_their_way_than_a_subscriber_keeps(caplog):
 
 @pytest.mark.parametrize("rate", [30.0, 100.0, 1000.0])
 def test_steps_that_have_waited_come_few_at_once_and_little_faster_than_the_world_makes_them(monkeypatch, rate):
-    now, published = 0.0, []
+    now = 0.0
+    published = []
     monkeypatch.setattr("vinesim.client.processes.ros_worker.time.monotonic", lambda: now)
     pace = Pace()
     while now < 4.0:

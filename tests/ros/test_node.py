@@ -149,7 +149,8 @@ def test_large_messages_reach_another_process():
         own = [name if name == "/clock" else name[1:] for name in (*small, *latched)]
         wait_until(lambda: all(robot.has_subscribers(name) for name in own))
         wait_until(lambda: all(sensors.has_subscribers(name[1:]) for name in large))
-        ticks, offered = 400, dict.fromkeys((*small, *large), 0)
+        ticks = 400
+        offered = dict.fromkeys((*small, *large), 0)
         due = time.monotonic()
         for tick in range(ticks):
             # A late tick delays the next ones: a busy machine makes no bursts.
@@ -181,7 +182,8 @@ def test_large_messages_reach_another_process():
 
 def test_every_topic_is_heard_with_its_official_type():
     contact = Contact("vinebot", "vinebot/arm_left_7_link", 5, np.ones(3), np.ones(3), 0.0)
-    names, poses = ("bunch_00001", "bunch_00002"), np.tile(REST, (2, 1))
+    names = ("bunch_00001", "bunch_00002")
+    poses = np.tile(REST, (2, 1))
     with (
         RobotNode("vinebot", URDF) as robot,
         SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
@@ -213,9 +215,12 @@ def test_every_topic_is_heard_with_its_official_type():
             received_by: set[tuple[str, str]] = set()
             for topic, qos in asked:
                 peer.node.create_subscription(
-                    message_class(TYPES[topic]), topic, lambda _, key=(topic, qos): received_by.add(key),
-                    10 if qos == "default" else rclpy.qos.qos_profile_sensor_data, raw=True,
-                )  # fmt: skip
+                    message_class(TYPES[topic]),
+                    topic,
+                    lambda _, key=(topic, qos): received_by.add(key),
+                    10 if qos == "default" else rclpy.qos.qos_profile_sensor_data,
+                    raw=True,
+                )
 
             def tick_and_hear() -> None:
                 tick()
@@ -232,8 +237,14 @@ def test_every_topic_is_heard_with_its_official_type():
 def test_ten_seconds_of_every_step_wait_for_a_subscriber_and_five_pictures_or_clouds():
     """As docs/ros.md says: keep last, 1,000 messages of every step."""
     steps = (
-        "joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "base_imu", "wrist/wrench", "see/k/state",
-    )  # fmt: skip
+        "joint_states",
+        "tf",
+        "mobile_base_controller/odom",
+        "vine/contacts",
+        "base_imu",
+        "wrist/wrench",
+        "see/k/state",
+    )
     elastic = ControllerSpec("see", ControllerKind.SERIES_ELASTIC, ("k",))
     with (
         RobotNode("vinebot", URDF, imus=["base_imu"], wrenches=["wrist"], controllers=[elastic]) as robot,
@@ -245,8 +256,16 @@ def test_ten_seconds_of_every_step_wait_for_a_subscriber_and_five_pictures_or_cl
         assert {topic.publisher.qos_profile.depth for topic in pictures} == {5}
 
 
-LATCHED = ("robot_description", "head_front_camera/label_info", "tf_static", "tf_environment_static", "human_intention",
-           "human_gesture", "audio_info", "indicator_lights/markers")  # fmt: skip
+LATCHED = (
+    "robot_description",
+    "head_front_camera/label_info",
+    "tf_static",
+    "tf_environment_static",
+    "human_intention",
+    "human_gesture",
+    "audio_info",
+    "indicator_lights/markers",
+)
 TYPES = {
     "/clock": "rosgraph_msgs/msg/Clock",
     "/robot_description": "std_msgs/msg/String",
@@ -496,7 +515,8 @@ def test_frames_lead_from_the_map_to_the_fingers():
             "torso_link",
         ]
         assert {(t.header.stamp.sec, t.header.stamp.nanosec) for t in tree.values()} == {(3, 210_000_000)}
-        drift, odom = tree["odom"].transform, tree["base_footprint"].transform
+        drift = tree["odom"].transform
+        odom = tree["base_footprint"].transform
         chain = [
             np.array(
                 [
@@ -540,7 +560,8 @@ def test_contacts_are_one_cloud_a_step():
 def test_the_newest_replaces_what_waits_and_is_counted():
     with SensorNode("vinebot", cameras=["left"]) as node:
         topic = node._topics["left/rgb/image_raw"]
-        busy, go = threading.Event(), threading.Event()
+        busy = threading.Event()
+        go = threading.Event()
 
         def slow() -> Image:
             busy.set()
@@ -549,7 +570,9 @@ def test_the_newest_replaces_what_waits_and_is_counted():
 
         node._enqueue([(topic, slow)], always=True)
         assert busy.wait(TIMEOUT)
-        built, kept, count = [], 1, 5
+        built = []
+        kept = 1
+        count = 5
         for i in range(count):  # the simulation does not wait while the first is being built
             node._enqueue([(topic, lambda i=i: built.append(i) or Image())], always=True)
         go.set()
@@ -573,7 +596,8 @@ def test_a_message_that_cannot_be_built_is_counted_and_the_rest_goes_on(caplog):
 
 
 def test_closing_leaves_nothing_behind():
-    handler, threads = signal.getsignal(signal.SIGINT), set(threading.enumerate())
+    handler = signal.getsignal(signal.SIGINT)
+    threads = set(threading.enumerate())
     for _ in range(3):
         for node in (RobotNode("vinebot", URDF), SensorNode("vinebot_sensors", cameras=["head_front_camera"])):
             assert signal.getsignal(signal.SIGINT) is handler

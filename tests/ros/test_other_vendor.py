@@ -81,9 +81,11 @@ class CyclonePeer:
 def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     own = str(1 + os.getpid() % 100)
     variables = {
-        "ROS_DOMAIN_ID": own, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "ROS_LOG_DIR": str(tmp_path_factory.mktemp("log")), "CYCLONEDDS_URI": CYCLONE,
-    }  # fmt: skip
+        "ROS_DOMAIN_ID": own,
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_LOG_DIR": str(tmp_path_factory.mktemp("log")),
+        "CYCLONEDDS_URI": CYCLONE,
+    }
     with pytest.MonkeyPatch.context() as monkeypatch:
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
@@ -92,7 +94,8 @@ def domain(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 def test_a_peer_of_another_vendor_hears_and_commands(domain: str) -> None:
     """Fields of /joint_states as sent, to a reader that knows neither vinesim nor ROS; and its trajectory back."""
-    names, rest = ("head_1_joint", "head_2_joint"), np.array([0, 0, 0, 0, 0, 0, 1.0])
+    names = ("head_1_joint", "head_2_joint")
+    rest = np.array([0, 0, 0, 0, 0, 0, 1.0])
     joints = JointSample(7.25, names, np.array([0.1, -0.2]), np.zeros(2), np.zeros(2), np.zeros(2))
     zeros = np.zeros((2, 3, 3))
     sample = RobotSample("robot", joints, rest, np.zeros(6), rest, np.zeros(6), zeros, (), np.zeros((0, 7)))
@@ -118,15 +121,19 @@ def test_a_peer_of_another_vendor_hears_and_commands(domain: str) -> None:
     assert received[0].positions.tolist() == [[0.35, -0.1]]
     assert received[0].times.tolist() == [1.5]
     assert peer.heard["/joint_states", "default"] == {
-        "header": {"stamp": {"sec": 7, "nanosec": 250_000_000}, "frame_id": ""}, "name": list(names),
-        "position": [0.1, -0.2], "velocity": [0.0, 0.0], "effort": [0.0, 0.0],
-    }  # fmt: skip
+        "header": {"stamp": {"sec": 7, "nanosec": 250_000_000}, "frame_id": ""},
+        "name": list(names),
+        "position": [0.1, -0.2],
+        "velocity": [0.0, 0.0],
+        "effort": [0.0, 0.0],
+    }
 
 
 # ---------------------------------------------------------------- every topic of a whole client
 
 VINEBOT = load_description("vinebot")
-CAMERA, OPTICAL = "/head_front_camera", "head_front_camera_rgb_optical_frame"
+CAMERA = "/head_front_camera"
+OPTICAL = "head_front_camera_rgb_optical_frame"
 ARMS = [f"arm_{side}_{i}_joint" for side in ("left", "right") for i in range(1, 8)]
 BODY_SENSORS = ("base_imu", "wrist_left_ft", "wrist_right_ft")
 
@@ -339,48 +346,75 @@ TABLE: dict[str, tuple[str, Callable[[dict[str, Any]], None]]] = {
     "/audio_stamped": ("audio_common_msgs/msg/AudioDataStamped", check_stamped_sound),
     "/audio_info": ("audio_common_msgs/msg/AudioInfo", check_sound_format),
     "/diagnostics": ("diagnostic_msgs/msg/DiagnosticArray", check_diagnostics),
-    "/vine/contacts": ("sensor_msgs/msg/PointCloud2", cloud(
-        frame="map", fields="x y z force_x force_y force_z body bunch link", least=0)),
+    "/vine/contacts": (
+        "sensor_msgs/msg/PointCloud2",
+        cloud(frame="map", fields="x y z force_x force_y force_z body bunch link", least=0),
+    ),
     "/vine/markers": ("visualization_msgs/msg/MarkerArray", check_no_markers),
     "/base_imu": ("sensor_msgs/msg/Imu", check_imu),
     **{
         f"/wrist_{side}_ft/wrench": (
-            "geometry_msgs/msg/WrenchStamped", partial(check_wrench, frame=f"wrist_{side}_ft_link"),
+            "geometry_msgs/msg/WrenchStamped",
+            partial(check_wrench, frame=f"wrist_{side}_ft_link"),
         )
         for side in ("left", "right")
     },
     **{
         f"/{spec.name}/controller_state": (
-            "control_msgs/msg/JointTrajectoryControllerState", partial(check_controller, joints=spec.joints),
+            "control_msgs/msg/JointTrajectoryControllerState",
+            partial(check_controller, joints=spec.joints),
         )
-        for spec in VINEBOT.controllers if spec.kind is ControllerKind.JOINT_TRAJECTORY
+        for spec in VINEBOT.controllers
+        if spec.kind is ControllerKind.JOINT_TRAJECTORY
     },
     **{f"/see/{joint}/state": ("sensor_msgs/msg/JointState", partial(check_element, joint=joint)) for joint in ARMS},
-    "/lidar/points": ("sensor_msgs/msg/PointCloud2", cloud(
-        frame="base_lidar_link", fields="x y z intensity ring time", least=1000)),
+    "/lidar/points": (
+        "sensor_msgs/msg/PointCloud2",
+        cloud(frame="base_lidar_link", fields="x y z intensity ring time", least=1000),
+    ),
     "/scan": ("sensor_msgs/msg/LaserScan", check_scan),
     f"{CAMERA}/rgb/image_raw": ("sensor_msgs/msg/Image", check_colours),
     f"{CAMERA}/rgb/camera_info": ("sensor_msgs/msg/CameraInfo", check_camera),
-    f"{CAMERA}/rgb/image_raw/compressed": ("sensor_msgs/msg/CompressedImage", partial(
-        check_compressed, form="jpeg", start=0, magic=b"\xff\xd8")),
+    f"{CAMERA}/rgb/image_raw/compressed": (
+        "sensor_msgs/msg/CompressedImage",
+        partial(check_compressed, form="jpeg", start=0, magic=b"\xff\xd8"),
+    ),
     f"{CAMERA}/depth/image_raw": ("sensor_msgs/msg/Image", check_depth),
     f"{CAMERA}/depth/camera_info": ("sensor_msgs/msg/CameraInfo", check_camera),
-    f"{CAMERA}/depth/image_raw/compressedDepth": ("sensor_msgs/msg/CompressedImage", partial(
-        check_compressed, form="compressedDepth", start=12, magic=b"\x89PNG")),
-    f"{CAMERA}/depth/points": ("sensor_msgs/msg/PointCloud2", cloud(
-        frame=OPTICAL, fields="x y z rgb", least=640 * 480)),
+    f"{CAMERA}/depth/image_raw/compressedDepth": (
+        "sensor_msgs/msg/CompressedImage",
+        partial(check_compressed, form="compressedDepth", start=12, magic=b"\x89PNG"),
+    ),
+    f"{CAMERA}/depth/points": (
+        "sensor_msgs/msg/PointCloud2",
+        cloud(frame=OPTICAL, fields="x y z rgb", least=640 * 480),
+    ),
     f"{CAMERA}/labels": ("sensor_msgs/msg/Image", check_labels),
     f"{CAMERA}/label_info": ("vision_msgs/msg/LabelInfo", check_label_names),
-    f"{CAMERA}/detections": ("vision_msgs/msg/Detection2DArray", partial(
-        check_detections, size=lambda box: min(box["size_x"], box["size_y"]))),
-    f"{CAMERA}/detections_3d": ("vision_msgs/msg/Detection3DArray", partial(
-        check_detections, size=lambda box: min(box["size"].values()))),
-    f"{CAMERA}/bunches": ("sensor_msgs/msg/PointCloud2", cloud(
-        frame=OPTICAL, fields="x y z u v seen bunch berries berries_seen pixels amodal_pixels", least=1)),
-}  # fmt: skip
+    f"{CAMERA}/detections": (
+        "vision_msgs/msg/Detection2DArray",
+        partial(check_detections, size=lambda box: min(box["size_x"], box["size_y"])),
+    ),
+    f"{CAMERA}/detections_3d": (
+        "vision_msgs/msg/Detection3DArray",
+        partial(check_detections, size=lambda box: min(box["size"].values())),
+    ),
+    f"{CAMERA}/bunches": (
+        "sensor_msgs/msg/PointCloud2",
+        cloud(frame=OPTICAL, fields="x y z u v seen bunch berries berries_seen pixels amodal_pixels", least=1),
+    ),
+}
 """Type and check of every topic that a client with one vinebot publishes."""
-LATCHED = {"/robot_description", "/tf_static", "/tf_environment_static", "/human_intention", "/human_gesture",
-           "/audio_info", "/indicator_lights/markers", f"{CAMERA}/label_info"}  # fmt: skip
+LATCHED = {
+    "/robot_description",
+    "/tf_static",
+    "/tf_environment_static",
+    "/human_intention",
+    "/human_gesture",
+    "/audio_info",
+    "/indicator_lights/markers",
+    f"{CAMERA}/label_info",
+}
 ROWS = [(topic, qos) for topic in TABLE for qos in (("latched",) if topic in LATCHED else ("default", "sensor"))]
 
 
@@ -389,9 +423,19 @@ def whole(domain: str) -> Iterator[CyclonePeer]:
     """A whole client, and the peer after it has heard all that it will hear."""
     with process_group(10.0) as group:
         client = group.start(
-            "client", "-m", "vinesim", "client", "--role", "robot", "--name", "vinebot", "--status", "none",
-            "--sensor-hz", "5",
-        )  # fmt: skip
+            "client",
+            "-m",
+            "vinesim",
+            "client",
+            "--role",
+            "robot",
+            "--name",
+            "vinebot",
+            "--status",
+            "none",
+            "--sensor-hz",
+            "5",
+        )
         peer = CyclonePeer(group.start("peer", str(PROGRAM), domain))
 
         def look() -> None:
@@ -430,7 +474,8 @@ def test_a_peer_of_another_vendor_hears_every_topic(whole: CyclonePeer, topic: s
 @pytest.mark.slow
 def test_a_peer_of_another_vendor_moves_the_arm(whole: CyclonePeer) -> None:
     """The peer publishes a trajectory for a joint of the arm and reads /joint_states until the joint is at its goal."""
-    joint, goal = "arm_left_4_joint", 1.85
+    joint = "arm_left_4_joint"
+    goal = 1.85
     place = VINEBOT.joints.index(joint)
     key = "/joint_states", "default"
 

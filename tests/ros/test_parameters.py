@@ -73,7 +73,8 @@ def test_a_robot_without_truth_and_bad_values():
     message_packages.ensure_importable(["tf2_msgs"])
     from tf2_msgs.msg import TFMessage
 
-    base, drifted = frames.pose([1.0, 2.0, 0.0]), frames.pose([1.5, 2.0, 0.0])
+    base = frames.pose([1.0, 2.0, 0.0])
+    drifted = frames.pose([1.5, 2.0, 0.0])
     joints = JointSample(1.0, (), NONE, NONE, NONE, NONE)
     sample = RobotSample(
         "r", joints, base, np.zeros(6), drifted, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7))
@@ -84,12 +85,13 @@ def test_a_robot_without_truth_and_bad_values():
     with RobotNode("r", "<robot name='r'/>", namespace="space") as node, StockNode() as peer:
         node.publish_environment_static(("pole_0",), REST[None])
         for message, topic, name, qos in (
-            (TFMessage, "space/tf", "tf", 10), (TFMessage, "space/tf_environment", "truth", 10),
+            (TFMessage, "space/tf", "tf", 10),
+            (TFMessage, "space/tf_environment", "truth", 10),
             (PointCloud2, "space/vine/contacts", "contacts", 10),
             (TFMessage, "space/tf_environment_static", "poles", latched),
             (DiagnosticArray, "/diagnostics", "diagnostics", 10),
             (Odometry, "space/mobile_base_controller/odom", "odometry", 10),
-        ):  # fmt: skip
+        ):
             peer.node.create_subscription(message, topic, heard[name].append, qos)
 
         def tick() -> None:
@@ -132,18 +134,26 @@ def test_a_robot_without_truth_and_bad_values():
 
         assert put("environment_rate", 20.0) == ""
         for name, value in (
-            ("environment_rate", 0.0), ("environment_rate", 1e9), ("environment_rate", float("nan")),
-            ("environment_rate", "fast"), ("publish_truth", 3), ("odom_frame_id", ""), ("odom_frame_id", "/odom"),
+            ("environment_rate", 0.0),
+            ("environment_rate", 1e9),
+            ("environment_rate", float("nan")),
+            ("environment_rate", "fast"),
+            ("publish_truth", 3),
+            ("odom_frame_id", ""),
+            ("odom_frame_id", "/odom"),
             ("odom_frame_id", 3),
-        ):  # fmt: skip
+        ):
             reason = put(name, value)
             assert reason, (name, value)
             assert "\n" not in reason
         assert node.environment_rate == 20.0
         kept = node.set_parameters
     assert kept == {
-        "publish_map_to_odom": False, "publish_truth": True, "environment_rate": 20.0, "odom_frame_id": "anna/odom",
-    }  # fmt: skip
+        "publish_map_to_odom": False,
+        "publish_truth": True,
+        "environment_rate": 20.0,
+        "odom_frame_id": "anna/odom",
+    }
     kept |= {"publish_truth": False}
     for one in heard.values():
         one.clear()
@@ -169,14 +179,17 @@ def test_odometry_without_the_slip_of_the_tracks():
         """Of a robot that looks along y, in which it drives; the tracks measure a quarter more."""
         way = 0.01 * next(times)
         joints = JointSample(way, (), NONE, NONE, NONE, NONE)
-        true, measured = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0]), np.array([1.25, 0.0, 0.0, 0.0, 0.0, 0.0])
-        base, odom = frames.pose([3.0, way, 0.0], turn), frames.pose([1.25 * way, 0.0, 0.0])
+        true = np.array([0.0, 1.0, 0.0, 0.0, 0.0, 0.0])
+        measured = np.array([1.25, 0.0, 0.0, 0.0, 0.0, 0.0])
+        base = frames.pose([3.0, way, 0.0], turn)
+        odom = frames.pose([1.25 * way, 0.0, 0.0])
         covariance = np.full((2, 3, 3), 0.04)
         return RobotSample("r", joints, base, true, odom, measured, covariance, (), np.zeros((0, 7)))
 
     def last() -> tuple[float, float, float]:
         """Of the newest odometry: how far it is along x, how fast, and the variance of x."""
-        pose, twist = odometry[-1].pose, odometry[-1].twist
+        pose = odometry[-1].pose
+        twist = odometry[-1].twist
         return pose.pose.position.x, twist.twist.linear.x, pose.covariance[0]
 
     def odom_in_map() -> tuple[float, float]:
@@ -201,7 +214,8 @@ def test_odometry_without_the_slip_of_the_tracks():
         put = Setter(peer, "/r", tick)
         assert put("exact_odometry", True) == ""
         wait_until(lambda: last()[1:] == pytest.approx((1.0, 1e-6)), tick, "exact odometry")
-        begin, at = time(), last()[0]
+        begin = time()
+        at = last()[0]
         assert begin < at < 1.25 * begin + 1e-9
         wait_until(lambda: time() > begin + 0.5, tick, "a way")
         assert last()[0] - at == pytest.approx(time() - begin)
@@ -222,7 +236,8 @@ def test_a_parameter_file_counts_from_the_start(tmp_path):
     file.write_text(f"/**: {{ros__parameters: {values}}}\n")
     joints = JointSample(1.0, (), NONE, NONE, NONE, NONE)
     sample = RobotSample("r", joints, REST, np.zeros(6), REST, np.zeros(6), np.zeros((2, 3, 3)), (), np.zeros((0, 7)))
-    heard, poles = [], []
+    heard = []
+    poles = []
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with (
         RobotNode("r", "<robot name='r'/>", params_file=file) as node,
@@ -264,7 +279,8 @@ def test_a_node_that_is_refused_leaves_the_graph(tmp_path):
 
 def test_depth_labels_and_rates_of_sensors():
     info = CameraInfo(8, 6, 8.0, 8.0, 3.5, 2.5, "optical")
-    depth, exact = np.full((6, 8), 1.5, np.float32), np.full((6, 8), 1.25, np.float32)
+    depth = np.full((6, 8), 1.5, np.float32)
+    exact = np.full((6, 8), 1.25, np.float32)
     labels = np.ones((6, 8), np.int32)
     frame = CameraFrame(1.0, "camera", info, REST, np.zeros((6, 8, 3), np.uint8), depth, labels, exact)
     images: list[Image] = []
@@ -284,9 +300,12 @@ def test_depth_labels_and_rates_of_sensors():
         assert node.camera_outputs_wanted("camera") == CameraOutput.DEPTH | CameraOutput.LABELS
         put = Setter(peer, "/r_sensors", tick)
         for name, value in (
-            ("camera.exact_depth", True), ("camera.depth_encoding_16uc1", True), ("publish_truth", False),
-            ("camera.rate", 5.0), ("camera.jpeg_quality", 40),
-        ):  # fmt: skip
+            ("camera.exact_depth", True),
+            ("camera.depth_encoding_16uc1", True),
+            ("publish_truth", False),
+            ("camera.rate", 5.0),
+            ("camera.jpeg_quality", 40),
+        ):
             assert put(name, value) == ""
         wait_until(lambda: last() == ("16UC1", 1250.0), tick, "exact depth in millimetres")
         assert node.camera_outputs_wanted("camera") == CameraOutput.EXACT_DEPTH
@@ -299,7 +318,8 @@ def test_ranges_of_a_lidar_without_its_errors():
     """Of the ground below a real lidar: scattered by centimetres, and exact with the parameter."""
     clouds: list[PointCloud2] = []
     above = frames.pose(np.array([0.0, 0.0, 1.2]))
-    (plane, view), times = sensor_scenes.world(), itertools.count()
+    (plane, view) = sensor_scenes.world()
+    times = itertools.count()
     with SensorNode("r_sensors", lidars=["lidar"]) as node, StockNode() as peer:
         peer.node.create_subscription(PointCloud2, "lidar/points", clouds.append, 10)
         lidar = Lidar(LidarSpec.load("vlp16"), "lidar")

@@ -52,7 +52,8 @@ class Robot:
 
     def __init__(self, peer: StockNode) -> None:
         self.peer = peer
-        scene, vinebot = load_scene("demo"), load_description("vinebot")
+        scene = load_scene("demo")
+        vinebot = load_description("vinebot")
         model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
         self.processes = RobotProcesses("robot", scene, model, vinebot, sensor_hz=5.0, standby=True)
         self.client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
@@ -118,11 +119,13 @@ def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
     """Exactly by the counts of the process. A stock reader receives all within one of a few windows of 3 s: without
     a processor for a second it loses messages, as the publisher keeps no more than a hundred."""
     wanted = wanted_topics(robot)
-    clocks, joints = robot.subscribe(Clock, "/clock", 1000), robot.subscribe(JointState, "/joint_states")
+    clocks = robot.subscribe(Clock, "/clock", 1000)
+    joints = robot.subscribe(JointState, "/joint_states")
     robot.run_until(lambda: len(clocks) >= 20 and joints)
     missing = []
     while 0 not in missing and len(missing) < 5:
-        first, lost_before = nanoseconds(clocks[-1]), lost_clocks(robot)
+        first = nanoseconds(clocks[-1])
+        lost_before = lost_clocks(robot)
         robot.run_until(lambda first=first: nanoseconds(clocks[-1]) - first >= 3 * 10**9)
         times = [t for t in map(nanoseconds, clocks) if t >= first]
         steps = (times[-1] - first) // 10**7 + 1
@@ -137,11 +140,14 @@ def test_every_step_is_published_once_and_in_order_or_counted_as_lost(robot):
 def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics_say_so(robot):
     """To subscribers with the default QoS of rclpy."""
     topics = {
-        f"/{CAMERA}/rgb/image_raw": Image, f"/{CAMERA}/depth/image_raw": Image, f"/{CAMERA}/depth/points": PointCloud2,
+        f"/{CAMERA}/rgb/image_raw": Image,
+        f"/{CAMERA}/depth/image_raw": Image,
+        f"/{CAMERA}/depth/points": PointCloud2,
         "/lidar/points": PointCloud2,
-    }  # fmt: skip
+    }
     received = [robot.subscribe(message, topic) for topic, message in topics.items()]
-    pictures, joints = received[0], robot.subscribe(JointState, "/joint_states")
+    pictures = received[0]
+    joints = robot.subscribe(JointState, "/joint_states")
     robot.run_until(lambda: all(len(messages) >= 2 for messages in received))
     diagnostics = robot.subscribe(DiagnosticArray, "/diagnostics")
 
@@ -215,7 +221,8 @@ def check_clock_counts(robot: Robot, wanted: list[np.ndarray]) -> None:
     One more or less: the subscription may be seen between the step and its count. And the process publishes a step that
     it received for another topic on /clock as well, once it has seen a subscriber; the client learns of that one later.
     """
-    at_least, at_most = sum(int(topics[0]) for topics in wanted), sum(int(topics.any()) for topics in wanted)
+    at_least = sum(int(topics[0]) for topics in wanted)
+    at_most = sum(int(topics.any()) for topics in wanted)
     wait_until(lambda: robot.processes.sent_messages()["/clock"] + lost_clocks(robot) >= at_least - 1)
     assert robot.processes.sent_messages()["/clock"] + lost_clocks(robot) <= at_most + 1
 
@@ -225,8 +232,10 @@ def lost_clocks(robot: Robot) -> int:
 
 
 def test_a_record_holds_a_sample_exactly():
-    scene, model = load_scene("demo"), assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
-    vinebot, bus = load_description("vinebot"), MemoryHub().bus("robot")
+    scene = load_scene("demo")
+    model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+    vinebot = load_description("vinebot")
+    bus = MemoryHub().bus("robot")
     client = Client(scene, model, vinebot, bus, name="robot", pose=spawn_pose(scene, 0))
     client.tick()
     contacts = [
@@ -260,7 +269,9 @@ class RecordingNode:
     """Takes the place of the robot's node, and notes what it is told, in order."""
 
     set_parameters: dict[str, Any] = {}  # noqa: RUF012 (constant)
-    has_goals, environment_rate, refused_commands = False, 10.0, 0
+    has_goals = False
+    environment_rate = 10.0
+    refused_commands = 0
 
     def __init__(self, *_, **__) -> None:
         self.told: list[tuple[str, Any]] = []
@@ -297,12 +308,14 @@ def test_a_result_is_sent_after_the_steps_that_led_to_it(monkeypatch):
     monkeypatch.setattr("vinesim.ros.robot_node.RobotNode", RecordingNode)
     monkeypatch.setattr(middleware, "configure", lambda **_: None)
     monkeypatch.setattr(ros_worker, "report_ready", lambda *_: None)  # it lowers the priority of its process
-    description, context = load_description("vinebot"), multiprocessing.get_context("spawn")
+    description = load_description("vinebot")
+    context = multiprocessing.get_context("spawn")
     records = StepRecords("robot", description, np.zeros(len(description.joints)))
     config = RosConfig(
         "robot", "", description.base, "", False, (), np.zeros((0, 7)), records, 0, np.zeros(0, np.int32), (), (), ()
     )
-    channel, (ours, theirs) = RosChannel(config, context), context.Pipe()
+    channel = RosChannel(config, context)
+    (ours, theirs) = context.Pipe()
     read_end = copy.copy(channel)
     read_end.steps = copy.copy(channel.steps)  # each end counts for itself, as in two processes
     worker = RosWorker(config, read_end, theirs)

@@ -130,7 +130,8 @@ def test_steps_by_the_action_are_told_of_one_by_one(world: SimulationInRos) -> N
     """Exactly as many as the goal says, and only of a paused simulation."""
     from simulation_interfaces.msg import Result, SimulationState
 
-    physics, actions = world.client.physics, world.connect()
+    physics = world.client.physics
+    actions = world.connect()
     heard: list[tuple[int, int]] = []
     runs = world.end_of(world.send(actions, 3, heard))
     assert runs == (GoalStatus.STATUS_ABORTED, Result.RESULT_OPERATION_FAILED, "the simulation runs; pause it first")
@@ -155,7 +156,8 @@ def test_steps_by_the_action_end_when_they_are_cancelled(world: SimulationInRos)
     """Services are answered meanwhile; other steps are refused, and play ends the goal, too."""
     from simulation_interfaces.msg import Result, SimulationState
 
-    physics, actions = world.client.physics, world.connect()
+    physics = world.client.physics
+    actions = world.connect()
     pause = SimulationState(state=SimulationState.STATE_PAUSED)
     play = SimulationState(state=SimulationState.STATE_PLAYING)
     world.call("SetSimulationState", state=pause)
@@ -201,8 +203,9 @@ def test_entities_and_their_states(world: SimulationInRos) -> None:
     assert state.state.pose.orientation.w == pytest.approx(expected[6], abs=1e-6)
     missing = world.call("GetEntityState", entity="missing").result
     assert (missing.result, missing.error_message) == (
-        Result.RESULT_NOT_FOUND, "no entity 'missing'; get_entities lists them",
-    )  # fmt: skip
+        Result.RESULT_NOT_FOUND,
+        "no entity 'missing'; get_entities lists them",
+    )
     wrong = world.call("GetEntities", filters=EntityFilters(filter="(")).result
     assert "no regular expression" in wrong.error_message
 

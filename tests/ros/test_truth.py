@@ -86,14 +86,17 @@ def poses_of(message: TFMessage) -> dict[str, np.ndarray]:
 
 def test_people_boxes_and_bunches_stand_in_tf_environment_where_they_are(peer):
     """A bunch leaves its frame when it is picked, and has another from then on; people come and go with all bones."""
-    scene, vinebot = load_scene("demo"), load_description("vinebot")
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
     box = {"box_pose": [[3.0, 5.0, 0.1, 0, 0, 0, 1]], "box_size": [[0.3, 0.2, 0.1]], "box_mass": [1.0]}
     model = assemble([cane((50.0, 5.0, 1.4), bunch=0.5), cane((52.0, 5.0, 1.4), bunch=0.5)], **box)
     hub = MemoryHub()
     with RosProcess("robot", model, vinebot) as process:
         client = Client(scene, model, vinebot, hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0))
         process.attach(client)
-        physics, true, heard = client.physics, {}, []
+        physics = client.physics
+        true = {}
+        heard = []
 
         def keep(_: Client) -> None:
             shown = zip(physics.visuals(), physics.visual_q(), strict=True)
@@ -156,7 +159,8 @@ class Chain:
 
     def pose(self, frame: str, at: int) -> np.ndarray:
         """Of a frame in the map at a time [ns]."""
-        pose, known = frames.pose(np.zeros(3)), self.static | self.moving[at]
+        pose = frames.pose(np.zeros(3))
+        known = self.static | self.moving[at]
         while frame != "map":
             frame, step = known[frame]
             pose = frames.compose(step, pose)
@@ -167,15 +171,20 @@ class Chain:
 def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer):
     """Of a real client: boxes are those of the label pixels. Bunches that are known project onto their label pixels
     within 1 px through tf and camera_info; poses and cut points agree with them."""
-    scene, vinebot, model = load_scene("demo"), load_description("vinebot"), sensor_scenes.demo()
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
+    model = sensor_scenes.demo()
     processes = RobotProcesses("robot", scene, model, vinebot, sensor_hz=5.0)
     client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
     with processes:
         processes.attach(client)
         types = {
-            "labels": Image, "rgb/camera_info": CameraInfoMessage, "detections": Detection2DArray,
-            "detections_3d": Detection3DArray, "bunches": PointCloud2,
-        }  # fmt: skip
+            "labels": Image,
+            "rgb/camera_info": CameraInfoMessage,
+            "detections": Detection2DArray,
+            "detections_3d": Detection3DArray,
+            "bunches": PointCloud2,
+        }
         heard: dict[str, dict[int, object]] = {topic: {} for topic in types}
         for topic, kind in types.items():
             take = heard[topic]
@@ -187,8 +196,10 @@ def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer
         peer.node.create_subscription(TFMessage, "/tf_environment", environment.append, 10)
         drive = peer.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 1)
         twist = TwistStamped()
-        twist.twist.linear.x, twist.twist.angular.z = 0.15, 0.25
-        chain, loop = Chain(peer), RateLoop(client.physics.dt)
+        twist.twist.linear.x = 0.15
+        twist.twist.angular.z = 0.25
+        chain = Chain(peer)
+        loop = RateLoop(client.physics.dt)
 
         def step() -> None:
             loop.begin()
@@ -225,7 +236,8 @@ def test_detections_and_label_pixels_agree_while_the_robot_drives_and_turns(peer
         labels = labels.reshape(info.height, info.width)
         pose = chain.pose(info.frame_id, now)
         known = known_labels(primitives, pose, info) if now in times[:: len(times) // 2] else None
-        flat, solid = heard["detections"][now].detections, heard["detections_3d"][now].detections
+        flat = heard["detections"][now].detections
+        solid = heard["detections_3d"][now].detections
         rows = np.frombuffer(heard["bunches"][now].data, BUNCH_POINT)
         shown = np.unique(labels[labels // LABEL_STRIDE == int(Organ.BUNCH)]) % LABEL_STRIDE
         assert [one.id for one in flat] == [one.id for one in solid] == [str(i) for i in shown]
@@ -276,7 +288,10 @@ def extent(mask: np.ndarray) -> tuple[int, int, int, int]:
 
 def box_of(box) -> tuple[float, float, float, float]:
     """First column and row, last column and row of the pixels in a vision_msgs box."""
-    x, y, wide, high = box.center.position.x, box.center.position.y, box.size_x, box.size_y
+    x = box.center.position.x
+    y = box.center.position.y
+    wide = box.size_x
+    high = box.size_y
     return x - 0.5 * (wide - 1), y - 0.5 * (high - 1), x + 0.5 * (wide - 1), y + 0.5 * (high - 1)
 
 
@@ -285,7 +300,8 @@ def test_the_example_of_a_perception_node_finds_bunches_in_colour_and_depth(peer
     file = pathlib.Path(__file__).parents[2] / "examples" / "ros" / "find_bunches.py"
     assert len(file.read_text().splitlines()) < 60
     model = sensor_scenes.demo()
-    view, primitives = rest_snapshot(model), Primitives(model)
+    view = rest_snapshot(model)
+    primitives = Primitives(model)
     primitives.update(view)
     middles = view.body_q[model.bunch_body].astype(float)
     middles = frames.compose(middles, frames.pose(np.outer(0.5 * model.bunch_length, [1.0, 0.0, 0.0])))[:, :3]

@@ -44,9 +44,10 @@ def peer(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StockNode]:
     """A stock node in a ROS domain of this module."""
     message_packages.ensure_importable(["tf2_msgs"])
     variables = {
-        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         "ROS_LOG_DIR": str(tmp_path_factory.mktemp("log")),
-    }  # fmt: skip
+    }
     with pytest.MonkeyPatch.context() as monkeypatch:
         for name, value in variables.items():
             monkeypatch.setenv(name, value)
@@ -69,7 +70,8 @@ class World:
     """A server and its clients, and a stock node that hears every message of /clock."""
 
     def __init__(self, group: ProcessGroup, peer: StockNode) -> None:
-        self._group, self.peer = group, peer
+        self._group = group
+        self.peer = peer
         _, self._endpoint = group.start_server()
         self.clients: dict[str, Process] = {}
         self.clocks: list[tuple[int, int]] = []
@@ -81,10 +83,25 @@ class World:
     def start(self, name: str, spawn: int) -> None:
         """Start a client whose robot has this name and namespace, and an :data:`INTEREST_RADIUS`."""
         self.clients[name] = self._group.start(
-            name, "-m", "vinesim", "client", "--role", "robot", "--connect", self._endpoint, "--name", name,
-            "--namespace", name, "--spawn", str(spawn), "--status", "none",
-            "--interest-radius", str(INTEREST_RADIUS),
-        )  # fmt: skip
+            name,
+            "-m",
+            "vinesim",
+            "client",
+            "--role",
+            "robot",
+            "--connect",
+            self._endpoint,
+            "--name",
+            name,
+            "--namespace",
+            name,
+            "--spawn",
+            str(spawn),
+            "--status",
+            "none",
+            "--interest-radius",
+            str(INTEREST_RADIUS),
+        )
 
     def look(self) -> None:
         """Take messages for a moment; every client must be running."""
@@ -170,7 +187,8 @@ def test_names_and_frames_of_two_clients_do_not_collide(world: World, peer: Stoc
         peer.node.destroy_subscription(one)
     assert {topic.split("/")[1] for topic in parents} == ours.keys()
     for space in ours.values():
-        moving, fixed = parents[f"{space}/tf"], parents[f"{space}/tf_static"]
+        moving = parents[f"{space}/tf"]
+        fixed = parents[f"{space}/tf_static"]
         assert moving.keys().isdisjoint(fixed)
         assert all(len(of) == 1 for of in (*moving.values(), *fixed.values()))
         for frame in moving.keys() | fixed.keys():

@@ -51,7 +51,8 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 
 ROOT = pathlib.Path(__file__).parents[2]
-EXAMPLES, FOLDER = ROOT / "examples" / "ros", ROOT / "ros"
+EXAMPLES = ROOT / "examples" / "ros"
+FOLDER = ROOT / "ros"
 SLIP = 0.2
 
 
@@ -68,9 +69,21 @@ def robot(tmp_path_factory) -> Iterator[StockNode]:
         for name, value in (*domain.items(), ("ROS_LOG_DIR", str(folder))):
             monkeypatch.setenv(name, value)
         client = group.start(
-            "client", "-m", "vinesim", "client", "--role", "robot", "--name", "vinebot", "--status", "none",
-            "--robot", str(folder / "vinebot.urdf"), "--params-file", str(FOLDER / "parameters.yaml"),
-        )  # fmt: skip
+            "client",
+            "-m",
+            "vinesim",
+            "client",
+            "--role",
+            "robot",
+            "--name",
+            "vinebot",
+            "--status",
+            "none",
+            "--robot",
+            str(folder / "vinebot.urdf"),
+            "--params-file",
+            str(FOLDER / "parameters.yaml"),
+        )
         with StockNode() as peer:
             poses: list[Odometry] = []
             peer.node.create_subscription(Odometry, "/mobile_base_controller/odom", poses.append, 10)
@@ -86,9 +99,12 @@ def example(name: str, *arguments: str) -> Iterator[Callable[[], list[str]]]:
     assert not re.search(r"^\s*(import|from) vinesim", text, re.MULTILINE)
     packages = [path for path in sys.path if "interfaces" in path]  # as if they were installed
     child = subprocess.Popen(
-        [sys.executable, str(EXAMPLES / name), *arguments], stdout=subprocess.PIPE, text=True, cwd="/",
+        [sys.executable, str(EXAMPLES / name), *arguments],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd="/",
         env=os.environ | {"PYTHONPATH": os.pathsep.join(packages)},
-    )  # fmt: skip
+    )
     printed: queue.SimpleQueue[str] = queue.SimpleQueue()
     lines: list[str] = []
 
@@ -143,7 +159,8 @@ def test_poles_and_elastic_elements_are_those_of_the_scene_and_the_drives(robot:
     description = load_description("vinebot")
     stiffness = series_stiffness(description.drives)[description.joints.index(joint)]
     for stamp in links.keys() & springs.keys():
-        link, spring = links[stamp], springs[stamp]
+        link = links[stamp]
+        spring = springs[stamp]
         place = link.name.index(joint)
         assert spring.name == [joint]
         assert spring.effort[0] == pytest.approx(stiffness * (spring.position[0] - link.position[place]), abs=1e-6)
@@ -157,7 +174,8 @@ def driver(peer: StockNode) -> Callable[[float, float], None]:
 
     def drive(ahead: float, turn: float) -> None:
         twist = TwistStamped()
-        twist.twist.linear.x, twist.twist.angular.z = ahead, turn
+        twist.twist.linear.x = ahead
+        twist.twist.angular.z = turn
         commands.publish(twist)
         for _ in range(40):
             peer.spin(0.001)
@@ -181,8 +199,9 @@ def test_an_arm_gives_way_and_comes_back(robot: StockNode) -> None:
         ways = iter(range(10**6))
         wait_until(
             lambda: any("gives way by" in line for line in printed()),
-            lambda: drive(0.0, 1.0 if next(ways) // 16 % 2 else -1.0), "a push",
-        )  # fmt: skip
+            lambda: drive(0.0, 1.0 if next(ways) // 16 % 2 else -1.0),
+            "a push",
+        )
         count = len(printed())
         wait_until(lambda: "back" in printed()[count - 1 :], lambda: drive(0.0, 0.0), "rest")
 
@@ -211,9 +230,14 @@ def test_a_low_battery_lights_the_signal_tower(robot: StockNode) -> None:
     with example("battery_light.py") as printed:
         said: list[str] = []
         for charge, pattern in (
-            (0.15, "warning"), (0.21, "warning"), (0.04, "alarm"), (0.06, "alarm"), (0.1, "warning"),
-            (float("nan"), "warning"), (0.9, "off"),
-        ):  # fmt: skip
+            (0.15, "warning"),
+            (0.21, "warning"),
+            (0.04, "alarm"),
+            (0.06, "alarm"),
+            (0.1, "warning"),
+            (float("nan"), "warning"),
+            (0.9, "off"),
+        ):
             told.clear()
             if pattern != (said or ["off"])[-1]:
                 said.append(pattern)
@@ -262,7 +286,8 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
 
     with example("localise.py", "vinebot") as printed:
         wait_until(lambda: own and others and "odom" not in own[-1], lambda: (printed(), robot.spin(0.05)), "tf")
-        before, start = true_yaw(), yaw(odometry[-1].pose.pose.orientation)
+        before = true_yaw()
+        start = yaw(odometry[-1].pose.pose.orientation)
         drive = driver(robot)
 
         def counted() -> float:
@@ -290,8 +315,11 @@ def test_goals_from_another_process_end_as_they_should(robot: StockNode) -> None
     """A small version of ``vinesim bench ros``: one goal to its end, one cancelled, one preempted; none is kept."""
     done = subprocess.run(
         [sys.executable, "-m", "vinesim.bench.goal_sender", "--goals", "1", "--cancels", "1", "--preempts", "1"],
-        capture_output=True, text=True, timeout=deadline(300.0), check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=deadline(300.0),
+        check=False,
+    )
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert sorted(row["kind"] for row in rows) == ["cancel", "end", "goal", "preempt"]
@@ -306,8 +334,12 @@ def test_resets_from_another_process_leave_nothing_behind(robot: StockNode) -> N
     """A small version of the resets of ``vinesim bench ros``: spawned, driven and commanded before each."""
     done = subprocess.run(
         [sys.executable, "-m", "vinesim.bench.reset_caller", "--resets", "2"],
-        capture_output=True, text=True, timeout=deadline(600.0), check=False, input="\n\n",
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=deadline(600.0),
+        check=False,
+        input="\n\n",
+    )
     assert done.returncode == 0, done.stderr
     rows = [json.loads(line) for line in done.stdout.splitlines()]
     assert len(rows) == 2
@@ -381,10 +413,13 @@ def test_a_robot_without_a_server_shows_no_area_of_interest(robot: StockNode) ->
 
 
 RVIZ_TYPES = {
-    "RobotModel": "std_msgs/msg/String", "Odometry": "nav_msgs/msg/Odometry", "Image": "sensor_msgs/msg/Image",
-    "PointCloud2": "sensor_msgs/msg/PointCloud2", "LaserScan": "sensor_msgs/msg/LaserScan",
+    "RobotModel": "std_msgs/msg/String",
+    "Odometry": "nav_msgs/msg/Odometry",
+    "Image": "sensor_msgs/msg/Image",
+    "PointCloud2": "sensor_msgs/msg/PointCloud2",
+    "LaserScan": "sensor_msgs/msg/LaserScan",
     "MarkerArray": "visualization_msgs/msg/MarkerArray",
-}  # fmt: skip
+}
 """What displays of rviz_default_plugins subscribe to."""
 FOXGLOVE_PANELS = ("3D", "Image", "Plot", "DiagnosticSummary", "RawMessages", "StateTransitions")
 
@@ -404,11 +439,15 @@ def test_files_name_topics_that_there_are(robot: StockNode) -> None:
     assert {"/robot_description", "/head_front_camera/depth/points", "/tf_environment"} <= named
     displays = {
         one.get("Topic", one.get("Description Topic"))["Value"]: one
-        for one in rviz["Visualization Manager"]["Displays"] if "Topic" in one or "Description Topic" in one
-    }  # fmt: skip
+        for one in rviz["Visualization Manager"]["Displays"]
+        if "Topic" in one or "Description Topic" in one
+    }
     assert displays.keys() <= named
-    wait_until(lambda: named <= {name for name, _ in robot.node.get_topic_names_and_types()},
-               lambda: robot.spin(0.05), f"topics {sorted(named)}")  # fmt: skip
+    wait_until(
+        lambda: named <= {name for name, _ in robot.node.get_topic_names_and_types()},
+        lambda: robot.spin(0.05),
+        f"topics {sorted(named)}",
+    )
     types = dict(robot.node.get_topic_names_and_types())
     for topic, one in displays.items():
         name = one["Class"].removeprefix("rviz_default_plugins/")
@@ -464,9 +503,12 @@ def test_the_launch_file_starts_a_robot_with_options_that_there_are(monkeypatch:
     (vinesim, rviz, relay) = started
     assert vinesim[:4] == ["vinesim", "client", "--role", "robot"]
     done = subprocess.run(
-        [sys.executable, "-m", "vinesim", "client", "--help"], capture_output=True, text=True, check=True,
+        [sys.executable, "-m", "vinesim", "client", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
         env=os.environ | {"COLUMNS": "200"},
-    )  # fmt: skip
+    )
     assert [word for word in vinesim if str(word).startswith("--") and word not in done.stdout] == []
     assert pathlib.Path(rviz[2]).is_file()
     assert relay[-2:] == ["/tf_environment", "/tf"]

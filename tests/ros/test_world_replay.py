@@ -49,9 +49,14 @@ def record(path: pathlib.Path) -> tuple[Client, float]:
     )
     scene = load_scene("demo")
     client = Client(
-        scene, generate(scene), load_description("vinebot"), hub.bus("picker"), name="picker",
-        pose=spawn_pose(scene, 0), clock=lambda: hub.time,
-    )  # fmt: skip
+        scene,
+        generate(scene),
+        load_description("vinebot"),
+        hub.bus("picker"),
+        name="picker",
+        pose=spawn_pose(scene, 0),
+        clock=lambda: hub.time,
+    )
     with RecordingWriter(path) as recording:
         recorder = Recorder(hub.bus("recorder", live=False), recording, clock=lambda: hub.time, everything=True)
         client.robot.command_position([0.4], ["head_1_joint"])
@@ -76,10 +81,14 @@ def test_a_recorded_world_is_heard_in_ros(tmp_path, monkeypatch) -> None:
     heard: dict[str, list] = {}
     with StockNode() as peer, WorldNode("vinesim_replay") as node:
         for name, message, qos in (
-            ("/clock", Clock, 100), ("/picker/joint_states", JointState, 100), ("/picker/tf", TFMessage, 100),
-            ("/picker/robot_description", String, LATCHED), ("/picker/tf_static", TFMessage, LATCHED),
-            ("/tf_environment", TFMessage, 100), ("/tf_environment_static", TFMessage, LATCHED),
-        ):  # fmt: skip
+            ("/clock", Clock, 100),
+            ("/picker/joint_states", JointState, 100),
+            ("/picker/tf", TFMessage, 100),
+            ("/picker/robot_description", String, LATCHED),
+            ("/picker/tf_static", TFMessage, LATCHED),
+            ("/tf_environment", TFMessage, 100),
+            ("/tf_environment_static", TFMessage, LATCHED),
+        ):
             heard[name] = []
             peer.node.create_subscription(message, name, heard[name].append, qos)
         RosReplay(spectator, node, lambda: bus.time)

@@ -188,10 +188,12 @@ def worn(outfit: str) -> dict[str, np.ndarray]:
     """Colours [3] of what people wear, and of their skin."""
     parts = appearance.load_human_model(1.75, outfit=outfit).parts
     pieces = {
-        "trousers": parts["left_thigh"][0], "shirt": parts["left_upper_arm"][0], "skin": parts["neck"][0],
+        "trousers": parts["left_thigh"][0],
+        "shirt": parts["left_upper_arm"][0],
+        "skin": parts["neck"][0],
         "hat": next(shape for shape in parts["head"] if shape.surface == "straw"),
         "vest": next(shape for shape in parts["chest"] if shape.kind == "box"),
-    }  # fmt: skip
+    }
     return {name: np.array(shape.rgba[:3]) for name, shape in pieces.items()}
 
 
@@ -200,7 +202,8 @@ def test_outfits_differ_visibly() -> None:
     outfits = appearance.outfit_names()
     assert len(outfits) >= 6
     for one, other in itertools.combinations(outfits, 2):
-        a, b = worn(one), worn(other)
+        a = worn(one)
+        b = worn(other)
         differ = [name for name in a if np.abs(a[name] - b[name]).max() >= 0.2]
         assert len(differ) >= 3, f"{one} and {other} differ in {differ} only"
     colours = [rgba for outfit in outfits for rgba in worn(outfit).values()]
@@ -243,7 +246,8 @@ def test_the_mouth_of_shears_is_between_their_blades() -> None:
         steel = [shape for shape in shears.parts[part] if shape.surface == "metal"]
         at = frames.compose(pose, np.stack([shape.pose for shape in steel]))
         tips.append(at[np.argmax(at[:, 0]), :3])
-    mouth, half = shears.mouth[:3], shears.mouth_half
+    mouth = shears.mouth[:3]
+    half = shears.mouth_half
     assert tips[0][1] > mouth[1] > tips[1][1]
     assert min(tip[0] for tip in tips) > mouth[0]
     assert all(abs(tip[2] - mouth[2]) < half[2] for tip in tips)

@@ -24,9 +24,11 @@ def test_prototypes_are_dense_and_do_not_overlap(which):
 
 def test_shapes_differ_and_taper():
     """Slenderness varies, and most bunches are wider at the shoulder than near the tip."""
-    slender, taper = [], []
+    slender = []
+    taper = []
     for bunch in berries.prototypes():
-        x, across = bunch.position[:, 0], np.hypot(*bunch.position[:, 1:].T)
+        x = bunch.position[:, 0]
+        across = np.hypot(*bunch.position[:, 1:].T)
         slender.append(x.max() / across.max())
         taper.append(across[x < np.quantile(x, 0.5)].max() / across[x > np.quantile(x, 0.85)].max())
     assert np.ptp(slender) > 0.6

@@ -90,12 +90,14 @@ def test_solve_rest_pose_keeps_the_drawn_shape_under_load():
 
 def test_a_weighted_beam_bends_by_the_angle_of_beam_theory():
     """A beam that is straight under its load is bent without it, by w L^3 / 6 EI + m g L^2 / 2 EI at its tip."""
-    load, length = 0.05, 1.0
+    load = 0.05
+    length = 1.0
     tree = beam(pieces=64, load=load)
     tree.solve_rest_pose()
     model = builder.assemble([tree])
     angle = np.linalg.norm(frames.log(model.joint_settled.astype(float)), axis=1)[:-1].sum()
-    ei, weight = 5e9 * np.pi * 0.004**4 / 4.0, 800.0 * np.pi * 0.004**2 * 9.81
+    ei = 5e9 * np.pi * 0.004**4 / 4.0
+    weight = 800.0 * np.pi * 0.004**2 * 9.81
     assert angle == pytest.approx(weight * length**3 / (6.0 * ei) + load * 9.81 * length**2 / (2.0 * ei), rel=2e-3)
 
 
@@ -176,7 +178,8 @@ def test_a_bunch_has_its_clusters_behind_the_core():
 
 
 def test_clusters_do_not_change_the_rest_pose():
-    fine, whole = cane_with_bunch(), cane_with_bunch(clusters=False)
+    fine = cane_with_bunch()
+    whole = cane_with_bunch(clusters=False)
     for tree in (fine, whole):
         tree.solve_rest_pose()
     models = [builder.assemble([tree]) for tree in (fine, whole)]

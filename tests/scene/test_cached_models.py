@@ -27,7 +27,8 @@ def models(cache: pathlib.Path) -> list[pathlib.Path]:
 
 def assert_same(a: Model, b: Model) -> None:
     for name in Model.array_fields():
-        x, y = getattr(a, name), getattr(b, name)
+        x = getattr(a, name)
+        y = getattr(b, name)
         assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), name
     assert a.digest() == b.digest()
 
@@ -35,7 +36,8 @@ def assert_same(a: Model, b: Model) -> None:
 @pytest.mark.parametrize("name", ["demo", "vsp"])
 def test_a_cached_model_is_the_computed_one(name: str, cache: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene(name)
-    computed, first = generate_uncached(scene), generate(scene)
+    computed = generate_uncached(scene)
+    first = generate(scene)
     monkeypatch.setattr(vineyard, "_generate", None)  # from here on it must come from the disk
     second = generate(scene)
     assert_same(computed, first)

@@ -89,7 +89,8 @@ def test_leaves_weigh_and_drag_on_what_carries_them(tmp_path):
     carrier, count = np.unique(model.leaf_body[ours], return_counts=True)
     for body in carrier[count == 1]:
         blade = model.leaf_pose[ours][model.leaf_body[ours] == body][0, :3]
-        mass, added = bare.body_mass[body], model.body_mass[body] - bare.body_mass[body]
+        mass = bare.body_mass[body]
+        added = model.body_mass[body] - bare.body_mass[body]
         com = (mass * bare.body_com[body] + added * blade) / (mass + added)
         np.testing.assert_allclose(model.body_com[body], com, atol=1e-5)
         reduced = mass * added / (mass + added)
@@ -101,7 +102,8 @@ def test_leaves_weigh_and_drag_on_what_carries_them(tmp_path):
 def test_old_wood_is_bare_side_shoots_have_small_leaves_and_the_season_takes_them(tmp_path):
     """A cane of 14 mm, older than a year, with two shoots of 8 mm, and on one of them a side shoot."""
     ends = [(0.0, 0.0, 0.3), (0.0, 0.0, 0.6), (0.3, 0.0, 1.0), (-0.3, 0.0, 1.0), (0.5, 0.0, 0.9), (0.6, 0.0, 1.3)]
-    parent, thick = [-1, 0, 1, 2, 2, 3, 3], [0.014, 0.014, 0.014, 0.008, 0.008, 0.004, 0.005]
+    parent = [-1, 0, 1, 2, 2, 3, 3]
+    thick = [0.014, 0.014, 0.014, 0.008, 0.008, 0.004, 0.005]
     plant = cane(tmp_path, ends)
     nodes = tuple((p, *node[1:4], d) for p, node, d in zip(parent, plant.nodes, thick, strict=True))
     plant = msgspec.structs.replace(plant, nodes=nodes)
@@ -110,7 +112,8 @@ def test_old_wood_is_bare_side_shoots_have_small_leaves_and_the_season_takes_the
     ours = np.isin(model.leaf_body, part(model, 1))
     carrier = model.leaf_body[ours]
     assert model.body_radius[carrier, 1].max() <= 0.00525
-    shoots, lateral = 0.5 + 0.5 + np.hypot(0.3, 0.3), np.hypot(0.2, 0.1)
+    shoots = 0.5 + 0.5 + np.hypot(0.3, 0.3)
+    lateral = np.hypot(0.2, 0.1)
     assert ours.sum() == pytest.approx((shoots + lateral) / 0.0542, abs=2)
     pose = model.forward_kinematics(model.joint_settled)[carrier]
     on_side = (pose[:, 0] > 1.79) & (frames.compose(pose, frames.pose(model.leaf_base[ours]))[:, 2] < 0.995)

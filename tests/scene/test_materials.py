@@ -64,8 +64,12 @@ def test_a_pair_given_in_both_orders_is_refused(tmp_path: pathlib.Path) -> None:
 def test_plants_and_trellis_are_of_the_materials_of_their_organs() -> None:
     organs = np.array([Organ.CANE, Organ.PEDUNCLE, Organ.BUNCH, Organ.WIRE, Organ.POLE])
     assert materials_of_organs(organs).tolist() == [
-        Material.BARK, Material.SHOOT, Material.BERRY, Material.STEEL, Material.UNKNOWN,
-    ]  # fmt: skip
+        Material.BARK,
+        Material.SHOOT,
+        Material.BERRY,
+        Material.STEEL,
+        Material.UNKNOWN,
+    ]
 
 
 def test_collision_shapes_are_of_what_is_seen_at_their_place() -> None:

@@ -27,8 +27,10 @@ def test_vines_that_are_missing_change_no_other(tmp_path):
         kind = full.fixed_organ == int(organ)
         np.testing.assert_array_equal(less.fixed_start[less.fixed_organ == int(organ)], full.fixed_start[kind])
     assert (less.fixed_organ == int(Organ.TRUNK)).sum() * 2 == (full.fixed_organ == int(Organ.TRUNK)).sum()
-    for missing, said in (("[[0, 2]]", r"layout.missing\[0\] is \[0, 2\]; give \[0 to 0, 0 to 1\]: row, place"),
-                          ("[[0, 0], [0, 1]]", "names all 2 vines; leave one")):  # fmt: skip
+    for missing, said in (
+        ("[[0, 2]]", r"layout.missing\[0\] is \[0, 2\]; give \[0 to 0, 0 to 1\]: row, place"),
+        ("[[0, 0], [0, 1]]", "names all 2 vines; leave one"),
+    ):
         (tmp_path / "scene.toml").write_text(SCENE.read_text().replace("[[0, 1]]", missing))
         (tmp_path / "vine.toml").write_text((SCENE.parent / "vine.toml").read_text())
         with pytest.raises(SceneError, match=said):

@@ -31,10 +31,12 @@ def test_forward_kinematics_is_the_chain_of_transforms(model):
         return m
 
     for body in range(len(joint_q)):
-        chain, at = np.eye(4), body
+        chain = np.eye(4)
+        at = body
         while at >= 0:
             chain = matrix(model.body_offset[at], model.body_rest[at]) @ matrix(np.zeros(3), joint_q[at]) @ chain
-            root, at = model.tree_pose[model.body_tree[at]], int(model.body_parent[at])
+            root = model.tree_pose[model.body_tree[at]]
+            at = int(model.body_parent[at])
         chain = matrix(root[:3], root[3:]) @ chain
         assert np.allclose(found[body, :3], chain[:3, 3], atol=1e-6)
         assert np.allclose(frames.to_matrix(found[body, 3:]), chain[:3, :3], atol=1e-6)
@@ -42,9 +44,11 @@ def test_forward_kinematics_is_the_chain_of_transforms(model):
 
 def test_depth_counts_ancestors(model):
     for body, depth in enumerate(model.depth()):
-        count, at = 0, model.body_parent[body]
+        count = 0
+        at = model.body_parent[body]
         while at >= 0:
-            count, at = count + 1, model.body_parent[at]
+            count = count + 1
+            at = model.body_parent[at]
         assert count == depth
 
 
@@ -54,7 +58,8 @@ def test_bodies_of_a_tree(model):
 
 
 def test_the_digest_depends_on_every_bit(model):
-    before, changed = model.digest(), model.copy()
+    before = model.digest()
+    changed = model.copy()
     assert changed.digest() == before
     changed.body_mass[3] = np.nextafter(changed.body_mass[3], np.float32(1.0))
     assert changed.digest() != before

@@ -48,8 +48,9 @@ def test_the_page_counts_the_guesses_among_them_and_among_pairs_of_materials():
     text = " ".join((pathlib.Path(__file__).parents[2] / "docs/validation.md").read_text().split())
     counted = re.search(
         r"(\d+) of (\d+) physics parameters are guesses\*\* \((\d+) tuned with this solver, (\d+) derived, (\d+) read, "
-        r"(\d+) switches and sizes\)", text,
-    )  # fmt: skip
+        r"(\d+) switches and sizes\)",
+        text,
+    )
     assert counted, "no count of physics parameters"
     kinds = (grades[kind] for kind in ("TUNED", "DERIVED", "READ", ""))
     assert tuple(map(int, counted.groups())) == (grades["GUESSED"], len(FIELDS), *kinds)

@@ -37,11 +37,13 @@ def imported(tmp_path, text, name="plant.mtg", **options):
 
 @pytest.mark.parametrize("name", ["vine.mtg", "vine.ply", "vine_cylinders.txt", "vine.xml"])
 def test_all_formats_give_the_same_wood(name):
-    plant, wanted = vinesim.import_plant(PLANTS / name), load_imported_plant(str(PLANTS / "vine.toml"))
+    plant = vinesim.import_plant(PLANTS / name)
+    wanted = load_imported_plant(str(PLANTS / "vine.toml"))
     has_fruit = name in ("vine.mtg", "vine.ply")
     assert sorted(mass for _, mass in plant.bunches) == ([0.3, 0.45, 0.6] if has_fruit else [])
     assert not plant.filled
-    points, others = plant.skeleton(), wanted.skeleton()
+    points = plant.skeleton()
+    others = wanted.skeleton()
     order, other = (np.lexsort(one.position.round(3).T) for one in (points, others))
     np.testing.assert_allclose(points.position[order], others.position[other], atol=5e-4)
     wood = [model.body_mass[model.body_organ == int(Organ.CANE)] for model in (grown(plant), grown(wanted))]
@@ -77,7 +79,8 @@ def test_an_imported_cane_sags_and_weighs_as_one_made_by_hand(tmp_path):
 def test_a_scene_with_an_imported_plant_is_in_equilibrium_as_drawn():
     scene = load_scene(PLANTS / "scene.toml")
     simulation = vinesim.Simulation(scene)
-    model, before = simulation.model, simulation.state.body_q.copy()
+    model = simulation.model
+    before = simulation.state.body_q.copy()
     trees = np.flatnonzero(model.tree_vine == 1)
     ours = np.isin(model.body_tree, trees)
     assert len(trees) == 3
@@ -142,17 +145,22 @@ BAD = {
     "two plants": ("plant.mtg", TABLE + "/E1\t\t\t0\t0\t0\n/E2\t\t\t1\t0\t0\n", "has 2 plants or a loop"),
     "point cloud": ("plant.ply", PLY + "end_header\n0 0 0\n0 0 1\n0 1 1\n", "tells no topology"),
     "loop": (
-        "plant.ply", PLY + "element edge 2\nproperty int vertex1\nproperty int vertex2\nend_header\n"
-        "0 0 0\n0 0 1\n0 1 1\n1 2\n2 1\n", "not joined to the base"),
+        "plant.ply",
+        PLY + "element edge 2\nproperty int vertex1\nproperty int vertex2\nend_header\n0 0 0\n0 0 1\n0 1 1\n1 2\n2 1\n",
+        "not joined to the base",
+    ),
     "short": ("plant.ply", PLY + "property int parent\nend_header\n0 0 0 -1\n", "fewer than 3 rows"),
     "no PLY": ("plant.ply", "solid\n", "is no PLY file"),
     "loose cylinder": ("plant.txt", CYLINDERS + "0.004\t0.1\t5\t0\t0\t0\t0\t1\t1\n", "starts 4"),
     "grown, not drawn": (
-        "plant.xml", "<helios><plant_instance ID='0'><base_position> 0 0 0 </base_position><shoot ID='0'/>"
-        "</plant_instance></helios>", "write the cylinders instead: writeQSMCylinderFile"),
+        "plant.xml",
+        "<helios><plant_instance ID='0'><base_position> 0 0 0 </base_position><shoot ID='0'/>"
+        "</plant_instance></helios>",
+        "write the cylinders instead: writeQSMCylinderFile",
+    ),
     "no XML": ("plant.xml", "<helios>", "not valid XML"),
     "mesh": ("plant.obj", "v 0 0 0\n", "give one of: .mtg, .ply, .txt, .xml"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(("name", "text", "said"), BAD.values(), ids=BAD)

@@ -67,8 +67,10 @@ def test_another_row_changes_no_tree_of_the_others(vineyard):
 
 def test_every_shoot_stands_in_the_middle_of_its_piece_of_an_arm(vineyard):
     _scene, model = vineyard
-    piece, foot = model.tree_piece, model.tree_pose[:, :3].astype(float)
-    start, way = model.fixed_start[piece].astype(float), (model.fixed_end - model.fixed_start)[piece].astype(float)
+    piece = model.tree_piece
+    foot = model.tree_pose[:, :3].astype(float)
+    start = model.fixed_start[piece].astype(float)
+    way = (model.fixed_end - model.fixed_start)[piece].astype(float)
     share = ((foot - start) * way).sum(1) / (way * way).sum(1)
     assert model.is_on_arm().all()
     assert ((share > -1e-5) & (share < 1.0 + 1e-5)).all()
@@ -108,9 +110,10 @@ def test_bodies_of_a_tree_are_contiguous_parents_first(vineyard):
         assert (model.body_tree[bodies] == tree).all()
     assert model.tree_size.sum() == len(model.body_mass)
     assert 12 <= model.tree_core.min() <= model.tree_core.max() <= 26
-    assert (model.tree_size - model.tree_core == np.bincount(
-        model.body_tree[model.bunch_body], model.bunch_clusters, len(model.tree_first)
-    )).all()  # fmt: skip
+    assert (
+        model.tree_size - model.tree_core
+        == np.bincount(model.body_tree[model.bunch_body], model.bunch_clusters, len(model.tree_first))
+    ).all()
 
 
 def test_some_shoots_fork(vineyard):
@@ -161,7 +164,8 @@ def test_clusters_are_a_chain_behind_the_core_with_the_mass_of_the_bunch(vineyar
     assert model.bunch_clusters[long].mean() > model.bunch_clusters[~long].mean() + 1.0
     q = model.forward_kinematics(model.joint_settled)
     for bunch in range(0, len(model.bunch_body), 5):
-        body, first = int(model.bunch_body[bunch]), int(model.bunch_cluster[bunch])
+        body = int(model.bunch_body[bunch])
+        first = int(model.bunch_cluster[bunch])
         parts = np.arange(first, first + model.bunch_clusters[bunch])
         assert (model.body_parent[parts] == [body, *parts[:-1]]).all()
         assert (parts >= model.tree_first[model.body_tree[body]] + model.tree_core[model.body_tree[body]]).all()
@@ -185,7 +189,8 @@ def test_shoots_are_tied_where_they_pass_wires(vineyard):
     at = q[:, :3] + frames.rotate(q[:, 3:], model.tie_point.astype(float))
     assert np.abs(at - model.tie_anchor).max() < 1e-5  # unstretched as drawn
     wire = model.fixed_organ == Organ.WIRE
-    start, end = model.fixed_start[wire].astype(float), model.fixed_end[wire].astype(float)
+    start = model.fixed_start[wire].astype(float)
+    end = model.fixed_end[wire].astype(float)
     gap = np.array([to_segment(point, start, end).min() for point in at])
     assert np.mean(gap < 0.075) > (0.99 if scene.training == "vsp" else 0.35)
     assert gap.max() < 0.36  # by a string of 0.3 m and a mesh of 0.5 m
@@ -318,13 +323,16 @@ def skew(v):
 def modes(model, tree):
     """Squared angular frequencies, shapes and mass matrix of small motions of one coarse tree about its equilibrium."""
     bodies = slice(int(model.tree_first[tree]), int(model.tree_first[tree] + model.tree_core[tree]))
-    first, n = bodies.start, bodies.stop - bodies.start
+    first = bodies.start
+    n = bodies.stop - bodies.start
     parent = model.body_parent[bodies] - first
-    mass, com = model.body_mass[bodies].astype(float), model.body_com[bodies].astype(float)
+    mass = model.body_mass[bodies].astype(float)
+    com = model.body_com[bodies].astype(float)
     rest = frames.log(model.joint_settled[bodies].astype(float))
 
     def place(angle):
-        q, axes = np.zeros((n, 7)), np.zeros((n, 4))
+        q = np.zeros((n, 7))
+        axes = np.zeros((n, 4))
         for i in range(n):
             base = model.tree_pose[tree].astype(float) if i == 0 else q[parent[i]]
             axes[i] = frames.multiply(base[3:], model.body_rest[first + i].astype(float))
@@ -336,7 +344,8 @@ def modes(model, tree):
     for i in reversed(range(1, n)):
         below[parent[i]] |= below[i]
     ties = np.flatnonzero((model.tie_body >= bodies.start) & (model.tie_body < bodies.stop))
-    tied, pull = model.tie_body[ties] - first, model.tie_stiffness[ties, None].astype(float)
+    tied = model.tie_body[ties] - first
+    pull = model.tie_stiffness[ties, None].astype(float)
 
     def unbalanced(angle):
         q, axes, centre = place(angle)
@@ -356,7 +365,8 @@ def modes(model, tree):
     q, axes, centre = place(rest)
     inertia = np.zeros((3 * n, 3 * n))
     for b in range(n):
-        turn, move = np.zeros((3, 3 * n)), np.zeros((3, 3 * n))
+        turn = np.zeros((3, 3 * n))
+        move = np.zeros((3, 3 * n))
         for i in np.flatnonzero(below[:, b]):
             turn[:, 3 * i : 3 * i + 3] = frames.to_matrix(axes[i])
             move[:, 3 * i : 3 * i + 3] = -skew(centre[b] - q[i, :3]) @ frames.to_matrix(axes[i])

@@ -101,8 +101,10 @@ def test_every_visible_bunch_has_a_label(model, primitives) -> None:
 
 
 def test_a_moved_bunch_moves_in_the_picture(model) -> None:
-    primitives, view = Primitives(model, grass=0.0), rest_snapshot(model)
-    camera, bunch = _camera(), 10
+    primitives = Primitives(model, grass=0.0)
+    view = rest_snapshot(model)
+    camera = _camera()
+    bunch = 10
     centre = _bunch_centre(model, view, bunch)
     pose = look_at(centre + np.array([-0.5, 0.0, -0.1]), centre)
     right = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]))
@@ -167,7 +169,8 @@ def test_things_cast_shadows_that_follow_them() -> None:
         u, v = np.round(project_points(local, sensor_scenes.SMALL)).astype(int)
         return float(camera.render(primitives, pose, time).rgb[v - 2 : v + 3, u - 2 : u + 3].mean())
 
-    lit, dark = ground(1.3, 0.55, 0.0), ground(1.3, 0.15, 0.0)
+    lit = ground(1.3, 0.55, 0.0)
+    dark = ground(1.3, 0.15, 0.0)
     assert dark < 0.7 * lit
     at[0, 1] += 0.6
     primitives.update(dataclasses.replace(view, visual_q=at, visuals=view.visuals))
@@ -222,7 +225,8 @@ def test_a_still_has_soft_edges() -> None:
     between = []
     for frame in (hard, soft):
         grey = frame.rgb.astype(np.float32).mean(2)
-        low, high = cv2.erode(grey, np.ones((3, 3))), cv2.dilate(grey, np.ones((3, 3)))
+        low = cv2.erode(grey, np.ones((3, 3)))
+        high = cv2.dilate(grey, np.ones((3, 3)))
         edge = border & (high - low > 30.0)
         share = (grey[edge] - low[edge]) / (high - low)[edge]
         between.append(((share > 0.15) & (share < 0.85)).mean())

@@ -71,7 +71,8 @@ def test_depth_is_exact(kind: str, away: float) -> None:
     info = CameraInfo(160, 120, 420.0, 400.0, 78.2, 61.7, "optical")
     depth, primitive = sensor_scenes.raster(primitives, pose, info)
     truth = _march(field, sensor_scenes.pixel_rays(info), eye, pose[3:])
-    here, there = primitive >= 0, np.isfinite(truth)
+    here = primitive >= 0
+    there = np.isfinite(truth)
     assert there.sum() > 80
     assert (here != there).sum() <= 0.02 * there.sum() + 2  # grazing rays only
     both = here & there
@@ -120,7 +121,8 @@ def test_the_ray_caster_sees_the_same(scene, where: str) -> None:
 
 def test_the_ray_caster_sees_the_same_from_anywhere(scene) -> None:
     rng = np.random.default_rng(4)
-    agree, total = 0, 0
+    agree = 0
+    total = 0
     for _ in range(6):
         eye = rng.uniform([0.0, 0.0, 1.5], [5.0, 2.5, 2.2])
         pose = look_at(eye, eye + rng.normal(size=3))
@@ -192,7 +194,8 @@ def test_leaves_seen_edge_on() -> None:
     for pose in blade:
         eye = pose[:3] + frames.rotate(pose[3:], np.array([-0.25, 0.02, 0.003]))
         camera = look_at(eye, pose[:3] + frames.rotate(pose[3:], np.array([0.05, 0.0, 0.0])))
-        primitive, ids = sensor_scenes.raster(primitives, camera)[1], sensor_scenes.oracle(primitives, camera)[1]
+        primitive = sensor_scenes.raster(primitives, camera)[1]
+        ids = sensor_scenes.oracle(primitives, camera)[1]
         shown += (primitives.organ[ids[ids >= 0]] == int(Organ.LEAF)).any()
         assert (primitive == ids).mean() >= 0.999
     assert shown >= len(blade) // 2
@@ -204,10 +207,8 @@ def test_a_mesh_that_crosses_the_pinhole_plane_is_seen(tmp_path) -> None:
     for side in ((0.0, 0.06), (0.06, 0.0), (-0.05, 0.05)):
         ball = sensor_scenes.shape("mesh", 1.0, 1.0, 1.0, at=(0.01, side[0], 1.0 + side[1]), file=str(file))
         primitives, _ = sensor_scenes.world(sensor_scenes.thing(ball))
-        primitive, ids = (
-            sensor_scenes.raster(primitives, sensor_scenes.AHEAD)[1],
-            sensor_scenes.oracle(primitives, sensor_scenes.AHEAD)[1],
-        )
+        primitive = sensor_scenes.raster(primitives, sensor_scenes.AHEAD)[1]
+        ids = sensor_scenes.oracle(primitives, sensor_scenes.AHEAD)[1]
         assert (ids >= 0).sum() > 50
         assert (primitive == ids).mean() >= 0.999
 
@@ -221,7 +222,8 @@ def test_leaves_that_cross_the_pinhole_plane_are_seen() -> None:
     for pose in blade:
         eye = pose[:3] + frames.rotate(pose[3:], np.array([0.03, 0.0, 0.004]))
         camera = look_at(eye, eye + frames.rotate(pose[3:], np.array([1.0, 0.2, -0.15])))
-        primitive, ids = sensor_scenes.raster(primitives, camera)[1], sensor_scenes.oracle(primitives, camera)[1]
+        primitive = sensor_scenes.raster(primitives, camera)[1]
+        ids = sensor_scenes.oracle(primitives, camera)[1]
         crossing += (primitives.organ[ids[ids >= 0]] == int(Organ.LEAF)).mean() > 0.3
         assert (primitive == ids).mean() >= 0.999
     assert crossing >= len(blade) // 2

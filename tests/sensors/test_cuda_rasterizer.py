@@ -37,7 +37,8 @@ def _small_rasterizer(**options) -> CudaRasterizer:
 @pytest.mark.parametrize("where", [*VIEWPOINTS, "close to a solid"])
 def test_small_rasterizer_show_what_whole_primitives_show(scene, where: str) -> None:
     pose = look_at(*map(np.array, VIEWPOINTS.get(where, CLOSE_TO_A_SOLID)))
-    (mine, depth), (other, truth) = _seen(scene, pose, _small_rasterizer()), _seen(scene, pose, None)
+    (mine, depth) = _seen(scene, pose, _small_rasterizer())
+    (other, truth) = _seen(scene, pose, None)
     same = mine == other
     assert same.mean() >= 0.999
     hit = same & (mine >= 0)
@@ -62,10 +63,8 @@ def test_any_share_of_the_work_gives_the_same_picture(scene, groups: int, lanes:
 
 
 def test_some_clusters_alone(scene) -> None:
-    lens, seen = (
-        pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"]))),
-        CameraRasterizer(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height),
-    )
+    lens = pinhole(sensor_scenes.SMALL, look_at(*map(np.array, VIEWPOINTS["solids"])))
+    seen = CameraRasterizer(sensor_scenes.SMALL.width, sensor_scenes.SMALL.height)
     some = np.arange(0, len(scene.cluster_first), 5)
     _small_rasterizer().rasterize(scene, lens, some, seen.keys)
     keys = seen.keys.numpy()

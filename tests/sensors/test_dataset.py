@@ -182,14 +182,16 @@ def test_every_image_has_its_yolo_boxes_depth_berries_and_pose(whole: pathlib.Pa
         for line, one in zip(lines, large, strict=True):
             rows, columns = np.nonzero(ids == one["label"])
             box = (line[1:] * [160, 120, 160, 120]).round(3)
-            low, size = box[:2] - 0.5 * box[2:], box[2:]
+            low = box[:2] - 0.5 * box[2:]
+            size = box[2:]
             assert low == pytest.approx([columns.min(), rows.min()], abs=1e-3)
             assert size == pytest.approx([np.ptp(columns) + 1, np.ptp(rows) + 1], abs=1e-3)
             seen = np.unique(berry[ids == one["label"]])
             assert one["berries_seen"] <= (seen > 0).sum() <= one["berries"]
         # the pose puts the depth of the largest bunch where truth has its box
         one = max(large, key=lambda b: b["pixels"])
-        camera, box = record["camera"], one["box_3d"]
+        camera = record["camera"]
+        box = one["box_3d"]
         fx, _, cx, _, fy, cy = camera["k"][:6]
         rows, columns = np.nonzero((ids == one["label"]) & (depth > 0))
         z = depth[rows, columns] * 1e-3
@@ -231,7 +233,8 @@ def test_an_image_is_the_same_whatever_was_drawn_before(
 
 
 def _turned(q, v: np.ndarray) -> np.ndarray:
-    u, w = np.asarray(q[:3], float), float(q[3])
+    u = np.asarray(q[:3], float)
+    w = float(q[3])
     return v + 2.0 * np.cross(u, np.cross(u, v) + w * v)
 
 
@@ -368,7 +371,8 @@ def test_fewer_images_than_there_are_are_refused(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
 ) -> None:
     """Lists and folders would tell of different data sets."""
-    plan, before = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE), _files(whole)
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (160, 120), LIFE)
+    before = _files(whole)
     with pytest.raises(DatasetError, match=r"holds image 000005, .*3 images.* give --images 6 or more") as said:
         dataset.prepare_folder(plan, whole, 3)
     assert "\n" not in str(said.value)

@@ -22,9 +22,17 @@ def options(folder: pathlib.Path, out: str, **more: object) -> dict:
     scene = folder / "vine.toml"
     scene.write_text(SCENE)
     given = {
-        "images": IMAGES, "out": folder / out, "scene": str(scene), "seed": 5, "camera": "pinhole", "size": "80x60",
-        "workers": None, "actors": 0.0, "renderer": "warp", "device": "cpu",
-    }  # fmt: skip
+        "images": IMAGES,
+        "out": folder / out,
+        "scene": str(scene),
+        "seed": 5,
+        "camera": "pinhole",
+        "size": "80x60",
+        "workers": None,
+        "actors": 0.0,
+        "renderer": "warp",
+        "device": "cpu",
+    }
     return given | more
 
 
@@ -39,9 +47,13 @@ def test_dask_workers_make_the_same_files_though_one_is_killed(tmp_path, capsys)
     assert run(**options(tmp_path, "local", workers=1)) == 0
     out = tmp_path / "cluster"
     cluster = distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
         local_directory=str(tmp_path / "dask"),
-    )  # fmt: skip
+    )
     with cluster, distributed.Client(cluster) as watcher:
         process: dict[str, int] = watcher.run(os.getpid)
         killed: list[int] = []

@@ -43,7 +43,8 @@ def test_exposure_settles_as_it_says() -> None:
     first = _exposed(film)
     film.radiance.fill_(0.8)
     film.tone_map(PLAIN, exposure.ADAPTATION_TIME)
-    now, final = _exposed(film), first * 0.25**exposure.ADAPTED_SHARE
+    now = _exposed(film)
+    final = first * 0.25**exposure.ADAPTED_SHARE
     assert np.log(now / final) / np.log(first / final) == pytest.approx(np.exp(-1.0), rel=1e-3)
     fresh = _even(0.8)
     fresh.tone_map(PLAIN, 5.0)

@@ -24,11 +24,13 @@ UPWARDS = frames.from_x_axis(np.array([0.0, 0.0, 1.0]), np.array([-1.0, 0.0, 0.0
 """Fingers up, the palm towards +x."""
 FRONT = look_at(PALM + np.array([0.55, 0.0, 0.0]), PALM + np.array([0.0, 0.0, 0.03]))
 """Where the camera sees the palm from."""
-RAYS, RADII = np.radians(np.arange(-30, 211, 3)), np.arange(1.0, 4.5, 0.1)
+RAYS = np.radians(np.arange(-30, 211, 3))
+RADII = np.arange(1.0, 4.5, 0.1)
 """Of an outline: angles from the right to above to the left, and distances from the palm's middle in its radii."""
 MOST_TURNED = 6
 """Rays by which an outline may be turned: 18 degrees."""
-HALF_FINGER, DEEP = 0.014, 0.14
+HALF_FINGER = 0.014
+DEEP = 0.14
 """What is thinner than twice this is a finger, not a palm; how far a hand reaches from its nearest point away [m]."""
 
 
@@ -84,10 +86,13 @@ def known_outlines() -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("turn", "shift", "height"),
-    [((0.12, 0.0, 0.0), (0.0, 0.05, 0.0), 1.6), ((-0.15, 0.0, 0.0), (-0.1, 0.0, 0.03), 1.9),
-     ((0.0, -0.2, -0.2), (0.0, 0.0, 0.0), 1.75)],
+    [
+        ((0.12, 0.0, 0.0), (0.0, 0.05, 0.0), 1.6),
+        ((-0.15, 0.0, 0.0), (-0.1, 0.0, 0.03), 1.9),
+        ((0.0, -0.2, -0.2), (0.0, 0.0, 0.0), 1.75),
+    ],
     ids=["turned to the left", "turned to the right, further away", "seen from the side and above"],
-)  # fmt: skip
+)
 def test_six_gestures_are_told_from_each_other_by_the_outline_of_the_hand(turn, shift, height):
     """Hands are turned by 7 to 16 degrees, elsewhere, and of other people than those that are known."""
     hand = frames.pose(PALM + shift, frames.multiply(frames.exp(np.array(turn)), UPWARDS))
@@ -103,7 +108,8 @@ def test_six_gestures_are_told_from_each_other_by_the_outline_of_the_hand(turn, 
 def test_where_a_finger_points_is_recovered_within_10_degrees(towards):
     """The long axis of what is thin at the hand, 0.8 m from the camera; from the palm to the tip. In the middle one of
     three pictures: the errors of the camera turn it by up to 12 degrees in a single one."""
-    distance, direction = 0.8, np.array(towards) / np.linalg.norm(towards)
+    distance = 0.8
+    direction = np.array(towards) / np.linalg.norm(towards)
     view = look_at(PALM + distance * np.array([0.5, -0.85, 0.15]) / np.linalg.norm([0.5, -0.85, 0.15]), PALM)
     hand = frames.pose(PALM, frames.from_x_axis(direction, np.array([0.0, 0.0, 1.0])))
     true = frames.rotate(frames.conjugate(view[3:]), direction)

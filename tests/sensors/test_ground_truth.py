@@ -55,7 +55,8 @@ SELDOM = 1e-3
 def grove():
     """The demo vineyard, its primitives and view."""
     model = sensor_scenes.demo()
-    view, primitives = rest_snapshot(model), Primitives(model, grass=2.0)
+    view = rest_snapshot(model)
+    primitives = Primitives(model, grass=2.0)
     primitives.update(view)
     return model, primitives, view
 
@@ -168,7 +169,9 @@ def test_a_wall_hides_and_truth_knows_how_much(grove) -> None:
             ground_truth.bunch_truths(primitives, view, ground_truth.render_buffers(primitives, NEAR, pose)), bunch
         )
 
-    free, half, hidden = behind(5.0), behind(0.0), behind(-0.5)
+    free = behind(5.0)
+    half = behind(0.0)
+    hidden = behind(-0.5)
     assert free.occlusion < 0.1
     assert free.cut_seen
     assert np.array_equal(free.amodal, half.amodal)
@@ -189,7 +192,8 @@ def test_cut_points_lie_in_the_middle_of_the_peduncle(grove, along) -> None:
     seen, truths = along
     assert 10 < sum(one.cut_seen for one in truths) < len(truths)
     for one in truths:
-        body, last = int(model.body_parent[model.bunch_body[one.bunch]]), view.body_q[model.bunch_body[one.bunch], :3]
+        body = int(model.body_parent[model.bunch_body[one.bunch]])
+        last = view.body_q[model.bunch_body[one.bunch], :3]
         reach = down = 0.0
         held = False
         while model.body_organ[body] == int(Organ.PEDUNCLE):
@@ -197,9 +201,11 @@ def test_cut_points_lie_in_the_middle_of_the_peduncle(grove, along) -> None:
             axis = last - first
             share = np.clip((one.cut - first) @ axis / (axis @ axis), 0.0, 1.0)
             if np.linalg.norm(first + share * axis - one.cut) < 1e-5 and not held:
-                held, down = True, reach + (1.0 - share) * np.linalg.norm(axis)
+                held = True
+                down = reach + (1.0 - share) * np.linalg.norm(axis)
             reach += np.linalg.norm(axis)
-            last, body = first, int(model.body_parent[body])
+            last = first
+            body = int(model.body_parent[body])
         assert held
         assert down == pytest.approx(0.5 * reach, abs=1e-5)
         pixel = np.full(2, -1.0) if one.cut_pixel is None else one.cut_pixel
@@ -237,7 +243,8 @@ def test_depth_labels_and_intrinsics_give_the_middle_of_a_bunch(grove) -> None:
     camera = Camera(sensor_scenes.IDEAL, NEAR)
     checked = 0
     for bunch in (22, 17, 69):
-        points, box = [], None
+        points = []
+        box = None
         for turn in np.arange(4) * np.pi / 2:
             pose = _before(model, view, bunch, (0.45 * np.cos(turn), 0.45 * np.sin(turn), -0.12))
             truths = ground_truth.bunch_truths(primitives, view, ground_truth.render_buffers(primitives, NEAR, pose))
@@ -305,7 +312,8 @@ def test_flow_of_a_moved_camera_lands_on_the_same_points(grove) -> None:
 
 def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
     model, _, view = grove
-    primitives, bunch = Primitives(model, grass=0.0), 22
+    primitives = Primitives(model, grass=0.0)
+    bunch = 22
     pose = _before(model, view, bunch)
     one = ground_truth.render_buffers(primitives, NEAR, pose)
     tree = int(model.body_tree[model.bunch_body[bunch]])
@@ -349,7 +357,8 @@ def test_depth_and_lidar_measure_the_same_scene(grove) -> None:
     local = frames.rotate(frames.conjugate(pose[3:]), scan.xyz.astype(float))
     pixel = np.round(np.nan_to_num(project_points(local, fine), nan=-1.0)).astype(int)
     inside = ((pixel >= 0) & (pixel < [fine.width, fine.height])).all(1) & (local[:, 2] < 4.0)
-    row, column = pixel[inside, 1], pixel[inside, 0]
+    row = pixel[inside, 1]
+    column = pixel[inside, 0]
     same = seen.labels[row, column] == scan.labels[inside]
     assert same.mean() > 0.9
     error = np.abs(seen.depth[row, column] - local[inside, 2])[same]

@@ -43,7 +43,8 @@ def test_labels_get_distinct_colours() -> None:
 
 def test_a_portrait_shows_sky_leaves_fruit_and_ground(tmp_path) -> None:
     model = sensor_scenes.demo()
-    view, primitives = rest_snapshot(model), Primitives(model)
+    view = rest_snapshot(model)
+    primitives = Primitives(model)
     image = images.render_overview(model, view, tmp_path / "p.png", width=240, height=160, primitives=primitives)
     assert image.shape == (160, 240, 3)
     assert np.array_equal(cv2.imread(str(tmp_path / "p.png"))[..., ::-1], image)

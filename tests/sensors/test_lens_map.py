@@ -69,8 +69,10 @@ def test_small_balls_lie_on_their_pixels(lens: str) -> None:
 
 @pytest.mark.parametrize("lens", LENSES)
 def test_labels_and_depth_are_those_of_rays_and_truth_counts_the_same_pixels(lens: str) -> None:
-    info, model = _info(LENSES[lens]), sensor_scenes.demo()
-    primitives, view = Primitives(model), rest_snapshot(model)
+    info = _info(LENSES[lens])
+    model = sensor_scenes.demo()
+    primitives = Primitives(model)
+    view = rest_snapshot(model)
     bunch = int(np.argmin(np.linalg.norm(view.body_q[model.bunch_body, :3] - [2.0, 0.7, 1.6], axis=1)))
     middle = view.body_q[model.bunch_body[bunch], :3].astype(float)
     pose = sensor_scenes.look_at(middle + np.array([-0.9, 0.5, -0.2]), middle)
@@ -161,7 +163,8 @@ def test_a_data_set_says_and_shows_the_distortion(tmp_path: pathlib.Path) -> Non
         'fruit = { bunches = [6, 8], varieties = ["italia"] }\n'
     )
     camera = _camera_file(tmp_path, str(list(BARREL)))
-    plan, out = dataset.DatasetPlan(load_scene(scene), 5, camera, (160, 120)), tmp_path / "set"
+    plan = dataset.DatasetPlan(load_scene(scene), 5, camera, (160, 120))
+    out = tmp_path / "set"
     dataset.prepare_folder(plan, out, 1)
     assert list(dataset.render_images(plan, out, [0])) == [0]
     record = json.loads((out / "records/000000.json").read_text())
@@ -169,8 +172,10 @@ def test_a_data_set_says_and_shows_the_distortion(tmp_path: pathlib.Path) -> Non
     assert (told["distortion_model"], told["d"]) == ("plumb_bob", list(BARREL))
     info = CameraSpec.load(camera).info("optical", size=(160, 120))
     channels = _read_png(out / "ids/000000.png").astype(int)  # blue, green, red
-    ids, millimetres = channels @ [65536, 256, 1], _read_png(out / "depth/000000.png")
-    position, turn = np.array(told["position"]), np.array(told["quaternion_xyzw"])
+    ids = channels @ [65536, 256, 1]
+    millimetres = _read_png(out / "depth/000000.png")
+    position = np.array(told["position"])
+    turn = np.array(told["quaternion_xyzw"])
     checked = 0
     for one in record["bunches"]:
         if one["cut_pixel"] is None:

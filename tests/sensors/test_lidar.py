@@ -23,7 +23,9 @@ def lidar() -> Lidar:
 
 def _post(x: float, y: float, radius: float) -> Primitives:
     model = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=1, tie=0, box=0)
-    model.fixed_start[0], model.fixed_end[0], model.fixed_radius[0] = (x, y, -1.0), (x, y, 4.0), radius
+    model.fixed_start[0] = (x, y, -1.0)
+    model.fixed_end[0] = (x, y, 4.0)
+    model.fixed_radius[0] = radius
     return Primitives(model, grass=0.0)
 
 
@@ -104,7 +106,8 @@ def test_too_near_and_too_far_return_nothing(lidar: Lidar) -> None:
 def test_a_scan_of_the_vineyard_follows_motion(lidar: Lidar) -> None:
     post = sensor_scenes.thing(sensor_scenes.shape("cylinder", 0.05, 2.0, at=(2.0, 0.0, 0.0)))
     primitives, view = sensor_scenes.world(post, model=sensor_scenes.demo())
-    first, again = lidar.scan(primitives, AT), lidar.scan(primitives, AT)
+    first = lidar.scan(primitives, AT)
+    again = lidar.scan(primitives, AT)
     assert np.array_equal(first.xyz, again.xyz)
     assert {int(v) >> 20 for v in np.unique(first.labels)} >= {
         int(Organ.LEAF),
@@ -167,7 +170,8 @@ def test_mixed_returns_lie_between_and_only_at_edges() -> None:
     """Nearer together than the pulse is long, two surfaces in one beam come back as one echo between them."""
     scan = Lidar(_steady()).scan(_two_walls(0.3), AT)
     here = _ahead(scan)
-    depth, side = scan.xyz[here, 0], np.abs(scan.xyz[here, 1] / scan.xyz[here, 0])
+    depth = scan.xyz[here, 0]
+    side = np.abs(scan.xyz[here, 1] / scan.xyz[here, 0])
     between = (depth > 2.0 + 0.005) & (depth < 2.3 - 0.005)
     assert between.sum() > 10
     spec = LidarSpec.load("vlp16")
@@ -228,7 +232,8 @@ def test_range_noise_and_steps() -> None:
     wall = sensor_scenes.world(sensor_scenes.thing(sensor_scenes.shape("box", 0.05, 30.0, 30.0, at=(4.05, 0.0, 1.0))))[
         0
     ]
-    real, ideal = Lidar(_but(rays=1)).scan(wall, AT), Lidar(spec.ideal()).scan(wall, AT)
+    real = Lidar(_but(rays=1)).scan(wall, AT)
+    ideal = Lidar(spec.ideal()).scan(wall, AT)
     head_on = [s.xyz[:, 0] / np.linalg.norm(s.xyz, axis=1) > 0.95 for s in (real, ideal)]
     error = np.linalg.norm(real.xyz[head_on[0]], axis=1) - np.linalg.norm(ideal.xyz[head_on[1]], axis=1)
     assert len(error) > 2000
@@ -241,8 +246,11 @@ def test_range_noise_and_steps() -> None:
 @pytest.mark.parametrize("returns", ["strongest", "dual"])
 def test_an_exact_revolution_is_that_of_an_ideal_lidar(returns: str) -> None:
     """From the next one on: the present revolution stays as it began."""
-    spec, walls = _but(returns=returns, weakest=8e-5), _two_walls(1.5)
-    lidar, other, ideal = Lidar(spec), Lidar(spec), Lidar(spec.ideal()).scan(walls, AT)
+    spec = _but(returns=returns, weakest=8e-5)
+    walls = _two_walls(1.5)
+    lidar = Lidar(spec)
+    other = Lidar(spec)
+    ideal = Lidar(spec.ideal()).scan(walls, AT)
     lidar.begin_revolution()
     lidar.is_exact = True
     lidar.fire(walls, 0, np.broadcast_to(AT, (lidar.firings, 7)))
@@ -277,7 +285,8 @@ def test_weak_echoes_are_lost() -> None:
 def test_noise_follows_from_seed_name_and_revolution() -> None:
     primitives = _two_walls(0.3)
     spec = LidarSpec.load("vlp16")
-    one, two = Lidar(spec, seed=3), Lidar(spec, seed=3)
+    one = Lidar(spec, seed=3)
+    two = Lidar(spec, seed=3)
     first = one.scan(primitives, AT)
     assert np.array_equal(first.xyz, two.scan(primitives, AT).xyz)
     again = one.scan(primitives, AT)
@@ -343,7 +352,8 @@ def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, say
 
 def test_any_number_of_threads_gives_the_same_scan() -> None:
     """In one revolution and in sectors, with noise."""
-    primitives, spec = _two_walls(0.3), LidarSpec.load("vlp16")
+    primitives = _two_walls(0.3)
+    spec = LidarSpec.load("vlp16")
     whole = Lidar(spec, threads=1).scan(primitives, AT)
     for threads in (2, 3):
         lidar = Lidar(spec, threads=threads)

@@ -47,7 +47,8 @@ def test_the_ray_caster_meets_the_same(scene, where: str) -> None:
 
 def test_a_slice_is_the_same_rays(scene) -> None:
     pose = np.array(STANDS["between rows"])
-    whole, parts = LidarRasterizer(LASERS, LAG, STEP, 1848), LidarRasterizer(LASERS, LAG, STEP, 1848)
+    whole = LidarRasterizer(LASERS, LAG, STEP, 1848)
+    parts = LidarRasterizer(LASERS, LAG, STEP, 1848)
     whole.cast(scene, pose)
     for first in range(0, 1848, 100):
         parts.cast(scene, pose, first, min(100, 1848 - first))

@@ -78,10 +78,12 @@ def test_a_second_view_from_the_first_misses_what_a_true_one_misses(primitives, 
     """Pixels without depth: as many to a tenth, and nearly all of them the same; what is measured is the same."""
     full, fast = (Camera(SPEC, SPEC.info("optical"), quality=q).render(primitives, pose) for q in ("full", "fast"))
     assert SPEC.stereo is not None
-    lens, reach = pinhole(full.info, pose), (SPEC.nearest.value, SPEC.farthest.value)
+    lens = pinhole(full.info, pose)
+    reach = (SPEC.nearest.value, SPEC.farthest.value)
     warping = Stereo(SPEC.stereo, full.info, reach, second_from_first=True, workers=ThreadPool(2))
     warped = warping.measure(primitives, lens, full.exact_depth, full.rgb, noise_rng(0, "camera", 0))
-    missed, missed_too = np.isnan(full.depth), np.isnan(warped)
+    missed = np.isnan(full.depth)
+    missed_too = np.isnan(warped)
     assert missed_too.mean() == pytest.approx(missed.mean(), rel=0.1)
     assert (missed != missed_too).mean() < 0.01
     measured = np.isfinite(full.depth) & np.isfinite(warped)
@@ -129,7 +131,9 @@ def test_actors_and_the_autumn_are_lit_alike(tmp_path) -> None:
 def test_shadows_drawn_in_part_are_those_drawn_anew() -> None:
     """A board is carried through the scene and out of it: after each step the near map is as if drawn anew."""
     board = sensor_scenes.shape("box", 0.2, 0.15, 0.01)
-    model, eye, forward = sensor_scenes.demo(), np.array([0.4, 1.2, 1.3]), np.array([1.0, 0.0, 0.0])
+    model = sensor_scenes.demo()
+    eye = np.array([0.4, 1.2, 1.3])
+    forward = np.array([1.0, 0.0, 0.0])
     at = [(1.0, 1.0, 1.5), (1.1, 1.0, 1.4), (2.5, -1.0, 1.2), (40.0, 0.0, 1.0), (2.6, 1.4, 1.9)]
     links = (sensor_scenes.thing(board),)
     poses = [np.array([[*place, *frames.from_yaw(0.3 * i)]]) for i, place in enumerate(at)]

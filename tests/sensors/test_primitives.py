@@ -50,7 +50,8 @@ def test_every_bunch_has_its_berries_where_its_body_is(model, primitives) -> Non
 
 
 def test_every_leaf_cane_and_post_is_there(model, primitives) -> None:
-    organ, kind = primitives.organ, primitives.shapes.kind.numpy()
+    organ = primitives.organ
+    kind = primitives.shapes.kind.numpy()
     assert ((organ == int(Organ.LEAF)) & (kind == 2)).sum() == len(model.leaf_body)
     assert (organ == int(Organ.CANE)).sum() >= (model.body_organ == int(Organ.CANE)).sum()
     for o in (Organ.POLE, Organ.WIRE, Organ.TRUNK, Organ.ARM):
@@ -67,7 +68,8 @@ def test_posts_in_pieces_are_whole(model, primitives) -> None:
     post = int(model.fixed_index[model.fixed_organ == int(Organ.POLE)][0])
     mine = _of(primitives, Organ.POLE, post)
     whole = (model.fixed_organ == int(Organ.POLE)) & (model.fixed_index == post)
-    a, b = primitives.shapes.a.numpy()[mine], primitives.shapes.b.numpy()[mine]
+    a = primitives.shapes.a.numpy()[mine]
+    b = primitives.shapes.b.numpy()[mine]
     length = np.linalg.norm(b[:, :3] - a[:, :3], axis=1).sum()
     assert length == pytest.approx(
         np.linalg.norm(model.fixed_end[whole] - model.fixed_start[whole], axis=1).sum(), rel=1e-5
@@ -95,7 +97,8 @@ def test_only_what_moved_is_moved(model, primitives) -> None:
 
 def test_bounds_hold_what_they_bound(model, primitives) -> None:
     ball = primitives.ball.numpy()
-    lower, upper = primitives.lower.numpy(), primitives.upper.numpy()
+    lower = primitives.lower.numpy()
+    upper = primitives.upper.numpy()
     owner = np.repeat(np.arange(len(ball)), primitives.cluster_size)
     corner = np.maximum(np.abs(lower - ball[owner, :3]), np.abs(upper - ball[owner, :3]))
     assert (corner.max(1) <= ball[owner, 3] + 1e-5).all()
@@ -185,7 +188,8 @@ def test_a_picked_bunch_keeps_the_shape_it_had(model, primitives) -> None:
 
 
 def test_links_come_move_and_go(model, primitives) -> None:
-    view, plants = rest_snapshot(model), primitives.count
+    view = rest_snapshot(model)
+    plants = primitives.count
     link = sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1, at=(0.0, 0.0, 0.5)), index=2)
     pose = np.array([[1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0]])
     links = (link,)

@@ -16,7 +16,8 @@ pytestmark = pytest.mark.long
 
 DOCS = pathlib.Path(__file__).parents[2] / "docs" / "sensors.md"
 VIEWPOINTS = "x,y,z,look_x,look_y,look_z\n0.4,1.2,1.3,3,1,1.7\n0.45,1.15,1.3,3,1,1.7\n0.5,1.2,1.35,3,1,1.7\n"
-VOXEL, FARTHEST = 0.01, 3.0
+VOXEL = 0.01
+FARTHEST = 3.0
 """As in the docs [m]."""
 TRUNCATION = 4.0 * VOXEL
 
@@ -47,7 +48,8 @@ def _assert_surface(vertices: np.ndarray, folder: pathlib.Path, truncation: floa
     the pictures show has vertices."""
     shown = np.concatenate([_picture(one)[2] for one in sorted((folder / "tour").iterdir())])
     assert len(vertices) > 5000
-    off, away = cKDTree(shown).query(vertices)[0], cKDTree(vertices).query(shown)[0]
+    off = cKDTree(shown).query(vertices)[0]
+    away = cKDTree(vertices).query(shown)[0]
     assert np.median(off) < VOXEL
     assert np.quantile(off, 0.99) < truncation
     assert np.median(away) < VOXEL
@@ -75,8 +77,11 @@ def test_the_older_volume_of_the_pinned_version_fuses_pictures(folder: pathlib.P
         fx, _, cx, _, fy, cy = camera["k"][:6]
         image = o3d.geometry.RGBDImage.create_from_color_and_depth(
             o3d.geometry.Image(np.zeros((*depth.shape, 3), np.uint8)),
-            o3d.geometry.Image(depth.astype(np.float32)), 1.0, FARTHEST, False,
-        )  # fmt: skip
+            o3d.geometry.Image(depth.astype(np.float32)),
+            1.0,
+            FARTHEST,
+            False,
+        )
         pose = np.eye(4)
         pose[:3, :3] = frames.to_matrix(np.array(camera["quaternion_xyzw"]))
         pose[:3, 3] = camera["position"]

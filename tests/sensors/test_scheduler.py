@@ -46,7 +46,8 @@ def test_frames_come_at_the_sensors_rate_of_simulation_time(view) -> None:
 
 
 def test_a_rate_that_changes_holds_from_the_next_frame_on(view) -> None:
-    inbox, rates = Inbox(), [10.0]
+    inbox = Inbox()
+    rates = [10.0]
     sensor = ScheduledSensor(_camera(), inbox, present_rate=lambda: rates[-1])
     scheduler = SensorScheduler(sensor_scenes.empty(), [sensor])
     for tick in range(21):
@@ -81,7 +82,9 @@ def test_warming_up_delivers_and_counts_nothing(view) -> None:
 
 
 def test_nothing_is_rendered_without_demand(view) -> None:
-    wanted, unwanted, is_wanted = Inbox(), Inbox(), []
+    wanted = Inbox()
+    unwanted = Inbox()
+    is_wanted = []
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
     sensors = [
         ScheduledSensor(
@@ -121,7 +124,9 @@ def test_a_late_lidar_fires_from_where_it_was() -> None:
 
 def test_trees_that_moved_between_two_frames_are_taken_over() -> None:
     model = sensor_scenes.demo()
-    view, inbox, bunch = rest_snapshot(model), Inbox(), 10
+    view = rest_snapshot(model)
+    inbox = Inbox()
+    bunch = 10
     tree = int(model.body_tree[model.bunch_body[bunch]])
     scheduler = SensorScheduler(model, [ScheduledSensor(_camera(), inbox, rate=1.0)])
     scheduler.advance(view, {"head": sensor_scenes.AHEAD})
@@ -152,7 +157,8 @@ def test_names_are_unique() -> None:
 
 
 def test_depth_is_measured_only_for_those_who_look_at_it(view) -> None:
-    inbox, wanted = Inbox(), [CameraOutput.RGB | CameraOutput.EXACT_DEPTH]
+    inbox = Inbox()
+    wanted = [CameraOutput.RGB | CameraOutput.EXACT_DEPTH]
     spec = CameraSpec.load("d435")
     camera = Camera(spec, spec.info("optical", 0.1), "head")
     sensor = ScheduledSensor(camera, inbox, wanted=lambda: wanted[-1], rate=10.0)
@@ -173,11 +179,17 @@ def frames_beside_a_slow_renderer(view, sensors, poses, pacing: SensorPacing, co
 
     Returns how fast simulated time passed.
     """
-    horizon, step = [np.inf], 0.01
+    horizon = [np.inf]
+    step = 0.01
     scheduler = SensorScheduler(
         sensor_scenes.empty(), sensors, pacing=pacing, on_taken=lambda: horizon.append(scheduler.horizon())
     )
-    time, tick, real, free, newest, seen = 0.0, 0, 0.0, 0.0, 0.0, -1.0
+    time = 0.0
+    tick = 0
+    real = 0.0
+    free = 0.0
+    newest = 0.0
+    seen = -1.0
     while time < seconds:
         real += step
         if time + 0.5 * step <= time_of_snapshot(horizon[-1], step):
@@ -185,7 +197,8 @@ def frames_beside_a_slow_renderer(view, sensors, poses, pacing: SensorPacing, co
             time = tick * step
             newest = time if tick % 2 == 0 else newest
         if real >= free and newest > seen:
-            seen, before = newest, sum(scheduler.frames.values())
+            seen = newest
+            before = sum(scheduler.frames.values())
             scheduler.advance(dataclasses.replace(view, time=seen), poses)
             free = real + cost * (sum(scheduler.frames.values()) - before)
     assert scheduler.sustainable_factor() < np.inf
@@ -198,7 +211,8 @@ POSES = {"head": sensor_scenes.AHEAD, "lidar": np.array([0, 0, 1.0, 0, 0, 0, 1])
 @pytest.mark.parametrize("cost", [0.02, 0.35, 3.0])
 def test_live_sensors_never_fall_below_their_least_rate_in_simulated_time(view, cost) -> None:
     """However long a frame takes: time waits, and no longer than it must."""
-    pictures, scans = Inbox(), Inbox()
+    pictures = Inbox()
+    scans = Inbox()
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
     sensors = [ScheduledSensor(_camera(), pictures, rate=30.0), ScheduledSensor(lidar, scans)]
     factor = frames_beside_a_slow_renderer(view, sensors, POSES, SensorPacing(least_rate=5.0), cost, 4.0)
@@ -220,7 +234,8 @@ def test_a_live_sensor_that_is_slower_by_itself_holds_nothing(view) -> None:
 
 @pytest.mark.parametrize("cost", [0.02, 0.5])
 def test_paced_sensors_deliver_every_frame_at_its_time(view, cost) -> None:
-    pictures, scans = Inbox(), Inbox()
+    pictures = Inbox()
+    scans = Inbox()
     lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
     sensors = [ScheduledSensor(_camera(), pictures, rate=10.0), ScheduledSensor(lidar, scans)]
     frames_beside_a_slow_renderer(view, sensors, POSES, SensorPacing(SensorMode.PACED), cost, 2.0)

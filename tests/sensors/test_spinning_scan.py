@@ -47,8 +47,11 @@ def test_a_plate_that_moves_sideways_is_sheared(speed: float) -> None:
     still = np.array([[0, 0, 0, 0, 0, 0, 1.0]])
     scan = _turn(_lidar(), [_plate()], motion=lambda t: still + np.array([speed * t, 0, 0, 0, 0, 0, 0]))
     mine = scan.labels == label(Organ.ROBOT, 0)
-    x, offset = scan.xyz[mine, 0].astype(float), scan.offset[mine]
-    first, last = x.argmax(), x.argmin()  # clockwise from ahead: the far end comes first
+    x = scan.xyz[mine, 0].astype(float)
+    offset = scan.offset[mine]
+    # clockwise from ahead: the far end comes first
+    first = x.argmax()
+    last = x.argmin()
     assert offset[first] < 0.02 < 0.03 < offset[last]
     spacing = 2.0 * np.pi * 10.0 * 55.3e-6 * 5.0 + abs(speed) * STEP  # between two shots there, and one step of motion
     assert x[first] == pytest.approx(1.0 + speed * offset[first], abs=spacing)
@@ -136,7 +139,8 @@ def test_revolutions_that_were_missed_are_counted() -> None:
 
 def test_a_slower_rate_turns_as_fast_and_rests_between() -> None:
     primitives, _ = sensor_scenes.world(_plate())
-    rolling, scans = SpinningScan(_lidar(), rate=4.0), []
+    rolling = SpinningScan(_lidar(), rate=4.0)
+    scans = []
     for k in range(101):
         rolling.pose_history.add(0.01 * k, AT)
         scans += rolling.advance(primitives, 0.01 * k)

@@ -90,7 +90,8 @@ def test_the_shadow_of_the_second_imager_lies_to_the_left(near: float, far: floa
 def test_near_edges_grow_and_by_less_than_a_window() -> None:
     frame = _see(_wall(0.8, 0.12), _wall(1.6, index=1), spec=_but(noise=0.0), info=SPEC.info("optical"))
     row = frame.info.height // 2
-    true, measured = frame.exact_depth[row] < 1.2, frame.depth[row] < 1.2
+    true = frame.exact_depth[row] < 1.2
+    measured = frame.depth[row] < 1.2
     right = np.flatnonzero(measured)[-1] - np.flatnonzero(true)[-1]
     assert 0 < right <= 0.5 * SPEC.stereo.window.value * SPEC.fx.value / SPEC.stereo.focal.value
 
@@ -255,7 +256,9 @@ def test_what_a_gpu_measures_from_its_own_picture_is_what_the_host_measures() ->
 
 def test_noise_of_a_gpu_is_normal_and_alike_within_a_window() -> None:
     """Variance 1; fields that are independent; correlation falls to zero over one window."""
-    raw, noise, window = wp.empty((2, 308, 408)), wp.empty((2, 300, 400)), 9
+    raw = wp.empty((2, 308, 408))
+    noise = wp.empty((2, 300, 400))
+    window = 9
     wp.launch(stereo_input.draw_normals, raw.size, inputs=[5], outputs=[raw.flatten()])
     wp.launch(stereo_input.correlate, noise.shape, inputs=[raw, window], outputs=[noise])
     first, second = noise.numpy()

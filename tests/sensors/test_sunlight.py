@@ -15,7 +15,8 @@ def test_air_mass_is_the_published_one(degrees: float, mass: float) -> None:
 
 
 def test_a_low_sun_is_dim_and_red() -> None:
-    high, low = daylight(0.75)[0], daylight(0.05)[0]
+    high = daylight(0.75)[0]
+    low = daylight(0.05)[0]
     assert (low < high).all()
     assert low[0] / low[2] > 4.0 * high[0] / high[2]
     assert daylight(-0.3)[0].max() == 0.0
@@ -27,7 +28,8 @@ def test_light_follows_a_moving_sun() -> None:
     primitives, _ = sensor_scenes.world()
     sun = Sun(hour=6.6)
     light = Sunlight(sun.direction)
-    balances, dim = [], 1.0
+    balances = []
+    dim = 1.0
     for time in (0.0, 30.0, 3600.0, 5.4 * 3600.0):
         light.update(primitives, np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), time)
         there = np.array([*light.light.sun])

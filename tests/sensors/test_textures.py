@@ -21,7 +21,8 @@ def test_octagons_hold_their_outlines() -> None:
         inside = table[shape] > 0
         p = np.stack([u[inside], v[inside]], 1)
         for k in range(8):
-            a, b = hull[shape, k], hull[shape, (k + 1) % 8]
+            a = hull[shape, k]
+            b = hull[shape, (k + 1) % 8]
             edge = b - a
             out = (p - a) @ np.array([-edge[1], edge[0]]) / np.linalg.norm(edge)
             inner = (hull[shape].mean(0) - a) @ np.array([-edge[1], edge[0]])

@@ -98,7 +98,8 @@ def test_what_a_killed_robot_carried_is_found_on_the_ground_by_those_who_come_la
     assert bytes_sent(ada) - before < 2 * 4 * 200, "both records every 3 m"
     place = kill(world)
     world.run(0.5)
-    cy, dan = world.join("cy", 8.0, -3.0), world.join("dan", 11.0, 1.0)
+    cy = world.join("cy", 8.0, -3.0)
+    dan = world.join("dan", 11.0, 1.0)
     world.until(lambda: all(world.server.records.get(number).parent == "" for number in CARRIED), 10.0)
     world.until(lambda: at_rest(world), 5.0)
     world.run(0.1)

@@ -30,7 +30,7 @@ def run(out: pathlib.Path, *options: str) -> dict:
     done = programs.run(
         [sys.executable, "-m", "vinesim", *words, "--out", str(out), *options],
         timeout=deadline(),
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr
     return json.loads((out / "report.json").read_text())
 

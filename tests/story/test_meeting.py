@@ -32,12 +32,16 @@ from vinesim.web.page_server import PageServer
 
 pytestmark = pytest.mark.slow
 
-BUNCH, BOX = 10, 0
+BUNCH = 10
+BOX = 0
 BOX_PLACE = np.array([-2.4, -0.7, 0.0])
 HANDED_OVER_FROM = BOX_PLACE[:2] + np.array([0.0, 0.5])
-POINTS_FROM, PICKS_FROM = 1.15, 0.75
+POINTS_FROM = 1.15
+PICKS_FROM = 0.75
 """Distances of the first person from the bunch [m]."""
-WORD, SPOKEN, WINDOW = 500.0, 0.5, 160
+WORD = 500.0
+SPOKEN = 0.5
+WINDOW = 160
 """Frequency [Hz] and amplitude of the word, a tone; samples of 10 ms, five periods."""
 HAND = BOX_PLACE + np.array([0.0, 0.08, 1.0])
 """Where the hand lets go [m]: the bunch hangs a bit ahead of it."""
@@ -71,7 +75,8 @@ class Meeting:
     """Clients of anna, ben and a robot, which step in turn in one thread; two of them serve pages."""
 
     def __init__(self) -> None:
-        self.hub, self.now = MemoryHub(), 0.0
+        self.hub = MemoryHub()
+        self.now = 0.0
         scene = load_scene("demo")
         model = generate(scene)
         boxes = model.box_pose.copy()
@@ -88,9 +93,15 @@ class Meeting:
         for name, start in starts.items():
             person = None if name == "robot" else TrackedHuman(start)
             client = Client(
-                scene, self.model, load_description("vinebot") if person is None else None, self.hub.bus(name),
-                name=name, pose=start, source=person, clock=lambda: self.now,
-            )  # fmt: skip
+                scene,
+                self.model,
+                load_description("vinebot") if person is None else None,
+                self.hub.bus(name),
+                name=name,
+                pose=start,
+                source=person,
+                clock=lambda: self.now,
+            )
             self.clients[name] = client
             if person is not None:
                 world = PageWorld(client, person)
@@ -129,9 +140,7 @@ class Meeting:
         spec = CameraSpec.load(mount.type)
         primitives = self.primitives
         primitives.update(self.robot.physics.snapshot())
-        frame = Camera(spec, spec.info(mount.frame, 0.25)).render(
-            primitives, self.robot.robot.frame_pose(mount.frame)
-        )  # fmt: skip
+        frame = Camera(spec, spec.info(mount.frame, 0.25)).render(primitives, self.robot.robot.frame_pose(mount.frame))
         return {name for name in ("anna", "ben") if (frame.labels == label(Organ.HUMAN, label_index(name))).sum() > 50}
 
     def robot_hears(self, frequency: float) -> float:
@@ -160,7 +169,8 @@ class Meeting:
 
     def is_within(self, point: np.ndarray, box: np.ndarray) -> bool:
         """Whether a point [3] m is between the walls of the box at a pose [7]."""
-        local, size = frames.compose(frames.inverse(box), frames.pose(point))[:3], self.model.box_size[BOX]
+        local = frames.compose(frames.inverse(box), frames.pose(point))[:3]
+        size = self.model.box_size[BOX]
         return bool((np.abs(local[:2]) < 0.5 * size[:2]).all() and 0.0 < local[2] < size[2])
 
 
@@ -209,7 +219,8 @@ def meet(tmp_path):
         wait(lambda: {"anna", "robot"} <= meeting.ben.remote_actors.keys(), "all have met")
         wait(lambda: {"anna", "ben"} <= meeting.robot.remote_actors.keys(), "the robot has met both")
         a.run(STEERING)
-        robot, bunch = meeting.robot.physics, meeting.bunch
+        robot = meeting.robot.physics
+        bunch = meeting.bunch
 
         # anna points at the bunch: on the robot's client her hand makes the gesture, towards the bunch
         point_at(a, bunch)
@@ -225,7 +236,8 @@ def meet(tmp_path):
 
         def off() -> float:
             palm = robot.hand("anna", "right").pose
-            way, ahead = bunch - palm[:3], frames.rotate(palm[3:], np.array([1.0, 0.0, 0.0]))
+            way = bunch - palm[:3]
+            ahead = frames.rotate(palm[3:], np.array([1.0, 0.0, 0.0]))
             return float(np.degrees(np.arccos(ahead @ way / np.linalg.norm(way))))
 
         wait(lambda: off() < 10.0, "she points at the bunch, within 10 degrees")

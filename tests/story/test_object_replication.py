@@ -117,7 +117,8 @@ def test_a_pushed_box_with_bunches_is_one_stream():
     before = bytes_sent(ada)
     world.run(0.5)
     assert bytes_sent(ada) == before
-    start, owners_seen = pose_of(ada, BOX(0))[0], []
+    start = pose_of(ada, BOX(0))[0]
+    owners_seen = []
     drive(ada, 0.12)
     before_pushing = ada.replicator.counters.environment.bytes_out, ada.replicator.counters.environment.messages_out
     while pose_of(ada, BOX(0))[0] < start + 0.15:
@@ -128,7 +129,8 @@ def test_a_pushed_box_with_bunches_is_one_stream():
     assert {owner for owner, *_ in owners_seen} == {"ada", None}
     assert {owner for _, *owners in owners_seen for owner in owners} == {None}
     counters = ada.replicator.counters.environment
-    size, messages = counters.bytes_out - before_pushing[0], counters.messages_out - before_pushing[1]
+    size = counters.bytes_out - before_pushing[0]
+    messages = counters.messages_out - before_pushing[1]
     assert size == messages * (14 + 26), "one record a message: the box"
     drive(ada, -0.2)
     world.until(lambda: at_rest(world), 4.0)
@@ -380,12 +382,15 @@ def test_a_bunch_pulled_off_carried_and_dropped_by_a_human_is_replicated():
     weak = vineyard.__wrapped__()
     weak.bunch_pull[:] = 20.0
     world = World(weak)
-    ada, bob = world.join("ada", 1.0, -2.5), world.join("bob", -1.0, -2.5)
+    ada = world.join("ada", 1.0, -2.5)
+    bob = world.join("bob", -1.0, -2.5)
     hang = weak.forward_kinematics(weak.joint_settled)[weak.bunch_body[0], :3] - [0.0, 0.0, 0.08]
-    standing, facing = frames.pose([1.65, 0.0, 0.0], frames.from_yaw(np.pi)), frames.from_yaw(np.pi)
+    standing = frames.pose([1.65, 0.0, 0.0], frames.from_yaw(np.pi))
+    facing = frames.from_yaw(np.pi)
 
     def source(time: float) -> HumanPose:
-        approach, carry = np.clip((time - 0.5) / 0.5, 0.0, 1.0), np.clip((time - 1.4) / 1.2, 0.0, 1.0)
+        approach = np.clip((time - 0.5) / 0.5, 0.0, 1.0)
+        carry = np.clip((time - 1.4) / 1.2, 0.0, 1.0)
         at = hang + np.array([0.075 + 0.25 * (1.0 - approach) + 0.1 * carry, -0.8 * carry, -0.2 * carry])
         return dataclasses.replace(
             standing_pose(standing), right=frames.pose(at, facing), right_closed=1.1 < time < 5.0

@@ -28,7 +28,9 @@ GRAVITY = 9.81
 def test_a_picked_bunch_is_in_the_box_with_its_weight_on_the_other_client():
     now = [100.0]
     scene = with_seed(load_scene("harvest"), 7)
-    model, vinebot, hub = generate(scene), load_description("vinebot"), MemoryHub(delay=0.02, jitter=0.005, seed=2)
+    model = generate(scene)
+    vinebot = load_description("vinebot")
+    hub = MemoryHub(delay=0.02, jitter=0.005, seed=2)
     task = next(pick_planning.plan_picks(model, start_poses.spawn_pose(scene, 0)[:2]))
     box = object_id(ObjectKind.BOX, task.box)
     visitor_xy = model.box_pose[task.box, :2] + [0.0, 1.6]
@@ -50,7 +52,8 @@ def test_a_picked_bunch_is_in_the_box_with_its_weight_on_the_other_client():
     empty = float(model.box_mass[task.box]) * GRAVITY
     pick = PickBunch(worker.physics, worker.robot, task)
     worker.pre_step.append(pick.control)
-    bunch, position_errors = object_id(ObjectKind.BUNCH, task.bunch), []
+    bunch = object_id(ObjectKind.BUNCH, task.bunch)
+    position_errors = []
     while not pick.is_done:
         run()
         cut = not worker.physics.state.bunch_attached[task.bunch]

@@ -106,16 +106,18 @@ def killed_recording(tmp_path_factory) -> Iterator[tuple[str, pathlib.Path, floa
 
             # a tree is bent, rests, and is bent again until the recorder is killed
             clients.until(
-                lambda: "tree/0/0/ada" in keys(path), "the tree to be recorded",
+                lambda: "tree/0/0/ada" in keys(path),
+                "the tree to be recorded",
                 lambda: ada.bend(0, 0.5 * np.sin(0.1 * clients.number)),
-            )  # fmt: skip
+            )
             ada.touched = set()
             clients.until(lambda: "own/0/0/ada" in keys(path) and rest_updates(path), "its rest to be recorded")
             motion_start = time.monotonic()
             clients.until(
-                lambda: time.monotonic() - motion_start > 1.5, "1.5 s of motion",
+                lambda: time.monotonic() - motion_start > 1.5,
+                "1.5 s of motion",
                 lambda: ada.bend(0, 0.5 * np.sin(0.1 * clients.number)),
-            )  # fmt: skip
+            )
             killed = time.time()
             recorder.send_signal(signal.SIGKILL)
             recorder.wait(deadline())
@@ -155,9 +157,10 @@ def test_a_second_recorder_writes_a_second_file(killed_recording):
         client = MinimalClient(bus, 1.5)
         clients = TickedClients(client)
         clients.until(
-            lambda: {"hello/eve", "a/eve", "tree/0/0/eve"} <= keys(second), "a client alone in the area to be recorded",
+            lambda: {"hello/eve", "a/eve", "tree/0/0/eve"} <= keys(second),
+            "a client alone in the area to be recorded",
             lambda: client.bend(1, 0.5 * np.sin(0.1 * clients.number)),
-        )  # fmt: skip
+        )
         recorder.send_signal(signal.SIGINT)
         _, output = recorder.communicate(timeout=deadline())
     assert recorder.returncode == 0, output
@@ -274,10 +277,8 @@ def count_bytes(endpoint: str, path: pathlib.Path | None, distance: float) -> li
 def test_a_recorder_does_not_change_traffic(tmp_path, distance):
     with Server("tcp/127.0.0.1:0") as server:
         path = tmp_path / "run.mcap"
-        without_recorder, with_recorder = (
-            count_bytes(server.endpoint, None, distance),
-            count_bytes(server.endpoint, path, distance),
-        )
+        without_recorder = count_bytes(server.endpoint, None, distance)
+        with_recorder = count_bytes(server.endpoint, path, distance)
     assert without_recorder == with_recorder
     recorded = {entry.key for entry in read_recording(path).messages}
     assert ("tree/0/0/ada" in recorded) == (distance < 5.0)
@@ -298,8 +299,10 @@ def test_a_full_disk_ends_a_recording_with_one_line(tmp_path):
             for name, x in (("ada", 0.5), ("bob", 2.0))
         ]
         process = programs.Popen(
-            [sys.executable, "-c", limited, str(path), "--connect", server.endpoint], stderr=subprocess.PIPE, text=True,
-        )  # fmt: skip
+            [sys.executable, "-c", limited, str(path), "--connect", server.endpoint],
+            stderr=subprocess.PIPE,
+            text=True,
+        )
         with terminated(process):
             TickedClients(*clients).until(lambda: process.poll() is not None, "its end")
             output = process.stderr.read().splitlines()
@@ -320,7 +323,8 @@ def test_recording_needs_only_a_spectator_certificate(tmp_path):
         def bus(name: str, **options: bool) -> ZenohBus:
             return stack.enter_context(ZenohBus(name, connect=server.endpoint, certificates=certs, **options))
 
-        ada, bob = MinimalClient(bus("ada"), 0.5), MinimalClient(bus("bob"), 2.0)
+        ada = MinimalClient(bus("ada"), 0.5)
+        bob = MinimalClient(bus("bob"), 2.0)
         recording = stack.enter_context(RecordingWriter(tmp_path / "run.mcap"))
         recorder = Recorder(bus("recorder", live=False), recording)
         clients = TickedClients(ada, bob)

@@ -84,7 +84,8 @@ def test_fingers_and_their_mimic_joints_close(tiago):
 def test_it_reaches_and_pushes_a_bunch(tiago):
     world = Vineyard(tiago)
     task = PushBunch(world.robot, "left", lambda: BUNCH, repeat=False, hold_time=0.5)
-    pushed, effort = 0.0, 0.0
+    pushed = 0.0
+    effort = 0.0
     while task.push_count == 0 and world.physics.time < 40.0:
         task.control(world.physics.time)
         world.run(world.physics.dt)

@@ -28,7 +28,8 @@ class World:
     """Two clients on one bus, ticked in turn by one clock."""
 
     def __init__(self, visitor_back=0.0, executor=None):
-        self.now, self.compared = 100.0, None
+        self.now = 100.0
+        self.compared = None
         self.scene = load_scene("demo")
         self.model = generate(self.scene)
         self.hub = MemoryHub(delay=DELAY, jitter=0.005, seed=1)
@@ -84,7 +85,8 @@ def world():
 
 
 def test_the_whole_way(world):
-    picker, visitor = world.picker, world.visitor
+    picker = world.picker
+    visitor = world.visitor
     world.until(lambda: "visitor" in picker.remote_actors and "picker" in visitor.remote_actors, 3.0)
 
     # 1, 2: a finger touches the bunch: equal and opposite forces, in the same tick
@@ -125,7 +127,8 @@ def test_the_whole_way(world):
     world.until(lambda: world.tree not in picker.physics.sleep_monitor.restless, 60.0)
     world.until(lambda: visitor.replicator.owner(world.tree) is None, 2.0)
     here = world.model.bodies_of(world.tree)
-    local, remote = picker.physics.state.joint_q[here], visitor.physics.state.joint_q[here]
+    local = picker.physics.state.joint_q[here]
+    remote = visitor.physics.state.joint_q[here]
     assert np.abs(np.abs((local * remote).sum(1)) - 1.0).max() < 1e-6
     sent = picker.replicator.counters.environment.bytes_out
     for _ in range(100):
@@ -178,7 +181,9 @@ class Approach(World):
 
     def __init__(self, distance):
         super().__init__(visitor_back=distance)
-        self.hub.delay, self.hub.jitter, self.task.repeat = 0.01, 0.008, True
+        self.hub.delay = 0.01
+        self.hub.jitter = 0.008
+        self.task.repeat = True
         drive = DriveTo(self.visitor.robot, spawn_pose(self.scene, 1), may_start=lambda: self.visitor.remote_actors)
         self.visitor.pre_step.append(drive)
 
@@ -221,7 +226,8 @@ def test_the_force_on_the_copy_is_that_on_the_bunch(approach):
     assert peaks[0] > 2.0
     assert peaks[1] == pytest.approx(peaks[0], rel=0.1)
     near = np.abs(copied.clock[:, None] - own.clock) < SKEW
-    least, most = np.where(near, there, np.inf).min(1), np.where(near, there, 0.0).max(1)
+    least = np.where(near, there, np.inf).min(1)
+    most = np.where(near, there, 0.0).max(1)
     allowed = np.maximum(0.3, 0.25 * most)
     pressed = (here > 0.0) | (most > 0.0)
     is_right = (here > least - allowed) & (here < most + allowed)

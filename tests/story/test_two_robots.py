@@ -70,7 +70,8 @@ class TwoRobots:
 
 def test_two_robots_of_one_client_are_two_actors_for_others():
     world = TwoRobots()
-    farm, visitor = world.farm, world.visitor
+    farm = world.farm
+    visitor = world.visitor
     world.until(lambda: len(visitor.remote_actors) == 2 and len(farm.remote_actors) == 1, 3.0)
     assert set(visitor.remote_actors) == {"farm_1", "farm_2"}
     assert set(farm.remote_actors) == {"visitor"}
@@ -115,7 +116,8 @@ def test_two_robots_of_one_client_send_each_other_no_plants():
 def test_robots_of_one_client_start_side_by_side_then_in_a_queue():
     scene = load_scene("demo")
     poses = [start_pose(scene, 0, 0.0, i) for i in range(2 * len(scene.spawns))]
-    first, behind = poses[0], poses[len(scene.spawns)]
+    first = poses[0]
+    behind = poses[len(scene.spawns)]
     assert np.linalg.norm(first[:3] - behind[:3]) == pytest.approx(QUEUE_SPACING)
     distances = [np.linalg.norm(a[:2] - b[:2]) for i, a in enumerate(poses) for b in poses[:i]]
     assert min(distances) > 1.1
@@ -134,15 +136,18 @@ def test_each_robot_publishes_under_its_prefix():
         monitor, client = (
             stack.enter_context(
                 programs.Popen(
-                    [sys.executable, "-m", *command], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                    stderr=subprocess.PIPE, text=True,
+                    [sys.executable, "-m", *command],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    stderr=subprocess.PIPE,
+                    text=True,
                 )
             )
             for command in (
                 ["vinesim.ros.tools.topic_monitor", *options],
                 ["vinesim", "client", *robots],
             )
-        )  # fmt: skip
+        )
         for process in (monitor, client):
             stack.callback(process.kill)
         watchdog = threading.Timer(PROCESS_TIMEOUT, client.kill)

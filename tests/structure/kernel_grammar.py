@@ -42,7 +42,9 @@ def written(function: ast.FunctionDef) -> Iterator[tuple[str, int]]:
 
 def grouped(function: ast.FunctionDef, lines: list[str]) -> dict[str, str | None]:
     """The group under which each argument stands."""
-    groups, current, line = {}, None, function.lineno
+    groups = {}
+    current = None
+    line = function.lineno
     for argument in function.args.args:
         for text in lines[line - 1 : argument.lineno]:
             mark = text.strip().removeprefix("#").strip()

@@ -62,9 +62,14 @@ class Beam:
         last = tree.add_rod(-1, self.length, (self.radius, self.taper * self.radius), wood, self.pieces)[-1]
         mass = max(self.tip, 1e-6)
         tree.add_body(
-            last, offset=(self.length / self.pieces, 0, 0), mass=mass, inertia=[mass * 1e-6] * 3, length=1e-3,
-            stiffness=[1e-3] * 3, damping=[1e-3] * 3,
-        )  # fmt: skip
+            last,
+            offset=(self.length / self.pieces, 0, 0),
+            mass=mass,
+            inertia=[mass * 1e-6] * 3,
+            length=1e-3,
+            stiffness=[1e-3] * 3,
+            damping=[1e-3] * 3,
+        )
         return tree
 
 
@@ -91,7 +96,8 @@ def elastica_line(beam: Beam) -> np.ndarray:
 
     EI(s) theta' = m, m' = V(s) cos theta, theta(0) = angle, m(L) = 0, with the weight V(s) of all beyond s.
     """
-    L, thin = beam.length, beam.taper - 1.0
+    L = beam.length
+    thin = beam.taper - 1.0
 
     def radius(s: np.ndarray) -> np.ndarray:
         return 1.0 + thin * s / L
@@ -103,7 +109,8 @@ def elastica_line(beam: Beam) -> np.ndarray:
             volume = L / (3.0 * thin) * (radius(np.asarray(L)) ** 3 - radius(s) ** 3)
         return G * (beam.tip + beam.line_mass * volume)
 
-    s, steps = np.linspace(0.0, L, 80), 1 + int(np.sqrt(weight_beyond(np.asarray(0.0)) * L**2 / beam.rigidity))
+    s = np.linspace(0.0, L, 80)
+    steps = 1 + int(np.sqrt(weight_beyond(np.asarray(0.0)) * L**2 / beam.rigidity))
     y = np.stack([np.full_like(s, beam.angle), 0.0 * s, s * np.cos(beam.angle), s * np.sin(beam.angle)])
     for load in np.linspace(0.0, 1.0, steps + 1)[1:] ** 2:
 
@@ -115,7 +122,8 @@ def elastica_line(beam: Beam) -> np.ndarray:
             slope, lambda a, b: np.array([a[0] - beam.angle, b[1], a[2], a[3]]), s, y, tol=1e-6, max_nodes=5000
         )
         assert solution.success, solution.message
-        s, y = solution.x, solution.y
+        s = solution.x
+        y = solution.y
     return y[2:]
 
 
@@ -132,7 +140,8 @@ def elastica_of_parts(parts: list[Beam]) -> tuple[float, float]:
         return G * part.line_mass * volume
 
     def back(tip_angle: float) -> np.ndarray:
-        y, beyond = np.array([tip_angle, 0.0, 0.0, 0.0]), G * parts[-1].tip
+        y = np.array([tip_angle, 0.0, 0.0, 0.0])
+        beyond = G * parts[-1].tip
         for part in reversed(parts):
 
             def slope(s: float, y: np.ndarray, part: Beam = part, beyond: float = beyond) -> list[float]:
@@ -195,7 +204,8 @@ def kirchhoff(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
     M(L) = R(L) (0, beside, 0) x weight.
     """
     compliance = np.array([1.0 / rod.twist, 1.0 / rod.bend, 1.0 / rod.bend])[:, None]
-    L, relaxed = rod.length, np.array([0.0, 0.0, rod.turn / rod.length])[:, None]
+    L = rod.length
+    relaxed = np.array([0.0, 0.0, rod.turn / rod.length])[:, None]
     s = np.linspace(0.0, L, 60)
     half = 0.5 * rod.turn * s / L
     y = np.zeros((10, len(s)))
@@ -203,7 +213,8 @@ def kirchhoff(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
     for load in np.linspace(0.0, 1.0, 5):
 
         def slope(s: np.ndarray, y: np.ndarray, load: float = load) -> np.ndarray:
-            q, moment = y[3:7].T, y[7:].T
+            q = y[3:7].T
+            moment = y[7:].T
             along = frames.rotate(q, np.array([1.0, 0.0, 0.0]))
             force = np.zeros_like(along)
             force[:, 2] = -load * (rod.weight + rod.line_weight * (L - s))
@@ -218,7 +229,8 @@ def kirchhoff(rod: Rod) -> tuple[np.ndarray, np.ndarray]:
 
         solution = solve_bvp(slope, ends, s, y, tol=1e-6, max_nodes=5000)
         assert solution.success, solution.message
-        s, y = solution.x, solution.y
+        s = solution.x
+        y = solution.y
     return y[:3, -1], frames.normalize(y[3:7, -1])
 
 
@@ -239,7 +251,8 @@ def chain(tree: TreeBuilder) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     middle = joint_at + [body.get("com", (0.0, 0.0, 0.0))[0] for body in tree.bodies]
     mass = np.array([body["mass"] for body in tree.bodies])
     inertia = np.array([body["inertia"][2] for body in tree.bodies])
-    move, turn = np.tril(middle[:, None] - joint_at), np.tril(np.ones((n, n)))
+    move = np.tril(middle[:, None] - joint_at)
+    turn = np.tril(np.ones((n, n)))
     M = move.T @ (mass[:, None] * move) + turn.T @ (inertia[:, None] * turn)
     C, K = (np.diag([body.get(name, np.zeros(3))[2] for body in tree.bodies]) for name in ("damping", "stiffness"))
     return M, C, K
@@ -248,7 +261,8 @@ def chain(tree: TreeBuilder) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def chain_modes(tree: TreeBuilder) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies [Hz] and damping ratios of the oscillating modes of :func:`chain`, slowest first."""
     M, C, K = chain(tree)
-    zero, one = np.zeros_like(M), np.eye(len(M))
+    zero = np.zeros_like(M)
+    one = np.eye(len(M))
     s = eig(np.block([[zero, one], [-K, -C]]), np.block([[one, zero], [zero, M]]), right=False)
     s = s[np.argsort(abs(s))]
     s = s[s.imag > 1e-3 * abs(s)]
@@ -306,7 +320,8 @@ def settle(trees: list[TreeBuilder], seconds: float = 30.0) -> ArticulationSolve
 
 def joined_rods(parts: list[Beam], side: float = 0.0) -> TreeBuilder:
     """Rods joined end to end, as bodies; the last carries its tip mass."""
-    first, last = parts[0], parts[-1]
+    first = parts[0]
+    last = parts[-1]
     tree = dataclasses.replace(first, tip=0.0).tree(side)
     tree.bodies.pop()
     for part in parts[1:]:
@@ -314,9 +329,14 @@ def joined_rods(parts: list[Beam], side: float = 0.0) -> TreeBuilder:
         tree.add_rod(len(tree.bodies) - 1, part.length, (part.radius, part.taper * part.radius), wood, part.pieces)
     mass = max(last.tip, 1e-6)
     tree.add_body(
-        len(tree.bodies) - 1, offset=(last.length / last.pieces, 0, 0), mass=mass, inertia=[mass * 1e-6] * 3,
-        length=1e-3, stiffness=[1e-3] * 3, damping=[1e-3] * 3,
-    )  # fmt: skip
+        len(tree.bodies) - 1,
+        offset=(last.length / last.pieces, 0, 0),
+        mass=mass,
+        inertia=[mass * 1e-6] * 3,
+        length=1e-3,
+        stiffness=[1e-3] * 3,
+        damping=[1e-3] * 3,
+    )
     return tree
 
 
@@ -396,7 +416,8 @@ def errors_over_pieces() -> dict[str, np.ndarray]:
     return dict(zip(CONVERGING, error, strict=True))
 
 
-SOFT, STIFF = Beam(modulus=1e9, length=0.5, tip=0.01), Beam(modulus=5e9, length=0.5, tip=0.01)
+SOFT = Beam(modulus=1e9, length=0.5, tip=0.01)
+STIFF = Beam(modulus=5e9, length=0.5, tip=0.01)
 JOINED = {
     "stiff wood, then soft": [STIFF, SOFT],
     "soft wood, then stiff": [SOFT, STIFF],
@@ -436,7 +457,8 @@ def errors_over_dt() -> dict[str, np.ndarray]:
     beam = Beam(modulus=1.6e10, pieces=8)  # so stiff that its weight is negligible
     expected = chain_modes(beam.tree())[0][0]
     fine = released(beam, 0.0005, 0.5)[-1]
-    frequency, tip = [], []
+    frequency = []
+    tip = []
     for dt in STEPS:
         swing = released(beam, dt, 2.0)
         f, _ = fitted_swing(np.arange(len(swing)) * dt, swing[:, 1], expected)

@@ -23,17 +23,25 @@ def compound(parts: list[tuple[float, np.ndarray, np.ndarray]]) -> tuple[float, 
 
 def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = None, pieces: int = 8) -> Model:
     """Horizontal canes of 1 m (side by side), each with a bunch of 0.5 kg on a peduncle half way; drawn at rest."""
-    trees, bunches = [], []
+    trees = []
+    bunches = []
     for i in range(count):
         tree = TreeBuilder(frames.pose(np.array([0.0, 0.5 * i, 2.0])) if pose is None else pose)
         cane = tree.add_rod(-1, 1.0, (0.005, 0.004), RodMaterial(5e9, 800.0, 0.01), pieces)
         stalk = tree.add_rod(cane[pieces // 2], 0.06, (0.002, 0.002), RodMaterial(1e9, 900.0, 0.02), 2, rest=DOWN)
         head = {"mass": 0.05, "com": np.array([0.03, 0.0, 0.0]), "inertia": np.array([1e-5, 4e-5, 4e-5])}
         bunch = tree.add_body(
-            stalk[-1], offset=(0.03, 0, 0), organ=int(Organ.BUNCH), length=0.15, radius=(0.05, 0.05),
-            stiffness=(0.3, 0.3, 0.3), damping=(0.004, 0.004, 0.004), **head,
-        )  # fmt: skip
-        cluster_mass, parent = 0.45 / clusters, bunch
+            stalk[-1],
+            offset=(0.03, 0, 0),
+            organ=int(Organ.BUNCH),
+            length=0.15,
+            radius=(0.05, 0.05),
+            stiffness=(0.3, 0.3, 0.3),
+            damping=(0.004, 0.004, 0.004),
+            **head,
+        )
+        cluster_mass = 0.45 / clusters
+        parent = bunch
         for j in range(clusters):
             side = frames.exp(np.array([1.3 * j, 0.0, 0.0]))
             out = frames.multiply(side, frames.exp(np.array([0.0, 0.0, 0.7])))
@@ -50,7 +58,8 @@ def clustered(count: int = 1, clusters: int = 5, *, pose: np.ndarray | None = No
     for i, (bunch, head, core) in enumerate(bunches):
         first = int(model.tree_first[i])
         model.tree_core[i], model.bunch_cluster[i], model.bunch_clusters[i] = core, first + core, clusters
-        model.bunch_head_mass[i], model.bunch_head_com[i] = head["mass"], head["com"]
+        model.bunch_head_mass[i] = head["mass"]
+        model.bunch_head_com[i] = head["com"]
         model.bunch_head_inertia[i] = head["inertia"]
         world = model.forward_kinematics(model.joint_settled)
         back = frames.inverse(world[first + bunch])
@@ -76,7 +85,8 @@ def momenta(
     plants: ArticulationSolver, bodies: np.ndarray, about: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Linear momentum, angular momentum about a point, centre of mass and kinetic energy of bodies."""
-    pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
+    pose = plants.state.body_q[bodies].astype(float)
+    speed = plants.state.body_qd[bodies].astype(float)
     mass = plants.body_mass[bodies].astype(float)
     com = frames.rotate(pose[:, 3:], plants.body_com[bodies].astype(float))
     omega = frames.rotate(frames.conjugate(pose[:, 3:]), speed[:, 3:])

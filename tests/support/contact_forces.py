@@ -10,8 +10,10 @@ from vinesim.world import Physics
 
 def pressed_on_ground(physics: Physics, box: int) -> float:
     """Upward force of the ground on a box [N], from MuJoCo's own contacts: its weight and that of its contents."""
-    world, data = physics.rigid.mj_model, physics.rigid.mj_data
-    ground, body = world.geom("ground").id, world.body(f"box/{box}").id
+    world = physics.rigid.mj_model
+    data = physics.rigid.mj_data
+    ground = world.geom("ground").id
+    body = world.body(f"box/{box}").id
     total = 0.0
     for i, geoms in enumerate(data.contact.geom):
         if ground in geoms and body in world.geom_bodyid[geoms]:

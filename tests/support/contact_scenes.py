@@ -15,9 +15,15 @@ DOWN = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
 
 
 def cane(
-    at, *, bunch: float = 0.0, radius: float = 0.006, beta: float = 0.01, heading: float = 0.0, pieces: int = 16,
+    at,
+    *,
+    bunch: float = 0.0,
+    radius: float = 0.006,
+    beta: float = 0.01,
+    heading: float = 0.0,
+    pieces: int = 16,
     clusters: bool = False,
-) -> TreeBuilder:  # fmt: skip
+) -> TreeBuilder:
     """A cane of 1 m in pieces (16 if it has a bunch), level when drawn.
 
     ``bunch`` [kg] hangs from its tip on a peduncle of 8 cm, as one body or with ``clusters`` that move near an actor.
@@ -28,15 +34,23 @@ def cane(
     )  # G = E/2 makes torsion as stiff as bending, as MuJoCo's ball wants
     last = tree.add_rod(-1, 1.0, (radius, radius), wood, pieces)[-1]
     if bunch:
-        mass, stiffness = 800.0 * np.pi * 0.002**2 * 0.04, 1e9 * np.pi * 0.002**4 / 4 / 0.04
+        mass = 800.0 * np.pi * 0.002**2 * 0.04
+        stiffness = 1e9 * np.pi * 0.002**4 / 4 / 0.04
         across = mass * (0.04**2 / 12 + 0.002**2 / 4)
         for i in range(2):
             last = tree.add_body(
-                last, offset=(0.0625 if i == 0 else 0.04, 0, 0), rest=DOWN if i == 0 else frames.IDENTITY,
-                organ=int(Organ.PEDUNCLE), mass=mass, com=(0.02, 0, 0), length=0.04, radius=(0.002, 0.002),
-                inertia=(0.5 * mass * 0.002**2, across, across), stiffness=np.full(3, stiffness),
+                last,
+                offset=(0.0625 if i == 0 else 0.04, 0, 0),
+                rest=DOWN if i == 0 else frames.IDENTITY,
+                organ=int(Organ.PEDUNCLE),
+                mass=mass,
+                com=(0.02, 0, 0),
+                length=0.04,
+                radius=(0.002, 0.002),
+                inertia=(0.5 * mass * 0.002**2, across, across),
+                stiffness=np.full(3, stiffness),
                 damping=np.full(3, 0.01 * stiffness + 1e-3),
-            )  # fmt: skip
+            )
         _hang_bunch(tree, last, bunch, stiffness, clusters)
     tree.solve_rest_pose()
     return tree
@@ -52,28 +66,50 @@ def _hang_bunch(tree: TreeBuilder, parent: int, mass: float, stiffness: float, c
     if clusters:
         vine = load_plant("vine")
         one = segment_bunches(
-            np.array([mass]), np.array([0.17]), np.array([0.045]), np.array([80]), np.array([0]), vine.rachis,
+            np.array([mass]),
+            np.array([0.17]),
+            np.array([0.045]),
+            np.array([80]),
+            np.array([0]),
+            vine.rachis,
             vine.bunch.stem_share.value,
-        )  # fmt: skip
+        )
         whole, com, inertia = (value[0] for value in one.compound())
         fields = {"mass": whole, "com": com, "inertia": inertia}
         bunch |= {
-            "clusters": int(one.count[0]) - 1, "head_mass": one.mass[0, 0], "head_com": one.com[0, 0],
+            "clusters": int(one.count[0]) - 1,
+            "head_mass": one.mass[0, 0],
+            "head_com": one.com[0, 0],
             "head_inertia": one.inertia[0, 0],
-        }  # fmt: skip
+        }
     body = tree.add_body(
-        parent, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), length=0.17, radius=(0.04, 0.04),
-        stiffness=np.full(3, stiffness), damping=np.full(3, 0.01 * stiffness + 2e-3), **fields,
-    )  # fmt: skip
+        parent,
+        offset=(0.04, 0, 0),
+        organ=int(Organ.BUNCH),
+        length=0.17,
+        radius=(0.04, 0.04),
+        stiffness=np.full(3, stiffness),
+        damping=np.full(3, 0.01 * stiffness + 2e-3),
+        **fields,
+    )
     tree.bunches.append({"body": body} | bunch)
     for i in range(1, bunch.get("clusters", 0) + 1):
         bends = float(one.stiffness[0, i, 1])
-        tree.clusters.append({
-            "parent": None if i > 1 else body, "offset": np.array([one.length[0], 0.0, 0.0]), "rest": frames.IDENTITY,
-            "organ": int(Organ.BUNCH), "mass": one.mass[0, i], "com": one.com[0, i], "inertia": one.inertia[0, i],
-            "length": one.length[0], "radius": one.radius[0, i], "stiffness": np.full(3, bends),
-            "damping": np.full(3, vine.rachis.damping.value * bends),
-        })  # fmt: skip
+        tree.clusters.append(
+            {
+                "parent": None if i > 1 else body,
+                "offset": np.array([one.length[0], 0.0, 0.0]),
+                "rest": frames.IDENTITY,
+                "organ": int(Organ.BUNCH),
+                "mass": one.mass[0, i],
+                "com": one.com[0, i],
+                "inertia": one.inertia[0, i],
+                "length": one.length[0],
+                "radius": one.radius[0, i],
+                "stiffness": np.full(3, bends),
+                "damping": np.full(3, vine.rachis.damping.value * bends),
+            }
+        )
 
 
 def _inertial(mass: float) -> str:

@@ -39,10 +39,14 @@ READER_QOS = {
 }
 """The default QoS of subscriptions in rclpy, ``qos_profile_sensor_data``, and that of subscribers to latched topics."""
 PRIMITIVES = {
-    "bool": bool, "byte": types.uint8, "char": types.uint8, "string": str, "float32": types.float32,
-    "float64": types.float64, **{f"{sign}int{size}": getattr(types, f"{sign}int{size}") for sign in ("", "u")
-    for size in (8, 16, 32, 64)},
-}  # fmt: skip
+    "bool": bool,
+    "byte": types.uint8,
+    "char": types.uint8,
+    "string": str,
+    "float32": types.float32,
+    "float64": types.float64,
+    **{f"{sign}int{size}": getattr(types, f"{sign}int{size}") for sign in ("", "u") for size in (8, 16, 32, 64)},
+}
 _FIELD = re.compile(r"(?P<kind>[\w/]+)(<=\d+)?(?P<many>\[(?P<bound><=)?(?P<count>\d*)\])?\s+(?P<name>[a-z]\w*)")
 """A line of a definition that is a field: names of constants are upper case."""
 
@@ -63,7 +67,8 @@ def make_type(type_name: str, definition: str) -> type[IdlStruct]:
         return made[name]
 
     def kind_of(field: re.Match[str], package: str) -> Any:
-        kind, count = field["kind"], field["count"]
+        kind = field["kind"]
+        count = field["count"]
         element = PRIMITIVES.get(kind) or make(kind if "/" in kind else f"{package}/{kind}")
         if field["many"] is None:
             return element
@@ -105,7 +110,8 @@ class Peer:
         if "list" in command:
             answer({"topics": self._topics})
         elif "read" in command:
-            topic, qos = command["read"], command["qos"]
+            topic = command["read"]
+            qos = command["qos"]
             self._readers[topic, qos] = DataReader(self._participant, self._topic(topic, command), qos=READER_QOS[qos])
         else:
             topic = command["write"]

@@ -21,12 +21,26 @@ import sys
 import types
 
 PRELOADED = (
-    "vinesim.cli.server", "vinesim.cli.robot_client", "vinesim.cli.human_client", "vinesim.cli.spectator_client",
-    "vinesim.cli.record", "vinesim.cli.replay", "vinesim.cli.render", "vinesim.cli.dataset", "vinesim.cli.scene",
-    "vinesim.cli.tune", "vinesim.cli.certs", "vinesim.cli.doctor.command", "vinesim.cli.bench",
-    "vinesim.api.simulation", "vinesim.api.client", "vinesim.api.sensors", "vinesim.tune",
-    "matplotlib.pyplot", "scipy.optimize",
-)  # fmt: skip
+    "vinesim.cli.server",
+    "vinesim.cli.robot_client",
+    "vinesim.cli.human_client",
+    "vinesim.cli.spectator_client",
+    "vinesim.cli.record",
+    "vinesim.cli.replay",
+    "vinesim.cli.render",
+    "vinesim.cli.dataset",
+    "vinesim.cli.scene",
+    "vinesim.cli.tune",
+    "vinesim.cli.certs",
+    "vinesim.cli.doctor.command",
+    "vinesim.cli.bench",
+    "vinesim.api.simulation",
+    "vinesim.api.client",
+    "vinesim.api.sensors",
+    "vinesim.tune",
+    "matplotlib.pyplot",
+    "scipy.optimize",
+)
 MAX_REQUEST = 1 << 20
 """Longest request [bytes]."""
 
@@ -82,9 +96,12 @@ def _become(request: dict, stdin: int, stdout: int, stderr: int, status: int) ->
     for target, file in enumerate((stdin, stdout, stderr)):
         os.dup2(file, target)
         os.close(file)
-    sys.stdin, sys.stdout = open(0), open(1, "w")  # noqa: SIM115
+    sys.stdin = open(0)  # noqa: SIM115
+    sys.stdout = open(1, "w")  # noqa: SIM115
     sys.stderr = open(2, "w", buffering=1, errors="backslashreplace")  # noqa: SIM115
-    sys.__stdin__, sys.__stdout__, sys.__stderr__ = sys.stdin, sys.stdout, sys.stderr
+    sys.__stdin__ = sys.stdin
+    sys.__stdout__ = sys.stdout
+    sys.__stderr__ = sys.stderr
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.chdir(request["cwd"])
     os.environ.clear()

@@ -29,7 +29,8 @@ class SteppedPage:
     """A page's server, and the clients behind it, which step in a thread of their own, as in their processes."""
 
     def __init__(self, server, step):
-        self.server, self._step = server, step
+        self.server = server
+        self._step = step
         self.due = []
         """Called once before the next step."""
         self._stop = threading.Event()
@@ -75,7 +76,8 @@ class LiveVineyard(SteppedPage):
     @contextlib.contextmanager
     def paused(self):
         """The client stands still within the block."""
-        standing, go_on = threading.Event(), threading.Event()
+        standing = threading.Event()
+        go_on = threading.Event()
         self.due.append(lambda: (standing.set(), go_on.wait()))
         standing.wait()
         try:

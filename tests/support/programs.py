@@ -32,9 +32,11 @@ class _Server:
         with theirs:
             self._process = subprocess.Popen(
                 [sys.executable, "-m", "tests.support.fork_server", str(theirs.fileno())],
-                pass_fds=[theirs.fileno()], cwd=ROOT, stdin=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                cwd=ROOT,
+                stdin=subprocess.DEVNULL,
                 env=os.environ | {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "MUJOCO_GL": "disable"},
-            )  # fmt: skip
+            )
         self._lock = threading.Lock()
 
     def start(self, request: dict, files: list[int]) -> None:
@@ -63,10 +65,16 @@ class Popen:
     """A program that runs: what tests use of ``subprocess.Popen``. Its output is text."""
 
     def __init__(
-        self, command: Sequence[str], *, stdin: int | IO | None = None, stdout: int | IO | None = None,
-        stderr: int | IO | None = None, cwd: str | os.PathLike[str] | None = None,
-        env: Mapping[str, str] | None = None, text: bool = True,
-    ) -> None:  # fmt: skip
+        self,
+        command: Sequence[str],
+        *,
+        stdin: int | IO | None = None,
+        stdout: int | IO | None = None,
+        stderr: int | IO | None = None,
+        cwd: str | os.PathLike[str] | None = None,
+        env: Mapping[str, str] | None = None,
+        text: bool = True,
+    ) -> None:
         assert command[0] == sys.executable, "only Python programs are forked"
         assert text, "pipes are text"
         self.args = command
@@ -77,7 +85,8 @@ class Popen:
             self.stdin, first = self._pipe(stdin, 0, stack)
             self.stdout, second = self._pipe(stdout, 1, stack)
             if stderr == subprocess.STDOUT:
-                self.stderr, third = None, second
+                self.stderr = None
+                third = second
             else:
                 self.stderr, third = self._pipe(stderr, 2, stack)
             request = {
@@ -176,9 +185,14 @@ class Popen:
 
 
 def run(
-    command: Sequence[str], *, cwd: str | os.PathLike[str] | None = None, env: Mapping[str, str] | None = None,
-    timeout: float | None = None, check: bool = False, input: str | None = None,
-) -> subprocess.CompletedProcess[str]:  # fmt: skip
+    command: Sequence[str],
+    *,
+    cwd: str | os.PathLike[str] | None = None,
+    env: Mapping[str, str] | None = None,
+    timeout: float | None = None,
+    check: bool = False,
+    input: str | None = None,
+) -> subprocess.CompletedProcess[str]:
     """Run a program to its end, with its output. It is killed after ``timeout`` [s].
 
     :raises subprocess.TimeoutExpired: if it runs longer than that.

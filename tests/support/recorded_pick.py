@@ -17,23 +17,31 @@ from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
-PICKED_AT, LENGTH = 1.5, 2.5
+PICKED_AT = 1.5
+LENGTH = 2.5
 """[s] of the recording."""
 
 
 def record_a_pick(path: pathlib.Path) -> int:
     """Write a recording of the scene ``demo``; the bunch that is picked."""
-    hub, scene = MemoryHub(delay=0.004), load_scene("demo")
+    hub = MemoryHub(delay=0.004)
+    scene = load_scene("demo")
     clock = hub.bus("server", live=False)
     clock.declare_queryable(
         "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e6 + hub.time)
     )
-    model, start = generate(scene), spawn_pose(scene, 0)
+    model = generate(scene)
+    start = spawn_pose(scene, 0)
     bunch = find_reachable_bunch(model, start)
     client = Client(
-        scene, model, load_description("vinebot"), hub.bus("picker"), name="picker",
-        pose=start, clock=lambda: hub.time,
-    )  # fmt: skip
+        scene,
+        model,
+        load_description("vinebot"),
+        hub.bus("picker"),
+        name="picker",
+        pose=start,
+        clock=lambda: hub.time,
+    )
     with RecordingWriter(path) as recording:
         recorder = Recorder(hub.bus("recorder", live=False), recording, clock=lambda: hub.time, everything=True)
         client.robot.command_position([0.5], ["head_1_joint"])

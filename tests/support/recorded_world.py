@@ -34,7 +34,9 @@ class MinimalClient:
     """A minimal client: a robot at ``x`` that bends trees on request and applies the updates it receives."""
 
     def __init__(self, bus: Bus, x: float, **hello) -> None:
-        self.model, self.bus, self.name = vineyard(), bus, bus.name
+        self.model = vineyard()
+        self.bus = bus
+        self.name = bus.name
         hello = {"scene": "rows", "digest": self.model.digest(), "joints": 2, "seed": 5} | hello
         self.replicator = Replicator(bus, Hello(bus.name, **hello), self.model)
         self.state = State.at_rest(self.model)

@@ -36,13 +36,16 @@ class Yard:
 
 def hand_of(description: RobotDescription, position: np.ndarray | None = None) -> tuple[float, np.ndarray]:
     """Mass [kg] beyond the left wrist sensor, and its centre [3] m in the base, from the URDF; at home by default."""
-    poses, mass, moment = description.link_poses(description.home if position is None else position), 0.0, np.zeros(3)
+    poses = description.link_poses(description.home if position is None else position)
+    mass = 0.0
+    moment = np.zeros(3)
     for link in ElementTree.fromstring(description.urdf).iterfind("link"):
         name = link.get("name")
         if (name.startswith("gripper_left") or name == "wrist_left_ft_link") and link.find("inertial") is not None:
             own = float(link.find("inertial/mass").get("value"))
             at = np.array(link.find("inertial/origin").get("xyz").split(), float)
-            mass, moment = mass + own, moment + own * (poses[name][:3] + frames.rotate(poses[name][3:], at))
+            mass = mass + own
+            moment = moment + own * (poses[name][:3] + frames.rotate(poses[name][3:], at))
     return mass, moment / mass
 
 

@@ -120,10 +120,12 @@ def finely(primitives: Primitives, which: np.ndarray) -> tuple[np.ndarray, np.nd
                 round_ = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), np.cross(axis, side))
                 normal = axis * lean + round_ * np.sqrt(1.0 - lean * lean)
                 points = np.concatenate([end[:3] + normal * end[3] for end in (a[i], b[i])])
-                k, n = np.arange(96), (np.arange(96) + 1) % 96
+                k = np.arange(96)
+                n = (np.arange(96) + 1) % 96
                 parts.append((points, np.concatenate([np.stack([k, n, k + 96], 1), np.stack([n, n + 96, k + 96], 1)])))
         else:
-            rib, up = b[i, :3], c[i, :3]
+            rib = b[i, :3]
+            up = c[i, :3]
             height = d[i, 0] * u**2 + d[i, 1] * v**2 + d[i, 2] * np.abs(u)
             points = (u[..., None] * np.cross(rib, up) + v[..., None] * rib + height[..., None] * up) * a[i, 3] + a[
                 i, :3

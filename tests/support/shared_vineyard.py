@@ -90,8 +90,10 @@ def vineyard(trees: int = 2, boxes: int = 2, gap: float = 1.0) -> Model:
     poses = [[-2.0, gap * i, 0.001, 0.0, 0.0, 0.0, 1.0] for i in range(boxes)]
     return assemble(
         [cane((0.0, gap * i, 1.4), bunch=0.5) for i in range(trees)],
-        box_pose=poses, box_size=[SIZE] * boxes, box_mass=[2.0] * boxes,
-    )  # fmt: skip
+        box_pose=poses,
+        box_size=[SIZE] * boxes,
+        box_mass=[2.0] * boxes,
+    )
 
 
 class Server:
@@ -159,7 +161,8 @@ class World:
         pytest.fail(f"condition false after {limit} s of simulated time")
 
 
-BUNCH, BOX = functools.partial(object_id, ObjectKind.BUNCH), functools.partial(object_id, ObjectKind.BOX)
+BUNCH = functools.partial(object_id, ObjectKind.BUNCH)
+BOX = functools.partial(object_id, ObjectKind.BOX)
 
 
 def pose_of(client: Client, number: int) -> np.ndarray:

@@ -89,9 +89,12 @@ class StockSubscriber:
 def stock_subscriber(*topics: str) -> Iterator[StockSubscriber]:
     """A running program that subscribes to ``topics``."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "tests.support.stock_subscriber", *topics], stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE, text=True, cwd=ROOT,
-    )  # fmt: skip
+        [sys.executable, "-m", "tests.support.stock_subscriber", *topics],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+    )
     try:
         yield StockSubscriber(process)
     finally:

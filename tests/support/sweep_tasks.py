@@ -21,7 +21,8 @@ def fail_at_three(number: int) -> int:
 
 def die_once(task: tuple[str, int]) -> int:
     """Kills its process the first time that the third task runs; notes every run in a folder."""
-    folder, number = pathlib.Path(task[0]), task[1]
+    folder = pathlib.Path(task[0])
+    number = task[1]
     runs = len(list(folder.glob(f"{number}-*")))
     (folder / f"{number}-{runs}").touch()
     if number == 3 and runs == 0:
@@ -32,7 +33,8 @@ def die_once(task: tuple[str, int]) -> int:
 def swing(task: tuple[str, int]) -> bytes:
     """The state of a cane after 100 steps, whose tip mass is the task's number. The first process that runs the third
     task dies half-way. Every run notes its process in a folder."""
-    folder, number = pathlib.Path(task[0]), task[1]
+    folder = pathlib.Path(task[0])
+    number = task[1]
     runs = len(list(folder.glob(f"{number}-*")))
     (folder / f"{number}-{runs}").write_text(str(os.getpid()))
     simulation = vinesim.Simulation(vinesim.CaneBuilder(tip_mass=0.01 * (1 + number), damping_ratio=0.1))

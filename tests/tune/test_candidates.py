@@ -118,17 +118,22 @@ def _adjoint(problem: Problem, theta: np.ndarray, off: np.ndarray) -> np.ndarray
     turned = frames.log(frames.multiply(pose[1], frames.conjugate(pose[2]))) / (2.0 * h)
     model = assemble([build_tree(problem.specimen)])
     ticks = np.unique(np.floor(problem.track.time / DT + 1e-6).astype(int))
-    body, point = candidates._body, candidates._point
+    body = candidates._body
+    point = candidates._point
     rollout = Rollout(model, int(ticks[-1]) + 2, watched=np.unique(body), dt=DT, fast_rate=1e4, max_rate=1e4)
-    stiffness, damping = model.joint_stiffness * np.exp(theta[0]), model.joint_damping * np.exp(theta[0] + theta[1])
+    stiffness = model.joint_stiffness * np.exp(theta[0])
+    damping = model.joint_damping * np.exp(theta[0] + theta[1])
     seen = rollout.run(stiffness=stiffness, damping=damping, joint_q=pose[0])
-    by_q, by_qd = np.zeros(seen.body_q.shape), np.zeros(seen.body_qd.shape)
+    by_q = np.zeros(seen.body_q.shape)
+    by_qd = np.zeros(seen.body_qd.shape)
     rows_of = problem.seen.cumsum().reshape(problem.seen.shape) - 1
     for sample, time in enumerate(problem.track.time):
         tick = int(np.floor(time / DT + 1e-6))
         s = time - tick * DT
         g = np.where(problem.seen[sample], off[rows_of[sample]], 0.0)  # left out as a gross error: no residual
-        q, w0, w1 = seen.body_q[tick, 0], seen.body_qd[tick, 0], seen.body_qd[tick + 1, 0]
+        q = seen.body_q[tick, 0]
+        w0 = seen.body_qd[tick, 0]
+        w1 = seen.body_qd[tick + 1, 0]
         _add_marker(by_q[tick, 0], by_qd[tick, 0], by_qd[tick + 1, 0], q, w0, w1, point[0], s, g)
     gradient = rollout.gradient(by_q, by_qd)
     by_modulus = (gradient.stiffness * stiffness).sum() + (gradient.damping * damping).sum()
@@ -140,7 +145,9 @@ def _add_marker(by_q, by_v, by_v_later, q, v, later, point, s, g) -> None:
     """Chain rule of a marker between two ticks, by central differences of its closed form."""
 
     def marker(x):
-        q, v, later = x[:7], x[7:13], x[13:]
+        q = x[:7]
+        v = x[7:13]
+        later = x[13:]
         arm = frames.rotate(q[3:], point)
         now = v[:3] + np.cross(v[3:], arm)
         then = later[:3] + np.cross(later[3:], arm + np.cross(v[3:], arm) * DT)

@@ -15,7 +15,8 @@ from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.tune import TrajectoryError, track_marker
 
-RADIUS, PINK = 0.012, (0.85, 0.05, 0.35)
+RADIUS = 0.012
+PINK = (0.85, 0.05, 0.35)
 EYE = look_at(np.array([0.0, -0.8, 1.2]), np.array([0.0, 0.0, 1.2]))
 D435 = CameraSpec.load("d435")
 

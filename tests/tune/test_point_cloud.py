@@ -34,7 +34,8 @@ def cloud(truth) -> np.ndarray:
 
 def distance(points: np.ndarray, line: np.ndarray) -> np.ndarray:
     """[n] m from points to a line through [k, 3]."""
-    a, way = line[:-1], np.diff(line, axis=0)
+    a = line[:-1]
+    way = np.diff(line, axis=0)
     share = np.clip(((points[:, None] - a) * way).sum(-1) / (way**2).sum(-1), 0.0, 1.0)
     return np.linalg.norm(points[:, None] - a - share[..., None] * way, axis=-1).min(1)
 
@@ -61,7 +62,8 @@ def test_a_fit_needs_the_shape(truth, cloud, tmp_path, capsys) -> None:
     track.write(tmp_path / "pull.csv")
     (tmp_path / "cane.toml").write_text(specimen_toml(cane(12e9, 0.001)))
     np.savetxt(tmp_path / "cloud.xyz", cloud, "%.5f")
-    files, out = (tmp_path / "pull.csv", tmp_path / "cane.toml"), tmp_path / "fitted.toml"
+    files = (tmp_path / "pull.csv", tmp_path / "cane.toml")
+    out = tmp_path / "fitted.toml"
     code = run(*files, "modulus,damping", out, True, None, None, False, 0, 0, "cpu", cloud=tmp_path / "cloud.xyz")
     said = json.loads(capsys.readouterr().out)
     assert (code, said["ok"]) == (0, True), said

@@ -25,7 +25,8 @@ SHAKE = Experiment(kind="shake", duration=4.0, from_frequency=2.0, to_frequency=
 def response(track: Trajectory, axis: int) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies [k] Hz up to a third of the pictures' rate, and motion relative to the base over that of the base."""
     assert track.base is not None
-    base, step = track.base[:, axis], 1.0 / track.rate
+    base = track.base[:, axis]
+    step = 1.0 / track.rate
     moved = track.position[:, 0, axis] - base
     count = 16 * len(base)
     frequency = np.fft.rfftfreq(count, step)
@@ -52,7 +53,8 @@ def test_the_response_peaks_at_the_first_mode_of_the_beam() -> None:
 def test_a_sweep_moves_as_fast_as_its_position_changes_and_begins_and_ends_at_rest() -> None:
     sweep = Sweep(np.array([0.0, 0.6, 0.8]), 0.005, (1.0, 8.0), 0.2, 4.0)
     time = np.linspace(0.0, 4.5, 45_001)
-    position, velocity = sweep.position(time) @ sweep.direction, sweep.velocity(time) @ sweep.direction
+    position = sweep.position(time) @ sweep.direction
+    velocity = sweep.velocity(time) @ sweep.direction
     np.testing.assert_allclose(np.gradient(position, time)[1:-1], velocity[1:-1], atol=1e-5 * np.abs(velocity).max())
     assert np.abs(position).max() == pytest.approx(0.005, rel=0.01)
     for still in (time < 0.2, time > 4.2):
@@ -61,7 +63,8 @@ def test_a_sweep_moves_as_fast_as_its_position_changes_and_begins_and_ends_at_re
 
 
 def test_the_acceleration_between_samples_is_known_up_to_a_quarter_of_their_rate() -> None:
-    time, between = np.arange(400.0), np.linspace(150.0, 250.0, 2001)
+    time = np.arange(400.0)
+    between = np.linspace(150.0, 250.0, 2001)
     omega = 0.5 * math.pi
     found = SampledMotion(time, np.sin(omega * time)).acceleration(between)
     np.testing.assert_allclose(found, -(omega**2) * np.sin(omega * between), atol=2e-3 * omega**2)

@@ -26,7 +26,11 @@ from vinesim.tune import Experiment, Trajectory, TrajectoryError, measure, read_
 from vinesim.tune.fit import specimen_toml
 
 INFO = CameraInfo(320, 240, 300.0, 300.0, 159.5, 119.5, "optical")
-PINK, BLUE, RADIUS, AWAY = (224, 60, 130), (30, 60, 220), 0.011 / 0.707, 0.8  # the balls are seen at whole mm
+# the balls are seen at whole mm
+PINK = (224, 60, 130)
+BLUE = (30, 60, 220)
+RADIUS = 0.011 / 0.707
+AWAY = 0.8
 MARKERS = ["224,60,130", "middle=30,60,220"]
 START = 1_732_415_000.25
 """[s] Stamp of the first picture: seconds since 1970, as ROS has them."""
@@ -69,9 +73,16 @@ Pictures = list[tuple[np.ndarray, np.ndarray]]
 
 
 def write_bag(
-    path: pathlib.Path, time: np.ndarray, pictures: Pictures, *, encoding: str = "rgb8", millimetres: bool = False,
-    without: tuple[str, ...] = (), late: float = 0.0, size: tuple[int, int] = (320, 240),
-) -> pathlib.Path:  # fmt: skip
+    path: pathlib.Path,
+    time: np.ndarray,
+    pictures: Pictures,
+    *,
+    encoding: str = "rgb8",
+    millimetres: bool = False,
+    without: tuple[str, ...] = (),
+    late: float = 0.0,
+    size: tuple[int, int] = (320, 240),
+) -> pathlib.Path:
     """An MCAP file as rosbag2 writes it, by the stock messages' own serialisation; depth ``late`` [s]."""
     pytest.importorskip("rclpy")
     from rclpy.serialization import serialize_message
@@ -80,7 +91,8 @@ def write_bag(
 
     def stamp(message, t: float) -> None:
         message.header.frame_id = "odd"  # so that what follows is not aligned by chance
-        message.header.stamp.sec, message.header.stamp.nanosec = int(t), round((t - int(t)) * 1e9)
+        message.header.stamp.sec = int(t)
+        message.header.stamp.nanosec = round((t - int(t)) * 1e9)
 
     with path.open("wb") as stream:
         writer = Writer(stream)
@@ -175,7 +187,7 @@ REFUSALS: dict[str, tuple[Callable[..., object], str]] = {
     "depth of other times": (lambda bag, run: run(bag(late=0.016)), r"found in \d+ of \d+ .* none has depth there"),
     "other size": (lambda bag, run: run(bag(size=(640, 480))), r"camera_info \(480, 640\); record depth"),
     "no marker": (lambda bag, run: run(bag(), markers=["20,220,40"]), r"'tip' of colour 20,220,40 was found in none"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", REFUSALS)
@@ -199,9 +211,11 @@ def test_files_that_are_no_recording_are_refused(tmp_path: pathlib.Path) -> None
     (tmp_path / "text.mcap").write_text("time,x\n")
     (tmp_path / "empty" / "records").mkdir(parents=True)
     for name, words in (
-        ("nothing", "is not there"), ("old", "ros2 bag convert"), ("text.mcap", "no whole MCAP file"),
+        ("nothing", "is not there"),
+        ("old", "ros2 bag convert"),
+        ("text.mcap", "no whole MCAP file"),
         ("empty", "is empty"),
-    ):  # fmt: skip
+    ):
         with pytest.raises(RecordedPicturesError, match=words):
             list(read_pictures(tmp_path / name))
 

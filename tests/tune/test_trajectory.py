@@ -71,7 +71,7 @@ def test_a_track_survives_its_file(tmp_path) -> None:
         ("time [s],x [m]\n" + "".join(f"{i},\n" for i in range(9)), "column tip x is empty in 100%", "remove"),
         ("\n", "is empty", "header"),
     ],
-)  # fmt: skip
+)
 def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, place, remedy) -> None:
     with pytest.raises(TrajectoryError) as refused:
         read(tmp_path, text)

@@ -33,7 +33,9 @@ from vinesim.scene.values import INTENTIONS, HumanSpec
 from vinesim.web.array_message import decode
 from vinesim.web.page_server import WINDOW, PageServer
 
-MAX_CALLS, MAX_TRIANGLES, MAX_BYTES = 20, 300_000, 4_000_000
+MAX_CALLS = 20
+MAX_TRIANGLES = 300_000
+MAX_BYTES = 4_000_000
 """Of one picture for one eye, and of the vineyard that a page loads [B]."""
 """Put there by tools/build_page."""
 
@@ -156,7 +158,8 @@ def test_the_live_vineyard_in_a_browser(page):
 def test_a_person_in_a_browser_touches_takes_and_picks_a_bunch(page):
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
         open_page(page, live)
-        physics, body = live.client.physics, live.client.model.bunch_body[BUNCH]
+        physics = live.client.physics
+        body = live.client.model.bunch_body[BUNCH]
         here = physics.state.body_q[body, :3].copy()
         eye = look_at(page, live.bunch)
         assert np.linalg.norm(eye - live.client.humans["viewer"].pose.head[:3]) < 1e-3, "the person's own eyes"
@@ -197,7 +200,9 @@ def test_a_person_in_a_browser_takes_shears_and_cuts_a_bunch(page):
     """The page shows the shears where the cut then happens, and says what they have cut."""
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
         open_page(page, live)
-        physics, model, shears = live.client.physics, live.client.model, appearance.load_shears()
+        physics = live.client.physics
+        model = live.client.model
+        shears = appearance.load_shears()
         stalk = int(model.body_parent[model.bunch_body[BUNCH]])
         assert model.body_organ[stalk] == int(Organ.PEDUNCLE)
 
@@ -281,7 +286,8 @@ def test_a_person_with_a_phone_picks_one_bunch_and_cuts_another_by_touch_alone(p
     with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live, touch_screen(page, 390, 844):
         page.open(live.server.address + "?triangles=10000&rate=10&shadows=0")
         wait(lambda: page.run("window.vinesim?.drawn >= 3 || window.vinesim?.failure"), "three states are drawn")
-        physics, human = live.client.physics, live.client.humans["viewer"]
+        physics = live.client.physics
+        human = live.client.humans["viewer"]
         hand = lambda: physics.hand("viewer", "right")  # noqa: E731
         start = human.pose.head.copy()
 
@@ -363,7 +369,8 @@ def test_a_headset_moves_head_and_hands(page):
         page.run("document.getElementById('enter').click()")
         wait(lambda: page.run("vinesim.viewer.headset.isWorn"), "the headset is worn")
         # 0.2 m ahead and 0.1 m to the right of the floor's middle, which looks along 0.5 rad
-        ahead, right = np.array([np.cos(0.5), np.sin(0.5)]), np.array([np.sin(0.5), -np.cos(0.5)])
+        ahead = np.array([np.cos(0.5), np.sin(0.5)])
+        right = np.array([np.sin(0.5), -np.cos(0.5)])
         head = np.array([*(start[:2] + 0.2 * ahead + 0.1 * right), 1.5])
         wait(lambda: np.linalg.norm(human.pose.head[:3] - head) < 5e-3, "the head is where the headset is")
         wait(lambda: frames.to_yaw(human.pose.head[3:]) == pytest.approx(0.5, abs=1e-3), "it looks where that looks")
@@ -372,9 +379,11 @@ def test_a_headset_moves_head_and_hands(page):
         fingers = frames.rotate(human.pose.right[3:], np.array([1.0, 0.0, 0.0]))
         assert np.dot(fingers[:2], ahead) > 0.7, "it points ahead"
         for button, fingers in (
-            ("Value('trigger', 1)", (0.0, 1.0, 0.0, 0.0, 0.0)), ("Touch('a-button', true)", (1.0, 1.0, 0.0, 0.0, 0.0)),
-            ("Value('trigger', 0)", (1.0, 0.0, 0.0, 0.0, 0.0)), ("Touch('a-button', false)", (0.0,) * 5),
-        ):  # fmt: skip
+            ("Value('trigger', 1)", (0.0, 1.0, 0.0, 0.0, 0.0)),
+            ("Touch('a-button', true)", (1.0, 1.0, 0.0, 0.0, 0.0)),
+            ("Value('trigger', 0)", (1.0, 0.0, 0.0, 0.0, 0.0)),
+            ("Touch('a-button', false)", (0.0,) * 5),
+        ):
             page.run(f"device.controllers.right.updateButton{button}, 0")
             wait(lambda fingers=fingers: human.pose.right_fingers == fingers, f"fingers {fingers} by {button}")
         page.run("device.controllers.right.updateButtonValue('squeeze', 1), 0")
@@ -418,7 +427,8 @@ def test_a_headset_moves_head_and_hands(page):
         wait(lambda: not human.pose.right_closed and max(human.pose.right_fingers) < 0.6, "it is open")
         page.run("device.hands.right.updatePinchValue(1), 0")
         wait(lambda: human.pose.right_closed, "a pinch takes hold")
-        hip, ahead_of_her = (0.25, 0.85, -0.2), (0.2, 1.3, -0.5)
+        hip = (0.25, 0.85, -0.2)
+        ahead_of_her = (0.2, 1.3, -0.5)
         pinch(page, hip)
         wait(lambda: human.pose.right_shears, "a pinch at the hip takes the shears into that hand")
         pinch(page, ahead_of_her)
@@ -437,7 +447,8 @@ def test_a_headset_moves_head_and_hands(page):
         mark = "(({ mark }) => [mark.visible, mark.position.x, -mark.position.z])(vinesim.viewer.headset)"
         wait(lambda: page.run(mark)[0], "the stick pushed ahead marks a place on the floor")
         is_drawn_anew(page)
-        place, head = np.array(page.run(mark)[1:]), human.pose.head.copy()
+        place = np.array(page.run(mark)[1:])
+        head = human.pose.head.copy()
         yaw = frames.to_yaw(head[3:])
         gone = 0.4 + 1.2 / np.tan(0.8)  # the controller is 0.4 m ahead of the head, 1.2 m above the floor
         expected = head[:2] + gone * np.array([np.cos(yaw), np.sin(yaw)])
@@ -489,7 +500,8 @@ def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
         )
         wait(lambda: "unseen" in page.run(told), "the page tells that it was away")
         tree = live.client.model.body_tree[live.client.model.bunch_body[BUNCH]]
-        body, port = live.client.model.bodies_of(tree).stop - 1, live.server.port
+        body = live.client.model.bodies_of(tree).stop - 1
+        port = live.server.port
         rest = live.client.model.forward_kinematics(live.client.model.joint_settled)[body, :3]
         carried = f"vinesim.viewer.world.place({body}).toArray()"
         page.run(f"vinesim.viewer.world.poses.image.data[{8 * body}] += 1, 0")  # as if it had moved for good
@@ -669,7 +681,9 @@ def test_who_flies_on_in_a_large_vineyard_sees_what_grows_there(page):
 def test_names_stand_just_above_heads_near_and_far_and_stay_in_the_picture(page):
     """By projection: eyes at a known place that look along x, and the highest point of a hat above its eyes. One person
     has turned and tilted the head."""
-    width, height, level = 480, 360, 1.65
+    width = 480
+    height = 360
+    level = 1.65
     places = {"anna": (0.7, -0.1), "ben": (3.0, 0.8), "clara": (12.0, -3.0)}
     tilted = {"ben": frames.exp(np.array([0.5, 0.3, 0.4]))}
     shapes = appearance.load_human_model(1.75).parts["head"]
@@ -748,7 +762,8 @@ def test_the_timeline_of_a_recording(page, tmp_path):
             page.open(server.address + "?triangles=10000&rate=10&shadows=0")
             wait(lambda: page.run("window.vinesim?.drawn >= 1 || window.vinesim?.failure"), "a state is drawn")
             assert page.run("vinesim.failure") is None
-            picked, button = "vinesim.viewer.world.picked.size", "document.querySelector('#timeline button')"
+            picked = "vinesim.viewer.world.picked.size"
+            button = "document.querySelector('#timeline button')"
             page.run(f"if ({button}.textContent === 'pause') {button}.click()")  # a slow machine may be at the end
             wait(lambda: page.run(f"{button}.textContent") == "play", "it pauses")
             go_to(PICKED_AT + 0.6)

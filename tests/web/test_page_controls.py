@@ -12,7 +12,8 @@ from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanSpec
 
-LEAST_CONTRAST, LEAST_OF_LARGE = 4.5, 3.0
+LEAST_CONTRAST = 4.5
+LEAST_OF_LARGE = 3.0
 """Of text, and of large text (WCAG 2.2, 1.4.3)."""
 COLOURS = """
 const linear = (c) => c <= 0.04045 ? c / 12.92 : ((c + 0.055) / 1.055) ** 2.4;

@@ -10,7 +10,11 @@ from vinesim.core import frames
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
-TUBE, SPHEROID, BOX, ELLIPSOID, TRIANGLE = 0, 1, 3, 4, 6
+TUBE = 0
+SPHEROID = 1
+BOX = 3
+ELLIPSOID = 4
+TRIANGLE = 6
 A = np.array([0.1, -0.2, 0.3])
 TURN = frames.exp(np.array([0.7, -0.4, 1.1]))
 HALF = np.array([0.3, 0.1, 0.05])

@@ -38,7 +38,8 @@ def test_the_side_is_chosen_by_what_is_between_and_kept_until_the_actor_has_move
 def test_clusters_of_plants_near_a_line_of_sight_are_counted(page) -> None:
     """Beside the exact distance of spheres of half the radius to the first four fifths of the line."""
     rng = np.random.default_rng(4)
-    eye, point = np.array([1.0, 2.0, 1.6]), np.array([4.0, 1.0, 1.1])
+    eye = np.array([1.0, 2.0, 1.6])
+    point = np.array([4.0, 1.0, 1.1])
     balls = np.column_stack([rng.uniform([0, 0, 0], [5, 3, 3], (500, 3)), rng.uniform(0.2, 0.6, 500)])
     samples = eye + np.linspace(0.0, 0.8, 4001)[:, None] * (point - eye)
     gap = np.linalg.norm(balls[:, None, :3] - samples, axis=2).min(1) - 0.5 * balls[:, 3]

@@ -24,9 +24,11 @@ VIEWS = {"demo": ((-0.6, 0.3, 1.5), (0.4, 0.75, 1.78)), "vsp": ((0.4, 1.0, 0.95)
 """By scene: where the eyes are, and a point that they look at [m]: bunches, leaves and wood are near."""
 SIZE = (480, 270)
 KINDS = {
-    "bunches": (Organ.BUNCH,), "leaves": (Organ.LEAF,), "wood": (Organ.POLE, Organ.TRUNK, Organ.ARM, Organ.CANE),
+    "bunches": (Organ.BUNCH,),
+    "leaves": (Organ.LEAF,),
+    "wood": (Organ.POLE, Organ.TRUNK, Organ.ARM, Organ.CANE),
     "ground": (Organ.GROUND,),
-}  # fmt: skip
+}
 MOST = 0.2
 """Share by which the mean luminance of a kind may differ. 0.143 at most was seen: texels of the page's shadows are 9 mm
 wide, those of the camera 3.5 mm, and the page's exposure is fixed."""
@@ -83,7 +85,8 @@ def test_bunches_leaves_and_wood_are_as_bright_as_in_a_camera(name, page):
         client = Spectator(scene, generate(scene), None, bus, name="viewer", pose=frames.pose(eye))
         seen, organ = camera_picture(client, eye, target)
         shown = page_picture(page, client, eye, target)
-    page_light, camera_light = luminance(shown), luminance(seen)
+    page_light = luminance(shown)
+    camera_light = luminance(seen)
     found = {}
     for kind, organs in KINDS.items():
         # edges are where pixels of the two may show different things

@@ -27,7 +27,8 @@ class CountingWorld:
     """A world whose state is the number of its tick."""
 
     def __init__(self):
-        self.tick, self.poses = -1, []
+        self.tick = -1
+        self.poses = []
 
     def scene(self):
         return b"scene"
@@ -115,16 +116,22 @@ def test_a_page_that_stalls_gets_no_more_than_the_window_and_then_the_newest_sta
 @pytest.mark.parametrize(
     "message",
     [
-        "no json", "[]", "{}", '{"drawn": 1}', '{"drawn": 1, "view": [1, 2]}', '{"drawn": 1, "view": "x"}',
+        "no json",
+        "[]",
+        "{}",
+        '{"drawn": 1}',
+        '{"drawn": 1, "view": [1, 2]}',
+        '{"drawn": 1, "view": "x"}',
         json.dumps({"drawn": 1, "view": [1e9, 0, 0, 0, 0, 0, 1]}),
         json.dumps({"drawn": 1, "view": [0, 0, 0, 0, 0, 0, 0]}),
-        '{"drawn": 1, "view": [NaN, 0, 0, 0, 0, 0, 1]}', '{"drawn": 1e999, "view": [0, 0, 0, 0, 0, 0, 1]}',
+        '{"drawn": 1, "view": [NaN, 0, 0, 0, 0, 0, 1]}',
+        '{"drawn": 1e999, "view": [0, 0, 0, 0, 0, 0, 1]}',
         json.dumps({"drawn": 1, "view": HERE, "person": {"head": HERE, "left": {"pose": HERE, "closed": 1}}}),
         json.dumps({"drawn": 1, "view": HERE, "person": {"head": [0.0] * 7}}),
         json.dumps({"drawn": 1, "view": HERE, "more": 1}),
         "[" * 3000,
     ],
-)  # fmt: skip
+)
 def test_what_is_no_message_of_a_page_is_counted_and_changes_nothing(served, message):
     world, server = served
 

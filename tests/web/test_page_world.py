@@ -102,7 +102,8 @@ def test_a_state_holds_the_trees_that_have_moved_since_the_last_one(shown):
     swing(client, 3)
     client.tick()
     tick, message = world.state(tick)
-    bodies, arrays = client.model.bodies_of(3), decode(message)[1]
+    bodies = client.model.bodies_of(3)
+    arrays = decode(message)[1]
     assert set(range(bodies.start, bodies.stop)) <= set(arrays["body"].tolist())
     assert len(arrays["body"]) < 100, "it and what it has touched"
     pose = client.physics.state.body_q[arrays["body"]]
@@ -115,14 +116,17 @@ def test_a_state_holds_the_segments_of_wires_that_have_moved(shown):
     client, world = shown
     world.scene()
     client.tick()
-    model, bodies = client.model, len(client.model.body_mass)
+    model = client.model
+    bodies = len(client.model.body_mass)
     tree = int(model.body_tree[model.tie_body[model.tie_wire >= 0]][0])
     swing(client, tree)
-    seen, before = -1, set()
+    seen = -1
+    before = set()
     while not before:
         client.tick()
         seen, message = world.state(-1)
-        arrays, wires = decode(message)[1], client.physics.snapshot().wires
+        arrays = decode(message)[1]
+        wires = client.physics.snapshot().wires
         before = set(wires.segment.tolist())
     told = arrays["body"] - np.uint32(bodies)
     rows = np.flatnonzero(np.isin(told, wires.segment))
@@ -176,7 +180,8 @@ def test_a_picked_bunch_becomes_a_rigid_body_of_the_page(shown):
 
 def test_the_eyes_of_a_spectator_follow_the_page(shown):
     client, world = shown
-    here, there = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0), (1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0)
+    here = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0)
+    there = (1.0, 0.0, 2.0, 0.0, 0.0, 0.0, 1.0)
     world.take(0, PageInput(1, here))
     world.take(1, PageInput(1, there))
     client.tick()
@@ -217,11 +222,13 @@ def test_only_the_first_page_moves_the_person(anna):
 def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(anna):
     client, world = anna
     world.scene()
-    head, palm = (-2.0, 0.0, 1.6, 0.0, 0.0, 0.0, 1.0), (-1.5, -0.2, 1.2, 0.0, 0.0, 0.0, 1.0)
+    head = (-2.0, 0.0, 1.6, 0.0, 0.0, 0.0, 1.0)
+    palm = (-1.5, -0.2, 1.2, 0.0, 0.0, 0.0, 1.0)
 
     def shown(*, shears, closed, left=False):
         """What a page is told after some steps, with the names of what it draws."""
-        hand, other = TrackedHand(palm, closed), TrackedHand((-1.5, 0.2, *palm[2:]), closed) if left else None
+        hand = TrackedHand(palm, closed)
+        other = TrackedHand((-1.5, 0.2, *palm[2:]), closed) if left else None
         world.take(0, PageInput(1, head, TrackedPerson(head, other, hand, shears=(left, shears))))
         for _ in range(5):
             client.tick()
@@ -345,7 +352,8 @@ def test_of_a_large_vineyard_a_page_loads_what_is_nearest(shown):
     client, _ = shown
     whole = decode(PageWorld(client).scene())[1]
     world = PageWorld(client, most=5000)
-    first, later = decode(world.scene()), decode(world.plants(np.array([3.0, -1.0, 1.0])))
+    first = decode(world.scene())
+    later = decode(world.plants(np.array([3.0, -1.0, 1.0])))
     assert first[0]["room"] == 5000
     assert later[0]["place"] == [3.0, -1.0, 1.0]
     for (header, part), place in ((first, client.pose[:3]), (later, [3.0, -1.0, 1.0])):

@@ -31,7 +31,8 @@ class LiveTalk(SteppedPage):
 
     def __init__(self):
         self.hub = MemoryHub()
-        scene, model = load_scene("demo"), assemble([cane((0.0, 30.0, 2.0))])
+        scene = load_scene("demo")
+        model = assemble([cane((0.0, 30.0, 2.0))])
         start = frames.pose(np.zeros(3))
         source = TrackedHuman(start, 1.75)
         self.anna = Client(scene, model, None, self.hub.bus("anna"), name="anna", pose=start, source=source)
@@ -47,7 +48,8 @@ class LiveTalk(SteppedPage):
         """A step of both; messages travel for as long as it took."""
         self.anna.tick()
         self.bot.tick()
-        before, self._before = self._before, time.monotonic()
+        before = self._before
+        self._before = time.monotonic()
         self.hub.advance(self._before - before)
 
     def loudness(self, frequency):

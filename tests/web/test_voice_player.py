@@ -4,7 +4,8 @@ import pytest
 
 from vinesim.web.page_files import PAGE
 
-FRAME, QUANTUM = 960, 128
+FRAME = 960
+QUANTUM = 128
 """Samples of a frame and of what the browser plays at once."""
 START = FRAME // 2
 """Delay of a voice behind the arrival of its first frame [samples]."""
@@ -43,7 +44,8 @@ def test_a_voice_waits_longer_after_stalls_and_no_longer_than_needed_once_its_ne
     def play(*sentences):
         return page.run(f"({script})({[list(one) for one in sentences]})")
 
-    even, rough = [0] * 20, [0, 0, 0, 3 * FRAME, 2 * FRAME, FRAME] + [0] * 14
+    even = [0] * 20
+    rough = [0, 0, 0, 3 * FRAME, 2 * FRAME, FRAME] + [0] * 14
     smooth = play(even, even, even)
     assert smooth["stalls"] == 0
     assert max(smooth["delays"]) <= START + 2 * QUANTUM, "half a frame after the first one has come"

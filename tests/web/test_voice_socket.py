@@ -11,14 +11,16 @@ from vinesim.audio.frame import Codec
 from vinesim.web.page_server import PageServer
 from vinesim.web.voice_socket import EXTRA, FRAME_HEADER, MAX_WAITING, encode_frame
 
-OPUS, PCM = bytes((72,)) + bytes(40), bytes(640)
+OPUS = bytes((72,)) + bytes(40)
+PCM = bytes(640)
 
 
 class Room:
     """Stands for the client."""
 
     def __init__(self):
-        self.pages, self.said = [], []
+        self.pages = []
+        self.said = []
 
     def join(self, page):
         self.pages.append(page)
@@ -74,9 +76,20 @@ def test_frames_go_both_ways(served):
 
 @pytest.mark.parametrize(
     "message",
-    [b"", b"\x01", b"\x02" + bytes(639), b"\x07" + PCM, b"\x01" + b"\xff" * 60, "no json", "[]", '{"opus": 1}', "{}",
-     '{"opus": true, "more": 1}', "[" * 300],
-)  # fmt: skip
+    [
+        b"",
+        b"\x01",
+        b"\x02" + bytes(639),
+        b"\x07" + PCM,
+        b"\x01" + b"\xff" * 60,
+        "no json",
+        "[]",
+        '{"opus": 1}',
+        "{}",
+        '{"opus": true, "more": 1}',
+        "[" * 300,
+    ],
+)
 def test_what_is_no_sound_is_counted_and_nothing_else_happens(served, message):
     room, server = served
 
@@ -114,7 +127,9 @@ def test_frames_for_a_page_that_takes_none_are_dropped_and_counted(served):
         await socket.send_json({"opus": True})
         await until(lambda: room.pages)
         voice = room.pages[0]
-        loop, voice._loop = voice._loop, asyncio.new_event_loop()  # nothing wakes the sender
+        # nothing wakes the sender
+        loop = voice._loop
+        voice._loop = asyncio.new_event_loop()
         for number in range(3 * MAX_WAITING):
             voice.send(encode_frame("bot", number, Codec.PCM16, PCM, (0.0, 0.0, 0.0)))
         assert voice.dropped == 2 * MAX_WAITING

@@ -43,7 +43,8 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire
     that it deflects by u; of a root on an arm that is twisted by u, less k u (theta - theta as drawn) / 2.
     """
-    model, state = plants.model, plants.state
+    model = plants.model
+    state = plants.state
     bodies = _moving_bodies(plants, trees)
     mass, com, velocity, omega, inertia = _motion(plants, bodies)
     kinetic = 0.5 * float(mass @ (velocity**2).sum(1) + np.einsum("bi,bij,bj->", omega, inertia, omega))
@@ -56,7 +57,8 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     ties = np.flatnonzero(np.isin(model.tie_body, bodies))
     pose = state.body_q[model.tie_body[ties]].astype(float)
     point = pose[:, :3] + frames.rotate(pose[:, 3:], model.tie_point[ties].astype(float))
-    away, whole = point - plants.tie_anchor[ties], point - model.tie_anchor[ties]
+    away = point - plants.tie_anchor[ties]
+    whole = point - model.tie_anchor[ties]
     whole = np.where(np.isin(ties, plants.ties.on_wire)[:, None], whole, away)
     elastic += 0.5 * float(plants.tie_stiffness[ties] @ (away * whole).sum(1))
     return Energy(kinetic, elastic, gravity * float(mass @ com[:, 2]))
@@ -83,13 +85,15 @@ def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.n
 
 def _motion(plants: ArticulationSolver, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
     """Mass [k], centre of mass [k, 3], its velocity [k, 3], angular velocity [k, 3], inertia [k, 3, 3]; world axes."""
-    pose, speed = plants.state.body_q[bodies].astype(float), plants.state.body_qd[bodies].astype(float)
+    pose = plants.state.body_q[bodies].astype(float)
+    speed = plants.state.body_qd[bodies].astype(float)
     arm = frames.rotate(pose[:, 3:], plants.body_com[bodies].astype(float))
     velocity = speed[:, :3] + np.cross(speed[:, 3:], arm)
     own = np.zeros((len(bodies), 3, 3))
     for axis in range(3):
         own[:, axis, axis] = plants.body_inertia[bodies, axis]
-        one, two = (axis + 1) % 3, (axis + 2) % 3
+        one = (axis + 1) % 3
+        two = (axis + 2) % 3
         own[:, one, two] = own[:, two, one] = plants.body_product[bodies, axis]
     turn = frames.to_matrix(pose[:, 3:])
     return (

@@ -47,7 +47,9 @@ class Camera:
         self.spec = rgbd.CameraSpec.load(kind)
         self.info: CameraInfo = resized_intrinsics(self.spec, size)
         """Intrinsics."""
-        self._name, self._quality, self._seed = name, quality, seed
+        self._name = name
+        self._quality = quality
+        self._seed = seed
         self._camera: rgbd.Camera | None = None
         self._last: Simulation | None = None
 
@@ -72,9 +74,15 @@ class Camera:
         if self._camera is None or self._last is not simulation:
             sun = DEFAULT_SUN if simulation.scene is None else simulation.scene.sun.direction()
             self._camera = rgbd.Camera(
-                self.spec, self.info, self._name, sun, self._quality, seed=self._seed, shadow_period=0.0,
+                self.spec,
+                self.info,
+                self._name,
+                sun,
+                self._quality,
+                seed=self._seed,
+                shadow_period=0.0,
                 device=simulation.device,
-            )  # fmt: skip
+            )
             self._last = simulation
         return self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
 
@@ -88,7 +96,8 @@ class Lidar:
         :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
         """
         self.spec = lidar.LidarSpec.load(kind)
-        self._name, self._seed = name, seed
+        self._name = name
+        self._seed = seed
         self._lidars: dict[str, lidar.Lidar] = {}
 
     def scan(
@@ -117,7 +126,8 @@ class Lidar:
 
 def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
     """Pose [7] of the optical frame of a camera at ``eye`` [3] m that points at ``target`` [3] m, upright."""
-    start, end = np.asarray(eye, float), np.asarray(target, float)
+    start = np.asarray(eye, float)
+    end = np.asarray(target, float)
     if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
         raise UsageError(f"cannot look from {start.tolist()} at {end.tolist()}; give two points [3] m that differ")
     return images.look_at(start, end)

@@ -224,7 +224,8 @@ class Simulation:
             at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
         """
         body = self._body(body)
-        force, torque = _vector("force", force, "N"), _vector("torque", torque, "N m")
+        force = _vector("force", force, "N")
+        torque = _vector("torque", torque, "N m")
         pose = self.body_pose(body)
         point = pose[:3] + frames.rotate(pose[3:], self.physics.plants.body_com[body].astype(float))
         if at is not None:
@@ -253,7 +254,8 @@ class Simulation:
         """
         if robot not in self.robots:
             raise UsageError(f"no robot {robot!r}; there are: {', '.join(self.robots) or 'none'}")
-        force, torque = _vector("force", force, "N"), _vector("torque", torque, "N m")
+        force = _vector("force", force, "N")
+        torque = _vector("torque", torque, "N m")
         if at is not None:
             torque = torque + np.cross(_vector("at", at, "m") - self.physics.rigid.link_centre(robot, link), force)
         self.physics.rigid.apply_wrench(robot, link, force, torque)

@@ -41,7 +41,9 @@ def find_fault(codec: int, data: bytes) -> str:
         return f"unknown codec {codec}"
     if not 1 <= len(data) <= MAX_OPUS:
         return f"Opus packet of {len(data)} B, not 1 to {MAX_OPUS}"
-    configuration, channels, count = data[0] >> 3, 1 + (data[0] >> 2 & 1), data[0] & 3
+    configuration = data[0] >> 3
+    channels = 1 + (data[0] >> 2 & 1)
+    count = data[0] & 3
     if configuration not in _OPUS_20_MS or channels != 1 or count != 0:
         return f"Opus packet that is not one frame of 20 ms of mono (first byte {data[0]})"
     return ""

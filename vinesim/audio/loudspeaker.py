@@ -49,14 +49,17 @@ class Loudspeaker:
                 enough = len(self._waiting) * FRAME >= PREPARATION
                 if not enough and 0.0 <= now - self._waits_since < PREPARATION:
                     return
-                self._due, self._waits_since = now - FRAME, None
+                self._due = now - FRAME
+                self._waits_since = None
             while self._due is not None and self._due + FRAME <= now + 1e-9:
                 if self._waiting:
                     data = self._waiting.popleft()
                 elif self._rest:
-                    data, self._rest = self._rest.ljust(_FRAME_BYTES, b"\0"), b""
+                    data = self._rest.ljust(_FRAME_BYTES, b"\0")
+                    self._rest = b""
                 else:
                     self._due = None
                     return
-                began, self._due = self._due, self._due + FRAME
+                began = self._due
+                self._due = self._due + FRAME
                 yield began, data

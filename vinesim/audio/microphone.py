@@ -135,7 +135,8 @@ class Microphone:
         end = round(now * SAMPLE_RATE)
         start, before, last = self._tones.pop(source, (end, 0.0, frequency))
         if start < end - 2 * FRAME_SAMPLES:  # it was not heard for a while
-            start, before = end - 2 * FRAME_SAMPLES, 0.0
+            start = end - 2 * FRAME_SAMPLES
+            before = 0.0
         frequency = frequency or last
         if end > start and (gain or before):
             time = np.arange(start, end)
@@ -178,7 +179,7 @@ class Microphone:
 
     def _decode(
         self, frame: HeardFrame, decoder: opus.OpusDecoder | None
-    ) -> tuple[np.ndarray | None, opus.OpusDecoder | None]:  # fmt: skip
+    ) -> tuple[np.ndarray | None, opus.OpusDecoder | None]:
         """Samples of a frame, None if it cannot be decoded; the decoder of that speaker."""
         if frame.codec is Codec.PCM16:
             return from_pcm(frame.data), decoder

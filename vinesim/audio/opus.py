@@ -38,7 +38,8 @@ class OpusDecoder:
 
     def _new(self):
         codec = self._av.CodecContext.create("libopus", "r")
-        codec.sample_rate, codec.layout = OPUS_RATE, "mono"
+        codec.sample_rate = OPUS_RATE
+        codec.layout = "mono"
         return codec
 
     def decode(self, packet: bytes) -> np.ndarray | None:

@@ -13,7 +13,8 @@ class HapticFeedback:
 
     def __init__(self, physics: Physics, name: str) -> None:
         """``name`` of a person in ``physics``."""
-        self.physics, self.name = physics, name
+        self.physics = physics
+        self.name = name
         self._period = physics.parameters.steps(physics.parameters.haptic_period)
         self._contact_steps: dict[str, int] = {}
         """By side: steps since the contact began."""

@@ -49,7 +49,8 @@ class LegEstimator:
         far = [float(np.linalg.norm(self._feet[foot, :2] - there[1 + foot, :2])) for foot in (0, 1)]
         foot = int(far[1] > far[0])
         if min(self._swing) >= 1.0 and far[foot] > STEP_LENGTH:
-            self._start[foot], self._swing[foot] = self._feet[foot], 0.0
+            self._start[foot] = self._feet[foot]
+            self._swing[foot] = 0.0
         for foot in (0, 1):
             if self._swing[foot] < 1.0:
                 share = self._swing[foot] = min(1.0, self._swing[foot] + self.dt / SWING_TIME)

@@ -14,7 +14,8 @@ from vinesim.rigid.human_shapes import SIDES
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, Haptic, HumanPose, HumanSpec, HumanUpdate
 from vinesim.world import Physics
 
-_HEAD, _HANDS = POINT_NAMES.index("head"), [POINT_NAMES.index(side) for side in SIDES]
+_HEAD = POINT_NAMES.index("head")
+_HANDS = [POINT_NAMES.index(side) for side in SIDES]
 
 
 class LocalHuman:
@@ -22,7 +23,9 @@ class LocalHuman:
 
     def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
         """``source(time)`` gives the pose at the end of the coming step, which begins at simulation ``time`` [s]."""
-        self.physics, self.name, self.source = physics, spec.name, source
+        self.physics = physics
+        self.name = spec.name
+        self.source = source
         physics.add_human(spec)
         self.pose = spec.pose
         self.intention = ""
@@ -58,7 +61,8 @@ class LocalHuman:
         self.closures = tuple(closure for shears in self._shears if (closure := shears.closure()) is not None)
         self.haptics = (*self._feedback.update(), *(closure.haptic(self.name) for closure in self.closures))
         self._hand_wrenches, pushing = self.physics.rigid.hand_wrenches(self.name)
-        points, before = self.pose.points, self._sent_points
+        points = self.pose.points
+        before = self._sent_points
         for i, side in enumerate(SIDES):
             hand = self.physics.hand(self.name, side)
             was_busy = self._is_busy(i)

@@ -120,7 +120,8 @@ class ScriptedHuman:
 
     def withdraw(self, side: str, way: float = 1.0) -> Iterator[None]:
         """Move a hand back to its rest pose, or a share ``way`` of the distance."""
-        start, goal = self._hands[side].copy(), self._rest[side]
+        start = self._hands[side].copy()
+        goal = self._rest[side]
         for tick in range(
             count := max(1, round(way * float(np.linalg.norm(goal[:3] - start[:3])) / (REACH_SPEED * self.dt)))
         ):

@@ -8,7 +8,8 @@ from vinesim.scene import appearance
 from vinesim.scene.values import Haptic, HumanPose
 from vinesim.world import Physics
 
-CUT_PULSE, MISS_PULSE = (1.0, 0.1), (0.3, 0.03)
+CUT_PULSE = (1.0, 0.1)
+MISS_PULSE = (0.3, 0.03)
 """Amplitude [1] and duration [s] of the vibration when shears have cut something, and when they have not. GUESSED."""
 
 
@@ -39,7 +40,8 @@ class Closure:
             cut = [f"{count} {one if count == 1 else several}" for one, several, count in pieces if count]
             return f"{shears} cut {' and '.join(cut)}."
         if self.resistance > self.force:
-            takes, gives = f"{self.resistance:,.0f} N", f"{self.force:,.0f} N"
+            takes = f"{self.resistance:,.0f} N"
+            gives = f"{self.force:,.0f} N"
             return f"{shears} are too weak: this wood takes {takes}, they close with {gives}."
         if self.resistance > 0.0:
             return f"{shears} cut nothing: the bunch of this peduncle was picked before."

@@ -66,10 +66,12 @@ class TrackedHuman:
         self._next: TrackedPoints | None = None
         self._points: TrackedPoints | None = None
         self._clock = clock
-        self._steps, self._input_at = 0, 0.0
+        self._steps = 0
+        self._input_at = 0.0
         self._period = 2.0 * dt
         self._start = np.stack([self.pose.head, self.pose.left, self.pose.right])
-        self._goal, self._share = self._start.copy(), 1.0
+        self._goal = self._start.copy()
+        self._share = 1.0
 
     def take(self, points: TrackedPoints) -> None:
         """The newest input; may be called from any thread."""
@@ -80,7 +82,8 @@ class TrackedHuman:
         """The pose a step later."""
         self._steps += 1
         with self._lock:
-            points, self._next = self._next, None
+            points = self._next
+            self._next = None
         if points is not None:
             self._begin(points)
         self._share = min(1.0, self._share + self.dt / self._period)
@@ -93,9 +96,19 @@ class TrackedHuman:
             for shears, closed, bend in zip(told.shears, told.closed, told.fingers, strict=True)
         ]
         self.pose = HumanPose(
-            root, head, left, right, hips, left_foot, right_foot, *told.closed, left_fingers=fingers[0],
-            right_fingers=fingers[1], left_shears=told.shears[0], right_shears=told.shears[1],
-        )  # fmt: skip
+            root,
+            head,
+            left,
+            right,
+            hips,
+            left_foot,
+            right_foot,
+            *told.closed,
+            left_fingers=fingers[0],
+            right_fingers=fingers[1],
+            left_shears=told.shears[0],
+            right_shears=told.shears[1],
+        )
         return self.pose
 
     def _begin(self, points: TrackedPoints) -> None:
@@ -104,12 +117,14 @@ class TrackedHuman:
         if self._points is not None:
             interval = float(np.clip(now - self._input_at, self.dt, MAX_PERIOD))
             self._period += _SMOOTHING * (interval - self._period)
-        self._input_at, self._points = now, points
+        self._input_at = now
+        self._points = points
         self._start = np.stack([self.pose.head, self.pose.left, self.pose.right])
         upright = frames.pose(points.head[:3], frames.from_yaw(frames.to_yaw(points.head[3:])))
         hanging = frames.compose(upright, self._below_head)
         left, right = (hanging[k] if hand is None else hand for k, hand in enumerate((points.left, points.right)))
-        self._goal, self._share = np.stack([points.head, left, right]).astype(float), 0.0
+        self._goal = np.stack([points.head, left, right]).astype(float)
+        self._share = 0.0
         if np.linalg.norm(self._goal[0, :3] - self._start[0, :3]) > MAX_MOTION:
             self._start = self._goal
             self._legs.stand(self._goal[0])

@@ -52,7 +52,9 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [n, 3] m and triangles [m, 3] of plants and posts, as finely as another simulator would draw them."""
     kind = primitives.shapes.kind.numpy()
     a, b, c = (getattr(primitives.shapes, name).numpy() for name in "abc")
-    vertices, faces, first = [], [], 0
+    vertices = []
+    faces = []
+    first = 0
 
     def add(points: np.ndarray, triangles: np.ndarray) -> None:
         """``points`` [thing, vertex, 3] and one list of triangles for all of them."""
@@ -77,16 +79,20 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     angle = np.arange(6) * np.pi / 3.0
     ring = side[:, None] * np.cos(angle)[:, None] + other[:, None] * np.sin(angle)[:, None]
     ends = np.concatenate([p[here, None, :3] + ring * p[here, None, 3:] for p in (a, b)], 1)
-    k, n = np.arange(6), (np.arange(6) + 1) % 6
+    k = np.arange(6)
+    n = (np.arange(6) + 1) % 6
     add(ends, np.concatenate([np.stack([k, n, k + 6], 1), np.stack([n, n + 6, k + 6], 1)]))
     here = kind == LEAF
-    rib, up, size = b[here, :3], c[here, :3], a[here, 3:]
+    rib = b[here, :3]
+    up = c[here, :3]
+    size = a[here, 3:]
     across = np.cross(rib, up)
     corners = [
         a[here, :3] + size * (u * across + v * rib) for u, v in ((-0.6, -0.3), (0.6, -0.3), (0.6, 0.9), (-0.6, 0.9))
     ]
     add(np.stack(corners, 1), np.array([[0, 1, 2], [0, 2, 3]]))
-    low, high = a[:, :2].min(0) - 50.0, a[:, :2].max(0) + 50.0
+    low = a[:, :2].min(0) - 50.0
+    high = a[:, :2].max(0) + 50.0
     ground = np.array([[*low, 0.0], [high[0], low[1], 0.0], [*high, 0.0], [low[0], high[1], 0.0]])
     add(ground[None], np.array([[0, 1, 2], [0, 2, 3]]))
     return np.concatenate(vertices).astype(np.float32), np.concatenate(faces).astype(np.uint32)
@@ -113,16 +119,20 @@ def camera() -> Iterator[Measurement]:
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
     pose = look_at(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
-    seen, lens = CameraRasterizer(info.width, info.height), pinhole(info, pose)
+    seen = CameraRasterizer(info.width, info.height)
+    lens = pinhole(info, pose)
     eyes = {name: Camera(spec, info, quality=name) for name in ("fast", "full")}
     cases: list[Callable[[], object]] = [lambda: seen.draw(primitives, lens)]
     cases += [lambda eye=eye: eye.render(primitives, pose) for eye in eyes.values()]
-    name, peer = f"depth and labels 640x480, {primitives.count} primitives", ""
+    name = f"depth and labels 640x480, {primitives.count} primitives"
+    peer = ""
     if find_spec("open3d") is not None:
         import open3d as o3d
 
         vertices, faces = triangle_mesh(primitives)
-        scene, rays = embree_scene(vertices, faces), o3d.core.Tensor(_rays(info, pose))  # pyright: ignore[reportArgumentType, reportCallIssue] it does take arrays
+        # pyright: ignore[reportArgumentType, reportCallIssue] it does take arrays
+        scene = embree_scene(vertices, faces)
+        rays = o3d.core.Tensor(_rays(info, pose))
         cases.append(lambda: scene.cast_rays(rays))
         peer = f"Open3D {o3d.__version__}, {len(faces)} triangles"
     raster, *pictures = median_cpu_times(*cases)
@@ -141,7 +151,8 @@ def live_camera() -> Iterator[Measurement]:
     model = generate(load_scene("demo"))
     primitives = Primitives(model)
     spec = CameraSpec.load("d435")
-    info, pose = spec.info("optical"), look_at(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
+    info = spec.info("optical")
+    pose = look_at(np.array([-0.6, 1.0, 1.45]), np.array([8.0, 1.35, 1.45]))
     one, all_cores = (Camera(spec, info, quality="fast", threads=threads) for threads in (1, None))
     wanted = CameraOutput.RGB | CameraOutput.DEPTH
     swaying = np.arange(0, len(model.body_mass) // 20)
@@ -165,7 +176,8 @@ def live_camera() -> Iterator[Measurement]:
     exact = frame.exact_depth
     assert spec.stereo is not None
     assert exact is not None
-    reach, rng = (spec.nearest.value, spec.farthest.value), np.random.default_rng(1)
+    reach = (spec.nearest.value, spec.farthest.value)
+    rng = np.random.default_rng(1)
     stereo = Stereo(spec.stereo, info, reach, second_from_first=True)
     cases: list[tuple[str, Callable[[], object], float]] = [
         ("visibility", lambda: one.rasterizer.draw(primitives, lens), 30.0),

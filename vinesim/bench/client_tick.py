@@ -42,7 +42,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, load_scene
 from vinesim.scene.values import Measurement
 
-WARM_UP_TICKS, MEASURED_TICKS = 300, 1000
+WARM_UP_TICKS = 300
+MEASURED_TICKS = 1000
 PARTS = ("receive", "control", "step", "sense", "send")
 """Parts of a tick, in their order."""
 TRUTH_PERIOD = 0.1
@@ -101,14 +102,23 @@ class PushingClient:
     """A client in whose world the first robot pushes a bunch again and again; a second client may watch beside it."""
 
     def __init__(
-        self, scene: Scene, model: Model, robot: RobotDescription, stack: contextlib.ExitStack, *,
-        robots: int = 1, has_visitor: bool = False, has_subscribers: bool = False,
-    ) -> None:  # fmt: skip
-        self._hub, self._now = MemoryHub(), 0.0
+        self,
+        scene: Scene,
+        model: Model,
+        robot: RobotDescription,
+        stack: contextlib.ExitStack,
+        *,
+        robots: int = 1,
+        has_visitor: bool = False,
+        has_subscribers: bool = False,
+    ) -> None:
+        self._hub = MemoryHub()
+        self._now = 0.0
         bunch, pose = find_push_pose(model, start_pose(scene, 0)[:2])
         self.client = client = self._add_client(scene, model, robot, "robot_0", pose, stack)
         for i in range(1, robots):
-            name, behind = f"robot_{i}", frames.pose([-QUEUE_SPACING * i, 0.0, 0.0])
+            name = f"robot_{i}"
+            behind = frames.pose([-QUEUE_SPACING * i, 0.0, 0.0])
             client.add_robot(robot, name, frames.compose(pose, behind), stack.enter_context(self._hub.bus(name)))
         self._visitor: Client | None = None
         if has_visitor:
@@ -136,9 +146,14 @@ class PushingClient:
         marks[2 * part + 1] = time.thread_time(), time.perf_counter()
 
     def _add_client(
-        self, scene: Scene, model: Model, robot: RobotDescription, name: str, pose: np.ndarray,
+        self,
+        scene: Scene,
+        model: Model,
+        robot: RobotDescription,
+        name: str,
+        pose: np.ndarray,
         stack: contextlib.ExitStack,
-    ) -> Client:  # fmt: skip
+    ) -> Client:
         bus = stack.enter_context(self._hub.bus(name))
         return Client(scene, model, robot, bus, name=name, pose=pose, clock=lambda: self._now)
 
@@ -172,13 +187,24 @@ class PushingClient:
 class _Demand:
     """Stands for a process of the client that runs and whose topics all have subscribers; it takes what is written."""
 
-    is_ready, pid, standby_pid, restarts, restart_time = True, 0, None, 0, 0.0
+    is_ready = True
+    pid = 0
+    standby_pid = None
+    restarts = 0
+    restart_time = 0.0
 
     def __init__(
-        self, title: str, modules: Any, target: Any, config: Any, share: Callable[[BaseContext], Any], receive: Any,
+        self,
+        title: str,
+        modules: Any,
+        target: Any,
+        config: Any,
+        share: Callable[[BaseContext], Any],
+        receive: Any,
         **_: Any,
-    ) -> None:  # fmt: skip
-        self.title, self.shared = title, share(get_context())
+    ) -> None:
+        self.title = title
+        self.shared = share(get_context())
         self.process = types.SimpleNamespace(pid=os.getpid())
 
     def current(self) -> _Demand:
@@ -229,9 +255,14 @@ def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) ->
     """Rows of one case."""
     with contextlib.ExitStack() as stack:
         pushing = PushingClient(
-            scene, model, robot, stack, robots=case.robots, has_visitor=case.has_visitor,
+            scene,
+            model,
+            robot,
+            stack,
+            robots=case.robots,
+            has_visitor=case.has_visitor,
             has_subscribers=case.has_subscribers,
-        )  # fmt: skip
+        )
         pushing.measure(WARM_UP_TICKS, is_paced=False)
         paced = pushing.measure(MEASURED_TICKS, is_paced=True)
         loop = pushing.measure(MEASURED_TICKS, is_paced=False)

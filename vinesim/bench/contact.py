@@ -40,7 +40,8 @@ ROBOT_COUNTS = (1, 10)
 ROBOT_POSITION = (15.5, 17.2)
 """[m] x, y of the first robot in the block: its arms reach into the row behind it."""
 AWAKE_TREES = 20
-MEASURED_STEPS, WARM_UP_STEPS = 1000, 100
+MEASURED_STEPS = 1000
+WARM_UP_STEPS = 100
 
 
 def contact_measurements() -> Iterator[Measurement]:
@@ -89,7 +90,8 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
     away = np.linalg.norm(model.tree_pose[:, :2] - ROBOT_POSITION, axis=1)
     away[reached] = -1.0
     scenes.keep_awake(physics, np.sort(np.argsort(away, kind="stable")[:AWAKE_TREES]))
-    seconds, contacts = np.zeros((MEASURED_STEPS, len(physics.stages) + 1)), 0
+    seconds = np.zeros((MEASURED_STEPS, len(physics.stages) + 1))
+    contacts = 0
     for i in range(-WARM_UP_STEPS, MEASURED_STEPS):
         _swing_joints(physics, robot, raised, i + WARM_UP_STEPS)
         marks = [time.perf_counter()]
@@ -102,7 +104,8 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
             contacts += len(physics.contacts)
     milliseconds = 1e3 * seconds
     owner = np.array([_stage_owner(name) for name, _ in physics.stages])
-    awake, bunches = len(physics.plants.awake), len(model.bunch_body)
+    awake = len(physics.plants.awake)
+    bunches = len(model.bunch_body)
     robots = f"{count} robot{'s' * (count > 1)}"
     case = f"{robots}, {awake} trees awake, {bunches} bunches, {contacts / MEASURED_STEPS:.0f} contacts"
     for share, text in (("", "tick"), ("MuJoCo", "MuJoCo's share"), ("ours", "ours"), ("rest", "the rest")):

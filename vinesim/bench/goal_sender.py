@@ -31,9 +31,11 @@ from vinesim.ros.messages import message_packages
 TIMEOUT = 120.0
 """Longest wait for anything [s]."""
 CONTROLLERS = {
-    "head_controller": "head_", "torso_controller": "torso_", "arm_left_controller": "arm_left_",
+    "head_controller": "head_",
+    "torso_controller": "torso_",
+    "arm_left_controller": "arm_left_",
     "arm_right_controller": "arm_right_",
-}  # fmt: skip
+}
 """Trajectory controllers of vinebot, and how the names of their joints begin."""
 REACH = 0.3
 """Targets are so far at most from where the joints were in the beginning [rad, m]."""
@@ -53,7 +55,10 @@ PLACE_STEP = 0.001
 """Between two places of the splines that are compared with a message [s]."""
 MOMENT = 0.4
 """After a trajectory's start, when it is cancelled or preempted [s]."""
-UNKNOWN, SUCCEEDED, CANCELED, ABORTED = 0, 4, 5, 6
+UNKNOWN = 0
+SUCCEEDED = 4
+CANCELED = 5
+ABORTED = 6
 INVALID_GOAL = -1
 
 
@@ -74,11 +79,15 @@ class Plan:
         """Positions and velocities [time, joint] of the cubic splines at ``times`` [time] s after the start, which is
         at ``begin`` [joint]."""
         knots = np.r_[0.0, self.times]
-        places, speeds = np.vstack([begin, self.positions]), np.vstack([0.0 * begin, self.velocities])
+        places = np.vstack([begin, self.positions])
+        speeds = np.vstack([0.0 * begin, self.velocities])
         i = np.clip(np.searchsorted(knots, times) - 1, 0, len(self.times) - 1)
         h = (knots[i + 1] - knots[i])[:, None]
         s = (times - knots[i])[:, None] / h
-        p0, p1, m0, m1 = places[i], places[i + 1], h * speeds[i], h * speeds[i + 1]
+        p0 = places[i]
+        p1 = places[i + 1]
+        m0 = h * speeds[i]
+        m1 = h * speeds[i + 1]
         position = (2 * s**3 - 3 * s**2 + 1) * p0 + (s**3 - 2 * s**2 + s) * m0
         position = position + (3 * s**2 - 2 * s**3) * p1 + (s**3 - s**2) * m1
         velocity = (6 * s**2 - 6 * s) * (p0 - p1) + (3 * s**2 - 4 * s + 1) * m0 + (3 * s**2 - 2 * s) * m1
@@ -157,7 +166,8 @@ class GoalSender:
     def _joints(self, start: str) -> dict[str, Joint]:
         found = {}
         for element in ElementTree.fromstring(self.urdf).iterfind("joint"):
-            name, limit = element.get("name", ""), element.find("limit")
+            name = element.get("name", "")
+            limit = element.find("limit")
             if name.startswith(start) and name in self.names and limit is not None:
                 lower, upper, velocity = (float(limit.get(key, "0")) for key in ("lower", "upper", "velocity"))
                 found[name] = Joint(lower, upper, velocity, float(self.positions([name])[0]))
@@ -214,7 +224,8 @@ class GoalSender:
         goal.trajectory.points = points
         goal.goal_tolerance = [JointTolerance(name=name, position=TOLERANCE) for name in one.joints]
         goal.goal_time_tolerance.sec = 2
-        self.feedback, self.history = [], self.history[-1:]
+        self.feedback = []
+        self.history = self.history[-1:]
         future = self.actions[one.controller].send_goal_async(goal, lambda m: self.feedback.append(m.feedback))
         self.until(future.done, "an answer to a goal")
         handle = future.result()
@@ -247,10 +258,12 @@ def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, i
     """Whether a goal that ran to its end did what it says."""
     columns = [sender.names.index(name) for name in one.joints]
     sender.wait(0.2)  # on a busy machine a result comes before the joint states of up to a second
-    wanted, measured = 0.0, 0.0
+    wanted = 0.0
+    measured = 0.0
     first = sender.history[0][1][columns]  # it stood there; the first feedback may be missing on a busy machine
     for told in sender.feedback:
-        desired, speed = np.array(told.desired.positions), np.array(told.desired.velocities)
+        desired = np.array(told.desired.positions)
+        speed = np.array(told.desired.velocities)
         wanted = max(wanted, one.velocity_off(first, desired, speed))
     stamps = np.array([row[0] for row in sender.history]) - begin
     speeds = np.array([row[2][columns] for row in sender.history])
@@ -259,10 +272,16 @@ def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, i
         measured = max(measured, float(np.abs(found - velocity).max()))
     off = float(np.abs(sender.positions(one.joints) - one.positions[-1]).max())
     return {
-        "kind": "goal", "controller": one.controller, "waypoints": len(one.times), "text": status[2],
-        "right": status[:2] == (SUCCEEDED, 0), "off": off,
-        "wanted_velocity_off": wanted, "velocity_off": measured, "fastest": float(np.abs(speeds).max()),
-    }  # fmt: skip
+        "kind": "goal",
+        "controller": one.controller,
+        "waypoints": len(one.times),
+        "text": status[2],
+        "right": status[:2] == (SUCCEEDED, 0),
+        "off": off,
+        "wanted_velocity_off": wanted,
+        "velocity_off": measured,
+        "fastest": float(np.abs(speeds).max()),
+    }
 
 
 def cancel(sender: GoalSender, one: Plan) -> tuple[dict[str, Any], list[Any]]:
@@ -293,8 +312,9 @@ def preempt(sender: GoalSender, one: Plan, newer: Plan) -> tuple[dict[str, Any],
     right = row["right"] and older[:2] == (ABORTED, INVALID_GOAL)
     text = f"{older[2]}; {row['text']}".strip("; ")
     return {"kind": "preempt", "controller": one.controller, "right": right, "off": row["off"], "text": text}, [
-        first, second,
-    ]  # fmt: skip
+        first,
+        second,
+    ]
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -306,7 +326,8 @@ def main(arguments: list[str] | None = None) -> int:
     middleware.clear_profile()
     message_packages.ensure_importable(["control_msgs"])
     rclpy.init(args=[])
-    sender, random = GoalSender(), np.random.default_rng(given.seed)
+    sender = GoalSender()
+    random = np.random.default_rng(given.seed)
     kinds = ["goal"] * given.goals + ["cancel"] * given.cancels + ["preempt"] * given.preempts
     handles: list[Any] = []
     for number, kind in enumerate(random.permutation(kinds)):
@@ -319,7 +340,8 @@ def main(arguments: list[str] | None = None) -> int:
         if kind == "goal":
             one = draw()
             handle, begin = sender.send(one)
-            row, sent = judge_goal(sender, one, begin, sender.result(handle)), [handle]
+            row = judge_goal(sender, one, begin, sender.result(handle))
+            sent = [handle]
         elif kind == "cancel":
             row, sent = cancel(sender, draw())
         else:

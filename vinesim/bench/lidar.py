@@ -40,8 +40,10 @@ def lidar() -> Iterator[Measurement]:
     """Distances and primitives of all rays, the whole scan, and both while twenty trees move."""
     model, primitives = demo_scene()
     spec = LidarSpec.load("vlp16")
-    head, caster = _grid(spec), RayCaster(primitives)
-    thin, wide = Lidar(spec.ideal()), Lidar(spec)
+    head = _grid(spec)
+    caster = RayCaster(primitives)
+    thin = Lidar(spec.ideal())
+    wide = Lidar(spec)
     rays = head.direction.numpy()
     reach = spec.farthest.value
     trees = np.unique(model.body_tree[model.bunch_body])[:20]

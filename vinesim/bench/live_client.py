@@ -19,7 +19,9 @@ from vinesim.ros import middleware
 
 POLL_PERIOD = 0.02
 """Wall time between two looks for first messages [s]."""
-RGB, DEPTH, LIDAR = "/head_front_camera/rgb/image_raw", "/head_front_camera/depth/image_raw", "/lidar/points"
+RGB = "/head_front_camera/rgb/image_raw"
+DEPTH = "/head_front_camera/depth/image_raw"
+LIDAR = "/lidar/points"
 """Sensor topics of vinebot."""
 CLOCK = "/clock"
 
@@ -65,9 +67,18 @@ def run_client(options: Sequence[str], topics: Sequence[str], seconds: float, **
         listener = RosListener(group, topics)
         listener.wait_until_listening()
         client = group.start(
-            "client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", "--tick-log", str(log),
+            "client",
+            "-m",
+            "vinesim",
+            "client",
+            "--role",
+            "robot",
+            "--status",
+            "json",
+            "--tick-log",
+            str(log),
             *options,
-        )  # fmt: skip
+        )
         deadline = time.monotonic() + START_TIMEOUT
         status: dict[str, Any] = {}
         while missing := listener.missing():

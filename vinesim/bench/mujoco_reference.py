@@ -43,10 +43,13 @@ def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[
     Berry clusters are bodies of their own, and the body of their bunch is its head.
     """
     made: list[mujoco.MjsBody] = []
-    mass, com, inertia = model.body_mass.copy(), model.body_com.copy(), model.body_inertia.copy()
+    mass = model.body_mass.copy()
+    com = model.body_com.copy()
+    inertia = model.body_inertia.copy()
     clustered = model.bunch_clusters > 0
     heads = model.bunch_body[clustered]
-    mass[heads], com[heads] = model.bunch_head_mass[clustered], model.bunch_head_com[clustered]
+    mass[heads] = model.bunch_head_mass[clustered]
+    com[heads] = model.bunch_head_com[clustered]
     inertia[heads] = model.bunch_head_inertia[clustered]
     for body in range(len(model.body_mass)):
         parent = int(model.body_parent[body])
@@ -54,13 +57,20 @@ def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[
         if parent < 0:
             pose = frames.compose(model.tree_pose[model.body_tree[body]].astype(float), pose)
         child = (spec.worldbody if parent < 0 else made[parent]).add_body(
-            name=f"plant/{body}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=float(mass[body]),
-            ipos=com[body], inertia=inertia[body], explicitinertial=True,
-        )  # fmt: skip
+            name=f"plant/{body}",
+            pos=pose[:3],
+            quat=frames.to_wxyz(pose[3:]),
+            mass=float(mass[body]),
+            ipos=com[body],
+            inertia=inertia[body],
+            explicitinertial=True,
+        )
         child.add_joint(
-            name=f"plant/{body}", type=mujoco.mjtJoint.mjJNT_BALL, stiffness=float(model.joint_stiffness[body, 1]),
+            name=f"plant/{body}",
+            type=mujoco.mjtJoint.mjJNT_BALL,
+            stiffness=float(model.joint_stiffness[body, 1]),
             damping=float(damping[body]),
-        )  # fmt: skip
+        )
         made.append(child)
     return made
 
@@ -98,14 +108,23 @@ class MujocoScene:
         fine = np.flatnonzero(shapes.level != 1)
         columns = shapes.body[fine], shapes.start[fine], shapes.end[fine], shapes.radius[fine]
         for body, start, end, radius in zip(*columns, strict=True):
-            kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
+            kind = mujoco.mjtGeom.mjGEOM_SPHERE
+            place = {"pos": start}
             if (start != end).any():
-                kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+                kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+                place = {"fromto": np.concatenate([start, end])}
             made[body].add_geom(
-                type=kind, size=[float(radius), 0, 0], contype=FIXED, conaffinity=0, mass=0.0,
-                friction=contact_friction(mine.parameters.friction), solref=[0.02, 1],
-                solimp=PLANT_IMPEDANCE, solmix=1e6, **place,
-            )  # fmt: skip
+                type=kind,
+                size=[float(radius), 0, 0],
+                contype=FIXED,
+                conaffinity=0,
+                mass=0.0,
+                friction=contact_friction(mine.parameters.friction),
+                solref=[0.02, 1],
+                solimp=PLANT_IMPEDANCE,
+                solmix=1e6,
+                **place,
+            )
         world = spec.compile()
         if contact_time_constant is not None:
             world.geom_solref[:] = contact_time_constant, 1.0
@@ -118,7 +137,8 @@ class MujocoScene:
         for body, q in enumerate(model.joint_settled):
             data.joint(f"plant/{body}").qpos[:] = frames.to_wxyz(q)
         mine.rebind(world, data)
-        self.world, self.data = world, data
+        self.world = world
+        self.data = data
 
     def step(self) -> None:
         """One step of the whole scene."""
@@ -134,7 +154,8 @@ class MujocoScene:
 
     def contact_force_on(self, link: str) -> np.ndarray:
         """[3] N of all contacts on the robot link of this name in the last step."""
-        total, wrench = np.zeros(3), np.zeros(6)
+        total = np.zeros(3)
+        wrench = np.zeros(6)
         for number in range(self.data.ncon):
             contact = self.data.contact[number]
             mujoco.mj_contactForce(self.world, self.data, number, wrench)

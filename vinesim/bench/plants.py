@@ -28,10 +28,17 @@ def plain_cane(side: float) -> TreeBuilder:
     tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
     last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), 16)[-1]
     tree.add_body(
-        last, offset=(1 / 16, 0, 0), rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])), organ=int(Organ.BUNCH),
+        last,
+        offset=(1 / 16, 0, 0),
+        rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])),
+        organ=int(Organ.BUNCH),
         mass=0.5,
-        com=(0.1, 0, 0), inertia=(5e-4, 5e-4, 5e-4), length=0.15, radius=(0.05, 0.05), damping=(0.002, 0.002, 0.002),
-    )  # fmt: skip
+        com=(0.1, 0, 0),
+        inertia=(5e-4, 5e-4, 5e-4),
+        length=0.15,
+        radius=(0.05, 0.05),
+        damping=(0.002, 0.002, 0.002),
+    )
     return tree
 
 

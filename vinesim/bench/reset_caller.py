@@ -75,7 +75,8 @@ class ResetCaller:
 
     def call(self, service: str, **fields: Any) -> Any:
         """The response of a service, by its type and name; RuntimeError unless its result is ok."""
-        name, kind = service, getattr(self._services, "".join(word.capitalize() for word in service.split("_")))
+        name = service
+        kind = getattr(self._services, "".join(word.capitalize() for word in service.split("_")))
         client = self._clients.get(name) or self._clients.setdefault(name, self.node.create_client(kind, name))
         self.until(client.service_is_ready, name)
         answer = client.call_async(kind.Request(**fields))
@@ -125,7 +126,8 @@ class ResetCaller:
             self.until(lambda end=end: time.monotonic() > end, "", lambda: self._drive.publish(message))
         before = start
         while np.linalg.norm((now := self.place(robot)) - before) > STANDS:
-            before, end = now, time.monotonic() + 0.2
+            before = now
+            end = time.monotonic() + 0.2
             self.until(lambda end=end: time.monotonic() > end, "", lambda: self._drive.publish(TwistStamped()))
 
 
@@ -147,9 +149,16 @@ def disturb_and_reset(caller: ResetCaller, robot: str, start: np.ndarray, entiti
     there = sorted(caller.call("get_entities").entities)
     right = off < AT_START and there == entities and ended.result().status == ABORTED
     return {
-        "kind": "reset", "right": right, "off": off, "goal": ended.result().status, "more": len(there) - len(entities),
-        "s": answered - begin, "sensors_s": back_after, "stamps_back": caller.back, **caller.graph(),
-    }  # fmt: skip
+        "kind": "reset",
+        "right": right,
+        "off": off,
+        "goal": ended.result().status,
+        "more": len(there) - len(entities),
+        "s": answered - begin,
+        "sensors_s": back_after,
+        "stamps_back": caller.back,
+        **caller.graph(),
+    }
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -167,7 +176,8 @@ def main(arguments: list[str] | None = None) -> int:
     robots = EntityFilters(categories=[EntityCategory(category=EntityCategory.CATEGORY_ROBOT)])
     robot = caller.call("get_entities", filters=robots).entities[0]
     caller.call("reset_simulation")  # wherever others have driven it
-    entities, start = sorted(caller.call("get_entities").entities), caller.place(robot)
+    entities = sorted(caller.call("get_entities").entities)
+    start = caller.place(robot)
     for _ in range(given.resets):
         sys.stdout.write(json.dumps(disturb_and_reset(caller, robot, start, entities)) + "\n")
         sys.stdout.flush()

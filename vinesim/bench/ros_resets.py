@@ -41,8 +41,15 @@ def reset_rows(rows: Sequence[dict[str, Any]], histories: dict[str, ProcessHisto
     """Evaluation of what :mod:`vinesim.bench.reset_caller` printed, and of samples of processes after each reset."""
     count = len(rows)
     right = sum(row["right"] for row in rows)
-    yield Measurement("ros", "resets: world as in the beginning, goal aborted", right, f"of {count}", "bar, at least",
-                      count, right / count)  # fmt: skip
+    yield Measurement(
+        "ros",
+        "resets: world as in the beginning, goal aborted",
+        right,
+        f"of {count}",
+        "bar, at least",
+        count,
+        right / count,
+    )
     yield at_most_none("resets: stamps that went back", rows[-1]["stamps_back"], "messages")
     for what in GRAPH:
         more = max(row[what] for row in rows[count // 2 :]) - max(row[what] for row in rows[: max(count // 2, 1)])
@@ -53,8 +60,15 @@ def reset_rows(rows: Sequence[dict[str, Any]], histories: dict[str, ProcessHisto
         for what in ("threads", "handles"):
             yield at_most_none(f"resets: {what} of {kind}, more in the second half", history.change(what), what)
         growth = growth_by_reset(history)
-        yield Measurement("ros", f"resets: memory of {kind}, growth by a reset", growth, "MB", "bar, at most", GROWTH,
-                          GROWTH / growth if growth > 0.0 else None)  # fmt: skip
+        yield Measurement(
+            "ros",
+            f"resets: memory of {kind}, growth by a reset",
+            growth,
+            "MB",
+            "bar, at most",
+            GROWTH,
+            GROWTH / growth if growth > 0.0 else None,
+        )
 
 
 def growth_by_reset(history: ProcessHistory) -> float:

@@ -30,9 +30,15 @@ from vinesim.scene.values import Measurement
 PERIOD = 0.01
 """Of the measured topics, and the delay after which a message is late [s]."""
 TOPICS = (
-    CLOCK, "/joint_states", "/tf", "/mobile_base_controller/odom", "/base_imu", "/wrist_left_ft/wrench",
-    "/wrist_right_ft/wrench", "/vine/contacts",
-)  # fmt: skip
+    CLOCK,
+    "/joint_states",
+    "/tf",
+    "/mobile_base_controller/odom",
+    "/base_imu",
+    "/wrist_left_ft/wrench",
+    "/wrist_right_ft/wrench",
+    "/vine/contacts",
+)
 """Topics of every step of vinebot."""
 JOINTS = 21
 """In a message of the stock publisher; vinebot has as many."""
@@ -41,9 +47,12 @@ WINDOW = 20.0
 SETTLING = 3.0
 """From the first messages to the measured time, and after the stop [s]."""
 POLL_PERIOD = 0.05
-ON_TIME, LATENCY = 98.0, 10.0
+ON_TIME = 98.0
+LATENCY = 10.0
 """Least share of messages on time [%] and greatest 99th percentile of the time from one process to the other [ms]."""
-GOALS, CANCELS, PREEMPTS = 50, 10, 10
+GOALS = 50
+CANCELS = 10
+PREEMPTS = 10
 ACTION_TIMEOUT = 180.0
 """Longest time of one goal [s]."""
 GOAL_TOLERANCE = 0.01
@@ -99,7 +108,8 @@ def share_on_time(delays: np.ndarray, seconds: float) -> float:
 
 def topic_rows(case: str, heard: Mapping[str, Arrivals], since: float, until: float) -> Iterator[Measurement]:
     """Timeliness of every topic in a span of time [s since the epoch]."""
-    latencies, lost = [], 0
+    latencies = []
+    lost = 0
     for topic in TOPICS:
         part = heard[topic].between(since, until)
         share = share_on_time(delay_ms(part, heard[CLOCK]), until - since)
@@ -118,9 +128,14 @@ def topic_rows(case: str, heard: Mapping[str, Arrivals], since: float, until: fl
     peer = share_on_time(delay_ms(part, stock), until - since)
     ours = share_on_time(delay_ms(heard["/joint_states"].between(since, until), heard[CLOCK]), until - since)
     yield Measurement(
-        "ros", f"{case}: late or lost of /joint_states", 100.0 - ours, "%", "stock rclpy timer", 100.0 - peer,
+        "ros",
+        f"{case}: late or lost of /joint_states",
+        100.0 - ours,
+        "%",
+        "stock rclpy timer",
+        100.0 - peer,
         (100.0 - peer) / (100.0 - ours) if ours < 100.0 else None,
-    )  # fmt: skip
+    )
     yield Measurement("ros", f"{case}: lost of {len(TOPICS)} topics", lost, "messages")
 
 
@@ -162,8 +177,12 @@ def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
             "rad/s, m/s",
         )
     yield Measurement("ros", "goals: fastest joint", max(row["fastest"] for row in kinds["goal"]), "rad/s, m/s")
-    yield at_most("cancels: motion in the second half of a second after", max(r["drift"] for r in kinds["cancel"]),
-                  "rad, m", 0.005)  # fmt: skip
+    yield at_most(
+        "cancels: motion in the second half of a second after",
+        max(r["drift"] for r in kinds["cancel"]),
+        "rad, m",
+        0.005,
+    )
     end = kinds["end"][0]
     yield at_most("goals whose handles a server knows for good", end["known"], "goals", 0.0)
     yield Measurement("ros", "goals: all handles forgotten after the end of the last goal", end["s"], "s")
@@ -185,7 +204,8 @@ def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Mea
 
 def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
     """Topics beside a subscriber that reads, then beside one that stopped reading."""
-    arrivals, log = folder / "arrivals.npz", folder / "ticks.npz"
+    arrivals = folder / "arrivals.npz"
+    log = folder / "ticks.npz"
     listener = RosListener(group, (*TOPICS, stock_publisher.TOPIC), arrivals=arrivals)
     other = RosListener(group, (*TOPICS, RGB, DEPTH, LIDAR))
     for one in (listener, other):
@@ -210,7 +230,8 @@ def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) ->
     listener.stop()
     listener.report()
     other.stop()
-    heard, ticks = load_arrivals(arrivals), TickLog.load(log)
+    heard = load_arrivals(arrivals)
+    ticks = TickLog.load(log)
     for case, (since, until, begin) in zip(("all read", "one stopped"), spans, strict=True):
         yield from topic_rows(case, heard, since, until)
         loop = ticks.between(begin, begin + until - since)
@@ -226,9 +247,16 @@ def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
     """Goals of a stock action client in a process of its own."""
     client = _start_client(group)
     sender = group.start(
-        "goal sender", "-m", "vinesim.bench.goal_sender", "--goals", str(GOALS), "--cancels", str(CANCELS),
-        "--preempts", str(PREEMPTS),
-    )  # fmt: skip
+        "goal sender",
+        "-m",
+        "vinesim.bench.goal_sender",
+        "--goals",
+        str(GOALS),
+        "--cancels",
+        str(CANCELS),
+        "--preempts",
+        str(PREEMPTS),
+    )
     rows: list[dict[str, Any]] = []
     while not rows or rows[-1]["kind"] != "end":
         rows.append(json.loads(sender.next_line(START_TIMEOUT if not rows else ACTION_TIMEOUT)))
@@ -244,7 +272,8 @@ def _start_client(group: ProcessGroup, *options: str) -> Process:
 def _rest(client: Process, settling: float, window: float) -> tuple[float, float, float]:
     """Wait; wall times between which to measure [s since the epoch], and the monotonic time of the first [s]."""
     time.sleep(settling)
-    since, begin = time.time(), time.monotonic()
+    since = time.time()
+    begin = time.monotonic()
     while time.monotonic() < begin + window:
         client.new_lines()
         time.sleep(POLL_PERIOD)

@@ -35,9 +35,17 @@ def cane_with_bunch(side: float) -> TreeBuilder:
     last = tree.add_rod(last, 0.08, (0.002, 0.002), stalk, 2, organ=Organ.PEDUNCLE, rest=down)[-1]
     spring = np.asarray(tree.bodies[last]["stiffness"])
     bunch = tree.add_body(
-        last, offset=(0.04, 0, 0), organ=int(Organ.BUNCH), mass=0.5, com=(BUNCH_CENTER, 0, 0), length=0.17,
-        radius=(0.04, 0.04), inertia=(3.2e-4, 8.7e-4, 8.7e-4), stiffness=spring, damping=0.01 * spring + 2e-3,
-    )  # fmt: skip
+        last,
+        offset=(0.04, 0, 0),
+        organ=int(Organ.BUNCH),
+        mass=0.5,
+        com=(BUNCH_CENTER, 0, 0),
+        length=0.17,
+        radius=(0.04, 0.04),
+        inertia=(3.2e-4, 8.7e-4, 8.7e-4),
+        stiffness=spring,
+        damping=0.01 * spring + 2e-3,
+    )
     tree.bunches.append({"body": bunch, "length": 0.17, "radius": 0.045, "berries": 80, "pull": 500.0, "bend": 50.0})
     tree.solve_rest_pose()
     return tree
@@ -49,7 +57,8 @@ def cane_row(count: int) -> Model:
     trees = []
     for i in range(count):
         tree = TreeBuilder(frames.pose(np.array([0.0, SPACING * i, HEIGHT])))
-        tree.bodies, tree.bunches = one.bodies, one.bunches
+        tree.bodies = one.bodies
+        tree.bunches = one.bunches
         trees.append(tree)
     return assemble(trees)
 
@@ -148,7 +157,8 @@ def interleaved_times(*works: Callable[[], object], rounds: int = 9) -> np.ndarr
     seconds = np.zeros((rounds, 2, len(works)))
     for row in seconds:
         for i, work in enumerate(works):
-            start, began = time.perf_counter(), time.thread_time()
+            start = time.perf_counter()
+            began = time.thread_time()
             work()
             row[:, i] = time.perf_counter() - start, time.thread_time() - began
     return np.median(seconds, axis=0)

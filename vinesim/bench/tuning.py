@@ -77,11 +77,14 @@ def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recove
 
 
 def _errors(fit: Fit, truth: Specimen) -> tuple[float, float, bool, bool]:
-    modulus, damping = fit.estimate("modulus"), fit.estimate("damping")
+    modulus = fit.estimate("modulus")
+    damping = fit.estimate("damping")
     return (
-        modulus.value / truth.modulus.value - 1.0, damping.value / truth.damping.value - 1.0,
-        modulus.low <= truth.modulus.value <= modulus.high, damping.low <= truth.damping.value <= damping.high,
-    )  # fmt: skip
+        modulus.value / truth.modulus.value - 1.0,
+        damping.value / truth.damping.value - 1.0,
+        modulus.low <= truth.modulus.value <= modulus.high,
+        damping.low <= truth.damping.value <= damping.high,
+    )
 
 
 # ---------------------------------------------------------------------- another simulator as the truth

@@ -14,7 +14,8 @@ import numpy as np
 from vinesim.scene.plant_parameters import Number, Specimen
 from vinesim.tune import Experiment
 
-MODULUS_BAR, DAMPING_BAR = 0.03, 0.15
+MODULUS_BAR = 0.03
+DAMPING_BAR = 0.15
 """Largest relative errors."""
 
 
@@ -35,10 +36,15 @@ def bench_cane(modulus: float, damping: float, segments: int = 8) -> Specimen:
         return Number(value, unit, "GUESSED", "benchmark")
 
     return Specimen(
-        organ="cane", length=number(1.0, "m"), base_diameter=number(0.009, "m"), tip_diameter=number(0.006, "m"),
-        modulus=number(modulus, "Pa"), density=number(900.0, "kg/m^3"), damping=number(damping, "s"),
+        organ="cane",
+        length=number(1.0, "m"),
+        base_diameter=number(0.009, "m"),
+        tip_diameter=number(0.006, "m"),
+        modulus=number(modulus, "Pa"),
+        density=number(900.0, "kg/m^3"),
+        damping=number(damping, "s"),
         segments=segments,
-    )  # fmt: skip
+    )
 
 
 def draw_case(seed: int) -> Case:

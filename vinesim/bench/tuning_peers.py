@@ -77,9 +77,16 @@ def fit_by_scipy(plain: PlainProblem, start: np.ndarray) -> np.ndarray:
     from scipy.optimize import least_squares
 
     return least_squares(
-        plain.residuals, start, x_scale=plain.scales, loss="soft_l1", f_scale=3.0, ftol=1e-5, xtol=1e-6,
-        diff_step=1e-4, max_nfev=30,
-    ).x  # fmt: skip
+        plain.residuals,
+        start,
+        x_scale=plain.scales,
+        loss="soft_l1",
+        f_scale=3.0,
+        ftol=1e-5,
+        xtol=1e-6,
+        diff_step=1e-4,
+        max_nfev=30,
+    ).x
 
 
 def fit_by_cma(plain: PlainProblem, start: np.ndarray, seed: int) -> np.ndarray:
@@ -102,17 +109,23 @@ def until_as_good(
 ) -> tuple[np.ndarray, float]:
     """What a method finds that begins where the user does, and again up to five times off until its loss is as good as
     ours; and the CPU time [s]."""
-    rng, begun = np.random.default_rng(seed), time.process_time()
-    start, best, least, turn = plain.plain, plain.plain, math.inf, 0
+    rng = np.random.default_rng(seed)
+    begun = time.process_time()
+    start = plain.plain
+    best = plain.plain
+    least = math.inf
+    turn = 0
     while True:
         found = fit(start, 100 * seed + turn)
         loss = float(plain.losses(found[None])[0])
         if loss < least:
-            best, least = found, loss
+            best = found
+            least = loss
         spent = time.process_time() - begun
         if least < target + AS_GOOD or spent > MOST_SECONDS:
             return best, spent
-        start, turn = plain.plain.copy(), turn + 1
+        start = plain.plain.copy()
+        turn = turn + 1
         start[:2] = rng.uniform(-math.log(5.0), math.log(5.0), 2)
 
 
@@ -123,7 +136,9 @@ def peer_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measureme
         "CMA-ES": lambda p: lambda start, seed: fit_by_cma(p, start, seed),
     }
     tune(cases[0].guess, tracks[0])  # loads every kernel
-    ours, seconds, good = [], {name: [] for name in peers}, dict.fromkeys(peers, 0)
+    ours = []
+    seconds = {name: [] for name in peers}
+    good = dict.fromkeys(peers, 0)
     for seed, (case, track) in enumerate(zip(cases, tracks, strict=True)):
         begun = time.process_time()
         tune(case.guess, track)
@@ -136,7 +151,8 @@ def peer_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measureme
             seconds[name].append(spent)
             good[name] += float(plain.losses(found[None])[0]) < target + AS_GOOD
     for name in peers:
-        mine, theirs = float(np.mean(ours)), float(np.mean(seconds[name]))
+        mine = float(np.mean(ours))
+        theirs = float(np.mean(seconds[name]))
         title = f"CPU time of a fit, mean ({name}: {good[name]} of {len(cases)} as good)"
         yield Measurement("tune", title, mine, "s", name, theirs, theirs / mine)
 
@@ -157,7 +173,8 @@ def stein_descent(
         iterations: how many.
         rate: [1] length of a step, in those units.
     """
-    x, history = particles.astype(float).copy(), np.zeros_like(particles)
+    x = particles.astype(float).copy()
+    history = np.zeros_like(particles)
     for turn in range(iterations):
         apart = x[:, None] - x[None]
         square = (apart**2).sum(-1)
@@ -183,7 +200,9 @@ class _Sides:
 def _stein(cases: list[Case], tracks: list[Trajectory], from_features: bool) -> _Sides:
     """Posteriors by Stein particles on a chain of few springs; particles begin up to five times off the user's start,
     or near our start values."""
-    error, covered, seconds = [], [], []
+    error = []
+    covered = []
+    seconds = []
     for seed, (case, track) in enumerate(zip(cases, tracks, strict=True)):
         rng = np.random.default_rng(seed)
         plain = PlainProblem(msgspec.structs.replace(case.guess, segments=STEIN_SEGMENTS), track)
@@ -211,7 +230,9 @@ def _stein(cases: list[Case], tracks: list[Trajectory], from_features: bool) -> 
 
 
 def _ours(cases: list[Case], tracks: list[Trajectory]) -> _Sides:
-    error, covered, seconds = [], [], []
+    error = []
+    covered = []
+    seconds = []
     for case, track in zip(cases, tracks, strict=True):
         begun = time.process_time()
         fit = tune(case.guess, track)

@@ -94,7 +94,8 @@ def _pictures(specimen: Specimen, true: Trajectory, pose: np.ndarray, seed: int)
     camera = Camera(spec, spec.info("optical"), seed=seed)
     ball = Shape("sphere", (RADIUS,), frames.pose(np.zeros(3)), (*PAINT, 1.0), surface="cloth")
     marker = (RigidVisual("marker", Organ.ROBOT, 0, (ball,)),)
-    primitives, length = Primitives(model, grass=0.0), specimen.length.value / PIECES
+    primitives = Primitives(model, grass=0.0)
+    length = specimen.length.value / PIECES
     for tick, (time, nodes) in enumerate(zip(true.time, true.position, strict=True)):
         nodes = np.vstack([np.zeros(3), nodes]) + np.array([0.0, 0.0, HEIGHT])
         turns = frames.from_x_axis(np.diff(nodes, axis=0) / length)

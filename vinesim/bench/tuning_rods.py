@@ -57,9 +57,12 @@ def rod_track(case: Case) -> Trajectory:
 def damping_rate(specimen: Specimen) -> float:
     """[1/s] The share of every velocity that must be lost for the first mode's damping ratio to be the specimen's."""
     mode = CaneBuilder(
-        length=specimen.length.value, radius=(0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value),
-        youngs_modulus=specimen.modulus.value, density=specimen.density.value, segments=FINE,
-    ).first_mode()  # fmt: skip
+        length=specimen.length.value,
+        radius=(0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value),
+        youngs_modulus=specimen.modulus.value,
+        density=specimen.density.value,
+        segments=FINE,
+    ).first_mode()
     return specimen.damping.value * mode**2
 
 
@@ -102,16 +105,26 @@ def _swing(specimen: Specimen, nodes: np.ndarray, tangents: np.ndarray, rate: fl
         pass
 
     middles = specimen.length.value / (ELEMENTS - 0.5) * np.arange(ELEMENTS)
-    thick, thin = 0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value
+    thick = 0.5 * specimen.base_diameter.value
+    thin = 0.5 * specimen.tip_diameter.value
     radius = thick + (thin - thick) * middles / specimen.length.value
     side = np.broadcast_to([0.0, 1.0, 0.0], tangents.shape)  # the cane bends in the plane of x and z
     directors = np.stack([side, np.cross(tangents, side), tangents]).transpose(0, 2, 1)
-    modulus, density = specimen.modulus.value, specimen.density.value
+    modulus = specimen.modulus.value
+    density = specimen.density.value
     rod = elastica.CosseratRod.straight_rod(
-        ELEMENTS, nodes[0], np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), specimen.length.value, radius,
-        density, youngs_modulus=modulus, shear_modulus=modulus / SHEAR, position=nodes.T.copy(),
+        ELEMENTS,
+        nodes[0],
+        np.array([1.0, 0.0, 0.0]),
+        np.array([0.0, 1.0, 0.0]),
+        specimen.length.value,
+        radius,
+        density,
+        youngs_modulus=modulus,
+        shear_modulus=modulus / SHEAR,
+        position=nodes.T.copy(),
         directors=directors.copy(),
-    )  # fmt: skip
+    )
     # an element turns against its shear at 2 / r sqrt(G / rho), whatever its length
     every = math.ceil(PICTURE_STEP * 2.0 / radius.min() * math.sqrt(modulus / SHEAR / density) / STEP_PHASE)
     dt = PICTURE_STEP / every
@@ -121,7 +134,9 @@ def _swing(specimen: Specimen, nodes: np.ndarray, tangents: np.ndarray, rate: fl
     world.add_forcing_to(rod).using(elastica.GravityForces, acc_gravity=GRAVITY)
     world.dampen(rod).using(elastica.AnalyticalLinearDamper, uniform_damping_constant=rate, time_step=dt)
     world.finalize()
-    stepper, time, path = elastica.PositionVerlet(), 0.0, [rod.position_collection[:, -1].copy()]
+    stepper = elastica.PositionVerlet()
+    time = 0.0
+    path = [rod.position_collection[:, -1].copy()]
     for _ in range(math.ceil(seconds / PICTURE_STEP)):
         for _ in range(every):
             time = stepper.step(world, time, dt)

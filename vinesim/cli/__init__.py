@@ -31,10 +31,13 @@ from vinesim.cli.commands.tuning import experiment, track, tune
 from vinesim.core import allocator, progress
 
 app = typer.Typer(
-    add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False,
+    add_completion=False,
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
     help="Soft vines and grapes with robots and people: simulated at 100 Hz by every client, no GPU needed.",
     epilog="Start with: vinesim demo",
-)  # fmt: skip
+)
 scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Vineyards: the content of a scene file.")
 ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
 certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certificates for secured links.")

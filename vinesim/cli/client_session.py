@@ -63,7 +63,8 @@ class ClientSession:
         self.spawn = options.spawn
         """Index of the start pose in the scene."""
         if options.pose is not None:
-            self.scene, self.spawn = with_start_pose(self.scene, *options.pose), 0
+            self.scene = with_start_pose(self.scene, *options.pose)
+            self.spawn = 0
         # those of cameras and lidars are compiled while the loop runs already; the sensor processes wait for them
         sensors = SENSOR_PACKAGES if options.role == "robot" else ()
         compile_kernels(PHYSICS_PACKAGES, options.device, then=sensors)
@@ -128,14 +129,13 @@ class ClientSession:
         from vinesim.client.page.page_world import PageWorld
         from vinesim.web.page_server import PageServer
 
-        world, sound = PageWorld(client, person), PageSound(client)
+        world = PageWorld(client, person)
+        sound = PageSound(client)
         if self.options.page_lan:
             from vinesim.client.page.page_access import network_access, print_code
 
             access = network_access()
-            server = self.enter(
-                PageServer(world, port, access.host, tls=access.tls, token=access.token, sound=sound)
-            )  # fmt: skip
+            server = self.enter(PageServer(world, port, access.host, tls=access.tls, token=access.token, sound=sound))
             print_code(server.address)
         else:
             server = self.enter(PageServer(world, port, sound=sound))
@@ -144,9 +144,14 @@ class ClientSession:
         client.faults_elsewhere.append(lambda: {"page_messages_refused": server.refused_messages})
 
     def run(
-        self, client: Client, *, task: Task | None = None, sent: Callable[[], dict[str, int]] = dict,
-        sensors: Callable[[], dict[str, Any]] = dict, publish: Callable[[dict[str, Any]], Any] = lambda _: None,
-    ) -> Status:  # fmt: skip
+        self,
+        client: Client,
+        *,
+        task: Task | None = None,
+        sent: Callable[[], dict[str, int]] = dict,
+        sensors: Callable[[], dict[str, Any]] = dict,
+        publish: Callable[[dict[str, Any]], Any] = lambda _: None,
+    ) -> Status:
         """Step as the world's clock says until a signal, the time limit or the end of the ``task``; returns the final
         status.
 
@@ -188,9 +193,13 @@ def start_trace(client: Client, model: Model, bunch: int) -> Trace:
 
 
 def run_loop(
-    stop: threading.Event, step: Callable[[], None], loop: RateLoop, seconds: float | None, dt: float,
+    stop: threading.Event,
+    step: Callable[[], None],
+    loop: RateLoop,
+    seconds: float | None,
+    dt: float,
     is_done: Callable[[], bool] = lambda: False,
-) -> None:  # fmt: skip
+) -> None:
     """Step at the loop's rate until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until
     done.
     """

@@ -20,7 +20,9 @@ from vinesim.world import Physics
 
 GIVING_HEIGHT = 0.70
 """Height of the hand above the bottom of a box when it lets a bunch go [m]. GUESSED."""
-LIFTED, STILL_SPEED, HOLDS_STILL = 0.08, 0.03, 1.0
+LIFTED = 0.08
+STILL_SPEED = 0.03
+HOLDS_STILL = 1.0
 """A box that is raised by so much [m], and slower than this [m/s] for so long [s], is held out. GUESSED."""
 
 
@@ -38,9 +40,16 @@ def run(options: ClientOptions) -> int:
         if options.is_for_page:
             human = TrackedHuman(start, options.height, gestures=gestures)
         client = Client(
-            session.scene, session.model, None, session.bus(session.name), pose=start, source=human,
-            height=options.height, outfit=options.outfit or "", **session.client_options(),
-        )  # fmt: skip
+            session.scene,
+            session.model,
+            None,
+            session.bus(session.name),
+            pose=start,
+            source=human,
+            height=options.height,
+            outfit=options.outfit or "",
+            **session.client_options(),
+        )
         session.leave_at_end(client)
         if options.walk is not None and isinstance(human, ScriptedHuman):
             human.do(human.walk(options.walk))
@@ -89,7 +98,8 @@ def pick_and_give(
 
     ``indicate`` is told what the person intends.
     """
-    body, middle = int(physics.model.bunch_body[bunch]), 0.5 * float(physics.model.bunch_length[bunch])
+    body = int(physics.model.bunch_body[bunch])
+    middle = 0.5 * float(physics.model.bunch_length[bunch])
 
     def centre() -> np.ndarray:
         physics.update_kinematics()
@@ -106,12 +116,15 @@ def pick_and_give(
     yield from human.back(lambda: False, 0.3)
     yield from human.withdraw("right")  # else it hits the bunches that hang on the way, and tears them off
     indicate("hand over")
-    low, before, still = box_place()[2], box_place(), 0.0
+    low = box_place()[2]
+    before = box_place()
+    still = 0.0
     while still < HOLDS_STILL:
         yield
         here = box_place()
         is_still = np.linalg.norm(here - before) < STILL_SPEED * human.dt and here[2] > low + LIFTED
-        before, still = here, still + human.dt if is_still else 0.0
+        before = here
+        still = still + human.dt if is_still else 0.0
     yield from human.walk(standing_place(box_place(), human.place))
     yield from human.face((float(before[0]), float(before[1])))
     yield from human.reach("right", lambda: box_place() + np.array([0.0, 0.0, GIVING_HEIGHT]))

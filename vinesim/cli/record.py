@@ -21,10 +21,18 @@ POLL = 0.004
 
 
 def run(
-    *, file: pathlib.Path, connect: str, world: str, name: str | None, tls: pathlib.Path | None,
-    scene: str | None, seed: int | None,
-    area: tuple[float, float, float, float] | None, only: str | None, seconds: float | None,
-) -> int:  # fmt: skip
+    *,
+    file: pathlib.Path,
+    connect: str,
+    world: str,
+    name: str | None,
+    tls: pathlib.Path | None,
+    scene: str | None,
+    seed: int | None,
+    area: tuple[float, float, float, float] | None,
+    only: str | None,
+    seconds: float | None,
+) -> int:
     """Record until asked to stop; 0 if the file is complete."""
     families = FAMILIES if only is None else tuple(filter(None, only.split(",")))
     if unknown := [family for family in families if family not in FAMILIES] or ([] if families else [only]):
@@ -40,9 +48,7 @@ def run(
         bus = stack.enter_context(ZenohBus(name, connect=connect, world=world, certificates=tls, live=False))
         path = free_path(file)
         recording = stack.enter_context(RecordingWriter(path, about))
-        recorder = Recorder(
-            bus, recording, only=families, everything=area is not None, digest=about.get("digest", "")
-        )  # fmt: skip
+        recorder = Recorder(bus, recording, only=families, everything=area is not None, digest=about.get("digest", ""))
         other = f" ({file} is there already and stays as it is)" if path != file else ""
         print(f"recording world {world} at {connect} into {path}{other}", file=sys.stderr, flush=True)
         standing: list[Observer] = []

@@ -86,7 +86,8 @@ def run(
     renderer_selection.check_renderer(renderer, device)
     spec = CameraSpec.load(camera)
     info = resized_intrinsics(spec, None if size is None else parse_size(size))
-    plan, staged = with_seed(load_scene(scene), seed), parse_composition(robots, people, crates)
+    plan = with_seed(load_scene(scene), seed)
+    staged = parse_composition(robots, people, crates)
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     compile_kernels(SENSOR_PACKAGES, device)
@@ -185,8 +186,11 @@ class _Stage:
         }
         actors = formats.actor_records(self.composer.actor_records(self.model), seen.labels)
         described: dict[str, Any] = {
-            "scene": self.plan.name, "seed": self.plan.seed, "digest": self.model.digest(), "actors": actors,
-        }  # fmt: skip
+            "scene": self.plan.name,
+            "seed": self.plan.seed,
+            "digest": self.model.digest(),
+            "actors": actors,
+        }
         records = {
             "camera": formats.camera_record(self.spec.model, self.info, pose),
             "truth": {**described, "bunches": formats.bunch_records(truths, self.info)},
@@ -249,7 +253,9 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
     from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance
 
-    placed_robots, placed_people, placed_crates = [], [], []
+    placed_robots = []
+    placed_people = []
+    placed_crates = []
     for text in robots:
         name, mark, where = text.rpartition("@")
         if not (mark and name):

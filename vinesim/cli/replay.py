@@ -32,10 +32,22 @@ POLL = 0.004
 
 
 def run(
-    *, file: pathlib.Path, connect: str | None, listen: str | None, insecure: bool, world: str, speed: float,
-    start: float, end: float | None, out: pathlib.Path | None, page: int | None, ros: bool,
-    pose: tuple[float, float, float] | None, scene: str | None, seed: int | None,
-) -> int:  # fmt: skip
+    *,
+    file: pathlib.Path,
+    connect: str | None,
+    listen: str | None,
+    insecure: bool,
+    world: str,
+    speed: float,
+    start: float,
+    end: float | None,
+    out: pathlib.Path | None,
+    page: int | None,
+    ros: bool,
+    pose: tuple[float, float, float] | None,
+    scene: str | None,
+    seed: int | None,
+) -> int:
     """Play a file; 0 when its end is reached, or on Ctrl-C."""
     if sum(way is not None for way in (connect, listen, out, page)) + ros != 1:
         raise UsageError(
@@ -64,9 +76,15 @@ def run(
 
 
 def _tell(
-    tape: Recording, stop: threading.Event, connect: str | None, listen: str | None, world: str, speed: float,
-    start: float, end: float | None,
-) -> int:  # fmt: skip
+    tape: Recording,
+    stop: threading.Event,
+    connect: str | None,
+    listen: str | None,
+    world: str,
+    speed: float,
+    start: float,
+    end: float | None,
+) -> int:
     """Play to a network."""
     from vinesim.client.recording.replay import Replay
     from vinesim.net.server.server import Server
@@ -95,9 +113,16 @@ def _tell(
 
 
 def _look(
-    tape: Recording, stop: threading.Event, out: pathlib.Path, pose: tuple[float, float, float] | None,
-    scene: str | None, seed: int | None, speed: float, start: float, end: float | None,
-) -> int:  # fmt: skip
+    tape: Recording,
+    stop: threading.Event,
+    out: pathlib.Path,
+    pose: tuple[float, float, float] | None,
+    scene: str | None,
+    seed: int | None,
+    speed: float,
+    start: float,
+    end: float | None,
+) -> int:
     """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
     from vinesim.client.spectator import PictureWriter
 
@@ -113,9 +138,14 @@ def _look(
 
 
 def make_page_replay(
-    tape: Recording, pose: tuple[float, float, float] | None = None, scene: str | None = None, seed: int | None = None,
-    speed: float = 1.0, start: float = 0.0, end: float | None = None,
-) -> PageReplay:  # fmt: skip
+    tape: Recording,
+    pose: tuple[float, float, float] | None = None,
+    scene: str | None = None,
+    seed: int | None = None,
+    speed: float = 1.0,
+    start: float = 0.0,
+    end: float | None = None,
+) -> PageReplay:
     """A recording for pages; arguments as of :func:`run`."""
     from vinesim.client.page.page_replay import PageReplay
 
@@ -128,9 +158,16 @@ def make_page_replay(
 
 
 def _show(
-    tape: Recording, stop: threading.Event, port: int, pose: tuple[float, float, float] | None, scene: str | None,
-    seed: int | None, speed: float, start: float, end: float | None,
-) -> int:  # fmt: skip
+    tape: Recording,
+    stop: threading.Event,
+    port: int,
+    pose: tuple[float, float, float] | None,
+    scene: str | None,
+    seed: int | None,
+    speed: float,
+    start: float,
+    end: float | None,
+) -> int:
     """Play to a spectator in this process and show it in browsers, which pause it and go to other times."""
     from vinesim.web import page_files
 
@@ -141,7 +178,8 @@ def _show(
     replay = make_page_replay(tape, pose, scene, seed, speed, start, end)
     with PageServer(replay.world, port) as server:
         print(f"the recording in a browser: {server.address}", file=sys.stderr, flush=True)
-        loop, was_playing = RateLoop(replay.dt), True
+        loop = RateLoop(replay.dt)
+        was_playing = True
         while not stop.is_set():
             if not was_playing:
                 stop.wait(POLL)
@@ -153,9 +191,14 @@ def _show(
 
 
 def _publish(
-    tape: Recording, stop: threading.Event, scene: str | None, seed: int | None, speed: float, start: float,
+    tape: Recording,
+    stop: threading.Event,
+    scene: str | None,
+    seed: int | None,
+    speed: float,
+    start: float,
     end: float | None,
-) -> int:  # fmt: skip
+) -> int:
     """Play to a spectator in this process in real time, and publish what it has as ROS topics."""
     from vinesim.ros import middleware
 
@@ -181,9 +224,13 @@ def _publish(
 
 
 def _spectator(
-    tape: Recording, pose: tuple[float, float, float] | None, scene: str | None, seed: int | None, start: float,
+    tape: Recording,
+    pose: tuple[float, float, float] | None,
+    scene: str | None,
+    seed: int | None,
+    start: float,
     end: float | None,
-) -> tuple[Spectator, ReplayBus]:  # fmt: skip
+) -> tuple[Spectator, ReplayBus]:
     """A spectator of a recording that stands at a ``pose``, unless given behind the first robot; and its bus."""
     plan, model = _vineyard(tape, scene, seed)
     return _spectator_in(tape, plan, model, _eyes(tape, model, pose), start, end)
@@ -224,7 +271,7 @@ def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None
 
 def _spectator_in(
     tape: Recording, plan: Scene, model: Model, eyes: np.ndarray, start: float, end: float | None
-) -> tuple[Spectator, ReplayBus]:  # fmt: skip
+) -> tuple[Spectator, ReplayBus]:
     """A spectator at a time of a recording, and its bus."""
     from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import Spectator

@@ -31,7 +31,8 @@ def run(options: ClientOptions) -> int:
     descriptions = [load_description(robot) for robot in options.robot or ["vinebot"]]
     with ClientSession(options) as session:
         start = start_pose(session.scene, session.spawn, options.approach)
-        begin, approach = None, options.approach
+        begin = None
+        approach = options.approach
         if options.job is not None:
             begin, start = plan_task(options.job, session.model, start_pose(session.scene, session.spawn))
             approach = 0.0
@@ -55,9 +56,12 @@ def run(options: ClientOptions) -> int:
             client.post_step.append(digest)
         session.show_page(client)
         status = session.run(
-            client, task=task, sent=sensors[0].sent_messages, sensors=lambda: _sensor_status(sensors),
+            client,
+            task=task,
+            sent=sensors[0].sent_messages,
+            sensors=lambda: _sensor_status(sensors),
             publish=lambda values: [one.publish_diagnostics(values) for one in sensors],
-        )  # fmt: skip
+        )
         if options.out is not None:
             for process in sensors:
                 process.sensors.complete_counts()
@@ -79,17 +83,27 @@ def _start_sensors(
     session: ClientSession, names: list[str], descriptions: list[RobotDescription]
 ) -> list[RobotProcesses]:
     """Processes for each robot; of several robots each publishes under its own namespace."""
-    options, processes = session.options, []
+    options = session.options
+    processes = []
     for i, (name, description) in enumerate(zip(names, descriptions, strict=True)):
         parts = (options.namespace,) if len(names) == 1 else (options.namespace, ros_name(name))
         process = RobotProcesses(
-            name, session.scene, session.model, description, namespace="/".join(filter(None, parts)), ros=options.ros,
-            keep_pictures=options.out is not None and i == 0, sensor_hz=options.sensor_hz,
-            params_file=options.params_file, clock=i == 0, renderer=options.renderer, device=options.device,
+            name,
+            session.scene,
+            session.model,
+            description,
+            namespace="/".join(filter(None, parts)),
+            ros=options.ros,
+            keep_pictures=options.out is not None and i == 0,
+            sensor_hz=options.sensor_hz,
+            params_file=options.params_file,
+            clock=i == 0,
+            renderer=options.renderer,
+            device=options.device,
             pacing=_pacing(options, description),
             standby=options.standby,
             interest_radius=None if options.connect is None else options.interest_radius,
-        )  # fmt: skip
+        )
         processes.append(session.enter(process))
     return processes
 
@@ -124,10 +138,12 @@ def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
         for key in ("frames_dropped", "messages_dropped", "sound_lost", "sensor_restarts", "ros_restarts")
     }
     return {
-        "sensors_ready": not awaited, "sensors_awaited": awaited, **counts,
+        "sensors_ready": not awaited,
+        "sensors_awaited": awaited,
+        **counts,
         "sensor_restart_s": max(status["sensor_restart_s"] for status in statuses),
         "processes": {what: pid for status in statuses for what, pid in status["processes"].items()},
-    }  # fmt: skip
+    }
 
 
 def _build_client(
@@ -135,9 +151,13 @@ def _build_client(
 ) -> Client:
     """A client that simulates all robots, the first at ``start`` [7], the others at the next start poses."""
     client = Client(
-        session.scene, session.model, descriptions[0], session.bus(names[0]), pose=start,
+        session.scene,
+        session.model,
+        descriptions[0],
+        session.bus(names[0]),
+        pose=start,
         **session.client_options(names[0]),
-    )  # fmt: skip
+    )
     for i in range(1, len(names)):
         pose = start_pose(session.scene, session.spawn, approach, i)
         client.add_robot(descriptions[i], names[i], pose, session.bus(names[i]))

@@ -50,7 +50,8 @@ def record(path: pathlib.Path, topics: list[str], seconds: float | None) -> int:
         return 3
     from vinesim.ros.tools.bag_recorder import BagRecorder
 
-    stop, path = stop_at_signals(threading.Event()), free_path(path)
+    stop = stop_at_signals(threading.Event())
+    path = free_path(path)
     began = told = time.monotonic()
     with BagRecorder(path, topics) as recorder:
         print(f"recording into {path}; Ctrl-C ends it", flush=True)

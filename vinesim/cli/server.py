@@ -21,10 +21,20 @@ STATUS_PERIOD = 1.0
 
 
 def run(
-    *, listen: list[str] | None, connect: list[str] | None, state_dir: pathlib.Path | None, scene: str | None,
-    seed: int | None, max_clients: int | None, quota: tuple[float, float], tls: pathlib.Path | None, insecure: bool,
-    status: str, spectators_speak_to: str = "people", real_time_factor: float | None = None,
-) -> int:  # fmt: skip
+    *,
+    listen: list[str] | None,
+    connect: list[str] | None,
+    state_dir: pathlib.Path | None,
+    scene: str | None,
+    seed: int | None,
+    max_clients: int | None,
+    quota: tuple[float, float],
+    tls: pathlib.Path | None,
+    insecure: bool,
+    status: str,
+    spectators_speak_to: str = "people",
+    real_time_factor: float | None = None,
+) -> int:
     """Carry messages until SIGINT or SIGTERM."""
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
@@ -39,10 +49,16 @@ def run(
     plan = None if scene is None else _plan(scene, seed)
     stop = stop_at_signals(threading.Event())
     with Server(
-        places, connect=connect or (), state_folder=state_dir, scene=plan,
-        max_actors=max_clients, quota=Quota(*quota), certificates=tls,
-        spectators_speak_to=SpectatorsSpeakTo(spectators_speak_to), real_time_factor=real_time_factor,
-    ) as server:  # fmt: skip
+        places,
+        connect=connect or (),
+        state_folder=state_dir,
+        scene=plan,
+        max_actors=max_clients,
+        quota=Quota(*quota),
+        certificates=tls,
+        spectators_speak_to=SpectatorsSpeakTo(spectators_speak_to),
+        real_time_factor=real_time_factor,
+    ) as server:
         if status != "json":
             print(f"listening on {', '.join(map(str, server.endpoints))}", flush=True)
         try:

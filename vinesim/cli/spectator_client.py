@@ -22,9 +22,13 @@ def run(options: ClientOptions) -> int:
             with writing(options.out):
                 options.out.mkdir(parents=True, exist_ok=True)
         spectator = Spectator(
-            session.scene, session.model, None, session.bus(session.name), pose=standing_view(*pose),
+            session.scene,
+            session.model,
+            None,
+            session.bus(session.name),
+            pose=standing_view(*pose),
             **session.client_options(),
-        )  # fmt: skip
+        )
         pictures = None
         if options.out is not None:
             pictures = PictureWriter(

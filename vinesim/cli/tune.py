@@ -32,16 +32,26 @@ def require_scipy() -> None:
 
 
 def run(
-    data: pathlib.Path, model: pathlib.Path, fit: str, out: pathlib.Path | None, as_json: bool,
-    plot: pathlib.Path | None, release: float | None, push: bool, samples: int, seed: int, device: str,
+    data: pathlib.Path,
+    model: pathlib.Path,
+    fit: str,
+    out: pathlib.Path | None,
+    as_json: bool,
+    plot: pathlib.Path | None,
+    release: float | None,
+    push: bool,
+    samples: int,
+    seed: int,
+    device: str,
     cloud: pathlib.Path | None = None,
-) -> int:  # fmt: skip
+) -> int:
     """Fit and print; the exit code: 0, or 5 if something speaks against the fit."""
     require_scipy()
     from vinesim.tune import load_specimen, read_trajectory, tune, with_cloud
 
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
-    specimen, track = load_specimen(model), read_trajectory(data)
+    specimen = load_specimen(model)
+    track = read_trajectory(data)
     if cloud is not None:
         specimen = with_cloud(specimen, cloud)
     found = tune(specimen, track, parameters, release=release, samples=samples, seed=seed, device=device, pushed=push)
@@ -60,9 +70,15 @@ def run(
 
 
 def track(
-    recording: pathlib.Path, markers: list[str], radius: float, out: pathlib.Path, image: str | None,
-    depth: str | None, pose: tuple[float, ...] | None, rate: float | None,
-) -> int:  # fmt: skip
+    recording: pathlib.Path,
+    markers: list[str],
+    radius: float,
+    out: pathlib.Path,
+    image: str | None,
+    depth: str | None,
+    pose: tuple[float, ...] | None,
+    rate: float | None,
+) -> int:
     """Write the track of markers in recorded pictures and say how many were found; the exit code."""
     require_scipy()
     import numpy as np
@@ -89,7 +105,8 @@ def track(
     print(f"track    {out}: {len(found.time)} pictures in {found.time[-1]:.2f} s")
     for name, places in zip(found.markers, found.position.swapaxes(0, 1), strict=True):
         seen = np.isfinite(places).all(1)
-        low, high = 1e3 * np.nanmin(places, 0), 1e3 * np.nanmax(places, 0)
+        low = 1e3 * np.nanmin(places, 0)
+        high = 1e3 * np.nanmax(places, 0)
         spans = ", ".join(f"{axis} {b - a:.0f} mm" for axis, a, b in zip("xyz", low, high, strict=True))
         print(f"{name:8s} found in {seen.sum()}, the others are gaps; moved over {spans}")
     return 0

@@ -103,7 +103,9 @@ class Client:
         than this to an object receive its motion. ``jitter_buffer`` [s]: delay of remote actors. ``executor`` compiles
         actors that join; without one that is done in the loop.
         """
-        self.name, self.model, self.scene = name, model, scene
+        self.name = name
+        self.model = model
+        self.scene = scene
         self._new_physics = functools.partial(
             Physics, model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking
         )
@@ -121,8 +123,11 @@ class Client:
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
         self.couplings = PlantCouplings(self.physics)
-        self._description, self._executor, self._outfit = description, executor, outfit
-        self._interest_radius, self._jitter_buffer = interest_radius, jitter_buffer
+        self._description = description
+        self._executor = executor
+        self._outfit = outfit
+        self._interest_radius = interest_radius
+        self._jitter_buffer = jitter_buffer
         self._add_own_actor(description, pose, source, height, bus)
         self.replicator = self.replicators[name]
         self.meshes.bus = bus
@@ -179,7 +184,8 @@ class Client:
         starts = {name: before.rigid.robot(name).spec.pose for name in self.robots}
         people = {name: (before.rigid.human(name).spec, human.source) for name, human in self.humans.items()}
         self.physics = self._new_physics()
-        self.physics.wind, self.physics.tick = wind_of(self.scene), before.tick
+        self.physics.wind = wind_of(self.scene)
+        self.physics.tick = before.tick
         self.physics.rigid.mj_data.time = before.time
         self.earlier_faults.update(before.faults | {"couplings_refused": self.couplings.refused})
         self.objects, self.couplings = ObjectSync(self.physics, self.replicators), PlantCouplings(self.physics)
@@ -197,12 +203,17 @@ class Client:
         release_free_memory()
 
     def _add_own_actor(
-        self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
-        height: float, bus: Bus,
-    ) -> None:  # fmt: skip
+        self,
+        description: RobotDescription | None,
+        pose: np.ndarray,
+        source: Callable[[float], HumanPose] | None,
+        height: float,
+        bus: Bus,
+    ) -> None:
         """Add the actor that gives this client its name."""
         if description is None:
-            standing, index = standing_pose(pose, height), label_index(self.name)
+            standing = standing_pose(pose, height)
+            index = label_index(self.name)
             self.add_human(HumanSpec(self.name, index, standing, height, outfit=self._outfit), source, bus)
         else:
             self.robot = self.add_robot(description, self.name, pose, bus)
@@ -210,11 +221,17 @@ class Client:
     def add_robot(self, description: RobotDescription, name: str, pose: np.ndarray, bus: Bus) -> Robot:
         """Add a local robot at ``pose`` [7] m, 1; ``bus`` must have its ``name``."""
         hello = Hello(
-            name=name, kind="robot", robot=description.name, urdf=description.urdf,
-            sidecar=encode_sidecar(description.base_limits, description.groups), scene=self.scene.name,
-            digest=self.model.digest(), index=label_index(name), joints=len(description.joints),
+            name=name,
+            kind="robot",
+            robot=description.name,
+            urdf=description.urdf,
+            sidecar=encode_sidecar(description.base_limits, description.groups),
+            scene=self.scene.name,
+            digest=self.model.digest(),
+            index=label_index(name),
+            joints=len(description.joints),
             seed=self.scene.seed,
-        )  # fmt: skip
+        )
         replicator = self._new_replicator(bus, hello)
         robot = self._add_robot_body(description, name, pose)
         self.meshes.offer(bus, description.urdf)
@@ -229,9 +246,15 @@ class Client:
     def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> LocalHuman:
         """Add a local human with the poses of ``source(time)`` (None: still); ``bus`` must have its name."""
         hello = Hello(
-            name=spec.name, kind="human", scene=self.scene.name, digest=self.model.digest(), index=spec.index,
-            height=spec.height, seed=self.scene.seed, outfit=spec.outfit,
-        )  # fmt: skip
+            name=spec.name,
+            kind="human",
+            scene=self.scene.name,
+            digest=self.model.digest(),
+            index=spec.index,
+            height=spec.height,
+            seed=self.scene.seed,
+            outfit=spec.outfit,
+        )
         replicator = self._new_replicator(bus, hello)
         self.humans[spec.name] = human = LocalHuman(self.physics, spec, source or (lambda _: spec.pose))
         self._add_replicator(spec.name, replicator)
@@ -245,9 +268,13 @@ class Client:
 
     def _new_replicator(self, bus: Bus, hello: Hello) -> Replicator:
         return Replicator(
-            bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer,
+            bus,
+            hello,
+            self.model,
+            interest_radius=self._interest_radius,
+            jitter_buffer=self._jitter_buffer,
             hand_force=self.physics.parameters.hand_force,
-        )  # fmt: skip
+        )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
         """Stamp, send and show all of a step for the world's time of that step, ``step_time()`` [s]; None: for the
@@ -330,9 +357,12 @@ class Client:
         for renewed in self.spawner.renewed():
             self.remote_actors[renewed.name] = renewed
         self.tree_copies.apply(
-            inbox.trees, self.replicator.received_at, is_owned_remotely=self._is_owned_remotely,
-            local_actors=self.replicators.keys(), coupled_trees=self.couplings.trees,
-        )  # fmt: skip
+            inbox.trees,
+            self.replicator.received_at,
+            is_owned_remotely=self._is_owned_remotely,
+            local_actors=self.replicators.keys(),
+            coupled_trees=self.couplings.trees,
+        )
         self.objects.receive(inbox)
 
     def control(self) -> None:
@@ -362,24 +392,32 @@ class Client:
         """Publish poses of local actors, and to actors nearby the states of what they touch."""
         objects = self.objects
         objects.collect()
-        moving, touching = objects.moving, False
+        moving = objects.moving
+        touching = False
         for name, actor in (*self.robots.items(), *self.humans.items()):
-            replicator, pose = self.replicators[name], actor.update(now)
+            replicator = self.replicators[name]
+            pose = actor.update(now)
             mine = replicator.owned
             detached = objects.detached_by(name, all_others=name == self.name)
             touched = objects.touched_by(name, mine)
             touching |= bool(touched)
             carried_on = objects.carried_on(name)
             settled = replicator.send(
-                now, pose, touched=touched, moving=moving, read=objects.read_state,
-                grabbed=objects.with_trees(detached), detached=detached, detached_roots=objects.cut_roots,
+                now,
+                pose,
+                touched=touched,
+                moving=moving,
+                read=objects.read_state,
+                grabbed=objects.with_trees(detached),
+                detached=detached,
+                detached_roots=objects.cut_roots,
                 is_changed=objects.is_changed,
                 pose_on_support=self.physics.support_tracker.pose_on_support,
                 has_body=self.physics.support_tracker.__contains__,
                 couplings=self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees),
                 wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
                 carried_on=carried_on,
-            )  # fmt: skip
+            )
             for update in settled:
                 # the last message is what all copies hold: hold the same, quantised state
                 objects.blend_tree(update, 1.0)
@@ -395,9 +433,13 @@ class Client:
             supported = self.objects.supported_by(name)
             if supported:
                 self.replicators[name].send(
-                    now, robot.update(now), read=self.objects.read_state, grabbed=supported, detached=supported,
+                    now,
+                    robot.update(now),
+                    read=self.objects.read_state,
+                    grabbed=supported,
+                    detached=supported,
                     pose_on_support=self.physics.support_tracker.pose_on_support,
-                )  # fmt: skip
+                )
 
     def side_of(self, point: np.ndarray) -> str:
         """The arm, "left" or "right", on the side of a point [3] m in the world."""

@@ -37,16 +37,18 @@ def count_faults(client: Client, steps_skipped: int = 0) -> dict[str, int]:
     counters = [replicator.counters for replicator in client.replicators.values()]
     physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
     counts = client.earlier_faults + collections.Counter(physics)
-    counts.update({
-        "messages_refused": sum(one.malformed for one in counters),
-        "messages_lost": sum(one.lost for one in counters),
-        "messages_foreign": sum(one.foreign for one in counters),
-        "network_failures": sum(one.network_failures for one in counters),
-        "wrenches_refused": sum(one.wrenches_refused for one in counters),
-        "meshes_refused": client.meshes.refused_count,
-        "meshes_not_taken": client.meshes.refused_offers,
-        "steps_skipped": steps_skipped,
-    })  # fmt: skip
+    counts.update(
+        {
+            "messages_refused": sum(one.malformed for one in counters),
+            "messages_lost": sum(one.lost for one in counters),
+            "messages_foreign": sum(one.foreign for one in counters),
+            "network_failures": sum(one.network_failures for one in counters),
+            "wrenches_refused": sum(one.wrenches_refused for one in counters),
+            "meshes_refused": client.meshes.refused_count,
+            "meshes_not_taken": client.meshes.refused_offers,
+            "steps_skipped": steps_skipped,
+        }
+    )
     for others in client.faults_elsewhere:
         counts.update(others())
     return {name: count for name, count in counts.items() if count}

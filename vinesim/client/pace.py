@@ -66,8 +66,10 @@ class OwnPace:
     """The clock of a client without a server: it passes as fast as this client can follow."""
 
     def __init__(self, name: str, now: float, report: Callable[[], PaceReport]) -> None:
-        self._name, self._report = name, report
-        self._clock, self._next_report = WorldClock(now), now
+        self._name = name
+        self._report = report
+        self._clock = WorldClock(now)
+        self._next_report = now
 
     @property
     def factor(self) -> float:
@@ -125,7 +127,8 @@ class _Span:
     """What a loop did in a span of real time."""
 
     def __init__(self, begun: float) -> None:
-        self.begun, self.ended = begun, begun
+        self.begun = begun
+        self.ended = begun
         self.steps = 0
         self.idle = 0.0
         """Time for which nothing was due [s]."""

@@ -42,15 +42,20 @@ class TickLog:
         :class:`ValueError` if there are fewer than two.
         """
         part = slice(*np.searchsorted(self.begins, (since, until)))
-        begins, work, periods = self.begins[part], self.work[part], self.periods[part]
+        begins = self.begins[part]
+        work = self.work[part]
+        periods = self.periods[part]
         if len(begins) < 2:
             raise ValueError(f"{len(begins)} steps began between {since:.3f} and {until:.3f} s")
         hz = float((len(begins) - 1) / (begins[-1] - begins[0]))
         p50, p99 = (1e3 * float(value) for value in np.percentile(work, (50, 99)))
         return {
-            "tick_hz": hz, "tick_p50_ms": p50, "tick_p99_ms": p99, "overruns": int((work > periods).sum()),
+            "tick_hz": hz,
+            "tick_p50_ms": p50,
+            "tick_p99_ms": p99,
+            "overruns": int((work > periods).sum()),
             "real_time_factor": hz * self.dt,
-        }  # fmt: skip
+        }
 
     def save(self, path: pathlib.Path) -> None:
         """Write it as a NumPy archive."""
@@ -95,7 +100,9 @@ class RateLoop:
         self, dt: float, clock: StepClock | None = None, *, max_lag: float = MAX_LAG, capacity: int = 1 << 16
     ) -> None:
         """``clock``: real time unless given. ``capacity``: steps whose times are kept."""
-        self.dt, self.clock, self.max_lag = dt, clock or RealTime(), max_lag
+        self.dt = dt
+        self.clock = clock or RealTime()
+        self.max_lag = max_lag
         self.next_time = 0.0
         """Time of the clock at which the next step is due [s]; from :meth:`begin` to :meth:`end`, the present step."""
         self.hold: Callable[[], str] = lambda: ""
@@ -139,13 +146,15 @@ class RateLoop:
         while (wait := self._time_to_wait(now)) > self.SHORTEST_SLEEP and not self.is_stopping():
             sleep = min(wait, self.LONGEST_SLEEP)
             time.sleep(sleep)
-            since, now = now, time.monotonic()
+            since = now
+            now = time.monotonic()
             self.meter.idle(now - since)
             if wait > sleep:
                 self.clock.keep(now)
         while (cause := self.hold()) and not self.is_stopping():
             time.sleep(self.HOLD_POLL)
-            since, now = now, time.monotonic()
+            since = now
+            now = time.monotonic()
             self.meter.hold(cause, now - since)
             self.clock.keep(now)
         now = self._wait_for_clock(now)
@@ -180,7 +189,8 @@ class RateLoop:
             and not self.is_stopping()
         ):
             time.sleep(self.HOLD_POLL)
-            since, now = now, time.monotonic()
+            since = now
+            now = time.monotonic()
             self.meter.idle(now - since)
             self.clock.keep(now)
         return now
@@ -195,8 +205,11 @@ class RateLoop:
     def end(self) -> None:
         """End the measurement of this step's work."""
         now = time.monotonic()
-        work, row = now - self._began, self.ticks % len(self._work)
-        self._work[row], self._begins[row], self._periods[row] = work, self._began, self.period
+        work = now - self._began
+        row = self.ticks % len(self._work)
+        self._work[row] = work
+        self._begins[row] = self._began
+        self._periods[row] = self.period
         self.overruns += work > self.period
         self.ticks += 1
         is_ahead = self.next_time - self.clock.time(now) > self.FREE_LEAD

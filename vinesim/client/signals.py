@@ -37,7 +37,8 @@ class IntentionLog:
         """
         has_changed = False
         for name in self._known.keys() | present.keys():
-            known, what = self._known.get(name), present.get(name, "")
+            known = self._known.get(name)
+            what = present.get(name, "")
             if (known.what if known is not None and known.end is None else "") == what:
                 continue
             if what:
@@ -62,7 +63,8 @@ class GestureLog:
         fingers = [(name, people[name].left_fingers, people[name].right_fingers) for name in sorted(people)]
         if fingers == self._fingers:
             return False
-        self._fingers, before = fingers, self.gestures
+        self._fingers = fingers
+        before = self.gestures
         name_of = self._known.name_of
         self.gestures = tuple(HandGestures(name, name_of(left), name_of(right)) for name, left, right in fingers)
         return self.gestures != before

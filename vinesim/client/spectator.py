@@ -52,14 +52,23 @@ class Spectator(Client):
     slows_the_world = False
 
     def _add_own_actor(
-        self, description: RobotDescription | None, pose: np.ndarray, source: Callable[[float], HumanPose] | None,
-        height: float, bus: Bus,
-    ) -> None:  # fmt: skip
+        self,
+        description: RobotDescription | None,
+        pose: np.ndarray,
+        source: Callable[[float], HumanPose] | None,
+        height: float,
+        bus: Bus,
+    ) -> None:
         self.pose = np.asarray(pose, float)
         hello = Hello(
-            name=self.name, kind=SPECTATOR, scene=self.scene.name, digest=self.model.digest(),
-            index=label_index(self.name), joints=0, seed=self.scene.seed,
-        )  # fmt: skip
+            name=self.name,
+            kind=SPECTATOR,
+            scene=self.scene.name,
+            digest=self.model.digest(),
+            index=label_index(self.name),
+            joints=0,
+            seed=self.scene.seed,
+        )
         self.replicators[self.name] = Replicator(
             bus, hello, self.model, interest_radius=self._interest_radius, jitter_buffer=self._jitter_buffer
         )
@@ -83,13 +92,19 @@ class PictureWriter:
     time; a spectator has no robot that would suffer from late steps.
     """
 
-    WIDTH, HEIGHT, ANGLE = 960, 640, 1.2
+    WIDTH = 960
+    HEIGHT = 640
+    ANGLE = 1.2
     """Size [px] and horizontal field of view [rad]."""
 
     def __init__(
-        self, spectator: Spectator, folder: pathlib.Path, period: float = 1.0, renderer: str = "warp",
+        self,
+        spectator: Spectator,
+        folder: pathlib.Path,
+        period: float = 1.0,
+        renderer: str = "warp",
         device: str = "cpu",
-    ) -> None:  # fmt: skip
+    ) -> None:
         """One picture every ``period`` [s] of simulated time, into a ``folder`` that exists."""
         if device == "cpu":
             load_kernels()
@@ -98,7 +113,8 @@ class PictureWriter:
             self.WIDTH, self.HEIGHT, focal, focal, 0.5 * (self.WIDTH - 1), 0.5 * (self.HEIGHT - 1), "viewpoint"
         )
         sun = spectator.scene.sun.direction
-        self.folder, self.count = folder, 0
+        self.folder = folder
+        self.count = 0
         self.last: CameraFrame | None = None
         self._camera = Camera(
             CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0, device=device

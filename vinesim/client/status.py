@@ -14,9 +14,16 @@ from vinesim.client.recording.bunch_trace import touch_to_motion
 from vinesim.robot.tasks.task import Task
 
 _WITHOUT_SENSORS = {
-    "sensors_ready": True, "sensors_awaited": [], "frames_dropped": 0, "messages_dropped": 0, "sound_lost": 0,
-    "sensor_restarts": 0, "ros_restarts": 0, "sensor_restart_s": 0.0, "processes": {},
-}  # fmt: skip
+    "sensors_ready": True,
+    "sensors_awaited": [],
+    "frames_dropped": 0,
+    "messages_dropped": 0,
+    "sound_lost": 0,
+    "sensor_restarts": 0,
+    "ros_restarts": 0,
+    "sensor_restart_s": 0.0,
+    "processes": {},
+}
 """Status of sensors of a client that has none."""
 
 
@@ -33,7 +40,9 @@ class Status:
     ) -> None:
         """``sent`` gives the number of ROS messages sent so far by topic; ``task``: what the robot does, if
         anything; ``sensors`` gives the status of sensors."""
-        self.client, self.rate_loop, self._task = client, rate_loop, task
+        self.client = client
+        self.rate_loop = rate_loop
+        self._task = task
         self._sensors = sensors
         self._fault_log = FaultLog()
         self._sent: Callable[[], dict[str, int]] = sent or dict
@@ -46,8 +55,10 @@ class Status:
 
         Recent faults are the kinds that occurred within the last minute.
         """
-        client, loop = self.client, self.rate_loop
-        sent, time = dict(self._sent()), loop.elapsed
+        client = self.client
+        loop = self.rate_loop
+        sent = dict(self._sent())
+        time = loop.elapsed
         span = max(time - self._before_time, 1e-9)
         rates = {topic: (count - self._before.get(topic, 0)) / span for topic, count in sent.items() if count}
         recent_factor = (loop.ticks - self._before_ticks) * loop.dt / span

@@ -42,7 +42,8 @@ class WorldTime:
     def follow(self, simulated: float, clock: float) -> None:
         """Follow the server's ``clock`` [s] at the step that starts at ``simulated`` time [s]; call it every step."""
         away = clock - simulated - self.offset
-        passed, self._clock = clock - self._clock, clock
+        passed = clock - self._clock
+        self._clock = clock
         if not self.is_shared:
             self.is_shared = True
             self.offset += away

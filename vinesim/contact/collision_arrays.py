@@ -28,8 +28,10 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     """The numbers of the contact model as a Warp struct."""
     made = structs.Parameters()
     made.dt = p.dt
-    made.margin, made.static_margin = p.contact_margin, p.static_contact_margin
-    made.max_separation_speed, made.impact_speed = p.max_separation_speed, p.impact_speed
+    made.margin = p.contact_margin
+    made.static_margin = p.static_contact_margin
+    made.max_separation_speed = p.max_separation_speed
+    made.impact_speed = p.impact_speed
     made.wire_damping_time = WIRE_DAMPING_TIME
     return made
 
@@ -51,7 +53,8 @@ class PlantArrays:
     """Bodies, trees and capsules of all plants."""
 
     def __init__(self, model: Model, plants: ArticulationSolver, capsules: PlantCapsules) -> None:
-        state, count = plants.state, len(model.tree_first)
+        state = plants.state
+        count = len(model.tree_first)
         self.trees = SharedArrays(
             structs.Trees,
             awake=np.zeros(count, np.int32),
@@ -105,9 +108,11 @@ def _tied_geoms(model: Model) -> tuple[np.ndarray, np.ndarray]:
     Also returns the body [body, k] whose joint connects it with that parent or child, -1 where it is tied itself.
     """
     bound = model.tie_wire >= 0
-    body, geom = model.tie_body[bound], model.tie_wire[bound] + FIRST_FIXED_GEOM
+    body = model.tie_body[bound]
+    geom = model.tie_wire[bound] + FIRST_FIXED_GEOM
     parent = model.body_parent
-    first, end = np.searchsorted(body, parent), np.searchsorted(body, parent, side="right")
+    first = np.searchsorted(body, parent)
+    end = np.searchsorted(body, parent, side="right")
     count = np.where(parent >= 0, end - first, 0)
     of_parent = spans(first, count)
     above = parent[body] >= 0
@@ -140,9 +145,11 @@ class RigidArrays:
         previous: RigidArrays | None,
     ) -> None:
         """``previous``: where the velocities of the last step are taken from, by the names of degrees of freedom."""
-        self.world, data = rigid.mj_model, rigid.mj_data
+        self.world = rigid.mj_model
+        data = rigid.mj_data
         world = self.world
-        self.capacity, self.static = world.ngeom, len(rigid.static_geoms.id)
+        self.capacity = world.ngeom
+        self.static = len(rigid.static_geoms.id)
         self.geoms = SharedArrays.zeros(structs.Geoms, self.capacity, count=np.zeros(2, np.int32))
         self.geom_states = SharedArrays.zeros(structs.GeomStates, self.capacity)
         self.bunch_of_geom = np.full(self.capacity, -1, np.int32)
@@ -158,11 +165,14 @@ class RigidArrays:
         """[fixed piece] the geom of a wire that gives, -1 for others."""
         self._list(rigid, remote_actors)
         self.dof_names = rigid.dof_names
-        velocity, correction, before = rigid.velocity_free, np.zeros(world.nv), np.zeros(world.nv)
+        velocity = rigid.velocity_free
+        correction = np.zeros(world.nv)
+        before = np.zeros(world.nv)
         if previous is not None:
             at = {name: i for i, name in enumerate(previous.dof_names)}
             same = np.array([at.get(name, -1) for name in self.dof_names], int)
-            new, old = same >= 0, same[same >= 0]
+            new = same >= 0
+            old = same[same >= 0]
             velocity[new] = previous.bodies.velocity_free[old]
             correction[new] = previous.bodies.correction[old]
             before[new] = previous.bodies.correction_before[old]
@@ -232,7 +242,8 @@ class RigidArrays:
         self.__dict__.pop("names", None)
         number = np.full(self.capacity, -1)
         number[self.geoms.id[: self.count]] = np.arange(self.count)
-        before, self.dof_names = self.dof_names, rigid.dof_names
+        before = self.dof_names
+        self.dof_names = rigid.dof_names
         if before != self.dof_names:
             other = [i for i, (old, new) in enumerate(zip(before, self.dof_names, strict=True)) if old != new]
             self.bodies.velocity_free[other] = rigid.velocity_free[other]

@@ -40,7 +40,10 @@ class ContactSolver:
         self, model: Model, plants: ArticulationSolver, rigid: RigidWorld, wires: DeflectedWires | None = None
     ) -> None:
         """``wires``: those that give to what presses on them; without, none does."""
-        self.model, self.plants, self.rigid, self.parameters = model, plants, rigid, rigid.parameters
+        self.model = model
+        self.plants = plants
+        self.rigid = rigid
+        self.parameters = rigid.parameters
         self.capsules = plant_capsules(model)
         self.plant_plant_contacts = True
         """Whether bunches and branches of awake trees touch each other too."""
@@ -69,7 +72,8 @@ class ContactSolver:
         self._rigid_arrays: RigidArrays | None = None
         self.detection = ContactDetection(plants, self._arrays, self.parameters, numbers)
         self.impulses = ImpulseSolver(plants, rigid, self._arrays, self.parameters, numbers, wires)
-        self._wires, self._deflected = wires, np.zeros(0, int)
+        self._wires = wires
+        self._deflected = np.zeros(0, int)
         self._update_rigid_world()
         self.update_tree_bounds(np.arange(len(model.tree_first), dtype=np.int32))
 
@@ -92,7 +96,9 @@ class ContactSolver:
 
     def solve(self) -> None:
         """Find the contacts of all awake trees, and of those that these wake, and their forces."""
-        self.count, self._reported, self._touched = 0, (), ()
+        self.count = 0
+        self._reported = ()
+        self._touched = ()
         self._awake = self.plants.awake
         if len(self._awake):
             self._awake = awake = self._wake_reached_trees()
@@ -108,7 +114,9 @@ class ContactSolver:
 
         Returns all awake trees [k].
         """
-        plants, detection, candidates = self.plants, self.detection, self.detection.candidates
+        plants = self.plants
+        detection = self.detection
+        candidates = self.detection.candidates
         while len(reached := detection.find_reached_trees(plants.awake, self.plant_plant_contacts)):
             plants.wake(reached)
             plants.predict(reached)
@@ -118,10 +126,13 @@ class ContactSolver:
 
     def _find_contacts(self, awake: np.ndarray) -> None:
         """List the contacts of the awake trees; of too many, the deepest."""
-        detection, impulses, capacity = self.detection, self.impulses, self.impulses.capacity
+        detection = self.detection
+        impulses = self.impulses
+        capacity = self.impulses.capacity
         impulses.find_contacts()
         counters = detection.counters.tolist()
-        count, overflow = counters[structs.CONTACTS], counters[structs.OVERFLOW]
+        count = counters[structs.CONTACTS]
+        overflow = counters[structs.OVERFLOW]
         self.skipped_geoms += counters[structs.SKIPPED_GEOMS]
         if count > capacity:
             overflow += count - capacity
@@ -186,16 +197,21 @@ class ContactSolver:
         ``body/42``).
         """
         if self._reported is None:
-            n, contacts = self.count, self.impulses.contacts
-            force, pressure = contacts.force[:n], self.impulses.rows.impulse[0 : 3 * n : 3]
+            n = self.count
+            contacts = self.impulses.contacts
+            force = contacts.force[:n]
+            pressure = self.impulses.rows.impulse[0 : 3 * n : 3]
             self._reported = tuple(
                 Contact(
-                    *self._actor_and_link(other), int(contacts.body[c]), contacts.point[c].copy(), -force[c],
+                    *self._actor_and_link(other),
+                    int(contacts.body[c]),
+                    contacts.point[c].copy(),
+                    -force[c],
                     float(contacts.gap[c]),
                 )
                 for c, other in enumerate(contacts.other[:n].tolist())
                 if pressure[c] > 0.0
-            )  # fmt: skip
+            )
         return self._reported
 
     @property
@@ -224,7 +240,8 @@ class ContactSolver:
     def nearest_body(self, points: np.ndarray, max_distance: float) -> tuple[float, int] | None:
         """See :func:`vinesim.contact.plant_capsules.nearest_body`; searches all trees near ``points`` [k, 3]
         m."""
-        low, high = points.min(0) - max_distance, points.max(0) + max_distance
+        low = points.min(0) - max_distance
+        high = points.max(0) + max_distance
         boxes = self.detection.tree_boxes
         trees = np.flatnonzero(((boxes.low <= high) & (low <= boxes.high)).all(1))
         if len(trees) == 0:

@@ -52,12 +52,15 @@ class ContactDetection:
         parameters: PhysicsParameters,
         kernel_parameters: structs.Parameters,
     ) -> None:
-        self.plants, self.arrays, self.parameters = plants, arrays, parameters
+        self.plants = plants
+        self.arrays = arrays
+        self.parameters = parameters
         self._kernel_parameters = kernel_parameters
         trees = len(arrays.trees.is_fine)
         self._order = np.arange(trees, dtype=np.int32)
         self._sorted_rows = np.zeros((2, trees), np.int32)
-        self._is_near, self._is_reached = np.zeros(trees, np.bool_), np.zeros(trees, np.bool_)
+        self._is_near = np.zeros(trees, np.bool_)
+        self._is_reached = np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
         self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
         self.counters = np.zeros(structs.COUNTERS, np.int32)
@@ -65,19 +68,22 @@ class ContactDetection:
         self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
         self._wood_boxes = SharedArrays.zeros(structs.Aabbs, trees)
         blocks = -(-trees // AABB_BLOCK)
-        self._blocks, self._block_boxes = np.zeros(blocks, np.int32), SharedArrays.zeros(structs.Aabbs, blocks)
+        self._blocks = np.zeros(blocks, np.int32)
+        self._block_boxes = SharedArrays.zeros(structs.Aabbs, blocks)
         self._listed: np.ndarray | None = None
         """Awake trees that the kernels' lists are about; None after others were listed."""
         self._block_count = ctypes.c_int32()
         """Blocks of these trees."""
-        self._searching_trees, self._paired_trees = ctypes.c_int32(), ctypes.c_int32()
+        self._searching_trees = ctypes.c_int32()
+        self._paired_trees = ctypes.c_int32()
         """Awake trees that look for sleeping ones, and for each other."""
         self.slots = np.arange(parameters.max_contacts_per_tree)
         self._room = 0
 
     def set_rigid_world(self, rigid_arrays: RigidArrays) -> None:
         """Take over the geoms of the rigid world after it was compiled anew."""
-        self.rigid_arrays, self._static_bounded = rigid_arrays, False
+        self.rigid_arrays = rigid_arrays
+        self._static_bounded = False
         self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-rigid_arrays.static // AABB_BLOCK))
         self._actor_boxes = SharedArrays.zeros(structs.Aabbs, len(rigid_arrays.actors.is_remote))
         self._passing_bunches = SharedArrays(
@@ -95,10 +101,15 @@ class ContactDetection:
         static = min(self.rigid_arrays.static, self.parameters.max_static_geoms_per_tree)
         near = self.rigid_arrays.capacity - self.rigid_arrays.static + static
         self.candidates = SharedArrays.zeros(
-            structs.Candidates, trees, slots, count=np.zeros(trees, np.int32), is_impact=np.zeros(trees, np.bool_),
-            near_geoms=np.zeros((trees, near), np.int32), skipped_geoms=np.zeros(trees, np.int32),
+            structs.Candidates,
+            trees,
+            slots,
+            count=np.zeros(trees, np.int32),
+            is_impact=np.zeros(trees, np.bool_),
+            near_geoms=np.zeros((trees, near), np.int32),
+            skipped_geoms=np.zeros(trees, np.int32),
             near_pairs=np.zeros((trees * PAIRS_AT_ONCE, 2), np.int32),
-        )  # fmt: skip
+        )
         self._bind_launches()
 
     # ------------------------------------------------------------------ broadphase
@@ -115,7 +126,8 @@ class ContactDetection:
         """Write the lists of kernels that are about some trees [k], and their blocks."""
         blocks = np.unique(trees // AABB_BLOCK)
         self.arrays.trees.awake[: len(trees)], self._blocks[: len(blocks)] = trees, blocks
-        self.counters[structs.AWAKE_TREES], self._block_count.value = len(trees), len(blocks)
+        self.counters[structs.AWAKE_TREES] = len(trees)
+        self._block_count.value = len(blocks)
 
     def compare_anew(self) -> None:
         """Compare all capsules of awake trees with the sleeping ones in the next step, however little they move."""
@@ -133,7 +145,9 @@ class ContactDetection:
         """Bring the geoms of wires [k] to where these are deflected to."""
         if not self._static_bounded:
             self._bound_static_geoms()
-        arrays, states, boxes = self.rigid_arrays, self.rigid_arrays.geom_states, self._static_blocks
+        arrays = self.rigid_arrays
+        states = self.rigid_arrays.geom_states
+        boxes = self._static_blocks
         geoms = arrays.geom_of_wire[pieces]
         ends = np.stack([wires.start[pieces], wires.end[pieces]], 1) + wires.offset[pieces]
         states.offset[geoms] = wires.offset[pieces].mean(1)
@@ -141,7 +155,8 @@ class ContactDetection:
         # it may spring back within the step
         states.speed[geoms] = np.sqrt((wires.offset[pieces] ** 2).sum(2).max(1)) / self.parameters.dt
         grown = (arrays.geoms.size[geoms, 0] + self.parameters.contact_margin)[:, None]
-        states.low[geoms], states.high[geoms] = ends.min(1) - grown, ends.max(1) + grown
+        states.low[geoms] = ends.min(1) - grown
+        states.high[geoms] = ends.max(1) + grown
         block = (geoms - arrays.movable) // AABB_BLOCK
         np.minimum.at(boxes.low, block, states.low[geoms])
         np.maximum.at(boxes.high, block, states.high[geoms])
@@ -149,13 +164,16 @@ class ContactDetection:
     def _bound_static_geoms(self) -> None:
         """Boxes around blocks of static geoms; the ground reaches down without end."""
         self._geom_aabbs(self.rigid_arrays.count)
-        first, states, boxes = self.rigid_arrays.movable, self.rigid_arrays.geom_states, self._static_blocks
+        first = self.rigid_arrays.movable
+        states = self.rigid_arrays.geom_states
+        boxes = self._static_blocks
         states.offset[:] = 0.0  # move_wires() follows
         ground = np.flatnonzero(self.rigid_arrays.geoms.kind[first:] == 0) + first
         states.low[ground, 2] = -PLANE_HALF_SIZE
         for block in range(len(boxes.low)):
             of = slice(first + AABB_BLOCK * block, first + AABB_BLOCK * (block + 1))
-            boxes.low[block], boxes.high[block] = states.low[of].min(0), states.high[of].max(0)
+            boxes.low[block] = states.low[of].min(0)
+            boxes.high[block] = states.high[of].max(0)
         self._static_bounded = True
 
     # ------------------------------------------------------------------ narrowphase
@@ -165,7 +183,8 @@ class ContactDetection:
         overlaps, until it is clear of them: as it hung there, that overlap was no contact."""
         near = np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1))
         room = self._passing[near] < 0
-        near, room = near[room.any(1)], room[room.any(1)]
+        near = near[room.any(1)]
+        room = room[room.any(1)]
         self._passing[near, room.argmax(1)] = bunch
 
     def find_reached_trees(self, awake: np.ndarray, among_plants: bool) -> np.ndarray:
@@ -176,7 +195,8 @@ class ContactDetection:
             self._listed = awake
             if len(awake) > self._room:
                 self._allocate_candidates(2 * len(awake))
-        count, sleep = len(awake), among_plants and len(awake) < len(self._is_reached)
+        count = len(awake)
+        sleep = among_plants and len(awake) < len(self._is_reached)
         self._paired_trees.value = count if among_plants else 0
         self._searching_trees.value = count if sleep else 0  # one that falls asleep has them compared anew
         self._find_reached_trees()
@@ -195,13 +215,22 @@ class ContactDetection:
 
     def _bind_launches(self) -> None:
         """Bind every kernel to its arrays."""
-        parameters, plants, rigid = self._kernel_parameters, self.arrays, self.rigid_arrays
-        trees, bodies = plants.trees.struct, plants.bodies.struct
-        capsules, capsule_states = plants.capsules.struct, plants.capsule_states.struct
-        geoms, geom_states, actors = rigid.geoms.struct, rigid.geom_states.struct, rigid.actors.struct
-        tree_boxes, wood_boxes = self.tree_boxes.struct, self._wood_boxes.struct
-        actor_boxes, block_boxes = self._actor_boxes.struct, self._block_boxes.struct
-        order, candidates = share(self._order, wp.int32), self.candidates.struct
+        parameters = self._kernel_parameters
+        plants = self.arrays
+        rigid = self.rigid_arrays
+        trees = plants.trees.struct
+        bodies = plants.bodies.struct
+        capsules = plants.capsules.struct
+        capsule_states = plants.capsule_states.struct
+        geoms = rigid.geoms.struct
+        geom_states = rigid.geom_states.struct
+        actors = rigid.actors.struct
+        tree_boxes = self.tree_boxes.struct
+        wood_boxes = self._wood_boxes.struct
+        actor_boxes = self._actor_boxes.struct
+        block_boxes = self._block_boxes.struct
+        order = share(self._order, wp.int32)
+        candidates = self.candidates.struct
 
         def bind_shared(kernel: wp.Kernel, given: list, results: list, chunk: str) -> BoundLaunch:
             """The same of a kernel over trees, which the threads of the plants share."""
@@ -233,34 +262,66 @@ class ContactDetection:
         )
         find_rigid_contacts = bind_shared(
             narrowphase_rigid.find_rigid_contacts,
-            [parameters, self.parameters.max_static_geoms_per_tree, capsules, geoms, order, trees, tree_boxes, bodies,
-             capsule_states, rigid.bodies.struct, rigid.hulls.struct, geom_states, self._static_blocks.struct],
+            [
+                parameters,
+                self.parameters.max_static_geoms_per_tree,
+                capsules,
+                geoms,
+                order,
+                trees,
+                tree_boxes,
+                bodies,
+                capsule_states,
+                rigid.bodies.struct,
+                rigid.hulls.struct,
+                geom_states,
+                self._static_blocks.struct,
+            ],
             [self._passing_bunches.struct, candidates],
             "rigid",
-        )  # fmt: skip
+        )
         sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
         sort_awake_trees = bind_launch(
             sweep_order.sort_awake_trees, [trees, tree_boxes], [share(self.counters, wp.int32), sorted_rows, scratch]
         )
         find_plant_contacts = bind_shared(
             narrowphase_plants.find_plant_contacts,
-            [parameters, capsules, order, sorted_rows, share(self.counters, wp.int32), trees,
-             tree_boxes, wood_boxes, bodies, capsule_states],
+            [
+                parameters,
+                capsules,
+                order,
+                sorted_rows,
+                share(self.counters, wp.int32),
+                trees,
+                tree_boxes,
+                wood_boxes,
+                bodies,
+                capsule_states,
+            ],
             [candidates],
             "plants",
-        )  # fmt: skip
-        sequence, awake = self.plants.launch_pool.sequence, entry(self.counters, structs.AWAKE_TREES)
-        self._find_near_trees = sequence([
-            (rigid.take_free_velocities, rigid.dofs),
-            (self._geom_aabbs, entry(rigid.geoms.count)),
-            (actor_aabbs, entry(rigid.actors.count)),
-            (mark_near_trees, ctypes.c_int32(len(self._blocks))),
-        ])  # fmt: skip
+        )
+        sequence = self.plants.launch_pool.sequence
+        awake = entry(self.counters, structs.AWAKE_TREES)
+        self._find_near_trees = sequence(
+            [
+                (rigid.take_free_velocities, rigid.dofs),
+                (self._geom_aabbs, entry(rigid.geoms.count)),
+                (actor_aabbs, entry(rigid.actors.count)),
+                (mark_near_trees, ctypes.c_int32(len(self._blocks))),
+            ]
+        )
         # boxes of blocks: or a tree that was dragged out of its block would have no actor near
-        self._find_reached_trees = sequence([
-            (tree_aabbs, awake), (block_aabbs, self._block_count), (find_reached_trees, self._searching_trees),
-        ])  # fmt: skip
+        self._find_reached_trees = sequence(
+            [
+                (tree_aabbs, awake),
+                (block_aabbs, self._block_count),
+                (find_reached_trees, self._searching_trees),
+            ]
+        )
         self.narrowphase = [
-            (find_rigid_contacts, awake), (sort_awake_trees, ONCE), (find_plant_contacts, self._paired_trees),
-        ]  # fmt: skip
+            (find_rigid_contacts, awake),
+            (sort_awake_trees, ONCE),
+            (find_plant_contacts, self._paired_trees),
+        ]
         """Launches that fill ``candidates`` for the listed awake trees, each with its number of threads."""

@@ -25,8 +25,13 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.wires.deflected_wires import DeflectedWires, WireContacts
 
-ITEMS_PER_CHUNK = {"write_contact_rows": 16, "respond_rigidly": 16, "assemble_delassus": 16, "solve_islands": 1,
-                   "store_warm_start": 48}  # fmt: skip
+ITEMS_PER_CHUNK = {
+    "write_contact_rows": 16,
+    "respond_rigidly": 16,
+    "assemble_delassus": 16,
+    "solve_islands": 1,
+    "store_warm_start": 48,
+}
 """Contacts or islands that a thread takes at a time: work of 5 us and more."""
 MATRIX_CONTACTS = 16
 """Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
@@ -49,7 +54,10 @@ class ImpulseSolver:
         """``wires``: those that give; without, none does."""
         self._wires = None if wires is None else WireContacts(wires)
         self._at_wires = np.zeros(0, int)
-        self.plants, self.rigid, self.arrays, self.parameters = plants, rigid, arrays, parameters
+        self.plants = plants
+        self.rigid = rigid
+        self.arrays = arrays
+        self.parameters = parameters
         self._kernel_parameters = kernel_parameters
         self._pairs = material_pairs(parameters)
         n = self.capacity = parameters.contact_capacity
@@ -61,9 +69,21 @@ class ImpulseSolver:
         self.touched = SharedArrays.zeros(structs.TouchedBodies, 2 * n + 1, **listed)
         self._island_arrays = {
             name: np.zeros(n + 1, np.int32)
-            for name in ("start", "first_block", "block_start", "row_start", "matrix_start", "rigid_start",
-                         "system_start", "contact", "label", "block_label", "first_dof", "sweeps")
-        }  # fmt: skip
+            for name in (
+                "start",
+                "first_block",
+                "block_start",
+                "row_start",
+                "matrix_start",
+                "rigid_start",
+                "system_start",
+                "contact",
+                "label",
+                "block_label",
+                "first_dof",
+                "sweeps",
+            )
+        }
         self._items = np.arange(3 * n, dtype=np.int32)
         self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
         self._row_arrays = {
@@ -73,12 +93,17 @@ class ImpulseSolver:
             "impulse": np.zeros(3 * n),
         }
         self._place_arrays = {
-            "friction": np.zeros(n), "compliance": np.zeros(n), "own": np.zeros((n, 3, 3)), "mass": np.zeros((n, 2)),
+            "friction": np.zeros(n),
+            "compliance": np.zeros(n),
+            "own": np.zeros((n, 3, 3)),
+            "mass": np.zeros((n, 2)),
             "pressed": np.zeros(n, np.int32),
-        }  # fmt: skip
+        }
         for name in ("free", "impulse", "impulse_first", "impulse_before", "direction"):
             self._place_arrays[name] = np.zeros(10 * n)  # a block of one contact has eight rows
-        self._rigid_spans, self._most_contacts, self._columns = np.zeros((n, 2), np.int32), 0, 0
+        self._rigid_spans = np.zeros((n, 2), np.int32)
+        self._most_contacts = 0
+        self._columns = 0
         """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
         contacts of one solve, and how long their rows are."""
         self._memory: dict[str, np.ndarray] = {}
@@ -171,7 +196,9 @@ class ImpulseSolver:
 
     def clear(self) -> None:
         """Forget the last solve: there is no contact."""
-        self.bodies, self.wrenches, self.rigid_force = self.touched.body[:0], self._wrench[:0], None
+        self.bodies = self.touched.body[:0]
+        self.wrenches = self._wrench[:0]
+        self.rigid_force = None
         self._detection.counters[structs.ISLANDS] = self.warm_start.count[0] = 0
 
     def find_contacts(self) -> None:
@@ -230,7 +257,8 @@ class ImpulseSolver:
 
     def _end_at_wires(self, count: int, wires: WireContacts) -> None:
         """Find the springs of the wires that are in contact."""
-        contacts, candidates = self.contacts, self._detection.candidates
+        contacts = self.contacts
+        candidates = self._detection.candidates
         piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
         self._at_wires = self._at_wires[:0]
         contacts.wire_stiffness[:count] = contacts.wire_shift[:count] = 0.0
@@ -238,18 +266,25 @@ class ImpulseSolver:
             return
         at = self._at_wires = np.flatnonzero(piece >= 0)
         row, slot = np.divmod(contacts.source[at], candidates.feature.shape[1])
-        body, point, normal = contacts.body[at], candidates.point[row, slot], candidates.normal[row, slot]
-        free, arm = self.plants.velocity_free[body], point - self.plants.state.body_q[body, :3]
+        body = contacts.body[at]
+        point = candidates.point[row, slot]
+        normal = candidates.normal[row, slot]
+        free = self.plants.velocity_free[body]
+        arm = point - self.plants.state.body_q[body, :3]
         closing = -((free[:, :3] + frames.cross(free[:, 3:], arm)) * normal).sum(1)
         key = contacts.feature[at].astype(np.int64) * len(self.rigid_arrays.geom_of_wire) + piece[at]
         wires.find_springs(
             piece[at], point, normal, candidates.gap[row, slot], closing, key, self.plants.model.body_tree[body]
         )
-        contacts.wire_stiffness[at], contacts.wire_shift[at] = wires.stiffness, wires.shift
+        contacts.wire_stiffness[at] = wires.stiffness
+        contacts.wire_shift[at] = wires.shift
 
     def report_wires(self) -> None:
         """Tell the wires what pressed on them in the last solve."""
-        wires, at, contacts, dt = self._wires, self._at_wires, self.contacts, self.parameters.dt
+        wires = self._wires
+        at = self._at_wires
+        contacts = self.contacts
+        dt = self.parameters.dt
         if wires is not None and len(at):
             force = self.rows.impulse[3 * at] / dt
             share = contacts.stiffness[at] * dt + contacts.damping[at]
@@ -269,12 +304,20 @@ class ImpulseSolver:
         with the tangent stiffness of the constraints under them. The impulses of the round with the least error are
         kept.
         """
-        rows, system, row_count, p = self.rows, self.system, 3 * count, self.parameters
-        jacobian, response = by_rows(rows.rigid_jacobian[:count]), by_rows(rows.rigid_response[:count])
-        impulse, velocity_free = rows.impulse[:row_count], rows.velocity_free[:row_count]
+        rows = self.rows
+        system = self.system
+        row_count = 3 * count
+        p = self.parameters
+        jacobian = by_rows(rows.rigid_jacobian[:count])
+        response = by_rows(rows.rigid_response[:count])
+        impulse = rows.impulse[:row_count]
+        velocity_free = rows.velocity_free[:row_count]
         of_islands = system.impulse[: self._padded_rows]
         kept = (impulse, velocity_free, of_islands, system.velocity, system.rigid_force)
-        free, best, best_error, error = self.rigid.velocity_free, (), np.inf, np.inf
+        free = self.rigid.velocity_free
+        best = ()
+        best_error = np.inf
+        error = np.inf
         for round_number in range(p.solver_constraint_steps + 1):
             assert self.rigid_force is not None
             self.rigid.predict_with(self.rigid_force)
@@ -283,11 +326,13 @@ class ImpulseSolver:
             if error < p.solver_constraint_tolerance:
                 return
             if error < best_error:
-                best, best_error = tuple(values.copy() for values in kept), error
+                best = tuple(values.copy() for values in kept)
+                best_error = error
             if round_number == p.solver_constraint_steps:
                 break
             response = self._respond_constrained(jacobian)
-            free_before, free = free, velocity + impulse @ response
+            free_before = free
+            free = velocity + impulse @ response
             velocity_free -= jacobian @ (free - free_before)
             self._solve_islands(self.island_count)
         if error > best_error:
@@ -302,14 +347,23 @@ class ImpulseSolver:
     def bind_launches(self, detection: ContactDetection) -> None:
         """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""
         self._detection = detection
-        p, parameters, rigid = self.parameters, self._kernel_parameters, self.rigid_arrays
-        capsules, bodies = self.arrays.capsules.struct, self.arrays.bodies.struct
-        geoms, rigid_bodies = rigid.geoms.struct, rigid.bodies.struct
-        candidates, contacts = detection.candidates.struct, self.contacts.struct
-        island_lists, rows, warm_start = self.islands.struct, self.rows.struct, self.warm_start.struct
-        system, side_groups = self.system.struct, self.response.groups.struct
+        p = self.parameters
+        parameters = self._kernel_parameters
+        rigid = self.rigid_arrays
+        capsules = self.arrays.capsules.struct
+        bodies = self.arrays.bodies.struct
+        geoms = rigid.geoms.struct
+        rigid_bodies = rigid.bodies.struct
+        candidates = detection.candidates.struct
+        contacts = self.contacts.struct
+        island_lists = self.islands.struct
+        rows = self.rows.struct
+        warm_start = self.warm_start.struct
+        system = self.system.struct
+        side_groups = self.response.groups.struct
         response = share(self.response.numbers, wp.float32)
-        counters, touched = share(detection.counters, wp.int32), self.touched.struct
+        counters = share(detection.counters, wp.int32)
+        touched = self.touched.struct
         items = share(self._items, wp.int32)
 
         def bind_shared(kernel: wp.Kernel, model: list, given: list, results: list) -> BoundLaunch:
@@ -357,9 +411,13 @@ class ImpulseSolver:
         rows_first = [(write_contact_rows, of_contacts), (self.response.launch, of_groups)]
         solved = [(assemble_delassus, of_contacts), (self._solve_islands, of_islands)]
         stored = [(store_warm_start, of_contacts), (count_unfinished, ONCE), (accumulate_wrenches, ONCE)]
-        self._find_contacts = sequence([
-            *detection.narrowphase, (compact_candidates, ONCE), (self._build_islands, have_room),
-        ])  # fmt: skip
+        self._find_contacts = sequence(
+            [
+                *detection.narrowphase,
+                (compact_candidates, ONCE),
+                (self._build_islands, have_room),
+            ]
+        )
         self._solve = sequence([*rows_first, (respond_rigidly, of_contacts), *solved, *stored])
         self._write_rows, self._assemble_and_solve, self._store = map(sequence, (rows_first, solved, stored))
 

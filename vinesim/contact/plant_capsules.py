@@ -50,7 +50,8 @@ def plant_capsules(model: Model) -> PlantCapsules:
         for k in range(count)
     }
     bunch_of = model.bunch_of_body().tolist()
-    lengths, radii = model.body_length.tolist(), model.body_radius.mean(1).tolist()
+    lengths = model.body_length.tolist()
+    radii = model.body_radius.mean(1).tolist()
     for b, (length, thick) in enumerate(zip(lengths, radii, strict=True)):
         if b in of_body:
             i = of_body[b]
@@ -82,7 +83,8 @@ def spheroid_spheres(half_length: float, max_radius: float) -> list[tuple[float,
 
     About a point c of the axis between the centres of curvature of its ends: R sqrt(1 - c^2 / (a^2 - R^2)).
     """
-    a, r = half_length, max_radius
+    a = half_length
+    r = max_radius
     furthest = (a * a - r * r) / a if a > r else 0.0
     count = min(1 + 2 * int(np.ceil(furthest / r - 1e-6)), MAX_SPHERES_PER_BUNCH) if furthest > 1e-6 else 1
     if count == 1:
@@ -101,7 +103,8 @@ def nearest_body(
     not its clusters move. None if nothing is nearer than ``max_distance`` [m].
     """
     c = capsules
-    first, end = c.tree_start[trees].tolist(), c.tree_start[trees + 1].tolist()
+    first = c.tree_start[trees].tolist()
+    end = c.tree_start[trees + 1].tolist()
     at = np.concatenate([np.arange(*ends) for ends in zip(first, end, strict=True)])
     is_fine = state.tree_fine[model.body_tree[c.body[at]]]
     at = at[(c.level[at] == 0) | (c.level[at] == 1 + is_fine)]
@@ -118,7 +121,8 @@ def nearest_body(
     best = int(np.argmin(gap)) if len(gap) else -1
     if best < 0 or gap[best] >= max_distance:
         return None
-    body, bunch = int(c.body[at[best]]), int(c.bunch[at[best]])
+    body = int(c.body[at[best]])
+    bunch = int(c.bunch[at[best]])
     tree = model.body_tree[body]
     is_cluster = body - model.tree_first[tree] >= model.tree_core[tree]
     return float(gap[best]), int(model.bunch_body[bunch]) if is_cluster else body

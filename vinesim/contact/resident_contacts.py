@@ -67,9 +67,12 @@ class ResidentContacts:
         *,
         slots: int = DEFAULT_SLOTS,
     ) -> None:
-        self.plants, self.parameters, self.slots = plants, parameters, slots
+        self.plants = plants
+        self.parameters = parameters
+        self.slots = slots
         self._device = plants.buffers.device
-        model, self._trees = plants.model, len(plants.model.tree_first)
+        model = plants.model
+        self._trees = len(plants.model.tree_first)
         rigid = RigidWorld(model, parameters=parameters)
         self._check(rigid)
         self._numbers = kernel_parameters(parameters)
@@ -116,9 +119,11 @@ class ResidentContacts:
         return made
 
     def _take_over_plants(self, arrays: PlantArrays) -> None:
-        rows, zeros = self.plants.buffers.arrays, self._zeros
+        rows = self.plants.buffers.arrays
+        zeros = self._zeros
         self._bodies = structs.PlantBodies()
-        self._bodies.parent, self._bodies.tree = rows["body_parent"], rows["body_tree"]
+        self._bodies.parent = rows["body_parent"]
+        self._bodies.tree = rows["body_tree"]
         self._bodies.is_cut = zeros(wp.bool, self._places)
         self._bodies.q, self._bodies.qd, self._bodies.qd_free = rows["body_q"], rows["body_qd"], rows["body_qd_free"]
         self._capsules = self._interleaved(arrays.capsules)
@@ -185,9 +190,11 @@ class ResidentContacts:
         return table
 
     def _allocate(self) -> None:
-        trees, slots = self._trees, self.slots
+        trees = self._trees
+        slots = self.slots
         self._groups = 1 if self._device.is_cpu else min(trees, WARPS)
-        rows, pairs = 3 * slots, PAIRS_PER_SLOT * slots
+        rows = 3 * slots
+        pairs = PAIRS_PER_SLOT * slots
         self.candidates = self._allocated(structs.Candidates, {}, {})
         for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
             setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, 2 * pairs))
@@ -197,7 +204,8 @@ class ResidentContacts:
         self.rows = self._allocated(structs.Rows, of_rows, {"plant_jacobian": 12})
         self._system = self._allocated(TreeSystem, {"free": trees * rows, "velocity": trees * rows}, {})
         self._system.matrix = self._zeros(float, trees * rows, rows)
-        self._system.friction, self._system.compliance = self.contacts.friction, self.contacts.compliance
+        self._system.friction = self.contacts.friction
+        self._system.compliance = self.contacts.compliance
         self._system.impulse = self.rows.impulse
         searched = trees * rows if self._device.is_cpu else 1  # a GPU searches in registers
         self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, searched), {"factor": rows + 1})
@@ -219,19 +227,37 @@ class ResidentContacts:
 
     def _bind(self) -> tuple[Launches, Launches, Launches]:
         """Every kernel of a step, bound to its arrays, with its number of threads: before the solves, these, after."""
-        p, plants, trees = self.parameters, self.plants.launches, self._trees
-        fill, s, arrays = plants.fill_resident, plant_structs, plants.resident_arrays
+        p = self.parameters
+        plants = self.plants.launches
+        trees = self._trees
+        fill = plants.fill_resident
+        s = plant_structs
+        arrays = plants.resident_arrays
         device = str(self._device)
-        parameters, capsules, geoms = self._numbers, self._capsules, self._geoms
-        model, forces, joints = fill(s.ArticulationModel), fill(s.AppliedForces), fill(s.JointState)
-        bodies, factors = fill(s.BodyState), fill(s.Factors)
-        scratch, prediction, work = fill(s.Scratch), fill(s.Prediction), fill(s.WrenchScratch)
-        onset, contacts = self.plants.onset_steps, self._tree_contacts
+        parameters = self._numbers
+        capsules = self._capsules
+        geoms = self._geoms
+        model = fill(s.ArticulationModel)
+        forces = fill(s.AppliedForces)
+        joints = fill(s.JointState)
+        bodies = fill(s.BodyState)
+        factors = fill(s.Factors)
+        scratch = fill(s.Scratch)
+        prediction = fill(s.Prediction)
+        work = fill(s.WrenchScratch)
+        onset = self.plants.onset_steps
+        contacts = self._tree_contacts
         width = 3 * self.slots
         entries = -(-trees // GROUP) * GROUP
-        few, first, lanes, block = self.slots, 1, 1, 1
+        few = self.slots
+        first = 1
+        lanes = 1
+        block = 1
         if not self._device.is_cpu:
-            few, first, lanes, block = int(FEW_ROWS) // 3, FIRST_LANES, WARP_SIZE, FULL_BLOCK
+            few = int(FEW_ROWS) // 3
+            first = FIRST_LANES
+            lanes = WARP_SIZE
+            block = FULL_BLOCK
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
@@ -241,36 +267,154 @@ class ResidentContacts:
         find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
         compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # free since the prediction
         before = [
-            bound(tree_narrowphase.list_near_pairs, trees, parameters, capsules, geoms, trees, self._bodies,
-                  self._geom_states, self._static_blocks, self._capsule_states, contacts),
-            bound(find, trees * self.slots, parameters, capsules, geoms, trees, trees * self.slots, self._bodies,
-                  self._capsule_states, self._rigid_bodies, self._hulls, self._geom_states, contacts,
-                  self.candidates),
+            bound(
+                tree_narrowphase.list_near_pairs,
+                trees,
+                parameters,
+                capsules,
+                geoms,
+                trees,
+                self._bodies,
+                self._geom_states,
+                self._static_blocks,
+                self._capsule_states,
+                contacts,
+            ),
+            bound(
+                find,
+                trees * self.slots,
+                parameters,
+                capsules,
+                geoms,
+                trees,
+                trees * self.slots,
+                self._bodies,
+                self._capsule_states,
+                self._rigid_bodies,
+                self._hulls,
+                self._geom_states,
+                contacts,
+                self.candidates,
+            ),
             bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source),
-            bound(tree_islands.predict_impacted_trees, trees, plants.parameters, model, onset, contacts.is_impact,
-                  forces, joints, arrays["phi_used"], arrays["tree_euler_steps"], bodies, factors, scratch, prediction),
-            bound(tree_islands.write_tree_rows, entries * self.slots, parameters, self._pairs, capsules, geoms, trees,
-                  self.slots, self._bodies, self._rigid_bodies, self.candidates, self._warm_start, contacts,
-                  self.contacts, self.rows),
-            bound(tree_delassus.respond_at_contacts, trees, model, arrays["body_branches"], trees, factors,
-                  self.contacts, self.rows, contacts, compliances, self._response),
-            bound(tree_delassus.write_delassus, entries * self.slots, model, trees, width, factors, contacts,
-                  self.contacts, self.rows, compliances, self._response, self._system),
-        ]  # fmt: skip
+            bound(
+                tree_islands.predict_impacted_trees,
+                trees,
+                plants.parameters,
+                model,
+                onset,
+                contacts.is_impact,
+                forces,
+                joints,
+                arrays["phi_used"],
+                arrays["tree_euler_steps"],
+                bodies,
+                factors,
+                scratch,
+                prediction,
+            ),
+            bound(
+                tree_islands.write_tree_rows,
+                entries * self.slots,
+                parameters,
+                self._pairs,
+                capsules,
+                geoms,
+                trees,
+                self.slots,
+                self._bodies,
+                self._rigid_bodies,
+                self.candidates,
+                self._warm_start,
+                contacts,
+                self.contacts,
+                self.rows,
+            ),
+            bound(
+                tree_delassus.respond_at_contacts,
+                trees,
+                model,
+                arrays["body_branches"],
+                trees,
+                factors,
+                self.contacts,
+                self.rows,
+                contacts,
+                compliances,
+                self._response,
+            ),
+            bound(
+                tree_delassus.write_delassus,
+                entries * self.slots,
+                model,
+                trees,
+                width,
+                factors,
+                contacts,
+                self.contacts,
+                self.rows,
+                compliances,
+                self._response,
+                self._system,
+            ),
+        ]
         solves = [
-            bound(tree_islands.solve_trees, -(-trees * first // block) * block, p.solver_sweeps, p.solver_newton_steps,
-                  p.solver_newton_contacts, p.solver_tolerance, trees, width, first, contacts, self._system,
-                  self._search),
-            bound(tree_islands.solve_busy_trees, self._groups * lanes, p.solver_sweeps, p.solver_newton_steps,
-                  p.solver_newton_contacts, p.solver_tolerance, trees, width, lanes, self._groups, contacts,
-                  self._system, self._dense, self._dense_search),
-        ]  # fmt: skip
+            bound(
+                tree_islands.solve_trees,
+                -(-trees * first // block) * block,
+                p.solver_sweeps,
+                p.solver_newton_steps,
+                p.solver_newton_contacts,
+                p.solver_tolerance,
+                trees,
+                width,
+                first,
+                contacts,
+                self._system,
+                self._search,
+            ),
+            bound(
+                tree_islands.solve_busy_trees,
+                self._groups * lanes,
+                p.solver_sweeps,
+                p.solver_newton_steps,
+                p.solver_newton_contacts,
+                p.solver_tolerance,
+                trees,
+                width,
+                lanes,
+                self._groups,
+                contacts,
+                self._system,
+                self._dense,
+                self._dense_search,
+            ),
+        ]
         after = [
-            bound(tree_islands.apply_tree_impulses, trees, parameters, model, arrays["body_branches"], onset, trees,
-                  width, self._bodies.q, self.rows, self._system, factors, self._was_in_contact,
-                  arrays["tree_euler_steps"], contacts, self.contacts, self._warm_start, arrays["body_wrench"], work,
-                  scratch, prediction),
-        ]  # fmt: skip
+            bound(
+                tree_islands.apply_tree_impulses,
+                trees,
+                parameters,
+                model,
+                arrays["body_branches"],
+                onset,
+                trees,
+                width,
+                self._bodies.q,
+                self.rows,
+                self._system,
+                factors,
+                self._was_in_contact,
+                arrays["tree_euler_steps"],
+                contacts,
+                self.contacts,
+                self._warm_start,
+                arrays["body_wrench"],
+                work,
+                scratch,
+                prediction,
+            ),
+        ]
         return before, solves, after
 
     def solve(self) -> None:

@@ -29,13 +29,15 @@ class RowResponse:
     """
 
     def __init__(self, plants: ArticulationSolver, contacts: int) -> None:
-        self.plants, buffers = plants, plants.buffers
+        self.plants = plants
+        buffers = plants.buffers
         self.jacobian = buffers.pinned(np.zeros((3 * contacts, 12)))
         self.body, self.tree_end = (buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for _ in range(2))
         self.body_slot, self.other_slot = (buffers.pinned(np.zeros(contacts, np.int32)) for _ in range(2))
         lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in SideGroups.vars}
         self.groups = SharedArrays(SideGroups, **lists)
-        self._contacts, self._there = contacts, SideGroups()
+        self._contacts = contacts
+        self._there = SideGroups()
         for name, data in lists.items():
             setattr(self._there, name, buffers.reach(data, wp.int32, name))
         self.numbers = np.zeros(0, np.float32)
@@ -51,11 +53,15 @@ class RowResponse:
         return True
 
     def _bind(self) -> None:
-        plants, buffers = self.plants, self.plants.buffers
-        given = [buffers.reach(data, wp.int32, "list of responses")
-                 for data in (self.body, self.tree_end, self.body_slot, self.other_slot)]  # fmt: skip
+        plants = self.plants
+        buffers = self.plants.buffers
+        given = [
+            buffers.reach(data, wp.int32, "list of responses")
+            for data in (self.body, self.tree_end, self.body_slot, self.other_slot)
+        ]
         items = wp.array(np.arange(2 * self._contacts), dtype=wp.int32, device=buffers.device)
-        slots, size = wp.array(buffers.slots, dtype=wp.int32, device=buffers.device), buffers.max_tree_size
+        slots = wp.array(buffers.slots, dtype=wp.int32, device=buffers.device)
+        size = buffers.max_tree_size
         jacobian = buffers.reach(self.jacobian, wp.float64, "jacobian")
         numbers = buffers.reach(self.numbers, wp.float32, "response")
         self._rows = 1 if buffers.device.is_cpu else ROWS_ON_A_GPU
@@ -67,10 +73,20 @@ class RowResponse:
                 self._rows * size * row_response.BODY_NUMBERS, dtype=wp.float32, device=buffers.device
             )
             return plants.launches.record(
-                row_response.respond_to_groups, plants.launches.fill(ArticulationModel), size, self._rows, slots,
-                items, *given, jacobian, self._there, plants.launches.fill(Factors), scratch, numbers,
+                row_response.respond_to_groups,
+                plants.launches.fill(ArticulationModel),
+                size,
+                self._rows,
+                slots,
+                items,
+                *given,
+                jacobian,
+                self._there,
+                plants.launches.fill(Factors),
+                scratch,
+                numbers,
                 index_list="items",
-            )  # fmt: skip
+            )
 
         pool = plants.launch_pool
         respond = pool.share([join_partitions([bind() for _ in range(pool.size)])], GROUPS_PER_CHUNK)

@@ -22,7 +22,8 @@ KEPT_SIZE = 64 << 20
 """So much free memory at the end of the heap is kept [bytes], as glibc does when it sets the threshold itself."""
 TRIM_PERIOD = 60.0
 """From one time to the next at which free pages are given back [s]."""
-_TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3
+_TRIM_THRESHOLD = -1
+_MMAP_THRESHOLD = -3
 """Numbers of glibc's malloc.h."""
 
 

@@ -165,7 +165,8 @@ def _write(path: pathlib.Path, arrays: Arrays) -> None:
 
 def _prune(place: pathlib.Path) -> None:
     """Delete what killed processes have left, then entries, oldest first, until the rest is small enough."""
-    now, entries = time.time(), []
+    now = time.time()
+    entries = []
     for file in place.iterdir():
         with contextlib.suppress(FileNotFoundError):  # another process prunes as well
             stat = file.stat()
@@ -189,7 +190,8 @@ def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") ->
     after ``timeout`` [s], :data:`LOCK_TIMEOUT` unless given. ``waiting_for``: logged after a second of waiting.
     """
     timeout = LOCK_TIMEOUT if timeout is None else timeout
-    start, waited = time.monotonic(), False
+    start = time.monotonic()
+    waited = False
     with ProgressLine() as line:
         while (lock := try_exclusive(name)) is None:
             waited = True

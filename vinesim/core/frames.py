@@ -22,8 +22,10 @@ OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
 """Rotation of an optical frame seen from its camera link (x forward): xyzw."""
 
 # taking by an array of indices is four times as fast as by a list
-_NEXT, _LAST = np.array([1, 2, 0]), np.array([2, 0, 1])
-_W_FIRST, _W_LAST = np.array([3, 0, 1, 2]), np.array([1, 2, 3, 0])
+_NEXT = np.array([1, 2, 0])
+_LAST = np.array([2, 0, 1])
+_W_FIRST = np.array([3, 0, 1, 2])
+_W_LAST = np.array([1, 2, 3, 0])
 
 
 _MANY = 512
@@ -52,8 +54,12 @@ def from_wxyz(q: np.ndarray) -> np.ndarray:
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Quaternion product ``a b`` [..., 4]: rotate by ``b`` first, then by ``a``."""
-    a, b = np.asarray(a), np.asarray(b)
-    av, aw, bv, bw = a[..., :3], a[..., 3:], b[..., :3], b[..., 3:]
+    a = np.asarray(a)
+    b = np.asarray(b)
+    av = a[..., :3]
+    aw = a[..., 3:]
+    bv = b[..., :3]
+    bw = b[..., 3:]
     vector = aw * bv + bw * av + cross(av, bv)
     scalar = aw * bw - (av * bv).sum(-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)
@@ -67,7 +73,8 @@ def conjugate(q: np.ndarray) -> np.ndarray:
 
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Vector ``v`` [..., 3] rotated by ``q`` [..., 4]."""
-    q, v = np.asarray(q), np.asarray(v)
+    q = np.asarray(q)
+    v = np.asarray(v)
     t = 2.0 * cross(q[..., :3], v)
     return v + q[..., 3:] * t + cross(q[..., :3], t)
 
@@ -154,7 +161,8 @@ def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np
 
 def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.ndarray:
     """Pose [..., 7] from position [..., 3] m and quaternion [..., 4]."""
-    x, q = np.asarray(position, float), np.asarray(quaternion, float)
+    x = np.asarray(position, float)
+    q = np.asarray(quaternion, float)
     lead = np.broadcast_shapes(x.shape[:-1], q.shape[:-1])
     return np.concatenate([np.broadcast_to(x, (*lead, 3)), np.broadcast_to(q, (*lead, 4))], -1)
 
@@ -171,7 +179,8 @@ def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = Valu
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Pose ``b`` [..., 7], given in the frame ``a`` [..., 7], in the parent frame of ``a``."""
-    a, b = np.asarray(a), np.asarray(b)
+    a = np.asarray(a)
+    b = np.asarray(b)
     return np.concatenate([a[..., :3] + rotate(a[..., 3:], b[..., :3]), multiply(a[..., 3:], b[..., 3:])], axis=-1)
 
 

@@ -30,7 +30,8 @@ class ProgressLine:
     def show(self, text: str) -> None:
         """Log the text of now, if the last one is :data:`PERIOD` old."""
         if (now := time.monotonic()) >= self._due:
-            self._due, self._is_shown = now + PERIOD, True
+            self._due = now + PERIOD
+            self._is_shown = True
             log.info("%s", text)
 
     def __enter__(self) -> Self:
@@ -67,5 +68,6 @@ class ProgressHandler(logging.Handler):
 
 def show_on(stream: TextIO) -> None:
     """Show the progress of this program on a stream from now on, and nowhere else."""
-    log.handlers, log.propagate = [ProgressHandler(stream)], False
+    log.handlers = [ProgressHandler(stream)]
+    log.propagate = False
     log.setLevel(logging.INFO)

@@ -53,7 +53,8 @@ class Blade:
 
     def close(self, force: float = np.inf) -> None:
         """Shut with at most ``force`` [N], and open again: cuts what is in the mouth at the end of the coming step."""
-        self.closing, self.force = True, force
+        self.closing = True
+        self.force = force
 
 
 class DetachmentMonitor:
@@ -70,7 +71,9 @@ class DetachmentMonitor:
         what a blade has to overcome."""
         self._overload_limit = parameters.steps(parameters.detachment_duration)
         self._cutting_strength = parameters.cutting_strength
-        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
+        self.plants = plants
+        self.rigid = rigid
+        self.contact_solver = contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
         """Hands that hold plants, as contacts: the actor that holds a bunch may have pulled it off."""
@@ -83,7 +86,8 @@ class DetachmentMonitor:
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self._awake: np.ndarray | None = None
-        self._awake_count, self._awake_bunches = ctypes.c_int32(), np.zeros(len(order), np.int32)
+        self._awake_count = ctypes.c_int32()
+        self._awake_bunches = np.zeros(len(order), np.int32)
         self._longest = np.zeros(1, np.int32)
         self._detachments: list[Detachment] = []
         self._bind()
@@ -93,16 +97,25 @@ class DetachmentMonitor:
         self._peduncles = peduncles = self.plants.launches.record_joint_wrenches(max(len(self._bunches), 1))
         count_steps = bind_launch(
             count_overloaded_steps,
-            [share(model.bunch_body, wp.int32), share(model.body_tree, wp.int32), share(model.bunch_pull, wp.float32),
-             share(model.bunch_bend, wp.float32), share(self._awake_bunches, wp.int32),
-             share(peduncles.carried, wp.spatial_vector), share(self.plants.state.bunch_attached, wp.bool),
-             share(self.contact_solver.remote_trees, wp.bool)],
+            [
+                share(model.bunch_body, wp.int32),
+                share(model.body_tree, wp.int32),
+                share(model.bunch_pull, wp.float32),
+                share(model.bunch_bend, wp.float32),
+                share(self._awake_bunches, wp.int32),
+                share(peduncles.carried, wp.spatial_vector),
+                share(self.plants.state.bunch_attached, wp.bool),
+                share(self.contact_solver.remote_trees, wp.bool),
+            ],
             [share(self._overloaded_steps, wp.int32), share(self._longest, wp.int32)],
-        )  # fmt: skip
+        )
         count = self._awake_count
-        self._count_overloaded_steps = self.plants.launch_pool.sequence([
-            (peduncles.compute, count), (count_steps, count),
-        ])  # fmt: skip
+        self._count_overloaded_steps = self.plants.launch_pool.sequence(
+            [
+                (peduncles.compute, count),
+                (count_steps, count),
+            ]
+        )
 
     # ------------------------------------------------------------------ the tick
 
@@ -112,7 +125,8 @@ class DetachmentMonitor:
             self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
             self._cut_with_blades()
-        told, self._detachments = tuple(sorted(self._detachments, key=lambda parting: parting.body)), []
+        told = tuple(sorted(self._detachments, key=lambda parting: parting.body))
+        self._detachments = []
         return told
 
     def _detach_overloaded(self) -> None:
@@ -124,7 +138,8 @@ class DetachmentMonitor:
         if self._longest[0] < self._overload_limit:
             return
         count = self._awake_count.value
-        model, attached = self.plants.model, self.plants.state.bunch_attached
+        model = self.plants.model
+        attached = self.plants.state.bunch_attached
         for i in np.flatnonzero(self._overloaded_steps[self._awake_bunches[:count]] >= self._overload_limit).tolist():
             bunch = int(self._awake_bunches[i])
             is_remote = self.contact_solver.remote_trees[model.body_tree[model.bunch_body[bunch]]]
@@ -132,7 +147,8 @@ class DetachmentMonitor:
                 square = np.square(self._peduncles.carried[i])
                 pulled = square[:3].sum() / np.square(model.bunch_pull[bunch])
                 bent = square[3:].sum() / np.square(model.bunch_bend[bunch])
-                cause, actor = "pull" if pulled >= bent else "bend", self._hardest_pressing_actor(bunch)
+                cause = "pull" if pulled >= bent else "bend"
+                actor = self._hardest_pressing_actor(bunch)
                 self._pick(bunch, cause, actor, self._peduncles.carried[i].copy())
 
     def _list_awake_bunches(self) -> None:
@@ -151,7 +167,9 @@ class DetachmentMonitor:
         self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
-                blade.closing, blade.resistance, before = False, 0.0, len(self._detachments)
+                blade.closing = False
+                blade.resistance = 0.0
+                before = len(self._detachments)
                 blade.closures += 1
                 for body in self._bodies_in_mouth(blade).tolist():
                     resistance = self.cutting_force(body)
@@ -178,7 +196,8 @@ class DetachmentMonitor:
 
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
         """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the one next to the root."""
-        model, body_q = self.plants.model, self.plants.state.body_q
+        model = self.plants.model
+        body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
         far = np.linalg.norm(blade.half)
         apart = body_q[:, :3] - mouth[:3].astype(np.float32)
@@ -189,8 +208,10 @@ class DetachmentMonitor:
         along = along * model.body_length[near, None]
         # the part of each axis between the planes of the box, side by side (slab test)
         along = np.where(np.abs(along) < 1e-12, 1e-12, along)
-        one, other = (-blade.half - start) / along, (blade.half - start) / along
-        enter, leave = np.minimum(one, other).max(1), np.maximum(one, other).min(1)
+        one = (-blade.half - start) / along
+        other = (blade.half - start) / along
+        enter = np.minimum(one, other).max(1)
+        leave = np.maximum(one, other).min(1)
         caught = near[(enter <= leave) & (leave >= 0.0) & (enter <= 1.0)]
         caught = caught[~self.plants.state.body_cut[caught]]
         inside = np.zeros(len(self._wood), bool)
@@ -199,8 +220,10 @@ class DetachmentMonitor:
 
     def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
         """Which of some bodies [k] grow on a marked one [body], with no cut between them."""
-        parent, cut = self.plants.model.body_parent, self.plants.state.body_cut
-        below, at = np.zeros(len(bodies), bool), bodies.copy()
+        parent = self.plants.model.body_parent
+        cut = self.plants.state.body_cut
+        below = np.zeros(len(bodies), bool)
+        at = bodies.copy()
         while (at >= 0).any():
             at = np.where((at >= 0) & ~cut[at], parent[at], -1)
             below |= (at >= 0) & marked[at]
@@ -218,12 +241,14 @@ class DetachmentMonitor:
         self._pick(bunch, cause, actor, self.plants.joint_wrench(np.array([body]))[0])
 
     def _pick(self, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
-        plants, model = self.plants, self.plants.model
+        plants = self.plants
+        model = self.plants.model
         body = int(model.bunch_body[bunch])
         tree = int(model.body_tree[body])
         plants.wake(tree)
         plants.forward_kinematics(np.array([tree]))
-        shapes, state = self.contact_solver.capsules, plants.state
+        shapes = self.contact_solver.capsules
+        state = plants.state
         # as touched so far, its clusters where they are: what holds it must not feel the difference
         here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
         of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
@@ -233,10 +258,14 @@ class DetachmentMonitor:
             local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
         )
         loose = FreeBunch(
-            mass=float(plants.body_mass[body]), com=plants.body_com[body].astype(float),
-            inertia=plants.body_inertia[body].astype(float), product=plants.body_product[body].astype(float),
-            start=start, end=end, radius=shapes.radius[of].astype(float),
-        )  # fmt: skip
+            mass=float(plants.body_mass[body]),
+            com=plants.body_com[body].astype(float),
+            inertia=plants.body_inertia[body].astype(float),
+            product=plants.body_product[body].astype(float),
+            start=start,
+            end=end,
+            radius=shapes.radius[of].astype(float),
+        )
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
         self.rigid.let_pass(bunch)
         self.contact_solver.let_pass(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
@@ -253,7 +282,8 @@ class DetachmentMonitor:
 
         :class:`ValueError` if it cannot be cut.
         """
-        plants, body = self.plants, checked_index("body", body, len(self._wood))
+        plants = self.plants
+        body = checked_index("body", body, len(self._wood))
         if plants.model.body_organ[body] == int(Organ.BUNCH):
             raise ValueError(f"body {body} is no piece of wood that can be cut")
         if self._bunch_of[body] >= 0:
@@ -286,7 +316,8 @@ class DetachmentMonitor:
 
     def _record(self, body: int, bunch: int, cause: str, actor: str, carried: np.ndarray) -> None:
         tree = int(self.plants.model.body_tree[body])
-        force, moment = carried[:3].astype(float), carried[3:].astype(float)
+        force = carried[:3].astype(float)
+        moment = carried[3:].astype(float)
         self._detachments.append(Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
 
     def _hardest_pressing_actor(self, bunch: int) -> str:

@@ -25,7 +25,10 @@ class DormantBunches:
     def __init__(
         self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, supports: SupportTracker
     ) -> None:
-        self.plants, self.rigid, self.contact_solver, self.supports = plants, rigid, contact_solver, supports
+        self.plants = plants
+        self.rigid = rigid
+        self.contact_solver = contact_solver
+        self.supports = supports
         self._bunches: dict[int, FreeBunch] = {}
         self._support: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
@@ -53,7 +56,8 @@ class DormantBunches:
 
         Bunches that still hang are taken off their vines without waking these.
         """
-        plants, model = self.plants, self.plants.model
+        plants = self.plants
+        model = self.plants.model
         new = [bunch for bunch in bunches if bunch not in self._bunches]
         if new:
             bodies = model.bunch_body[new]
@@ -73,7 +77,8 @@ class DormantBunches:
                 plants.set_mass(body, STUB_MASS)
         places = poses if places is None else places
         for bunch, support, pose, place in zip(bunches, supports, poses, places, strict=True):
-            self._support[bunch], self._relative[bunch] = support, np.asarray(pose, float)
+            self._support[bunch] = support
+            self._relative[bunch] = np.asarray(pose, float)
             self._place[bunch] = np.asarray(place, float)
         self._visuals = None
 
@@ -96,7 +101,8 @@ class DormantBunches:
         if not self._bunches or not len(actors):
             return []
         distance = np.linalg.norm(self.visual_q()[:, None, :2] - actors[None, :, :2], axis=-1).min(1)
-        visuals, radius = self.visuals(), self.rigid.parameters.dormant_radius
+        visuals = self.visuals()
+        radius = self.rigid.parameters.dormant_radius
         return [visuals[i].index for i in np.argsort(distance, kind="stable")[:most].tolist() if distance[i] < radius]
 
     def visuals(self) -> tuple[RigidVisual, ...]:

@@ -42,7 +42,9 @@ class GraspManager:
     """Closes and opens the hands of local people and connects plants to them."""
 
     def __init__(self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver) -> None:
-        self.plants, self.rigid, self.contact_solver = plants, rigid, contact_solver
+        self.plants = plants
+        self.rigid = rigid
+        self.contact_solver = contact_solver
         self.contacts: tuple[Contact, ...] = ()
         """Hands that held a plant in the last step, as contacts; their ``distance`` is 0."""
         self.refused_grasps = 0
@@ -119,7 +121,8 @@ class GraspManager:
 
     def _close(self, human: HumanBody, hand: HandBody) -> None:
         """Grasp what is nearest to the hand, if anything is near enough."""
-        key, distance = (human.spec.name, hand.side), self.rigid.parameters.grasp_distance
+        key = (human.spec.name, hand.side)
+        distance = self.rigid.parameters.grasp_distance
         palm = self.rigid.hand_sample(*key).pose
         rigid = self.rigid.nearest_to_hand(*key, distance)
         points = palm[:3] + frames.rotate(palm[3:], GRASP_POINTS)
@@ -157,7 +160,8 @@ class GraspManager:
     def _place_on_plant(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> Contact:
         """Place a hand on the plant that it holds and set its force; the same as a contact."""
         plants = self.plants
-        pose, motion = plants.state.body_q[grasp.body].astype(float), plants.state.body_qd[grasp.body].astype(float)
+        pose = plants.state.body_q[grasp.body].astype(float)
+        motion = plants.state.body_qd[grasp.body].astype(float)
         self.rigid.place_hand(human.spec.name, hand.side, frames.compose(pose, hand.grasp_pose))
         at = self._grasped_point(grasp)
         velocity = motion[:3] + frames.cross(motion[3:], at - pose[:3])

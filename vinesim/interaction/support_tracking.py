@@ -71,19 +71,25 @@ class SupportTracker:
         """After a step: find out which objects are still in their support's frame; determine the supports of the
         others."""
         self._update_tables()
-        d, move_speed = self.rigid.mj_data, self.rigid.parameters.support_move_speed
+        d = self.rigid.mj_data
+        move_speed = self.rigid.parameters.support_move_speed
         self._still_steps += 1
         self._still_steps[self._held_rows()] = 0
         asleep = d.tree_asleep[self._tree] >= 0
-        all_slept, self._all_sleep = self._all_sleep, bool(asleep.all())
+        all_slept = self._all_sleep
+        self._all_sleep = bool(asleep.all())
         if all_slept and self._all_sleep and self._bands_before is self._bands_on_ground and not self._support.any():
             self._slow_steps += 1
-            self._touching_pairs, self._touched = _NO_PAIRS, None  # MuJoCo reports none of what sleeps
+            # MuJoCo reports none of what sleeps
+            self._touching_pairs = _NO_PAIRS
+            self._touched = None
             return
         speed = d.qvel[self._v[:, None] + np.arange(3)]
         self._slow_steps = np.where((speed * speed).sum(1) > move_speed * move_speed, 0, self._slow_steps + 1)
-        self._touching_pairs, self._touched = self._find_touching_pairs(), None
-        bands, before = self._band_sizes(), self._bands_before
+        self._touching_pairs = self._find_touching_pairs()
+        self._touched = None
+        bands = self._band_sizes()
+        before = self._bands_before
         self._bands_before = bands
         # an object that fell asleep in a moving box is checked when the box has come to rest
         awake = np.flatnonzero(~asleep | (bands[:, 0] < before[:, 0]))
@@ -173,7 +179,8 @@ class SupportTracker:
 
     def object_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (of its origin, angular; world axes)."""
-        row, d = self._row_of(object_id), self.rigid.mj_data
+        row = self._row_of(object_id)
+        d = self.rigid.mj_data
         pose = self._poses(np.array([row]))[0]
         v = d.qvel[self._v[row] : self._v[row] + 6]
         return pose, np.concatenate([v[:3], frames.rotate(pose[3:], v[3:])])
@@ -196,7 +203,8 @@ class SupportTracker:
         body = self._body_named.get(support)
         if body is None:
             return None
-        m, d = self.rigid.mj_model, self.rigid.mj_data
+        m = self.rigid.mj_model
+        d = self.rigid.mj_data
         self.rigid.update_kinematics()
         twist = np.zeros(6)
         mujoco.mj_objectVelocity(m, d, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
@@ -222,7 +230,8 @@ class SupportTracker:
 
     def set_states(self, object_ids: list[int], pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put objects [k] at poses [k, 7] with velocities [k, 6] in world axes."""
-        rows, d = np.array([self._row_of(object_id) for object_id in object_ids]), self.rigid.mj_data
+        rows = np.array([self._row_of(object_id) for object_id in object_ids])
+        d = self.rigid.mj_data
         turn = frames.normalize(pose[:, 3:])
         d.qpos[self._q[rows][:, None] + np.arange(7)] = np.concatenate([pose[:, :3], frames.to_wxyz(turn)], -1)
         spin = frames.rotate(frames.conjugate(turn), velocity[:, 3:])
@@ -246,7 +255,8 @@ class SupportTracker:
         """Set an object at rest in a support's frame at ``relative`` [7], as its owner says."""
         row = self._row_of(object_id)
         self._support[row] = self._body_of_support(support)
-        self._anchor_pose[row], self._still_steps[row] = relative, self._rest_steps
+        self._anchor_pose[row] = relative
+        self._still_steps[row] = self._rest_steps
 
     def set_moving(self, object_ids: list[int]) -> None:
         """Set objects moving, as their owner says."""
@@ -274,7 +284,8 @@ class SupportTracker:
         moves = np.flatnonzero(support)
         if len(moves) == 0:
             return pose
-        d, relative = self.rigid.mj_data, pose.copy()
+        d = self.rigid.mj_data
+        relative = pose.copy()
         frame = np.concatenate([d.xpos[support[moves]], frames.from_wxyz(d.xquat[support[moves]])], -1)
         row = self._row_of_body[support[moves]]
         free = np.flatnonzero(row >= 0)  # poses of objects are in qpos: no kinematics needed
@@ -293,7 +304,8 @@ class SupportTracker:
 
     def _find_touching_pairs(self) -> np.ndarray:
         """(row, MuJoCo body) of all contacts of the last step [k, 2], each from both sides."""
-        m, d = self.rigid.mj_model, self.rigid.mj_data
+        m = self.rigid.mj_model
+        d = self.rigid.mj_data
         if d.ncon == 0:
             return _NO_PAIRS
         pairs = m.geom_bodyid[d.contact.geom[d.contact.efc_address >= 0]].astype(np.int64)
@@ -314,11 +326,13 @@ class SupportTracker:
             np.minimum.at(best[rank], row[these], other[these])
         static, box, link = np.where(best == np.iinfo(np.int64).max, _NONE, best)
         bunch = self._kind_of_body[self._body] == _BUNCH
-        first, second = np.where(bunch, box, link), np.where(bunch, link, box)
+        first = np.where(bunch, box, link)
+        second = np.where(bunch, link, box)
         second[~bunch & (second >= 0) & (self._support[self._row_of_body[np.maximum(second, 0)]] == self._body)] = _NONE
         found = np.where(static >= 0, 0, np.where(first >= 0, first, second))
         on_bunch = self._kind_of_body[other] == _BUNCH
-        upper, lower = row[on_bunch], self._row_of_body[other[on_bunch]]
+        upper = row[on_bunch]
+        lower = self._row_of_body[other[on_bunch]]
         for _ in range(count):  # an object on a bunch has the support of that bunch
             supported = (found[upper] == _NONE) & (found[lower] != _NONE) & bunch[upper]
             if not supported.any():
@@ -360,13 +374,15 @@ class SupportTracker:
                 self._kind_of_body[body] = _LINK if actor in rigid.robots else _HUMAN
                 self._body_named[f"{actor}/{link}"] = body
         joint = m.body_jntadr[self._body]
-        self._q, self._v = m.jnt_qposadr[joint], m.jnt_dofadr[joint]
+        self._q = m.jnt_qposadr[joint]
+        self._v = m.jnt_dofadr[joint]
         self._tree = m.body_treeid[self._body]
         self._support = np.zeros(len(self.object_ids), np.int64)
         self._anchor_pose = self._poses(np.arange(len(self.object_ids)))
         self._still_steps = np.where(self.object_ids >= object_id(ObjectKind.BOX, 0), self._rest_steps, 0)
         self._slow_steps = self._still_steps.copy()
-        self._touching_pairs, self._touched = np.zeros((0, 2), np.int64), None
+        self._touching_pairs = np.zeros((0, 2), np.int64)
+        self._touched = None
         self._bands_before = self._bands_on_ground = np.tile(STILL_BAND, (len(self.object_ids), 1))
         for number, (support, anchor, still, slow) in known.items():
             if number in self._row_of_object:

@@ -12,8 +12,9 @@ def use_temporary_cache(reason: object) -> None:
     folder = tempfile.mkdtemp(prefix="vinesim-kernels-")
     logging.getLogger(__name__).warning(
         "compiled kernels are kept in %s for this time, as Warp's cache cannot be written (set WARP_CACHE_PATH): %s",
-        folder, reason,
-    )  # fmt: skip
+        folder,
+        reason,
+    )
     os.environ["WARP_CACHE_PATH"] = folder
     wp.config.kernel_cache_dir = os.path.join(folder, wp.config.version)
     os.makedirs(wp.config.kernel_cache_dir)
@@ -23,7 +24,8 @@ def _start_warp() -> None:
     """Start Warp without its greeting (standard output belongs to the command) and without its words about a missing
     GPU, which is no reason to warn. Whatever else it writes to standard error is passed on.
     """
-    level, wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING), wp.LOG_ERROR
+    level = max(wp.config.log_level, wp.LOG_WARNING)
+    wp.config.log_level = wp.LOG_ERROR
     with tempfile.TemporaryFile() as words:
         standard_error = os.dup(2)
         os.dup2(words.fileno(), 2)

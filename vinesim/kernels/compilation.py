@@ -253,9 +253,13 @@ def _start_compiler() -> subprocess.Popen[str]:
     """A process that runs :mod:`vinesim.kernels.compiler_process`, in a group of its own: Ctrl-C is for this process."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", "vinesim.kernels.compiler_process"], stdin=subprocess.PIPE, text=True,
-        stdout=subprocess.PIPE, env=environment, **({"process_group": 0} if os.name == "posix" else {}),
-    )  # fmt: skip
+        [sys.executable, "-P", "-m", "vinesim.kernels.compiler_process"],
+        stdin=subprocess.PIPE,
+        text=True,
+        stdout=subprocess.PIPE,
+        env=environment,
+        **({"process_group": 0} if os.name == "posix" else {}),
+    )
 
 
 def _ask(process: subprocess.Popen[str], name: str) -> dict[str, str] | None:
@@ -288,6 +292,8 @@ def _compile_for_gpu(names: Sequence[str], device: str) -> None:
 def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ONLY) -> list[str]:
     """All modules of some packages that define kernels, below :mod:`vinesim.kernels`, all unless given.
 
+    ``packages`` may name single modules, too.
+
     Long ones first, by and large, so that no core waits for the last one.
     """
     found = {
@@ -295,7 +301,7 @@ def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ON
         for name, source in _sources().items()
         if _KERNEL.search(source)
         if name not in without
-        if not packages or name.split(".")[0] in packages
+        if not packages or name.split(".")[0] in packages or name in packages
     }
     return sorted(found, key=lambda name: -found[name])
 

@@ -67,19 +67,28 @@ def bind_launch(
     if not wp.get_device(device).is_cpu:
         return _recorded(commands, inputs, at)
     try:
-        calls, parts, no_list = [], [], ctypes.c_int64()
+        calls = []
+        parts = []
+        no_list = ctypes.c_int64()
         for command in commands:
-            bounds, values = command.params[0], command.params[1:]
+            bounds = command.params[0]
+            values = command.params[1:]
             fields = [(arg.label, type(value)) for arg, value in zip(kernel.adj.args, values, strict=True)]
             packed = type("Arguments", (ctypes.Structure,), {"_fields_": fields})(*values)
             listed = getattr(packed, index_list) if index_list else None
             calls.append((bounds, bounds.shape, listed, ctypes.byref(bounds), ctypes.byref(packed)))
-            at_bounds, fields_of = ctypes.addressof(bounds), type(bounds)
+            at_bounds = ctypes.addressof(bounds)
+            fields_of = type(bounds)
             at_list = ctypes.addressof(no_list if listed is None else listed)
-            parts.append((
-                at_bounds, at_bounds + fields_of.shape.offset, at_bounds + fields_of.size.offset,
-                ctypes.addressof(packed), at_list + (0 if listed is None else type(listed).data.offset),
-            ))  # fmt: skip
+            parts.append(
+                (
+                    at_bounds,
+                    at_bounds + fields_of.shape.offset,
+                    at_bounds + fields_of.size.offset,
+                    ctypes.addressof(packed),
+                    at_list + (0 if listed is None else type(listed).data.offset),
+                )
+            )
         forward = commands[0].hooks.forward
         start, step = (listed.data, inputs[at].strides[0]) if index_list else (0, 0)
         address = ctypes.cast(forward, ctypes.c_void_p).value or 0
@@ -102,7 +111,9 @@ def bound(
     launch: Callable[..., None], packed: PackedLaunch | None = None, job: ctypes.Array | None = None
 ) -> BoundLaunch:
     """A function that launches kernels, as a :class:`BoundLaunch`."""
-    launch.packed, launch.job = packed, job  # type: ignore[attr-defined]
+    # type: ignore[attr-defined]
+    launch.packed = packed
+    launch.job = job
     return cast(BoundLaunch, launch)
 
 
@@ -184,7 +195,8 @@ class ThreadPool:
 
     def close(self) -> None:
         """End the threads."""
-        size, self.size = self.size, 1
+        size = self.size
+        self.size = 1
         for i in range(1, size):
             self._work[i] = None
             self._start[i].release()
@@ -202,7 +214,8 @@ def _wait_and_work(
 ) -> None:
     while True:
         start.acquire()
-        mine, work[i] = work[i], None
+        mine = work[i]
+        work[i] = None
         if mine is None:
             return
         try:

@@ -23,9 +23,12 @@ from vinesim.kernels.launch import BoundLaunch, bind_launch, bound, usable_cores
 POLL_TIME = 300_000
 """[ns] More than passes between the launches of a step, much less than a step."""
 
-_IDLE, _ASLEEP, _ENDED = 0, 3, 4
+_IDLE = 0
+_ASLEEP = 3
+_ENDED = 4
 """States of a thread that Python knows; native code has them all."""
-_FIRST_THREAD, _LINE = 16, 8
+_FIRST_THREAD = 16
+_LINE = 8
 """Places in the memory of a pool, by numbers of eight bytes: the states of the threads, each in a cache line of its own
 with the address of its semaphore. Before them, in lines of their own, are the next chunk and the address of the job."""
 ONCE = ctypes.c_int32(1)
@@ -155,9 +158,7 @@ def lead(address: wp.uint64, jobs: wp.uint64, count: int, threads: int, post: wp
 #endif
 """
 )
-def follow(
-    address: wp.uint64, thread: int, poll_time: int, clock: int, wait: wp.uint64, get_time: wp.uint64
-):  # fmt: skip
+def follow(address: wp.uint64, thread: int, poll_time: int, clock: int, wait: wp.uint64, get_time: wp.uint64):
     """Work on every job, and sleep when there has been none for ``poll_time`` [ns]."""
     ...
 
@@ -206,7 +207,8 @@ class LaunchPool:
             self._post = library.sem_post
             can_sleep = not any(library.sem_init(semaphore, 0, 0) for semaphore in self._semaphores)
         except (OSError, AttributeError, TypeError):
-            calls, can_sleep = [0] * len(_C_FUNCTIONS), False
+            calls = [0] * len(_C_FUNCTIONS)
+            can_sleep = False
         self.size = size if can_sleep else 1  # without POSIX semaphores the caller works alone
         self._calls = [wp.uint64(call) for call in calls]
         self._memory = (ctypes.c_int64 * (_FIRST_THREAD + _LINE * (size + 1)))()
@@ -244,7 +246,8 @@ class LaunchPool:
         run = self._bind([(job, entries)])
 
         def launch(threads: int, first: int = 0, partition: int = 0) -> None:
-            entries.value, job[_FIRST_ENTRY] = threads, first
+            entries.value = threads
+            job[_FIRST_ENTRY] = first
             run(1)
             job[_FIRST_ENTRY] = 0
 

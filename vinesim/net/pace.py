@@ -84,7 +84,8 @@ class WorldClock:
         """How many times as fast as real time the world's time passes now."""
         self.cause = ""
         """Which client limits the factor, and by what: "picker: sensors"; empty while nothing does."""
-        self._time, self._now = time, now
+        self._time = time
+        self._now = now
         self._pace = self.factor
         """The factor before the brake for those who are behind."""
         self._clients: dict[str, _Client] = {}
@@ -135,16 +136,19 @@ class WorldClock:
 
     def _adapt(self, step: float) -> None:
         """Choose the factor for the next time step, and note its cause."""
-        limit, brake = 1.0, 1.0
+        limit = 1.0
+        brake = 1.0
         limited_by = braked_by = ""
         for name, client in sorted(self._clients.items()):
             if client.is_left_behind:
                 continue
             if client.report.factor < limit:
-                limit, limited_by = client.report.factor, f"{name}: {client.report.cause}"
+                limit = client.report.factor
+                limited_by = f"{name}: {client.report.cause}"
             free = min(max((STOP_LAG - client.lag) / (STOP_LAG - FREE_LAG), 0.0), 1.0)
             if free < brake:
-                brake, braked_by = free, f"{name}: behind"
+                brake = free
+                braked_by = f"{name}: behind"
         if limit < self._pace:
             self._pace += (limit - self._pace) * -math.expm1(-step / FALL_TIME)
         else:

@@ -56,7 +56,8 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
-_NO_TREES, _NO_WRENCHES = np.zeros(0, np.int32), np.zeros((0, 6), np.float32)
+_NO_TREES = np.zeros(0, np.int32)
+_NO_WRENCHES = np.zeros((0, 6), np.float32)
 
 
 class ArticulationSolver:
@@ -100,22 +101,28 @@ class ArticulationSolver:
         buffers: DeviceBuffers | None = None,
     ) -> None:
         p = parameters
-        dt, phi = p.dt if dt is None else dt, p.phi if phi is None else phi
+        dt = p.dt if dt is None else dt
+        phi = p.phi if phi is None else phi
         buffers = DeviceBuffers(device) if buffers is None else buffers
         if not isinstance(threads, int) or threads < 1 or (threads > 1 and not buffers.device.is_cpu):
             raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
         if not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
             raise ValueError(f"dt {dt} s, phi {phi}: need a finite dt above 0 and phi from 0.5 to 1")
         validate(model, state)
-        self.model, self.state, self._dt, self._gravity = model, state, dt, p.gravity
+        self.model = model
+        self.state = state
+        self._dt = dt
+        self._gravity = p.gravity
         self.fast_rate = p.fast_joint_rate if fast_rate is None else fast_rate
         self.max_rate = p.max_joint_rate if max_rate is None else max_rate
         self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
-        self.buffers, self.threads = buffers, threads
+        self.buffers = buffers
+        self.threads = threads
         """Where arrays live, for NumPy and for kernels."""
         self.tick = 0
         """Integrations so far."""
-        self.ties, self.root_rests = TieTable(model, p.max_held_bodies, p.max_hands_per_body), RootRests(model)
+        self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
+        self.root_rests = RootRests(model)
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
@@ -127,24 +134,36 @@ class ArticulationSolver:
         self.launches = KernelLaunches(self, numbers, self.launch_pool, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
-            buffers, self.launches, tree_substeps=self.tree_substeps, tree_steps=self._steps,
-            tree_rate=self.tree_rate, tree_budget=self.tree_budget, stepping=self._stepping, groups=self._groups,
-            floating=self._floating, topologies=Topologies(model, state.body_cut, self.tree_moving),
+            buffers,
+            self.launches,
+            tree_substeps=self.tree_substeps,
+            tree_steps=self._steps,
+            tree_rate=self.tree_rate,
+            tree_budget=self.tree_budget,
+            stepping=self._stepping,
+            groups=self._groups,
+            floating=self._floating,
+            topologies=Topologies(model, state.body_cut, self.tree_moving),
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
             | model.is_on_arm(),
-        )  # fmt: skip
+        )
 
         def apply_on_device(touched: int, first: int = 0, partition: int = 0) -> None:
             self.launches.upload_wrenches(len(self._runner.stepped))
             self.launches.apply_wrenches(touched)
 
         self._loads = ContactLoads(
-            body_tree=model.body_tree, place_in_tree=self._place_in_tree, is_stepped=self._runner.is_stepped,
-            tree_moving=self.tree_moving, body_wrench=self._wrench, touched=self._subset,
-            euler_steps=self._euler_steps, onset=self.onset_steps + 1,  # the first step counts
+            body_tree=model.body_tree,
+            place_in_tree=self._place_in_tree,
+            is_stepped=self._runner.is_stepped,
+            tree_moving=self.tree_moving,
+            body_wrench=self._wrench,
+            touched=self._subset,
+            euler_steps=self._euler_steps,
+            onset=self.onset_steps + 1,  # the first step counts
             apply=bound(apply_on_device) if buffers.has_copies else self.launches.apply_wrenches,
             pool=self.launch_pool,
-        )  # fmt: skip
+        )
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self.berry_clusters = BerryClusters(self)
@@ -157,7 +176,10 @@ class ArticulationSolver:
 
     def _allocate(self, phi: float) -> None:
         """Arrays of the solver beside model and state."""
-        model, state, trees, bodies = self.model, self.state, len(self.model.tree_first), len(self.model.body_mass)
+        model = self.model
+        state = self.state
+        trees = len(self.model.tree_first)
+        bodies = len(self.model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
         """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
@@ -178,29 +200,37 @@ class ArticulationSolver:
         """Velocity of each body of an awake tree at the end of the step if nothing touches it [body, 6]."""
         self.acceleration = np.zeros((bodies, 6), np.float32)
         """Acceleration over the last step [body, 6] m/s^2, rad/s^2, world axes."""
-        self.body_mass, self.body_com = model.body_mass.copy(), model.body_com.copy()
-        self.body_inertia, self.body_drag = model.body_inertia.copy(), model.body_drag.copy()
+        self.body_mass = model.body_mass.copy()
+        self.body_com = model.body_com.copy()
+        self.body_inertia = model.body_inertia.copy()
+        self.body_drag = model.body_drag.copy()
         """What moves now, in the model's units: the body of a bunch is its compound while the tree is coarse, its head
         while it is fine; a picked bunch is a stub."""
         self.body_product = np.zeros((bodies, 3), np.float32)
         """Entries yz, zx, xy of the inertia in the body's axes [body, 3] kg m^2: a compound is not symmetric."""
-        self.joint_stiffness, self.joint_damping = model.joint_stiffness.copy(), model.joint_damping.copy()
+        self.joint_stiffness = model.joint_stiffness.copy()
+        self.joint_damping = model.joint_damping.copy()
         """The model's, but none where a body has been cut off; if ties hold that, the damping is how they resist that
         it turns."""
         self.tree_moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
         """Bodies of each tree that move [tree]: all, or all but the clusters."""
         self.body_impulse = np.zeros((bodies, 6), np.float32)
         """Impulses of a plastic impact while it is solved [body, 6] N s, N m s."""
-        self.joint_xd_free, self.joint_qd_free = np.zeros((bodies, 3), np.float32), np.zeros((bodies, 3), np.float32)
+        self.joint_xd_free = np.zeros((bodies, 3), np.float32)
+        self.joint_qd_free = np.zeros((bodies, 3), np.float32)
         """Predicted rates of roots and joints [body, 3] m/s, rad/s."""
         self._place_in_tree = (np.arange(bodies) - model.tree_first[model.body_tree]).astype(np.int32)
         # as the kernels see the trees: a cut body has no parent and no lever
-        self._parent, self._root = model.body_parent.copy(), np.full(bodies, -1, np.int32)
-        self._offset, self._rest = model.body_offset.copy(), model.body_rest.copy()
+        self._parent = model.body_parent.copy()
+        self._root = np.full(bodies, -1, np.int32)
+        self._offset = model.body_offset.copy()
+        self._rest = model.body_rest.copy()
         self._falls = np.zeros(bodies, np.bool_)  # of a floating component that no tie holds
-        self._floating, self._falling_roots = np.zeros(bodies, np.int32), np.zeros(0, np.int32)
+        self._floating = np.zeros(bodies, np.int32)
+        self._falling_roots = np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
-        self._euler_steps, self._steps = np.zeros(trees, np.int32), np.ones(trees, np.int32)
+        self._euler_steps = np.zeros(trees, np.int32)
+        self._steps = np.ones(trees, np.int32)
         self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
 
     def _pin_arrays(self) -> None:
@@ -212,30 +242,68 @@ class ArticulationSolver:
 
     def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
         """All arrays that kernels read or write, by element type and name."""
-        model, state, ties, rests = self.model, self.state, self.ties, self.root_rests
+        model = self.model
+        state = self.state
+        ties = self.ties
+        rests = self.root_rests
         return {
-            wp.int32: {"tree_moving": self.tree_moving, "body_tree": model.body_tree, "body_parent": self._parent,
-                       "body_root": self._root, "stepping": self._stepping, "subset": self._subset,
-                       "tree_euler_steps": self._euler_steps, "tree_steps": self._steps, "floating": self._floating,
-                       "tree_substeps": self.tree_substeps, "tree_budget": self.tree_budget},
-            float: {"body_mass": self.body_mass, "body_drag": self.body_drag, "tie_stiffness": ties.stiffness,
-                    "tie_damping": ties.damping, "tie_softening": ties.softening, "tree_phi": self.phi,
-                    "phi_used": self.phi_used, "tree_rate": self.tree_rate},
+            wp.int32: {
+                "tree_moving": self.tree_moving,
+                "body_tree": model.body_tree,
+                "body_parent": self._parent,
+                "body_root": self._root,
+                "stepping": self._stepping,
+                "subset": self._subset,
+                "tree_euler_steps": self._euler_steps,
+                "tree_steps": self._steps,
+                "floating": self._floating,
+                "tree_substeps": self.tree_substeps,
+                "tree_budget": self.tree_budget,
+            },
+            float: {
+                "body_mass": self.body_mass,
+                "body_drag": self.body_drag,
+                "tie_stiffness": ties.stiffness,
+                "tie_damping": ties.damping,
+                "tie_softening": ties.softening,
+                "tree_phi": self.phi,
+                "phi_used": self.phi_used,
+                "tree_rate": self.tree_rate,
+            },
             wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
             wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
-            wp.vec3: {"body_offset": self._offset, "body_com": self.body_com, "body_inertia": self.body_inertia,
-                      "body_product": self.body_product, "joint_stiffness": self.joint_stiffness,
-                      "joint_damping": self.joint_damping, "tie_point": ties.point, "tie_anchor": ties.anchor,
-                      "tie_anchor_velocity": ties.anchor_velocity, "tie_axis": ties.axis, "tree_air": self.tree_air,
-                      "root_turn": rests.turn, "root_turn_rate": rests.rate, "root_softening": rests.softening,
-                      "joint_x": state.joint_x, "joint_xd": state.joint_xd, "joint_qd": state.joint_qd,
-                      "joint_xd_free": self.joint_xd_free, "joint_qd_free": self.joint_qd_free},
+            wp.vec3: {
+                "body_offset": self._offset,
+                "body_com": self.body_com,
+                "body_inertia": self.body_inertia,
+                "body_product": self.body_product,
+                "joint_stiffness": self.joint_stiffness,
+                "joint_damping": self.joint_damping,
+                "tie_point": ties.point,
+                "tie_anchor": ties.anchor,
+                "tie_anchor_velocity": ties.anchor_velocity,
+                "tie_axis": ties.axis,
+                "tree_air": self.tree_air,
+                "root_turn": rests.turn,
+                "root_turn_rate": rests.rate,
+                "root_softening": rests.softening,
+                "joint_x": state.joint_x,
+                "joint_xd": state.joint_xd,
+                "joint_qd": state.joint_qd,
+                "joint_xd_free": self.joint_xd_free,
+                "joint_qd_free": self.joint_qd_free,
+            },
             wp.quat: {"body_rest": self._rest, "joint_q": state.joint_q},
             wp.transform: {"body_q": state.body_q},
-            wp.spatial_vector: {"body_qd": state.body_qd, "body_load": self.body_load, "body_wrench": self._wrench,
-                                "body_impulse": self.body_impulse, "body_acceleration": self.acceleration,
-                                "body_qd_free": self.velocity_free},
-        }  # fmt: skip
+            wp.spatial_vector: {
+                "body_qd": state.body_qd,
+                "body_load": self.body_load,
+                "body_wrench": self._wrench,
+                "body_impulse": self.body_impulse,
+                "body_acceleration": self.acceleration,
+                "body_qd_free": self.velocity_free,
+            },
+        }
 
     # ------------------------------------------------------------------ awake and asleep
 
@@ -301,7 +369,8 @@ class ArticulationSolver:
 
         Its tree wakes; the rest of it goes on as before. Numbers never change. :class:`ValueError` if it cannot be cut.
         """
-        model, state = self.model, self.state
+        model = self.model
+        state = self.state
         body = checked_index("body", body, len(model.body_mass))
         tree = int(model.body_tree[body])
         if state.body_cut[body]:
@@ -309,8 +378,10 @@ class ArticulationSolver:
         if body - model.tree_first[tree] >= model.tree_core[tree]:
             raise ValueError(f"body {body} of tree {tree} is a berry cluster; cut off its bunch")
         self.forward_kinematics(tree)
-        state.joint_x[body], state.joint_q[body] = state.body_q[body, :3], state.body_q[body, 3:]
-        state.joint_xd[body], state.joint_qd[body] = state.body_qd[body, :3], state.body_qd[body, 3:]
+        state.joint_x[body] = state.body_q[body, :3]
+        state.joint_q[body] = state.body_q[body, 3:]
+        state.joint_xd[body] = state.body_qd[body, :3]
+        state.joint_qd[body] = state.body_qd[body, 3:]
         state.body_cut[body] = True
         self._detach_joints(self.bodies_of(np.array([tree])))
         self.wake(tree)
@@ -319,8 +390,10 @@ class ArticulationSolver:
         """Take over which of the bodies of some whole trees have been cut off."""
         cut = bodies[self.state.body_cut[bodies]]
         self._parent[cut] = -1
-        self._offset[cut], self._rest[cut] = 0.0, frames.IDENTITY
-        self.joint_stiffness[cut], self.joint_damping[cut] = 0.0, 0.0
+        self._offset[cut] = 0.0
+        self._rest[cut] = frames.IDENTITY
+        self.joint_stiffness[cut] = 0.0
+        self.joint_damping[cut] = 0.0
         up = bodies
         while ((above := self._parent[up]) >= 0).any():
             up = np.where(above >= 0, above, up)
@@ -329,7 +402,8 @@ class ArticulationSolver:
 
     def _find_falling(self, bodies: np.ndarray) -> None:
         """Note which floating components of some whole trees no tie holds; ties resist that the others turn."""
-        root, is_cut = self._root[bodies], self.state.body_cut[bodies]
+        root = self._root[bodies]
+        is_cut = self.state.body_cut[bodies]
         tied = np.isin(bodies, self.ties.tied_bodies)
         self._falls[bodies] = (root >= 0) & ~np.isin(root, root[tied])
         if is_cut.any():
@@ -381,7 +455,9 @@ class ArticulationSolver:
 
         ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
         """
-        launches, touched, loads = self.launches, _NO_TREES, self._loads
+        launches = self.launches
+        touched = _NO_TREES
+        loads = self._loads
         count = len(self._runner.stepped)
         if bodies is not None and len(bodies):
             touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
@@ -537,9 +613,11 @@ class BerryClusters:
         clustered = np.flatnonzero(model.bunch_clusters > 0)
         tree = model.body_tree[model.bunch_body[clustered]]
         order = np.argsort(tree, kind="stable")
-        self.bunches, self._bunch_tree = clustered[order], tree[order]
+        self.bunches = clustered[order]
+        self._bunch_tree = tree[order]
         """Bunches that have clusters, by tree [k]."""
-        self.head_mass, self.head_inertia = model.bunch_head_mass.copy(), model.bunch_head_inertia.copy()
+        self.head_mass = model.bunch_head_mass.copy()
+        self.head_inertia = model.bunch_head_inertia.copy()
         """[bunch] kg, [bunch, 3] kg m^2 of the part of a bunch that is no cluster."""
         fine = solver.state.tree_fine[self._bunch_tree]
         self.lock(self.bunches[~fine])
@@ -547,7 +625,8 @@ class BerryClusters:
 
     def clustered_trees(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
         """Those of some trees that have clusters and are fine or not [k], sorted."""
-        model, trees = self._solver.model, np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
+        model = self._solver.model
+        trees = np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
         return trees[(self._solver.state.tree_fine[trees] == fine) & (model.tree_core[trees] < model.tree_size[trees])]
 
     def clusters_of(self, trees: np.ndarray) -> np.ndarray:
@@ -563,7 +642,8 @@ class BerryClusters:
 
     def refine(self, trees: np.ndarray | int) -> None:
         """See :meth:`ArticulationSolver.refine`."""
-        solver, trees = self._solver, self.clustered_trees(trees, fine=False)
+        solver = self._solver
+        trees = self.clustered_trees(trees, fine=False)
         if len(trees) == 0:
             return
         self.unlock(self.bunches_of(trees))
@@ -574,10 +654,12 @@ class BerryClusters:
 
     def coarsen(self, trees: np.ndarray | int) -> None:
         """See :meth:`ArticulationSolver.coarsen`."""
-        solver, trees = self._solver, self.clustered_trees(trees, fine=True)
+        solver = self._solver
+        trees = self.clustered_trees(trees, fine=True)
         if len(trees) == 0:
             return
-        bunches, riding = self.bunches_of(trees), self.clusters_of(trees)
+        bunches = self.bunches_of(trees)
+        riding = self.clusters_of(trees)
         impulse = self.lock(bunches)
         solver.state.tree_fine[trees] = False
         solver.tree_moving[trees] = solver.model.tree_core[trees]
@@ -591,13 +673,16 @@ class BerryClusters:
     def _apply_impact(self, trees: np.ndarray, bodies: np.ndarray, impulse: np.ndarray) -> None:
         """Change joint rates of trees by impulses [k, 6] N s, N m s on bunches [k], about their origins, in their
         axes."""
-        solver, state, launches = self._solver, self._solver.state, self._solver.launches
+        solver = self._solver
+        state = self._solver.state
+        launches = self._solver.launches
         solver.forward_kinematics(trees)
         axes = state.body_q[bodies, 3:].astype(float)
         solver.body_impulse[bodies, :3] = frames.rotate(axes, impulse[:, :3])
         solver.body_impulse[bodies, 3:] = frames.rotate(axes, impulse[:, 3:])
         springs = solver.joint_stiffness[bodies], solver.joint_damping[bodies]
-        solver.joint_stiffness[bodies], solver.joint_damping[bodies] = 0.0, 0.0
+        solver.joint_stiffness[bodies] = 0.0
+        solver.joint_damping[bodies] = 0.0
         solver.list_subset(trees)
         launches.changed = True
         launches.upload_changed()
@@ -607,7 +692,8 @@ class BerryClusters:
         solver.joint_stiffness[bodies], solver.joint_damping[bodies] = springs
         launches.changed = True
         moving = spans(solver.model.tree_first[trees], solver.model.tree_core[trees])
-        solver.joint_qd_free[moving], solver.joint_xd_free[moving] = state.joint_qd[moving], state.joint_xd[moving]
+        solver.joint_qd_free[moving] = state.joint_qd[moving]
+        solver.joint_xd_free[moving] = state.joint_xd[moving]
         launches.upload_impact_rates(len(trees))
         launches.apply_impulses(len(trees))
         launches.download_impact_rates(len(trees))
@@ -619,7 +705,8 @@ class BerryClusters:
 
     def set_mass(self, body: int, mass: float) -> None:
         """See :meth:`ArticulationSolver.set_mass`."""
-        solver, model = self._solver, self._solver.model
+        solver = self._solver
+        model = self._solver.model
         bunches = self.bunches[model.bunch_body[self.bunches] == body]
         parts = spans(model.bunch_cluster[bunches], model.bunch_clusters[bunches])
         whole = solver.body_mass[body]
@@ -641,12 +728,15 @@ class BerryClusters:
         The state stays as it is: it is for a bunch that leaves its tree, see :meth:`release`. Its poses and
         velocities must be current.
         """
-        solver, body = self._solver, int(self._solver.model.bunch_body[bunch])
-        pose, velocity = solver.state.body_q[body].astype(float), solver.state.body_qd[body].astype(float)
+        solver = self._solver
+        body = int(self._solver.model.bunch_body[bunch])
+        pose = solver.state.body_q[body].astype(float)
+        velocity = solver.state.body_qd[body].astype(float)
         if not solver.state.tree_fine[solver.model.body_tree[body]] or solver.model.bunch_clusters[bunch] == 0:
             return velocity
         momentum = self.lock(np.array([bunch]))[0]
-        mass, com = float(solver.body_mass[body]), solver.body_com[body].astype(float)
+        mass = float(solver.body_mass[body])
+        com = solver.body_com[body].astype(float)
         x, y, z = solver.body_product[body].astype(float)
         tensor = np.diag(solver.body_inertia[body].astype(float)) + np.array([[0, z, y], [z, 0, x], [y, x, 0]])
         spin = np.linalg.solve(tensor, momentum[3:] - np.cross(com, momentum[:3]))
@@ -659,7 +749,8 @@ class BerryClusters:
 
     def unlock(self, bunches: np.ndarray) -> None:
         """Leave to each bunch's body its head only."""
-        solver, model = self._solver, self._solver.model
+        solver = self._solver
+        model = self._solver.model
         bodies = model.bunch_body[bunches]
         solver.body_mass[bodies] = self.head_mass[bunches]
         solver.body_com[bodies] = model.bunch_head_com[bunches]
@@ -672,22 +763,29 @@ class BerryClusters:
 
         Returns the momentum of the clusters' motion against it [bunch, 6]: N s, and N m s about its origin, its axes.
         """
-        solver, model, state = self._solver, self._solver.model, self._solver.state
-        n, bodies = len(bunches), model.bunch_body[bunches]
+        solver = self._solver
+        model = self._solver.model
+        state = self._solver.state
+        n = len(bunches)
+        bodies = model.bunch_body[bunches]
         most = int(model.bunch_clusters[bunches].max(initial=0))
-        here, speed = np.zeros((n, most + 1, 7)), np.zeros((n, most + 1, 6))  # in the bunch's frame; the head first
+        # in the bunch's frame; the head first
+        here = np.zeros((n, most + 1, 7))
+        speed = np.zeros((n, most + 1, 6))
         here[..., 6] = 1.0
         mass = np.zeros((n, most + 1))
-        com, inertia = np.zeros((n, most + 1, 3)), np.zeros((n, most + 1, 3))
-        mass[:, 0], com[:, 0], inertia[:, 0] = (
-            self.head_mass[bunches], model.bunch_head_com[bunches], self.head_inertia[bunches]
-        )  # fmt: skip
+        com = np.zeros((n, most + 1, 3))
+        inertia = np.zeros((n, most + 1, 3))
+        mass[:, 0] = self.head_mass[bunches]
+        com[:, 0] = model.bunch_head_com[bunches]
+        inertia[:, 0] = self.head_inertia[bunches]
         for number in range(most):  # over the clusters of one bunch, a handful
             has = np.flatnonzero(model.bunch_clusters[bunches] > number)
             body = model.bunch_cluster[bunches[has]] + number
             parent = model.body_parent[body]
             above = np.where(parent == bodies[has], 0, parent - model.bunch_cluster[bunches[has]] + 1)
-            base, motion = here[has, above], speed[has, above]
+            base = here[has, above]
+            motion = speed[has, above]
             frame = frames.compose(base, frames.pose(model.body_offset[body].astype(float), model.body_rest[body]))
             turn = frames.rotate(frame[:, 3:], state.joint_qd[body].astype(float))
             here[has, number + 1, :3] = frame[:, :3]
@@ -695,7 +793,8 @@ class BerryClusters:
             speed[has, number + 1, :3] = motion[:, :3] + np.cross(motion[:, 3:], frame[:, :3] - base[:, :3])
             speed[has, number + 1, 3:] = motion[:, 3:] + turn
             mass[has, number + 1] = solver.body_mass[body]
-            com[has, number + 1], inertia[has, number + 1] = solver.body_com[body], solver.body_inertia[body]
+            com[has, number + 1] = solver.body_com[body]
+            inertia[has, number + 1] = solver.body_inertia[body]
         axes = frames.to_matrix(here[..., 3:])
         tensor = np.einsum("...ij,...j,...kj->...ik", axes, inertia, axes)
         arm = np.einsum("...ij,...j->...i", axes, com)
@@ -709,7 +808,8 @@ class BerryClusters:
             (arm * arm).sum(-1)[..., None, None] * np.eye(3) - arm[..., :, None] * arm[..., None, :]
         )
         tensor = tensor.sum(1)
-        solver.body_mass[bodies], solver.body_com[bodies] = whole, center
+        solver.body_mass[bodies] = whole
+        solver.body_com[bodies] = center
         solver.body_inertia[bodies] = np.diagonal(tensor, axis1=1, axis2=2)
         solver.body_product[bodies] = tensor[:, [1, 2, 0], [2, 0, 1]]
         solver.launches.changed = True
@@ -723,8 +823,10 @@ def blend_towards(
     plants: ArticulationSolver, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float
 ) -> None:
     """See :meth:`vinesim.plants.articulation_solver.ArticulationSolver.blend_towards`."""
-    state, bodies = plants.state, plants.model.bodies_of(tree)
-    there, rates = np.asarray(joint_q, np.float32), np.asarray(joint_qd, np.float32)
+    state = plants.state
+    bodies = plants.model.bodies_of(tree)
+    there = np.asarray(joint_q, np.float32)
+    rates = np.asarray(joint_qd, np.float32)
     here = state.joint_q[bodies]
     if there.shape != here.shape or rates.shape != (len(here), 3):
         raise ValueError(f"tree {tree}: pulled by joints {there.shape}, {rates.shape}; it has {len(here)} bodies")
@@ -746,13 +848,32 @@ of one tree of 17 bodies."""
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
 """Rows that are carried to the device before every prediction."""
 DEVICE_RESULTS = (
-    "body_q", "body_qd", "joint_xd_free", "joint_qd_free", "body_acceleration", "body_qd_free", "body_impulse",
-)  # fmt: skip
+    "body_q",
+    "body_qd",
+    "joint_xd_free",
+    "joint_qd_free",
+    "body_acceleration",
+    "body_qd_free",
+    "body_impulse",
+)
 """Rows that kernels write, or that are carried over when they are needed."""
 TREE_INPUTS = (
-    "stepping", "tree_moving", "tree_phi", "tree_euler_steps", "tree_steps", "tree_rate", "tree_awake", "tree_budget",
-    "tree_air", "root_turn", "root_turn_rate", "tie_stiffness", "tie_damping", "tie_anchor", "tie_anchor_velocity",
-)  # fmt: skip
+    "stepping",
+    "tree_moving",
+    "tree_phi",
+    "tree_euler_steps",
+    "tree_steps",
+    "tree_rate",
+    "tree_awake",
+    "tree_budget",
+    "tree_air",
+    "root_turn",
+    "root_turn_rate",
+    "tie_stiffness",
+    "tie_damping",
+    "tie_anchor",
+    "tie_anchor_velocity",
+)
 """Lists and numbers of trees and ties that kernels of a step read."""
 TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
 """Numbers of trees that they write."""
@@ -762,9 +883,15 @@ SCRATCH = {
     wp.mat33: ("J", "H", "M", "D", "DJ", "DH", "root_inverse_mass"),
     wp.transform: ("after_q",),
     wp.spatial_vector: (
-        "bias", "subtree_wrench", "added_acceleration", "before", "after_qd", "impact_acceleration", "impact_velocity",
+        "bias",
+        "subtree_wrench",
+        "added_acceleration",
+        "before",
+        "after_qd",
+        "impact_acceleration",
+        "impact_velocity",
     ),
-}  # fmt: skip
+}
 """Rows that only kernels see."""
 
 
@@ -773,10 +900,14 @@ def kernel_parameters(
 ) -> dict[str, Any]:
     """Fields of :class:`vinesim.kernels.plants.structs.SolverParameters`."""
     return {
-        "dt": dt, "fast_rate": fast_rate, "max_rate": max_rate, "fault_rate": fault_rate,
+        "dt": dt,
+        "fast_rate": fast_rate,
+        "max_rate": max_rate,
+        "fault_rate": fault_rate,
         "contact_steps": max(1, round(p.contact_onset_duration / dt)) + 1,
-        "geometric_stiffness": float(geometric_stiffness), "gravity": wp.vec3(0.0, 0.0, -p.gravity),
-    }  # fmt: skip
+        "geometric_stiffness": float(geometric_stiffness),
+        "gravity": wp.vec3(0.0, 0.0, -p.gravity),
+    }
 
 
 BUDGET_PERIOD = 8
@@ -824,14 +955,18 @@ class KernelLaunches:
     ) -> None:
         """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity;
         ``pool``: threads that share the launches over trees."""
-        self.buffers, self._pool, self._max_substeps = solver.buffers, pool, max_substeps
+        self.buffers = solver.buffers
+        self._pool = pool
+        self._max_substeps = max_substeps
         self._body_tree = solver.model.body_tree
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
         self.substeps_due = False
         """Whether they have changed since the substeps of trees were counted."""
         self._budgeted = np.zeros(0, np.int32)
-        self._keeps_budgets, self._watches_closely, self._budget_phase = False, False, -1
+        self._keeps_budgets = False
+        self._watches_closely = False
+        self._budget_phase = -1
         self._seldom: list[str] = []
         self._register_arrays(solver)
         self._record_transfers()
@@ -857,7 +992,8 @@ class KernelLaunches:
     # ------------------------------------------------------------------ arrays
 
     def _register_arrays(self, solver: ArticulationSolver) -> None:
-        buffers, model = self.buffers, solver.model
+        buffers = self.buffers
+        model = solver.model
         buffers.set_layout(model.tree_first, model.tree_size)
         buffers.add_constant("tree_pose", model.tree_pose, wp.transform)
         for dtype, arrays in solver.kernel_arrays().items():
@@ -894,7 +1030,8 @@ class KernelLaunches:
             self.buffers.upload(self._seldom)
             self.budget.limit.fill_(NO_LIMIT)
             self._budget_phase = -1
-            self.changed, self.substeps_due = False, True
+            self.changed = False
+            self.substeps_due = True
 
     def fill(self, struct: Any, **values: Any) -> Any:
         """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
@@ -946,10 +1083,16 @@ class KernelLaunches:
     # ------------------------------------------------------------------ kernels
 
     def _record_step(self, parameters: Any) -> None:
-        fill, record, s = self.fill, self.record, structs
-        self._model, self._forces = fill(s.ArticulationModel), fill(s.AppliedForces)
-        joints, self._bodies, self._factors = fill(s.JointState), fill(s.BodyState), fill(s.Factors)
-        scratch, prediction = fill(s.Scratch), fill(s.Prediction)
+        fill = self.fill
+        record = self.record
+        s = structs
+        self._model = fill(s.ArticulationModel)
+        self._forces = fill(s.AppliedForces)
+        joints = fill(s.JointState)
+        self._bodies = fill(s.BodyState)
+        self._factors = fill(s.Factors)
+        scratch = fill(s.Scratch)
+        prediction = fill(s.Prediction)
         self.predict = self._record_predict(parameters, "stepping")
         self.predict_subset = self._record_predict(parameters, "subset")
         self.predict_groups = (
@@ -959,60 +1102,138 @@ class KernelLaunches:
         self.integrate = self._record_integrate(parameters)
         self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
         self.apply_wrenches = self.record_shared(
-            apply_wrenches, parameters.dt, self._model, "subset", "body_wrench", self._factors, fill(s.WrenchScratch),
-            scratch, prediction, chunk=TREES_PER_CHUNK["wrenches"],
-        )  # fmt: skip
+            apply_wrenches,
+            parameters.dt,
+            self._model,
+            "subset",
+            "body_wrench",
+            self._factors,
+            fill(s.WrenchScratch),
+            scratch,
+            prediction,
+            chunk=TREES_PER_CHUNK["wrenches"],
+        )
         self.correct_floating_momentum = self._record_momentum(parameters)
         self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
         self.count_substeps = record(
-            first_mode.count_substeps, parameters.dt, first_mode.MAX_ANGLE, self._max_substeps, self._model, "stepping",
-            scratch, fill(s.WrenchScratch), "tree_substeps",
-        )  # fmt: skip
+            first_mode.count_substeps,
+            parameters.dt,
+            first_mode.MAX_ANGLE,
+            self._max_substeps,
+            self._model,
+            "stepping",
+            scratch,
+            fill(s.WrenchScratch),
+            "tree_substeps",
+        )
 
     def _record_predict(self, parameters: Any, trees: str) -> Launch:
-        fill, s = self.fill, structs
+        fill = self.fill
+        s = structs
         kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
         return self.record_shared(
-            kernel[0], parameters, fill(s.ArticulationModel), *kernel[1], trees, "tree_phi", "tree_euler_steps",
-            "tree_steps", fill(s.AppliedForces), fill(s.JointState), "phi_used", fill(s.BodyState), fill(s.Factors),
-            fill(s.Scratch), fill(s.Prediction), chunk=TREES_PER_CHUNK["predict"],
-        )  # fmt: skip
+            kernel[0],
+            parameters,
+            fill(s.ArticulationModel),
+            *kernel[1],
+            trees,
+            "tree_phi",
+            "tree_euler_steps",
+            "tree_steps",
+            fill(s.AppliedForces),
+            fill(s.JointState),
+            "phi_used",
+            fill(s.BodyState),
+            fill(s.Factors),
+            fill(s.Scratch),
+            fill(s.Prediction),
+            chunk=TREES_PER_CHUNK["predict"],
+        )
 
     def _record_integrate(self, parameters: Any) -> Callable[..., None]:
         """An integration, with the energy budgets around it."""
-        fill, record, s = self.fill, self.record, structs
+        fill = self.fill
+        record = self.record
+        s = structs
         model, forces, joints, prediction = (
             fill(struct) for struct in (s.ArticulationModel, s.AppliedForces, s.JointState, s.Prediction)
         )
         partitioned = {"index_list": "trees", "partitions": self._pool.size}
         apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
         begin = record(
-            begin_budget, parameters, model, "stepping", "tree_budget", "tree_phi", forces, joints,
-            self.budget, apart, **partitioned,
-        )  # fmt: skip
+            begin_budget,
+            parameters,
+            model,
+            "stepping",
+            "tree_budget",
+            "tree_phi",
+            forces,
+            joints,
+            self.budget,
+            apart,
+            **partitioned,
+        )
         move = record(
-            integrate, parameters, model, "stepping", "tree_awake", "phi_used", "tree_steps", joints, prediction,
-            "tree_rate", "tree_euler_steps", joints, **partitioned,
-        )  # fmt: skip
+            integrate,
+            parameters,
+            model,
+            "stepping",
+            "tree_awake",
+            "phi_used",
+            "tree_steps",
+            joints,
+            prediction,
+            "tree_rate",
+            "tree_euler_steps",
+            joints,
+            **partitioned,
+        )
         keep = record(
-            keep_budget, parameters, model, "stepping", "tree_budget", "tree_phi", "tree_steps", "tree_rate",
-            forces, self.budget, "tree_euler_steps", joints, apart, fill(s.Factors), fill(s.Scratch),
-            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"), **partitioned,
-        )  # fmt: skip
+            keep_budget,
+            parameters,
+            model,
+            "stepping",
+            "tree_budget",
+            "tree_phi",
+            "tree_steps",
+            "tree_rate",
+            forces,
+            self.budget,
+            "tree_euler_steps",
+            joints,
+            apart,
+            fill(s.Factors),
+            fill(s.Scratch),
+            fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"),
+            **partitioned,
+        )
         chunk = TREES_PER_CHUNK["integrate"]
         return self._keeping_budgets(self._pool.share([move], chunk), self._pool.share([begin, move, keep], chunk))
 
     def _record_momentum(self, parameters: Any) -> Launch:
-        fill, s = self.fill, structs
+        fill = self.fill
+        s = structs
         return self.record(
-            correct_floating_momentum, parameters, fill(s.ArticulationModel), "floating", "phi_used", "tree_rate",
-            "tree_steps", fill(s.AppliedForces), fill(s.BodyState), "body_acceleration", "lever",
-            fill(s.FloatingScratch), fill(s.JointState), index_list="roots",
-        )  # fmt: skip
+            correct_floating_momentum,
+            parameters,
+            fill(s.ArticulationModel),
+            "floating",
+            "phi_used",
+            "tree_rate",
+            "tree_steps",
+            fill(s.AppliedForces),
+            fill(s.BodyState),
+            "body_acceleration",
+            "lever",
+            fill(s.FloatingScratch),
+            fill(s.JointState),
+            index_list="roots",
+        )
 
     def _record_resident(self, parameters: Any) -> None:
         """The launches of a step once more, on copies of what there is of each tree."""
-        device, shared = self.buffers.device, self.buffers.arrays
+        device = self.buffers.device
+        shared = self.buffers.arrays
         names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
         copies = {name: wp.empty_like(shared[name], device=device) for name in names}
         self.resident_arrays = self._arrays = shared | copies
@@ -1032,7 +1253,8 @@ class KernelLaunches:
 
     def list_budgets(self, trees: np.ndarray) -> None:
         """These trees [k] have energy budgets (:mod:`vinesim.kernels.plants.energy_budget`), no others."""
-        self._budgeted, self._budget_phase = trees, -1
+        self._budgeted = trees
+        self._budget_phase = -1
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
@@ -1062,33 +1284,69 @@ class KernelLaunches:
         size = LANES * RECORD * (self.buffers.max_tree_size + 2)
         launches = [
             self.record(
-                predict_groups, parameters, self._model, "groups", "stepping", "tree_phi", "tree_euler_steps",
-                "tree_steps", self._forces, joints, wp.zeros(size, dtype=float, device=self.buffers.device),
-                "phi_used", self._bodies, self._factors, scratch, prediction, index_list="groups",
+                predict_groups,
+                parameters,
+                self._model,
+                "groups",
+                "stepping",
+                "tree_phi",
+                "tree_euler_steps",
+                "tree_steps",
+                self._forces,
+                joints,
+                wp.zeros(size, dtype=float, device=self.buffers.device),
+                "phi_used",
+                self._bodies,
+                self._factors,
+                scratch,
+                prediction,
+                index_list="groups",
             )
             for _ in range(self._pool.size)
-        ]  # fmt: skip
+        ]
         return self._pool.share([join_partitions(launches)], 1)
 
     def _record_impact(self, parameters: Any) -> None:
         """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""
-        fill, s = self.fill, structs
-        joints, scratch = fill(s.JointState), fill(s.Scratch)
+        fill = self.fill
+        s = structs
+        joints = fill(s.JointState)
+        scratch = fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self.factor_impact = self.record(
-            predict, parameters, self._model, "subset", "tree_phi", "tree_euler_steps", "tree_steps", self._forces,
-            joints, "impact_phi",
-            self._bodies, self._factors, scratch, prediction, index_list="trees",
-        )  # fmt: skip
-        self.apply_impulses = self.record(
-            apply_wrenches, 1.0, self._model, "subset", "body_impulse", self._factors, fill(s.WrenchScratch), scratch,
+            predict,
+            parameters,
+            self._model,
+            "subset",
+            "tree_phi",
+            "tree_euler_steps",
+            "tree_steps",
+            self._forces,
+            joints,
+            "impact_phi",
+            self._bodies,
+            self._factors,
+            scratch,
             prediction,
-        )  # fmt: skip
+            index_list="trees",
+        )
+        self.apply_impulses = self.record(
+            apply_wrenches,
+            1.0,
+            self._model,
+            "subset",
+            "body_impulse",
+            self._factors,
+            fill(s.WrenchScratch),
+            scratch,
+            prediction,
+        )
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
         """Response [n, 6, m, 6] of some bodies [n] to unit impulses on the listed bodies of the same tree (neighbours
         in the list, at most m); a view, good until the next call."""
-        n, buffers = len(bodies), self.buffers
+        n = len(bodies)
+        buffers = self.buffers
         if n > self.response_capacity or self.response_capacity == 0:
             self._record_response(max(2 * self.response_capacity, n, MIN_CAPACITY))
         self._response_bodies[:n] = buffers.slots[bodies]
@@ -1111,7 +1369,8 @@ class KernelLaunches:
         return dense
 
     def _record_response(self, capacity: int) -> None:
-        self.response_capacity, buffers = capacity, self.buffers
+        self.response_capacity = capacity
+        buffers = self.buffers
         self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
         self._response = buffers.pinned(np.zeros((capacity, 6, buffers.max_tree_size, 6), np.float32))
         buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
@@ -1123,9 +1382,14 @@ class KernelLaunches:
             for name in structs.fields(structs.ResponseColumns)
         }
         self._respond = self.record(
-            impulse_response, self._model, stride, "response_bodies", self._factors,
-            self.fill(structs.ResponseColumns, **columns), "response",
-        )  # fmt: skip
+            impulse_response,
+            self._model,
+            stride,
+            "response_bodies",
+            self._factors,
+            self.fill(structs.ResponseColumns, **columns),
+            "response",
+        )
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
@@ -1142,10 +1406,17 @@ class KernelLaunches:
         places = buffers.pinned(np.zeros(capacity, np.int32))
         carried = buffers.pinned(np.zeros((capacity, 6), np.float32))
         launch = self.record(
-            joint_wrench, self.parameters, self._model, buffers.reach(places, wp.int32, "joint_bodies"), "phi_used",
-            "tree_steps", self._forces, self._bodies, "body_acceleration",
+            joint_wrench,
+            self.parameters,
+            self._model,
+            buffers.reach(places, wp.int32, "joint_bodies"),
+            "phi_used",
+            "tree_steps",
+            self._forces,
+            self._bodies,
+            "body_acceleration",
             buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
-        )  # fmt: skip
+        )
 
         def launch_and_wait(count: int, first: int = 0, partition: int = 0) -> None:
             launch(count)
@@ -1201,21 +1472,31 @@ class StepRunner:
         floating: np.ndarray,
         topologies: Topologies,
     ) -> None:
-        self._buffers, self._launches, self._list = buffers, launches, stepping
-        self._substeps, self._steps_of, self._rate, self._floating = tree_substeps, tree_steps, tree_rate, floating
-        self._is_whole, self._budget_kind = whole, tree_budget
+        self._buffers = buffers
+        self._launches = launches
+        self._list = stepping
+        self._substeps = tree_substeps
+        self._steps_of = tree_steps
+        self._rate = tree_rate
+        self._floating = floating
+        self._is_whole = whole
+        self._budget_kind = tree_budget
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
         self.is_stepped = np.zeros(len(tree_rate), np.bool_)
         """Which these are [tree]."""
         self.fast = np.zeros(0, np.int32)
         """Those of them whose step is to be divided [k], sorted."""
-        self._whole, self._levels, self._roots, self._root_levels = 0, (), 0, ()
+        self._whole = 0
+        self._levels = ()
+        self._roots = 0
+        self._root_levels = ()
         self._divided = np.zeros(0, np.int32)
         """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
-        self._groups, self._topologies = groups, topologies
+        self._groups = groups
+        self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
         """Place in the list at which each group begins, and the end of the list."""
         self._whole_groups = 0
@@ -1245,13 +1526,16 @@ class StepRunner:
 
     def _order(self) -> None:
         """List the trees by what ``_steps_of`` says of each."""
-        trees, on_cpu = self.stepped, self._buffers.device.is_cpu
+        trees = self.stepped
+        on_cpu = self._buffers.device.is_cpu
         topologies = self._topologies.of(trees)
         if on_cpu:
             order = np.argsort(topologies, kind="stable")
-            trees, topologies = trees[order], topologies[order]
+            trees = trees[order]
+            topologies = topologies[order]
         listed, self._whole, self._levels = _by_substeps(np.arange(len(trees)), self._steps_of[trees])
-        trees, topologies = trees[listed], topologies[listed]
+        trees = trees[listed]
+        topologies = topologies[listed]
         self._list[: len(trees)] = trees
         in_groups = self._launches.predict_groups is not None
         self._starts = group_starts(topologies, self._whole) if in_groups else np.arange(len(trees) + 1)
@@ -1275,7 +1559,8 @@ class StepRunner:
     def _list_roots(self, roots: np.ndarray, trees: np.ndarray) -> None:
         """List floating roots [k] (places of bodies) of trees [k] as their trees are listed."""
         if len(roots) == 0:
-            self._roots, self._root_levels = 0, ()
+            self._roots = 0
+            self._root_levels = ()
             return
         order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
         self._floating[: len(roots)] = roots[order]
@@ -1301,7 +1586,8 @@ class StepRunner:
         self._take_substeps(self._launches.shared)
 
     def _take_substeps(self, step: Step) -> None:
-        roots, first = self._root_levels, self._whole
+        roots = self._root_levels
+        first = self._whole
         for level, count in enumerate(self._levels):
             step.predict(count, first)
             step.integrate(count, first)
@@ -1370,7 +1656,9 @@ class Topologies:
     """
 
     def __init__(self, model: Model, body_cut: np.ndarray, tree_moving: np.ndarray) -> None:
-        self._model, self._body_cut, self._moving = model, body_cut, tree_moving
+        self._model = model
+        self._body_cut = body_cut
+        self._moving = tree_moving
         known: dict[bytes, int] = {}
         parent = np.maximum(model.body_parent - model.tree_first[model.body_tree], -1).astype(np.int32)
 

@@ -40,27 +40,38 @@ class ContactLoads:
         apply: lets what has been summed act on the touched trees.
         pool: makes the launches.
         """
-        self._apply, self._pool = apply, pool
+        self._apply = apply
+        self._pool = pool
         self._touched_count = np.zeros(1, np.int32)
-        self._touched, self._body_tree, self._place_in_tree = touched, body_tree, place_in_tree
-        self._is_stepped, self._tree_moving = is_stepped, tree_moving
+        self._touched = touched
+        self._body_tree = body_tree
+        self._place_in_tree = place_in_tree
+        self._is_stepped = is_stepped
+        self._tree_moving = tree_moving
         self._numbers = np.zeros(kernels.NUMBERS, np.int64)
         self._numbers[kernels.ONSET_STEPS] = onset
         last_contact = np.full(len(touched), -2, np.int64)  # step of the last contact
         self._given = [
-            share(body_tree, wp.int32), share(place_in_tree, wp.int32), share(is_stepped, wp.bool),
+            share(body_tree, wp.int32),
+            share(place_in_tree, wp.int32),
+            share(is_stepped, wp.bool),
             share(tree_moving, wp.int32),
-        ]  # fmt: skip
+        ]
         self._results = [
-            share(body_wrench, wp.spatial_vector), share(touched, wp.int32), share(self._touched_count, wp.int32),
-            share(last_contact, wp.int64), share(euler_steps, wp.int32),
-        ]  # fmt: skip
+            share(body_wrench, wp.spatial_vector),
+            share(touched, wp.int32),
+            share(self._touched_count, wp.int32),
+            share(last_contact, wp.int64),
+            share(euler_steps, wp.int32),
+        ]
         self._loaded = self._body = np.zeros(0, np.int32)  # room is made, and the kernel loaded, by the first contact
 
     def _make_room(self, bodies: int) -> None:
-        loaded, self._loaded = self._loaded, np.zeros(bodies, np.int32)
+        loaded = self._loaded
+        self._loaded = np.zeros(bodies, np.int32)
         self._loaded[: len(loaded)] = loaded
-        self._body, self._wrench = np.zeros(bodies, np.int32), np.zeros((bodies, 6), np.float32)
+        self._body = np.zeros(bodies, np.int32)
+        self._wrench = np.zeros((bodies, 6), np.float32)
         load = bind_launch(
             kernels.load_bodies,
             [*self._given, share(self._body, wp.int32), share(self._wrench, wp.spatial_vector)],
@@ -82,7 +93,8 @@ class ContactLoads:
         count = len(bodies)
         if count > len(self._body):
             self._make_room(max(2 * count, LEAST_ROOM))
-        self._body[:count], self._wrench[:count] = bodies, wrenches
+        self._body[:count] = bodies
+        self._wrench[:count] = wrenches
         self._numbers[kernels.GIVEN], self._numbers[kernels.TICK] = count, tick
         self._load()
         if self._numbers[kernels.REFUSED]:

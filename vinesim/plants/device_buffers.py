@@ -124,11 +124,13 @@ class DeviceBuffers:
 
     def add_constant(self, name: str, data: np.ndarray, dtype: type) -> None:
         """An array that is never written."""
-        self.arrays[name], self.host[name] = wp.array(data, dtype=dtype, device=self.device), data
+        self.arrays[name] = wp.array(data, dtype=dtype, device=self.device)
+        self.host[name] = data
 
     def add_shared(self, name: str, data: np.ndarray, dtype: type) -> None:
         """An array that kernels read and write where it is; with a GPU it must come from :meth:`pinned`."""
-        self.arrays[name], self.host[name] = self.reach(data, dtype, name), data
+        self.arrays[name] = self.reach(data, dtype, name)
+        self.host[name] = data
 
     def reach(self, data: np.ndarray, dtype: Any, name: str) -> wp.array:
         """The same memory for kernels; with a GPU it must come from :meth:`pinned`. ``name``: for messages."""
@@ -142,7 +144,8 @@ class DeviceBuffers:
 
     def host_array(self, name: str) -> wp.array:
         """A shared array as one of the host, to be copied from or to."""
-        shared, data = self.arrays[name], self.host[name]
+        shared = self.arrays[name]
+        data = self.host[name]
         if self.device.is_cpu or data.size == 0:
             return shared
         return wp.array(ptr=data.ctypes.data, shape=shared.shape, dtype=shared.dtype, device="cpu", pinned=True)
@@ -155,7 +158,8 @@ class DeviceBuffers:
         if not self.has_copies:
             self.add_shared(name, data, dtype)
             return
-        self.host[name], self._dtypes[name] = data, dtype
+        self.host[name] = data
+        self._dtypes[name] = dtype
         self._points |= {name} if body_indices else set()
         self.arrays[name] = wp.zeros(self.slot_count, dtype=dtype, device=self.device)
         self.upload([name])
@@ -186,7 +190,8 @@ class DeviceBuffers:
         (pitch, first, source), (pitch_there, first_there, target) = (there, here) if to_host else (here, there)
         ints = [wp.array(x, dtype=wp.int32, device=self.device) for x in (starts, widths)]
         addresses = [wp.array(np.array(x, np.uint64), dtype=wp.uint64, device=self.device) for x in (source, target)]
-        a, threads = self.arrays, int(starts[-1])
+        a = self.arrays
+        threads = int(starts[-1])
         given = [threads, pitch, pitch_there, a[first], a[first_there], a["tree_size"], *ints, a[trees], addresses[0]]
         launch = bind_launch(copy_rows, given, [addresses[1]], device=str(self.device), block=256)
         return lambda count: launch(count * threads)

@@ -19,8 +19,11 @@ class EquilibriumFinder:
     """Measures trees between steps; see :mod:`vinesim.kernels.plants.residual_motion`."""
 
     def __init__(self, plants: ArticulationSolver) -> None:
-        self._plants, buffers = plants, plants.buffers
-        trees, slots, device = len(plants.model.tree_first), buffers.slot_count, buffers.device
+        self._plants = plants
+        buffers = plants.buffers
+        trees = len(plants.model.tree_first)
+        slots = buffers.slot_count
+        device = buffers.device
         self._speed, self._distance = (buffers.pinned(np.zeros(trees, np.float32)) for _ in range(2))
         self._is_free = buffers.pinned(np.zeros(trees, bool))
         buffers.add_body_rows("body_length", buffers.pinned(plants.model.body_length), float)
@@ -41,20 +44,33 @@ class EquilibriumFinder:
 
     def _record(self, plants: ArticulationSolver) -> None:
         """Bind the kernel; scratch, factors and predicted rates are those of a step, unused between steps."""
-        launches, s = plants.launches, structs
+        launches = plants.launches
+        s = structs
         fill = launches.fill
         numbers = {name: getattr(launches.parameters, name) for name in s.fields(s.SolverParameters)}
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         self._measure = launches.record(
-            residual_motion, fill(s.SolverParameters, **(numbers | {"dt": REST_STEP})),
-            fill(s.ArticulationModel, joint_damping="no_rate"), "body_length", "tie_axis", "tie_softening",
-            "root_softening", "subset",
-            fill(s.AppliedForces), fill(s.JointState), fill(s.JointState, joint_xd="no_rate", joint_qd="no_rate"),
+            residual_motion,
+            fill(s.SolverParameters, **(numbers | {"dt": REST_STEP})),
+            fill(s.ArticulationModel, joint_damping="no_rate"),
+            "body_length",
+            "tie_axis",
+            "tie_softening",
+            "root_softening",
+            "subset",
+            fill(s.AppliedForces),
+            fill(s.JointState),
+            fill(s.JointState, joint_xd="no_rate", joint_qd="no_rate"),
             fill(s.AppliedForces, body_load="static_load", body_wrench="no_wrench", root_turn_rate="no_turn_rate"),
             "static_load",
-            fill(s.BodyState, body_q="rest_q", body_qd="rest_qd"), fill(s.Factors), fill(s.Scratch), prediction,
-            "rest_speed", "rest_distance", "is_free",
-        )  # fmt: skip
+            fill(s.BodyState, body_q="rest_q", body_qd="rest_qd"),
+            fill(s.Factors),
+            fill(s.Scratch),
+            prediction,
+            "rest_speed",
+            "rest_distance",
+            "is_free",
+        )
 
     def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Speed [k] m/s of the fastest point of some trees [k], distance [k] m of the one that is furthest from where
@@ -76,6 +92,7 @@ class EquilibriumFinder:
         plants.buffers.synchronize()
         bodies = plants.bodies_of(trees)
         moving = bodies - plants.model.tree_first[tree := plants.model.body_tree[bodies]] < plants.tree_moving[tree]
-        bodies, state = bodies[moving], plants.state
+        bodies = bodies[moving]
+        state = plants.state
         turn = frames.exp(0.25 * REST_STEP * plants.joint_qd_free[bodies])
         state.joint_q[bodies] = frames.normalize(frames.multiply(turn, state.joint_q[bodies]))

@@ -54,7 +54,8 @@ class FaultGuard:
 
     def stop_faulty_trees(self) -> np.ndarray:
         """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
-        plants, state = self.plants, self.plants.state
+        plants = self.plants
+        state = self.plants.state
         awake = plants.awake
         self._fastest[0] = 0.0
         self._find_fastest(len(awake))
@@ -85,7 +86,8 @@ class FaultGuard:
 
     def report(self) -> list[Fault]:
         """Log what happened since the last report and return it. Call it outside the tick."""
-        faults, self._faults = self._faults, []
+        faults = self._faults
+        self._faults = []
         for fault in faults:
             log.warning("tree %d stopped in tick %d at %g rad/s; it rests", fault.tree, fault.tick, fault.rate)
         return faults

@@ -20,17 +20,21 @@ class LevelOfDetail:
         """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is
         coarsened."""
         p = parameters
-        self.plants, self.rest_rate = plants, p.detail_rate
-        self.fine_steps, self.rest_steps = p.steps(p.detail_duration), p.steps(p.detail_rest_duration)
+        self.plants = plants
+        self.rest_rate = p.detail_rate
+        self.fine_steps = p.steps(p.detail_duration)
+        self.rest_steps = p.steps(p.detail_rest_duration)
         """Steps that a tree stays fine with no actor near, and that its clusters must be at rest by then."""
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)
         self._bodies = model.bunch_body[self._clustered]
         self._tree = model.body_tree[self._bodies]
-        self._alone, self._still = np.zeros(trees, np.int32), np.zeros(trees, np.int32)
+        self._alone = np.zeros(trees, np.int32)
+        self._still = np.zeros(trees, np.int32)
         self._wanted = np.zeros(trees, bool)
-        self._points, self._radius = np.zeros((0, 3)), 0.0
+        self._points = np.zeros((0, 3))
+        self._radius = 0.0
         self._attached = -1
         self._worth = np.zeros(trees, bool)
         self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
@@ -38,7 +42,8 @@ class LevelOfDetail:
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:
         """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
-        self._points, self._radius = np.asarray(points, float).reshape(-1, 3), float(radius)
+        self._points = np.asarray(points, float).reshape(-1, 3)
+        self._radius = float(radius)
 
     @property
     def fine_trees(self) -> np.ndarray:
@@ -51,7 +56,8 @@ class LevelOfDetail:
         coarsened = near[:0]
         if len(self._clustered) == 0:
             return coarsened
-        plants, state = self.plants, self.plants.state
+        plants = self.plants
+        state = self.plants.state
         attached = int(np.count_nonzero(state.bunch_attached))
         if attached != self._attached:  # a tree whose bunches are gone has nothing to refine
             self._attached = attached
@@ -95,7 +101,8 @@ class LevelOfDetail:
     def _rate(self, trees: np.ndarray) -> np.ndarray:
         """The fastest cluster of each tree [k] rad/s, against what it hangs on."""
         if not np.array_equal(trees, self._rated_trees):
-            model, self._rated_trees = self.plants.model, trees
+            model = self.plants.model
+            self._rated_trees = trees
             core = model.tree_core[trees]
             count = model.tree_size[trees] - core
             self._first_cluster = np.cumsum(count) - count

@@ -116,13 +116,11 @@ class Rollout:
                 f"{ticks} ticks of {dt} s, a checkpoint every {checkpoint}, phi {phi}: need 1 or more, a finite dt "
                 "above 0, phi from 0.5 to 1"
             )
-        self.model, self.ticks, self.dt, self.fault_rate, self.device = (
-            model,
-            ticks,
-            dt,
-            fault_rate,
-            find_device(device),
-        )
+        self.model = model
+        self.ticks = ticks
+        self.dt = dt
+        self.fault_rate = fault_rate
+        self.device = find_device(device)
         self.state = State.at_rest(model)
         plants = ArticulationSolver(model, self.state, buffers=DeviceBuffers("cpu"))  # for the arrays of its kernels
         if fine:
@@ -274,7 +272,8 @@ class Rollout:
 
     def _argument(self, kernel: Any, arg: Any, slot: int, end: bool) -> Any:
         """What an argument is in one step: a struct filled field by field, an array, or a number."""
-        name, written = arg.label.removesuffix("_out"), arg.label.endswith("_out")
+        name = arg.label.removesuffix("_out")
+        written = arg.label.endswith("_out")
         if not isinstance(arg.type, _STRUCT):
             return self._value(kernel, name, arg.type, written, slot, end)
         filled = arg.type()

@@ -41,8 +41,10 @@ class SleepMonitor:
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         """``parameters``: those that begin with ``sleep_`` say what is at rest."""
-        self.plants, self.rate = plants, parameters.sleep_rate
-        self.speed, self.distance = parameters.sleep_speed, parameters.sleep_distance
+        self.plants = plants
+        self.rate = parameters.sleep_rate
+        self.speed = parameters.sleep_speed
+        self.distance = parameters.sleep_distance
         self._equilibrium = EquilibriumFinder(plants)
         self.patience = parameters.steps(parameters.sleep_duration)
         """Steps that the joints of a tree must be slow before it is measured."""
@@ -56,14 +58,19 @@ class SleepMonitor:
         """Tick of each tree's :attr:`_seen_x` [tree]; -1: it has none."""
         self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
         """[body, 3] m where bodies were then."""
-        self._limit, self._longest = np.zeros(1, np.float32), np.zeros(1, np.int32)
+        self._limit = np.zeros(1, np.float32)
+        self._longest = np.zeros(1, np.int32)
         """[1] What :attr:`rate` is, and for how many steps the joints of the quietest awake tree have been slower."""
         self._count_quiet_steps = bind_launch(
             count_quiet_steps,
             [share(self._limit, wp.float32), share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
-            [share(self.quiet_steps, wp.int32), share(self._is_at_rest, wp.bool), share(self._seen_tick, wp.int64),
-             share(self._longest, wp.int32)],
-        )  # fmt: skip
+            [
+                share(self.quiet_steps, wp.int32),
+                share(self._is_at_rest, wp.bool),
+                share(self._seen_tick, wp.int64),
+                share(self._longest, wp.int32),
+            ],
+        )
 
     @property
     def restless(self) -> np.ndarray:
@@ -85,9 +92,11 @@ class SleepMonitor:
         self.wake(asleep[distance > CONTACT_SHARE * self.distance])
 
     def update(
-        self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
+        self,
+        keep_awake: np.ndarray | None = None,
+        contact_pairs: np.ndarray = _NO_PAIRS,
         is_coupled: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """:meth:`watch`, and :meth:`check` where it is due: the trees that have just been put to sleep [k].
 
         ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees that
@@ -99,16 +108,20 @@ class SleepMonitor:
     def watch(self) -> bool:
         """After an integration: note which trees were slow in it; whether some are due for :meth:`check`."""
         plants = self.plants
-        self._limit[0], self._longest[0] = self.rate, 0
+        self._limit[0] = self.rate
+        self._longest[0] = 0
         self._count_quiet_steps(len(plants.awake))
         return plants.tick % self._check_steps == 0 and bool(self._longest[0] >= self.patience)
 
     def check(
-        self, keep_awake: np.ndarray | None = None, contact_pairs: np.ndarray = _NO_PAIRS,
+        self,
+        keep_awake: np.ndarray | None = None,
+        contact_pairs: np.ndarray = _NO_PAIRS,
         is_coupled: np.ndarray | None = None,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """Measure the trees that have been slow for long enough; see :meth:`update`."""
-        plants, awake = self.plants, self.plants.awake
+        plants = self.plants
+        awake = self.plants.awake
         slow = awake[self.quiet_steps[awake] >= self.patience]
         if keep_awake is not None:  # what is at rest and stays awake all the same is measured when it has moved
             slow = slow[~(keep_awake[slow] & self._is_at_rest[slow])]
@@ -133,7 +146,8 @@ class SleepMonitor:
 
     def _find_still(self, trees: np.ndarray) -> None:
         """Of slow trees [k] those that have not moved for :data:`STILL_DURATION` are at rest."""
-        plants, now = self.plants, self.plants.tick
+        plants = self.plants
+        now = self.plants.tick
         due = trees[(self._seen_tick[trees] >= 0) & (now - self._seen_tick[trees] >= self._still_steps)]
         if len(due):
             bodies = plants.bodies_of(due)

@@ -33,7 +33,9 @@ class TieTable:
     """
 
     def __init__(self, model: Model, max_bodies: int, max_hands: int) -> None:
-        self._max_bodies, self._max_hands, self._model_ties = max_bodies, max_hands, len(model.tie_body)
+        self._max_bodies = max_bodies
+        self._max_hands = max_hands
+        self._model_ties = len(model.tie_body)
         self._model_body = np.unique(model.tie_body)
         bodies = len(model.body_mass)
         self._max_model_ties = int(np.bincount(model.tie_body, minlength=bodies).max(initial=0))
@@ -91,7 +93,9 @@ class TieTable:
             raise TieLimitError(f"body {body} is held in {self._max_hands} places already; let go of one")
         tie = start + int(spare[0])
         self.anchor[tie] = pose[:3] + frames.rotate(pose[3:], np.asarray(point, float))
-        self.point[tie], self.stiffness[tie], self.damping[tie] = point, stiffness, damping
+        self.point[tie] = point
+        self.stiffness[tie] = stiffness
+        self.damping[tie] = damping
         return tie
 
     def remove(self, body: int, tie: int) -> None:
@@ -114,8 +118,14 @@ class TieTable:
         start = self._model_ties + self._span_size * free[0]
         here = slice(start, start + own.stop - own.start)
         for values in (
-            self.anchor, self.anchor_velocity, self.axis, self.softening, self.stiffness, self.damping, self.point,
-        ):  # fmt: skip
+            self.anchor,
+            self.anchor_velocity,
+            self.axis,
+            self.softening,
+            self.stiffness,
+            self.damping,
+            self.point,
+        ):
             values[start : start + self._span_size] = 0.0
             values[here] = values[own]
         self.span[body] = start, start + self._span_size
@@ -152,7 +162,8 @@ def turning_damping(model: Model, bodies: np.ndarray, root: np.ndarray, tied: np
         gravity: [m/s^2]
     """
     damping = np.zeros(len(bodies), np.float32)
-    along, up = np.zeros(len(bodies)), bodies
+    along = np.zeros(len(bodies))
+    up = bodies
     while (up >= 0).any():
         along += np.where(up >= 0, np.linalg.norm(model.body_offset[up], axis=1), 0.0)
         up = np.where(up >= 0, model.body_parent[up], -1)

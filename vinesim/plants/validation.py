@@ -31,8 +31,12 @@ def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
         _log.warning(
             "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, least of phi %g and dt %g s,"
             " and have that; lower dt or phi (0.5 adds none), or raise their beta",
-            raised.sum(), len(model.body_mass), 1e3 * floor, phi, dt,
-        )  # fmt: skip
+            raised.sum(),
+            len(model.body_mass),
+            1e3 * floor,
+            phi,
+            dt,
+        )
 
 
 def validate(model: Model, state: State) -> None:
@@ -80,14 +84,17 @@ def validate(model: Model, state: State) -> None:
 
 def _validate_clusters(model: Model) -> None:
     """Clusters are all that stands behind a tree's core, each run on one bunch."""
-    core, size = model.tree_core, model.tree_size
+    core = model.tree_core
+    size = model.tree_size
     if (bad := (core < 1) | (core > size)).any():
         tree = int(np.argmax(bad))
         raise ValueError(f"tree {tree}: tree_core {core[tree]} of {size[tree]} bodies; give 1 to tree_size (all)")
     riding = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree] >= core[model.body_tree]
     owner = np.full(len(model.body_mass), -1)
     for bunch in np.flatnonzero(model.bunch_clusters > 0).tolist():
-        first, count, body = model.bunch_cluster[bunch], model.bunch_clusters[bunch], model.bunch_body[bunch]
+        first = model.bunch_cluster[bunch]
+        count = model.bunch_clusters[bunch]
+        body = model.bunch_body[bunch]
         parts = np.arange(first, first + count)
         where = f"bunch {bunch}: clusters {first} to {first + count - 1}"
         if first < 0 or first + count > len(owner) or not riding[parts].all():
@@ -123,7 +130,8 @@ def _validate_clusters(model: Model) -> None:
 
 def _validate_ties(model: Model) -> None:
     """Ties are sorted, on bodies that are there and always move, and pull back."""
-    body, count = model.tie_body, len(model.body_mass)
+    body = model.tie_body
+    count = len(model.body_mass)
 
     def refuse(bad: np.ndarray, what: str) -> None:
         if bad.any():
@@ -135,7 +143,8 @@ def _validate_ties(model: Model) -> None:
     tree = model.body_tree[body]
     refuse(body - model.tree_first[tree] >= model.tree_core[tree], "a berry cluster cannot be tied; tie its bunch")
     refuse(~(model.tie_stiffness >= 0.0), "stiffness below 0 N/m; a spring pulls back: use 0 or more")
-    wire, pieces = model.tie_wire, len(model.fixed_start)
+    wire = model.tie_wire
+    pieces = len(model.fixed_start)
     refuse(
         (wire < -1) | (wire >= pieces),
         f"wire of {pieces} fixed pieces, counted from 0; give one of them, or -1 for none",

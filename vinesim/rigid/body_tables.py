@@ -28,7 +28,8 @@ def list_visuals(
 
     ``bunches`` gives the shapes and the MuJoCo body of every free bunch.
     """
-    visuals, bodies = [], []
+    visuals = []
+    bodies = []
     for number, box in boxes.items():
         length, width, height = map(float, box.size)
         shapes = appearance.crate_shapes((length, width, height), number)

@@ -77,7 +77,9 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
     """The properties of some geoms ``ids`` [k]; ``names``: actor and link of each."""
     moved_by = m.body_weldid  # a body without joints moves with the one that it is welded to
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1)[moved_by]
-    body, kind, size = m.geom_bodyid[ids], m.geom_type[ids].copy(), m.geom_size[ids].copy()
+    body = m.geom_bodyid[ids]
+    kind = m.geom_type[ids].copy()
+    size = m.geom_size[ids].copy()
     mesh = kind == _MESH
     size[mesh] = m.geom_aabb[ids][mesh, 3:]
     hull = hull_numbers(m, ids)
@@ -90,7 +92,8 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
     cylinder = kind == _CYLINDER
     half[cylinder] = size[cylinder][:, [0, 0, 1]]
     plane = kind == _PLANE
-    half[plane], radius[plane] = (PLANE_HALF_SIZE, PLANE_HALF_SIZE, 0.0), np.inf
+    half[plane] = (PLANE_HALF_SIZE, PLANE_HALF_SIZE, 0.0)
+    radius[plane] = np.inf
     return RigidGeoms(
         id=ids.astype(np.int32),
         body=body.astype(np.int32),

@@ -74,9 +74,11 @@ class _Block:
         self.at = np.full(world.nv, -1)
         self.at[dofs] = np.arange(len(dofs))
         self.dofs = dofs
-        row, column = np.repeat(np.arange(world.nv), world.M_rownnz), world.M_colind
+        row = np.repeat(np.arange(world.nv), world.M_rownnz)
+        column = world.M_colind
         self.entry = np.flatnonzero(self.at[row] >= 0)
-        self.row, self.column = self.at[row[self.entry]], self.at[column[self.entry]]
+        self.row = self.at[row[self.entry]]
+        self.column = self.at[column[self.entry]]
 
     def hessian(self, d: mujoco.MjData) -> np.ndarray:
         """[k, k]: M^ and the tangent of the active constraints."""

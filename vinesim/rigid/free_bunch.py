@@ -29,14 +29,33 @@ _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
 that moves loses contact for a step: fingers that hold with 25 N are then 3 mm further, and the bunch falls."""
 
 BODY_ARRAYS = (
-    "body_mass", "body_ipos", "body_iquat", "body_inertia", "body_subtreemass", "body_sameframe", "body_invweight0",
-    "body_contype", "body_conaffinity",
-)  # fmt: skip
+    "body_mass",
+    "body_ipos",
+    "body_iquat",
+    "body_inertia",
+    "body_subtreemass",
+    "body_sameframe",
+    "body_invweight0",
+    "body_contype",
+    "body_conaffinity",
+)
 """Constants that MuJoCo derives from the mass and the shapes of a body."""
 GEOM_ARRAYS = (
-    "geom_type", "geom_contype", "geom_conaffinity", "geom_condim", "geom_priority", "geom_size", "geom_pos",
-    "geom_quat", "geom_aabb", "geom_rbound", "geom_sameframe", "geom_friction", "geom_solimp", "geom_solref",
-)  # fmt: skip
+    "geom_type",
+    "geom_contype",
+    "geom_conaffinity",
+    "geom_condim",
+    "geom_priority",
+    "geom_size",
+    "geom_pos",
+    "geom_quat",
+    "geom_aabb",
+    "geom_rbound",
+    "geom_sameframe",
+    "geom_friction",
+    "geom_solimp",
+    "geom_solref",
+)
 """The same of a geom."""
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
@@ -63,14 +82,17 @@ class FreeBunch:
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
         """Spheres and capsules, in the bunch's frame."""
-        axis, middle = self.end - self.start, 0.5 * (self.start + self.end)
-        half, rgba = 0.5 * np.linalg.norm(axis, axis=-1), (0.25, 0.05, 0.3, 1.0)
+        axis = self.end - self.start
+        middle = 0.5 * (self.start + self.end)
+        half = 0.5 * np.linalg.norm(axis, axis=-1)
+        rgba = (0.25, 0.05, 0.3, 1.0)
         turn = frames.multiply(frames.from_x_axis(axis), _Z_TO_X)
         return tuple(
-            Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba) if h > 0.0
+            Shape("capsule", (float(r), float(h)), frames.pose(p, q), rgba)
+            if h > 0.0
             else Shape("sphere", (float(r),), frames.pose(p), rgba)
             for r, h, p, q in zip(self.radius, half, middle, turn, strict=True)
-        )  # fmt: skip
+        )
 
 
 def slot_name(slot: int) -> str:
@@ -81,15 +103,25 @@ def slot_name(slot: int) -> str:
 def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
     """Add a body to the pool: asleep, with numbers that have no meaning yet; see :func:`disable_collision`."""
     body = spec.worldbody.add_body(
-        name=slot_name(slot), pos=_parking_pose(slot)[:3], mass=0.5, ipos=[0.05, 0.0, 0.0], inertia=[1e-3, 1e-3, 1e-3],
-        explicitinertial=True, sleep=mujoco.mjtSleepPolicy.mjSLEEP_INIT,
-    )  # fmt: skip
+        name=slot_name(slot),
+        pos=_parking_pose(slot)[:3],
+        mass=0.5,
+        ipos=[0.05, 0.0, 0.0],
+        inertia=[1e-3, 1e-3, 1e-3],
+        explicitinertial=True,
+        sleep=mujoco.mjtSleepPolicy.mjSLEEP_INIT,
+    )
     body.add_freejoint(name=slot_name(slot))
     for _ in range(MAX_GEOMS):
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.01, 0, 0], pos=[0.05, 0.0, 0.0], mass=0.0, contype=FREE_BUNCH,
-            conaffinity=CONAFFINITY, userdata=geom_user(Material.BERRY),
-        )  # fmt: skip  # with collision bits, or MuJoCo makes no bounding volumes
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[0.01, 0, 0],
+            pos=[0.05, 0.0, 0.0],
+            mass=0.0,
+            contype=FREE_BUNCH,
+            conaffinity=CONAFFINITY,
+            userdata=geom_user(Material.BERRY),
+        )  # with collision bits, or MuJoCo makes no bounding volumes
 
 
 def _parking_pose(slot: int) -> np.ndarray:
@@ -116,18 +148,33 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
     )
     body.add_freejoint()
     for start, end, radius in zip(bunch.start, bunch.end, bunch.radius, strict=True):
-        kind, place = mujoco.mjtGeom.mjGEOM_SPHERE, {"pos": start}
+        kind = mujoco.mjtGeom.mjGEOM_SPHERE
+        place = {"pos": start}
         if (start != end).any():
-            kind, place = mujoco.mjtGeom.mjGEOM_CAPSULE, {"fromto": np.concatenate([start, end])}
+            kind = mujoco.mjtGeom.mjGEOM_CAPSULE
+            place = {"fromto": np.concatenate([start, end])}
         body.add_geom(
-            type=kind, size=[float(radius), 0, 0], mass=0.0, contype=FREE_BUNCH, conaffinity=CONAFFINITY,
-            condim=6, friction=friction, priority=1, solref=softness, solimp=_SOLIMP, **place,
-        )  # fmt: skip
+            type=kind,
+            size=[float(radius), 0, 0],
+            mass=0.0,
+            contype=FREE_BUNCH,
+            conaffinity=CONAFFINITY,
+            condim=6,
+            friction=friction,
+            priority=1,
+            solref=softness,
+            solimp=_SOLIMP,
+            **place,
+        )
     for _ in range(MAX_GEOMS - len(bunch.radius)):
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[1e-3, 0, 0], pos=bunch.start[0], mass=0.0, contype=FREE_BUNCH,
+            type=mujoco.mjtGeom.mjGEOM_SPHERE,
+            size=[1e-3, 0, 0],
+            pos=bunch.start[0],
+            mass=0.0,
+            contype=FREE_BUNCH,
             conaffinity=CONAFFINITY,
-        )  # fmt: skip
+        )
 
 
 def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco.MjModel) -> None:

@@ -25,7 +25,9 @@ class HandBody:
     def __init__(self, side: str, stiffness: float, max_force: float, parameters: PhysicsParameters) -> None:
         """``side``: left or right; ``stiffness`` [N/m] and ``max_force`` [N] of its spring."""
         p = self.parameters = parameters
-        self.side, self.stiffness, self.max_force = side, stiffness, max_force
+        self.side = side
+        self.stiffness = stiffness
+        self.max_force = max_force
         self.damping = 2.0 * math.sqrt(stiffness * p.hand_mass)
         """[N s/m] of the spring: critical, so that an empty hand returns without overshoot."""
         self.torsional_damping = 2.0 * math.sqrt(p.hand_torsional_stiffness * p.hand_inertia)
@@ -65,9 +67,12 @@ class HandBody:
         """Find the hand of ``actor`` in a world that was compiled anew."""
         name = f"{actor}/{self.link}"
         joint = names.joint[name]
-        self.body, self.weld = names.body[name], names.equality[name]
-        qpos, dof = int(m.jnt_qposadr[joint]), int(m.jnt_dofadr[joint])
-        self.qpos, self.dofs = slice(qpos, qpos + 7), slice(dof, dof + 6)
+        self.body = names.body[name]
+        self.weld = names.equality[name]
+        qpos = int(m.jnt_qposadr[joint])
+        dof = int(m.jnt_dofadr[joint])
+        self.qpos = slice(qpos, qpos + 7)
+        self.dofs = slice(dof, dof + 6)
 
     # ------------------------------------------------------------------ the step
 
@@ -105,7 +110,8 @@ class HandBody:
         motion: tuple[np.ndarray, np.ndarray],
     ) -> None:
         """Set the wrench of the spring, limited to what the hand can do."""
-        p, dt = self.parameters, self.parameters.dt
+        p = self.parameters
+        dt = self.parameters.dt
         offset, angle = error
         step, spin = motion
         turning = frames.rotate(pose[3:], velocity[3:])
@@ -124,7 +130,8 @@ class HandBody:
         motion: tuple[np.ndarray, np.ndarray],
     ) -> None:
         """Set the velocity of a free hand: with its controller, and towards it."""
-        p, dt = self.parameters, self.parameters.dt
+        p = self.parameters
+        dt = self.parameters.dt
         offset, angle = error
         step, spin = motion
         step = step + offset * dt / max(p.hand_return_time, math.sqrt(offset @ offset) / p.hand_return_speed)
@@ -137,7 +144,9 @@ class HandBody:
         length = float(np.linalg.norm(step))
         if length < HAND_HALF_THICKNESS or self.busy:
             return step
-        way, gone, geom = step / length, 0.0, np.zeros(1, np.int32)
+        way = step / length
+        gone = 0.0
+        geom = np.zeros(1, np.int32)
         while gone < length + HAND_HALF_THICKNESS:
             ahead = mujoco.mj_ray(m, d, at + gone * way, way, None, 1, self.body, geom)
             if ahead < 0.0 or gone + ahead > length + HAND_HALF_THICKNESS:
@@ -168,7 +177,8 @@ class HandBody:
 
     def weld_to(self, m: mujoco.MjModel, d: mujoco.MjData, body: int | None) -> None:
         """Weld the hand to a MuJoCo body at ``grasp_pose``; None: the hand holds a plant and is placed on it."""
-        self.on_plant, self.steps_since_contact = body is None, 0
+        self.on_plant = body is None
+        self.steps_since_contact = 0
         d.eq_active[self.weld] = body is not None
         if body is not None:
             m.eq_obj2id[self.weld] = body
@@ -180,7 +190,9 @@ class HandBody:
 
     def release(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
         """Open the hand; it stays on its spring for ``hand_contact_duration`` and then returns to its controller."""
-        self.held, self.on_plant, self.steps_since_contact = None, False, 0
+        self.held = None
+        self.on_plant = False
+        self.steps_since_contact = 0
         if d.eq_active[self.weld]:
             wake_body(m, d, m.eq_obj2id[self.weld])
         d.eq_active[self.weld] = 0

@@ -24,8 +24,11 @@ def hull_numbers(m: mujoco.MjModel, ids: np.ndarray) -> np.ndarray:
 
 def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
     """Hulls of all meshes of a world; those without a hull are empty."""
-    planes, edges, sides = [np.zeros((0, 4))], [np.zeros((0, 2, 3))], [np.zeros((0, 2), int)]
-    plane_counts, edge_counts = [0], [0]
+    planes = [np.zeros((0, 4))]
+    edges = [np.zeros((0, 2, 3))]
+    sides = [np.zeros((0, 2), int)]
+    plane_counts = [0]
+    edge_counts = [0]
     center = np.zeros((m.nmesh, 3))
     of_mesh = m.geom_type == _MESH
     center[m.geom_dataid[of_mesh]] = m.geom_aabb[of_mesh, :3]
@@ -38,7 +41,8 @@ def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
             sides.append(found[2] + sum(plane_counts))
         plane_counts.append(len(planes[-1]) if m.mesh_graphadr[mesh] >= 0 else 0)
         edge_counts.append(len(edges[-1]) if m.mesh_graphadr[mesh] >= 0 else 0)
-    corners, side = np.concatenate(edges), np.concatenate(sides).astype(np.int32)
+    corners = np.concatenate(edges)
+    side = np.concatenate(sides).astype(np.int32)
     return SharedArrays(
         structs.Hulls,
         first_plane=np.cumsum(plane_counts, dtype=np.int32),
@@ -82,12 +86,14 @@ def faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
     area = np.linalg.norm(normal, axis=1)
     has_area = area > 1e-12 * np.square(np.ptp(vertices, axis=0).max())
-    triangles, normal = triangles[has_area], normal[has_area] / area[has_area, None]
+    triangles = triangles[has_area]
+    normal = normal[has_area] / area[has_area, None]
     outward = np.einsum("fi,fi->f", normal, vertices[triangles[:, 0]] - vertices.mean(0)) >= 0.0
     normal[~outward] *= -1.0
     # of triangles in one plane, the largest gives the plane: slivers have poor normals
     by_area = np.argsort(-area[has_area], kind="stable")
-    plane_of, kept = np.full(len(triangles), -1), []
+    plane_of = np.full(len(triangles), -1)
+    kept = []
     for triangle in by_area.tolist():
         same = np.flatnonzero(normal[kept] @ normal[triangle] > COPLANAR_COSINE) if kept else np.zeros(0, int)
         plane_of[triangle] = same[0] if len(same) else len(kept)

@@ -41,9 +41,11 @@ table A.2, allows 110 to 160 N between robots and trunk, arms and hands for cont
 shorter ones."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2.0]
 _KINDS = {
-    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE, "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
-    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "box": mujoco.mjtGeom.mjGEOM_BOX,
-}  # fmt: skip
+    "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
+    "capsule": mujoco.mjtGeom.mjGEOM_CAPSULE,
+    "ellipsoid": mujoco.mjtGeom.mjGEOM_ELLIPSOID,
+    "box": mujoco.mjtGeom.mjGEOM_BOX,
+}
 
 
 class HumanError(ValueError):
@@ -71,7 +73,10 @@ class HumanBody:
         for name, value in (("height", spec.height), ("stiffness", stiffness), ("force", force)):
             if not (math.isfinite(value) and value > 0.0):
                 raise HumanError(f"human {spec.name!r}: {name} is {value}; give a number above 0")
-        self.spec, self.code, self.is_remote, self.parameters = spec, code, is_remote, parameters
+        self.spec = spec
+        self.code = code
+        self.is_remote = is_remote
+        self.parameters = parameters
         self.hands = tuple(HandBody(side, stiffness, force, parameters) for side in SIDES)
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
@@ -131,7 +136,8 @@ class HumanBody:
 
     def visual_poses(self, hands: np.ndarray) -> np.ndarray:
         """Poses [part, 7] of :data:`VISUAL_PARTS`, then of :attr:`shears_parts`, for palms at ``hands`` [2, 7]."""
-        chest, head = self.part_poses[BODY_PARTS.index("chest")], self.part_poses[BODY_PARTS.index("head")]
+        chest = self.part_poses[BODY_PARTS.index("chest")]
+        head = self.part_poses[BODY_PARTS.index("head")]
         poses = [self._posture.visual_parts(chest, head, hands, self._fingers)]
         for hand, palm in zip(self.hands, hands, strict=True):
             if hand.has_shears:
@@ -153,30 +159,51 @@ class HumanBody:
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the person's bodies to a world."""
-        name, me, p = self.spec.name, self.code, self.parameters
+        name = self.spec.name
+        me = self.code
+        p = self.parameters
         meets = ALL_BITS & ~me & ~REMOTE_HAND if self.is_remote else ALL_BITS & ~me
         never = mujoco.mjtSleepPolicy.mjSLEEP_NEVER
         for part, shape, pose in zip(BODY_PARTS, body_shapes(self.spec.height), self.part_poses, strict=True):
             body = spec.worldbody.add_body(
-                name=f"{name}/{part}", pos=pose[:3], quat=frames.to_wxyz(pose[3:]), mass=KINEMATIC_MASS,
-                ipos=np.zeros(3), inertia=[KINEMATIC_MASS] * 3, explicitinertial=True, gravcomp=1.0, sleep=never,
-            )  # fmt: skip
+                name=f"{name}/{part}",
+                pos=pose[:3],
+                quat=frames.to_wxyz(pose[3:]),
+                mass=KINEMATIC_MASS,
+                ipos=np.zeros(3),
+                inertia=[KINEMATIC_MASS] * 3,
+                explicitinertial=True,
+                gravcomp=1.0,
+                sleep=never,
+            )
             body.add_freejoint(name=f"{name}/{part}")
             _add_geom(body, shape, (me, meets & ~GROUND), p.friction, Material.UNKNOWN)
         for hand in self.hands:
             hand.collision_bits = (REMOTE_HAND, meets & ~ROBOTS) if self.is_remote else (me, meets)
             at = self.controller_pose(hand)
             body = spec.worldbody.add_body(
-                name=f"{name}/{hand.link}", pos=at[:3], quat=frames.to_wxyz(at[3:]), mass=p.hand_mass,
-                ipos=np.zeros(3), inertia=[p.hand_inertia] * 3, explicitinertial=True, gravcomp=1.0, sleep=never,
-            )  # fmt: skip
+                name=f"{name}/{hand.link}",
+                pos=at[:3],
+                quat=frames.to_wxyz(at[3:]),
+                mass=p.hand_mass,
+                ipos=np.zeros(3),
+                inertia=[p.hand_inertia] * 3,
+                explicitinertial=True,
+                gravcomp=1.0,
+                sleep=never,
+            )
             body.add_freejoint(name=f"{name}/{hand.link}")
             for shape in hand_shapes(hand.side):
                 _add_geom(body, shape, hand.collision_bits, p.friction, Material.HAND)
             spec.add_equality(
-                name=f"{name}/{hand.link}", type=mujoco.mjtEq.mjEQ_WELD, objtype=mujoco.mjtObj.mjOBJ_BODY,
-                name1=f"{name}/{hand.link}", active=False, solref=[0.02, 1.0], solimp=_SOLIMP,
-            )  # fmt: skip
+                name=f"{name}/{hand.link}",
+                type=mujoco.mjtEq.mjEQ_WELD,
+                objtype=mujoco.mjtObj.mjOBJ_BODY,
+                name1=f"{name}/{hand.link}",
+                active=False,
+                solref=[0.02, 1.0],
+                solimp=_SOLIMP,
+            )
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames) -> None:
         """Find the person's bodies and joints in a world that was compiled anew."""
@@ -210,7 +237,8 @@ class HumanBody:
             self._teleport(d)
         at = d.qpos[self._hand_q]
         at[:, 3:] = frames.from_wxyz(at[:, 3:])
-        parts, start = len(BODY_PARTS), self._last_poses[: len(BODY_PARTS)]
+        parts = len(BODY_PARTS)
+        start = self._last_poses[: len(BODY_PARTS)]
         on_spring = np.array([[hand.is_on_spring] for hand in self.hands])
         goal = np.where(on_spring, self._poses[parts:], self._last_poses[parts:])
         way, turn, turn_within = self._posture.difference((self._last_poses, at), (self._poses, goal))
@@ -227,7 +255,8 @@ class HumanBody:
         )
         d.qvel[self.part_dofs[:, 3:]] = turn_within[:parts] / dt
         for i, hand in enumerate(self.hands):
-            error, motion = (way[i - 2], turn[i - 2]), (way[parts + i], turn[parts + i])
+            error = (way[i - 2], turn[i - 2])
+            motion = (way[parts + i], turn[parts + i])
             hand.apply_control(m, d, at[i], error, motion)
 
     def measure(self, d: mujoco.MjData) -> None:
@@ -262,7 +291,15 @@ def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], frictio
     """Add a collision shape; ``bits``: contype and conaffinity."""
     size = [*shape.size, 0.0, 0.0][:3]
     body.add_geom(
-        type=_KINDS[shape.kind], size=size, pos=shape.pose[:3], quat=frames.to_wxyz(shape.pose[3:]), mass=0.0,
-        contype=bits[0], conaffinity=bits[1], friction=contact_friction(friction), priority=1, solimp=_SOLIMP,
+        type=_KINDS[shape.kind],
+        size=size,
+        pos=shape.pose[:3],
+        quat=frames.to_wxyz(shape.pose[3:]),
+        mass=0.0,
+        contype=bits[0],
+        conaffinity=bits[1],
+        friction=contact_friction(friction),
+        priority=1,
+        solimp=_SOLIMP,
         userdata=geom_user(material),
-    )  # fmt: skip
+    )

@@ -22,11 +22,16 @@ from vinesim.scene.appearance import PHALANGES
 from vinesim.scene.values import POINT_NAMES, HumanPose
 
 VISUAL_PARTS = (
-    "neck", "left_upper_arm", "left_forearm", "right_upper_arm", "right_forearm",
+    "neck",
+    "left_upper_arm",
+    "left_forearm",
+    "right_upper_arm",
+    "right_forearm",
     *(f"{side}_{finger}_{k + 1}" for side in SIDES for finger in appearance.FINGERS for k in range(PHALANGES)),
-)  # fmt: skip
+)
 """Parts that are only drawn: they connect head, chest and hands, and touch nothing."""
-EYE_HEIGHT, HIP_HEIGHT = 0.939, 0.53
+EYE_HEIGHT = 0.939
+HIP_HEIGHT = 0.53
 """[1] Heights above the ground of a standing person, as shares of the person's height. READ: Winter 2009."""
 NECK_BELOW_EYES = -0.2
 """[m] Height of the neck above the eyes. GUESSED."""
@@ -39,12 +44,17 @@ def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
     def at(x: float, y: float, z: float) -> np.ndarray:
         return frames.compose(root, frames.pose(np.array([x, y, z])))
 
-    side, hip = HIP_HALF_WIDTH * height, HIP_HEIGHT * height
+    side = HIP_HALF_WIDTH * height
+    hip = HIP_HEIGHT * height
     return HumanPose(
-        root=np.asarray(root, float), head=at(EYES_TO_HEAD_BACK, 0.0, EYE_HEIGHT * height), hips=at(0.0, 0.0, hip),
-        left=at(0.35, 0.2, hip + 0.1), right=at(0.35, -0.2, hip + 0.1),
-        left_foot=at(0.0, side, ANKLE_HEIGHT * height), right_foot=at(0.0, -side, ANKLE_HEIGHT * height),
-    )  # fmt: skip
+        root=np.asarray(root, float),
+        head=at(EYES_TO_HEAD_BACK, 0.0, EYE_HEIGHT * height),
+        hips=at(0.0, 0.0, hip),
+        left=at(0.35, 0.2, hip + 0.1),
+        right=at(0.35, -0.2, hip + 0.1),
+        left_foot=at(0.0, side, ANKLE_HEIGHT * height),
+        right_foot=at(0.0, -side, ANKLE_HEIGHT * height),
+    )
 
 
 def body_posture(height: float, pose: HumanPose) -> np.ndarray:
@@ -58,9 +68,12 @@ class PostureSolver:
 
     def __init__(self, height: float) -> None:
         """``height`` [m] of the person."""
-        points, poses = len(POINT_NAMES) - 3, len(BODY_PARTS) + 2 * len(SIDES)
-        self._tracked, self._parts = np.zeros((points, 7)), np.zeros((len(BODY_PARTS), 7))
-        self._start, self._goal = np.zeros((poses, 7)), np.zeros((poses, 7))
+        points = len(POINT_NAMES) - 3
+        poses = len(BODY_PARTS) + 2 * len(SIDES)
+        self._tracked = np.zeros((points, 7))
+        self._parts = np.zeros((len(BODY_PARTS), 7))
+        self._start = np.zeros((poses, 7))
+        self._goal = np.zeros((poses, 7))
         self._difference = np.zeros((3, poses, 3))
 
         def shared(data: np.ndarray) -> wp.array:
@@ -78,17 +91,25 @@ class PostureSolver:
             [shared(rows) for rows in self._difference],
         )
         looks = appearance.load_human_model(height)
-        self._ends, self._closed = np.zeros((4, 7)), np.zeros(2 * len(appearance.FINGERS))
-        self._visual_parts, limbs = np.zeros((len(VISUAL_PARTS), 7)), looks.limbs
+        self._ends = np.zeros((4, 7))
+        self._closed = np.zeros(2 * len(appearance.FINGERS))
+        self._visual_parts = np.zeros((len(VISUAL_PARTS), 7))
+        limbs = looks.limbs
         bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
         self._pose_arms_and_fingers = bind_launch(
             kernels.pose_arms_and_fingers,
             [
-                limbs.upper_arm, limbs.forearm, *map(wp.vec3d, (limbs.shoulder, limbs.wrist, limbs.elbow)), limbs.neck,
-                wp.vec3d(limbs.nape), *map(shared, bones), shared(self._ends), shared(self._closed),
+                limbs.upper_arm,
+                limbs.forearm,
+                *map(wp.vec3d, (limbs.shoulder, limbs.wrist, limbs.elbow)),
+                limbs.neck,
+                wp.vec3d(limbs.nape),
+                *map(shared, bones),
+                shared(self._ends),
+                shared(self._closed),
             ],
             [shared(self._visual_parts)],
-        )  # fmt: skip
+        )
 
     def body_parts(self, pose: HumanPose) -> np.ndarray:
         """Poses [part, 7] of :data:`BODY_PARTS`; knees bend forward as hips and ankles require."""

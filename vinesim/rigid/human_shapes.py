@@ -11,13 +11,26 @@ from vinesim.scene.values import Shape
 
 SIDES = ("left", "right")
 BODY_PARTS = (
-    "head", "chest", "hips", "left_thigh", "left_shank", "left_foot", "right_thigh", "right_shank", "right_foot",
-)  # fmt: skip
+    "head",
+    "chest",
+    "hips",
+    "left_thigh",
+    "left_shank",
+    "left_foot",
+    "right_thigh",
+    "right_shank",
+    "right_foot",
+)
 """Kinematic bodies of a person, in the order in which :mod:`vinesim.rigid.human_posture` poses them."""
 
-THIGH_LENGTH, SHANK_LENGTH, ANKLE_HEIGHT, HIP_HALF_WIDTH, TRUNK_LENGTH = 0.245, 0.246, 0.039, 0.095, 0.288
+THIGH_LENGTH = 0.245
+SHANK_LENGTH = 0.246
+ANKLE_HEIGHT = 0.039
+HIP_HALF_WIDTH = 0.095
+TRUNK_LENGTH = 0.288
 """[1] Shares of a person's height. READ: Winter 2009, after Drillis and Contini."""
-EYES_TO_HEAD_BACK, EYES_TO_HEAD_DOWN = 0.09, 0.02
+EYES_TO_HEAD_BACK = 0.09
+EYES_TO_HEAD_DOWN = 0.02
 """[m] From between the eyes to the middle of the head. GUESSED."""
 HAND_HALF_THICKNESS = 0.012
 """[m] Half thickness of a palm. GUESSED."""
@@ -43,18 +56,21 @@ def body_shapes(height: float) -> tuple[Shape, ...]:
 
     sole = 0.5 * ANKLE_HEIGHT * height
     legs = (
-        limb(THIGH_LENGTH, 0.07), limb(SHANK_LENGTH, 0.05),
-        Shape("box", (0.13, 0.045, sole), frames.pose(np.array([0.06, 0.0, -0.5 * ANKLE_HEIGHT * height])),
-              CLOTH_COLOR),
-    )  # fmt: skip
+        limb(THIGH_LENGTH, 0.07),
+        limb(SHANK_LENGTH, 0.05),
+        Shape(
+            "box", (0.13, 0.045, sole), frames.pose(np.array([0.06, 0.0, -0.5 * ANKLE_HEIGHT * height])), CLOTH_COLOR
+        ),
+    )
     half = 0.5 * TRUNK_LENGTH * height
     head = frames.pose(np.array([-EYES_TO_HEAD_BACK, 0.0, -EYES_TO_HEAD_DOWN]))
     return (
         Shape("ellipsoid", (0.1, 0.078, 0.115), head, SKIN_COLOR),
         Shape("ellipsoid", (0.12, 0.17, half + 0.03), frames.pose(np.array([0.0, 0.0, half])), CLOTH_COLOR),
         Shape("ellipsoid", (0.12, 0.16, 0.12), frames.pose(np.zeros(3)), CLOTH_COLOR),
-        *legs, *legs,
-    )  # fmt: skip
+        *legs,
+        *legs,
+    )
 
 
 @functools.cache
@@ -66,4 +82,4 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
         Shape("box", (0.05, 0.04, HAND_HALF_THICKNESS), frames.pose(np.zeros(3)), SKIN_COLOR),
         Shape("box", (0.04, 0.036, HAND_HALF_THICKNESS - 0.003), frames.pose(GRASP_POINTS[1]), SKIN_COLOR),
         Shape("capsule", (0.01, 0.025), frames.pose(thumb, _Z_TO_X), SKIN_COLOR),
-    )  # fmt: skip
+    )

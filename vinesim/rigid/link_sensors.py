@@ -18,10 +18,12 @@ class LinkSensors:
         """Row of a sensor, by robot and link."""
         self._body = self._root = np.zeros(0, int)
         """[sensor] MuJoCo body of the link, and of the root of its robot."""
-        self._wrench, self._com = np.zeros((0, 6)), np.zeros((0, 3))
+        self._wrench = np.zeros((0, 6))
+        self._com = np.zeros((0, 3))
         """[sensor, 6] moment about the robot's centre of mass and force of the parent on the link [N m, N]; [sensor, 3]
         that centre [m]; world axes."""
-        self._position, self._rotation = np.zeros((0, 3)), np.zeros((0, 9))
+        self._position = np.zeros((0, 3))
+        self._rotation = np.zeros((0, 9))
         """[sensor, 3] m and [sensor, 9] row by row: pose of the link."""
         self._acceleration = np.zeros((0, 6))
         """[sensor, 6] rad/s^2, m/s^2: see :meth:`acceleration`."""
@@ -46,15 +48,18 @@ class LinkSensors:
         if not len(body):
             return
         mujoco.mj_rnePostConstraint(m, d)
-        self._wrench, self._com = d.cfrc_int[body], d.subtree_com[self._root]
-        self._position, self._rotation = d.xpos[body], d.xmat[body]
+        self._wrench = d.cfrc_int[body]
+        self._com = d.subtree_com[self._root]
+        self._position = d.xpos[body]
+        self._rotation = d.xmat[body]
         for row, link in enumerate(body.tolist()):
             mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, link, self._acceleration[row], 1)
 
     def wrench(self, robot: str, link: str) -> np.ndarray:
         """Force [N] and moment about the link's origin [N m] of the link on its parent [6], in the link's axes."""
         row = self._find(robot, link)
-        (x, y, z), (u, v, w) = (self._com[row] - self._position[row]).tolist(), self._wrench[row, 3:].tolist()
+        (x, y, z) = (self._com[row] - self._position[row]).tolist()
+        (u, v, w) = self._wrench[row, 3:].tolist()
         moment = self._wrench[row, :3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
         rotation = self._rotation[row].reshape(3, 3)
         return -np.concatenate([self._wrench[row, 3:] @ rotation, moment @ rotation])

@@ -66,7 +66,8 @@ class WorldCore:
     """MuJoCo's model and data, and what they contain; compiled anew when an actor joins or leaves."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        self.model, self.parameters = model, parameters
+        self.model = model
+        self.parameters = parameters
         self._robots: dict[str, RobotBody] = {}
         self._humans: dict[str, HumanBody] = {}
         self._boxes = static_world.boxes_of(model)
@@ -198,7 +199,8 @@ class WorldCore:
     def visual_q(self) -> np.ndarray:
         """World poses [visual, 7] of :meth:`visuals`."""
         self.update_kinematics()
-        d, body = self.mj_data, self._visual_body
+        d = self.mj_data
+        body = self._visual_body
         pose = np.empty((len(body), 7))
         pose[:, :3] = d.xpos[body]
         pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
@@ -214,11 +216,14 @@ class WorldCore:
 
     def _compile_world(self, robots: tuple[RobotBody, ...], humans: tuple[HumanBody, ...]) -> CompiledWorld:
         """Compile a world with these actors and a pool of bodies for free bunches; the world in use is not changed."""
-        slot_of, bodies = dict(self._bunch_slot), dict(self._free_bunches)  # steps may go on meanwhile
+        # steps may go on meanwhile
+        slot_of = dict(self._bunch_slot)
+        bodies = dict(self._free_bunches)
         slots = max(slot_of.values(), default=-1) + 1 + self.parameters.bunch_pool_size
         bunches = {bunch: (slot_of[bunch], body) for bunch, body in bodies.items() if bunch in slot_of}
         with self._compile_lock:
-            spec, boxes = self._static_spec.copy(), self.boxes
+            spec = self._static_spec.copy()
+            boxes = self.boxes
             for robot in robots:
                 robot.add_to(spec)
             for human in humans:
@@ -251,8 +256,11 @@ class WorldCore:
     def _replace_world(self, compiled: CompiledWorld) -> None:
         """Use another compiled world; the state of every joint and body is transferred by its name."""
         before = (self.mj_model, self._names, self.mj_data, self.contact_force) if self.generation else None
-        self.mj_model, self._names, self._pool_size = compiled.mj_model, compiled.names, compiled.bunch_slots
-        m, self.hulls = self.mj_model, compiled.hulls
+        self.mj_model = compiled.mj_model
+        self._names = compiled.names
+        self._pool_size = compiled.bunch_slots
+        m = self.mj_model
+        self.hulls = compiled.hulls
         for bunch, (slot, body) in compiled.bunches.items():
             if self._free_bunches.get(bunch) is not body or self._bunch_slot[bunch] != slot:
                 free_bunch.disable_collision(m, slot)  # it was removed meanwhile
@@ -261,7 +269,8 @@ class WorldCore:
             if compiled.bunches.get(bunch) != (slot, body):
                 free_bunch.activate(m, slot, body, self._derive(body))
         if before is None:
-            self.mj_data, self.contact_force = mujoco.MjData(m), np.zeros(m.nv)
+            self.mj_data = mujoco.MjData(m)
+            self.contact_force = np.zeros(m.nv)
         else:
             slots = set(range(self._pool_size)) - set(self._bunch_slot.values())
             unused = {free_bunch.slot_name(slot) for slot in slots}
@@ -314,7 +323,8 @@ class WorldCore:
 
     def _show_lamps(self, robot: RobotBody) -> None:
         """List the shapes of a robot anew after its indicator lights changed; only sensors need to know."""
-        prefix, shown = robot.spec.name + "/", robot.shown_shapes
+        prefix = robot.spec.name + "/"
+        shown = robot.shown_shapes
         self._visuals = tuple(
             dataclasses.replace(one, shapes=shown[one.name.removeprefix(prefix)])
             if one.name.startswith(prefix) and one.organ == Organ.ROBOT

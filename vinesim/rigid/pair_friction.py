@@ -20,7 +20,8 @@ class PairFriction:
 
     def find_materials(self, m: mujoco.MjModel) -> None:
         """Find the materials of all geoms of a world that was compiled anew."""
-        material, has_own = m.geom_user[:, 0], m.geom_user[:, 1] > 0.0
+        material = m.geom_user[:, 0]
+        has_own = m.geom_user[:, 1] > 0.0
         self._material = np.where(has_own, int(Material.UNKNOWN), material).astype(np.int32)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:

@@ -28,13 +28,15 @@ class PassingParts:
     """Which parts [k] of one remote person are light, and which touch nothing now."""
 
     def __init__(self, count: int) -> None:
-        self.is_passing, self.is_light = np.zeros(count, bool), np.ones(count, bool)
+        self.is_passing = np.zeros(count, bool)
+        self.is_light = np.ones(count, bool)
         self._bodies = self._geoms = self._obstacles = np.zeros(0, int)
         self._bits = np.zeros((count, 2), int)
 
     def find_indices(self, m: mujoco.MjModel, bodies: np.ndarray) -> None:
         """Find the geoms of the parts' ``bodies`` [k] and those of robots in a world that was compiled anew."""
-        self._bodies, self._geoms = bodies, m.body_geomadr[bodies]
+        self._bodies = bodies
+        self._geoms = m.body_geomadr[bodies]
         self._bits = np.stack([m.geom_contype[self._geoms], m.geom_conaffinity[self._geoms]], 1)
         self._obstacles = np.flatnonzero(m.geom_contype & ROBOTS)
         self._apply(m)
@@ -58,7 +60,8 @@ class PassingParts:
             passing = released | (passing & self._overlaps(m, d, places))
         light = passing | (speed > STILL_SPEED) | (self.is_light & (force > 0.0))
         if (passing != self.is_passing).any() or (light != self.is_light).any():
-            self.is_passing, self.is_light = passing, light
+            self.is_passing = passing
+            self.is_light = light
             self._apply(m)
 
     def _overlaps(self, m: mujoco.MjModel, d: mujoco.MjData, places: np.ndarray) -> np.ndarray:

@@ -15,9 +15,15 @@ _NEVER, _INIT, _ALLOWED = (
     int(getattr(mujoco.mjtSleepPolicy, f"mjSLEEP_{policy}")) for policy in ("NEVER", "INIT", "AUTO_ALLOWED")
 )
 DOF_ARRAYS = (
-    "qvel", "qacc", "qacc_smooth", "qacc_warmstart", "qfrc_smooth", "qfrc_applied", "qfrc_gravcomp",
+    "qvel",
+    "qacc",
+    "qacc_smooth",
+    "qacc_warmstart",
+    "qfrc_smooth",
+    "qfrc_applied",
+    "qfrc_gravcomp",
     "qfrc_actuator",
-)  # fmt: skip
+)
 """Arrays of MuJoCo's data with one entry for each degree of freedom that last from step to step."""
 
 
@@ -54,9 +60,14 @@ def object_names(m: mujoco.MjModel, address: np.ndarray) -> list[str]:
 
 
 def transfer_state(
-    old: mujoco.MjModel, old_names: WorldNames, old_data: mujoco.MjData, old_contact: np.ndarray,
-    new: mujoco.MjModel, new_names: WorldNames, unused: set[str],
-) -> tuple[mujoco.MjData, np.ndarray]:  # fmt: skip
+    old: mujoco.MjModel,
+    old_names: WorldNames,
+    old_data: mujoco.MjData,
+    old_contact: np.ndarray,
+    new: mujoco.MjModel,
+    new_names: WorldNames,
+    unused: set[str],
+) -> tuple[mujoco.MjData, np.ndarray]:
     """State and contact forces [dof] of a new world: those of all joints and bodies of the old, and which of them
     sleep.
 
@@ -87,7 +98,8 @@ def transfer_state(
     new.opt.disableflags &= ~_CONSTRAINT
     contact = np.zeros(new.nv)
     data.time = old_data.time
-    data.qpos[to_q], contact[to_v] = old_data.qpos[from_q], old_contact[from_v]
+    data.qpos[to_q] = old_data.qpos[from_q]
+    contact[to_v] = old_contact[from_v]
     for name in DOF_ARRAYS:
         getattr(data, name)[to_v] = getattr(old_data, name)[from_v]
     trees = set(zip(new.dof_treeid[to_v].tolist(), old.dof_treeid[from_v].tolist(), strict=True))
@@ -99,12 +111,11 @@ def transfer_state(
     bodies = _pairs(new_names.bodies, old_names.bodies, unused)
     to, source = np.array(bodies, int).reshape(-1, 2).T
     data.xfrc_applied[to] = old_data.xfrc_applied[source]
-    to, source = new.body_mocapid[to], old.body_mocapid[source]
+    to = new.body_mocapid[to]
+    source = old.body_mocapid[source]
     mocap = (to >= 0) & (source >= 0)
-    data.mocap_pos[to[mocap]], data.mocap_quat[to[mocap]] = (
-        old_data.mocap_pos[source[mocap]],
-        old_data.mocap_quat[source[mocap]],
-    )
+    data.mocap_pos[to[mocap]] = old_data.mocap_pos[source[mocap]]
+    data.mocap_quat[to[mocap]] = old_data.mocap_quat[source[mocap]]
     return data, contact
 
 

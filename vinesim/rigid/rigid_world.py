@@ -81,9 +81,12 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         self._recompile()
 
     def compile_with(
-        self, *specs: RobotSpec | HumanSpec, is_remote: bool = False, replaces: bool = False,
+        self,
+        *specs: RobotSpec | HumanSpec,
+        is_remote: bool = False,
+        replaces: bool = False,
         without: Collection[str] = (),
-    ) -> CompiledWorld:  # fmt: skip
+    ) -> CompiledWorld:
         """Compile the world with more actors, ``without`` those of some names, and with a full pool of spare bodies for
         free bunches, for :meth:`adopt`.
 
@@ -91,7 +94,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         robots without saying which. ``is_remote``: see :meth:`add_human`. ``replaces``: the robots
         are here and keep their states; only their shapes are others.
         """
-        robots, humans = list(self._robots.values()), list(self._humans.values())
+        robots = list(self._robots.values())
+        humans = list(self._humans.values())
         removed = tuple(actor for actor in (*robots, *humans) if actor.spec.name in without)
         robots = [robot for robot in robots if robot not in removed]
         humans = [human for human in humans if human not in removed]
@@ -156,7 +160,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
     def penetrations(self) -> list[tuple[str, str, float]]:
         """Pairs of actors or objects that overlapped when the step began, as :meth:`predict` found them, and depth
         [m]."""
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         found = []
         for contact in d.contact:
             if contact.dist > 0.0:
@@ -176,7 +181,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
 
     def predict(self) -> None:
         """First half: poses, contacts of rigid bodies, and the velocity at the end of the step without plants."""
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         self.apply_controls()
         for human in self._humans.values():
             human.apply_controls(m, d, self.dt)
@@ -207,7 +213,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
     @property
     def velocity_free(self) -> np.ndarray:
         """[dof] the prediction of :meth:`predict`; zero for sleeping trees, whose ``qacc`` MuJoCo does not update."""
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         velocity = d.qvel + self.dt * d.qacc
         if d.nv_awake < m.nv:
             velocity[d.tree_asleep[m.dof_treeid] >= 0] = 0.0
@@ -243,7 +250,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
 
     def integrate(self, force: np.ndarray | None = None) -> None:
         """Second half: integrate with generalised contact forces of plants, ``force`` [dof] N or N m."""
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         if force is not None:
             np.add(force, 0.0, out=d.qfrc_applied)  # see predict_with()
         mujoco.mj_step2(m, d)
@@ -268,7 +276,9 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
 
     def rebind(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
         """Use another MuJoCo world in which the robots' joints and bodies have the same names."""
-        self.mj_model, self.mj_data, self.contact_force = mj_model, mj_data, np.zeros(mj_model.nv)
+        self.mj_model = mj_model
+        self.mj_data = mj_data
+        self.contact_force = np.zeros(mj_model.nv)
         self._names = recompile.WorldNames.of(mj_model)
         self._kinematics_current = False
         for robot in self._robots.values():
@@ -279,7 +289,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
 
     def _is_faulty(self) -> bool:
         """Whether a number is not finite, or a rate beyond :data:`MAX_RATE`."""
-        rate, position = self.mj_data.qvel, self.mj_data.qpos
+        rate = self.mj_data.qvel
+        position = self.mj_data.qpos
         if rate.dot(rate) < MAX_RATE**2 and position.dot(position) < np.inf:  # enough, and the cheapest
             return False
         return not (rate.min() > -MAX_RATE and rate.max() < MAX_RATE and np.isfinite(position).all())
@@ -287,7 +298,8 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
     def _stop_faulty_trees(self) -> None:
         """Stop the kinematic trees with a number that is not finite, or a rate beyond :data:`MAX_RATE`, where the step
         began; the others go on."""
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         joint_tree = m.dof_treeid[m.jnt_dofadr]
         width = np.where(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE, 7, 1)
         tree = np.repeat(joint_tree, width)  # of each entry of qpos
@@ -310,9 +322,13 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
 
 
 def _free_code(
-    name: str, kind: str, codes: tuple[int, ...], actors: Sequence[RobotBody | HumanBody],
-    others: Sequence[RobotBody | HumanBody], error: type[ValueError],
-) -> int:  # fmt: skip
+    name: str,
+    kind: str,
+    codes: tuple[int, ...],
+    actors: Sequence[RobotBody | HumanBody],
+    others: Sequence[RobotBody | HumanBody],
+    error: type[ValueError],
+) -> int:
     """A collision code that none of ``actors`` of its kind has; ``error`` if there is none or the name is taken."""
     if any(name == actor.spec.name for actor in (*actors, *others)):
         raise error(f"{kind} {name!r} is already here; give the newcomer another name")

@@ -25,5 +25,6 @@ class BoxAccess(WorldCore):
     def _use_boxes(self, boxes: dict[int, RigidBox]) -> None:
         static = static_world.build_static_world(self.model, self.parameters, boxes)
         with self._compile_lock:
-            self._boxes, self._static_spec = boxes, static
+            self._boxes = boxes
+            self._static_spec = static
         self._recompile()

@@ -35,7 +35,8 @@ class BunchAccess(WorldCore):
         derived = {bunch: self._derive(body) for bunch, (body, _, _) in bunches.items()}
         unused = iter(sorted(set(range(self._pool_size + len(bunches))) - set(self._bunch_slot.values())))
         for bunch, (body, _, _) in bunches.items():
-            self._free_bunches[bunch], self._bunch_slot[bunch] = body, next(unused)
+            self._free_bunches[bunch] = body
+            self._bunch_slot[bunch] = next(unused)
         if max(self._bunch_slot[bunch] for bunch in bunches) >= self._pool_size:
             self._recompile()
         else:
@@ -47,7 +48,8 @@ class BunchAccess(WorldCore):
 
     def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
         """Put a free bunch at ``pose`` [7] with ``velocity`` [6] in world axes, and wake it."""
-        joint, pose = self._bunch_joint(bunch), np.asarray(pose, float)
+        joint = self._bunch_joint(bunch)
+        pose = np.asarray(pose, float)
         rotation = frames.normalize(pose[3:])
         joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(rotation)])
         joint.qvel[:3] = velocity[:3]
@@ -83,11 +85,13 @@ class BunchAccess(WorldCore):
             m.geom_conaffinity[self._geoms_of_bunch(bunch)] = bits
 
     def _overlaps_fixed_piece(self, bunch: int) -> bool:
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         geoms = self._geoms_of_bunch(bunch)
         low = (d.geom_xpos[geoms] - m.geom_rbound[geoms, None]).min(0)
         high = (d.geom_xpos[geoms] + m.geom_rbound[geoms, None]).max(0)
-        start, end = self.model.fixed_start, self.model.fixed_end
+        start = self.model.fixed_start
+        end = self.model.fixed_end
         radius = self.model.fixed_radius.mean(1)[:, None]
         near = (np.minimum(start, end) - radius < high) & (low < np.maximum(start, end) + radius)
         pieces = np.flatnonzero(near.all(1)) + FIRST_FIXED_GEOM

@@ -20,7 +20,8 @@ class HumanAccess(WorldCore):
         """Set where a person's tracked points are at the end of the coming step, which hands are closed or have
         shears."""
         human = self.human(name)
-        busy, shears = [hand.busy for hand in human.hands], human.shears_parts
+        busy = [hand.busy for hand in human.hands]
+        shears = human.shears_parts
         human.set_pose(pose)
         if shears != human.shears_parts:
             self._list_visuals()
@@ -44,11 +45,13 @@ class HumanAccess(WorldCore):
     def grasp(self, name: str, side: str, actor: str, link: str) -> None:
         """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are those of
         ``RigidGeoms``."""
-        hand, body = self.human(name).hand(side), self._body_of_object(actor, link)
+        hand = self.human(name).hand(side)
+        body = self._body_of_object(actor, link)
         self.update_kinematics()
         pose = np.concatenate([self.mj_data.xpos[[body, hand.body]], self.mj_data.xquat[[body, hand.body]]], -1)
         pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
-        hand.grasp_pose, hand.held = frames.compose(frames.inverse(pose[0]), pose[1]), (actor, link)
+        hand.grasp_pose = frames.compose(frames.inverse(pose[0]), pose[1])
+        hand.held = (actor, link)
         hand.weld_to(self.mj_model, self.mj_data, body)
         self._update_geoms()
 
@@ -77,7 +80,8 @@ class HumanAccess(WorldCore):
         """
         hand = self.human(name).hand(side)
         self.update_kinematics()
-        m, d = self.mj_model, self.mj_data
+        m = self.mj_model
+        d = self.mj_data
         of_hand = range(m.body_geomadr[hand.body], m.body_geomadr[hand.body] + m.body_geomnum[hand.body])
         best: tuple[float, str, str] | None = None
         for geoms in (self.geoms, self.static_geoms):

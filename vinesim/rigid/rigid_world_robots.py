@@ -126,7 +126,8 @@ class RobotAccess(WorldCore):
         The effort is that of the drive in the last step: servo and its share of gravity compensation. The contact
         effort is J^T f of the contacts with plants and with rigid bodies; at rest the two cancel.
         """
-        robot, d = self.robot(name), self.mj_data
+        robot = self.robot(name)
+        d = self.mj_data
         return d.qpos[robot.q], d.qvel[robot.v], robot.transmitted_effort(d), self.contact_force[robot.v]
 
     def joint_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +146,8 @@ class RobotAccess(WorldCore):
 
     def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Pose [7] and velocity [6] (world axes) of the base link."""
-        robot, d = self.robot(name), self.mj_data
+        robot = self.robot(name)
+        d = self.mj_data
         x, y, yaw = d.qpos[robot.base_q].tolist()
         vx, vy, wz = d.qvel[robot.base_v].tolist()
         half = 0.5 * yaw
@@ -160,7 +162,8 @@ class RobotAccess(WorldCore):
 
     def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
         """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per joint velocity."""
-        robot, body = self.robot(name), self._link_body(name, link)
+        robot = self.robot(name)
+        body = self._link_body(name, link)
         self.update_kinematics()
         jacobian = np.zeros((6, self.mj_model.nv))
         mujoco.mj_jac(self.mj_model, self.mj_data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)

@@ -25,7 +25,8 @@ from vinesim.scene.triangles import to_stl
 from vinesim.scene.values import RobotSpec, Shape
 from vinesim.scene.values.signals import UNLIT, Color
 
-MIN_FRICTION, MAX_FRICTION = 1e-5, 10.0
+MIN_FRICTION = 1e-5
+MAX_FRICTION = 10.0
 """[1] Bounds of a link's own coefficient: the least that MuJoCo takes, and what hardly slips. Files give up to 1e14 for
 what never does."""
 MAX_HULL_VERTICES = 64
@@ -44,8 +45,11 @@ class RobotBody:
     def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         """``code``: of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
         check(spec)
-        joints, pose = len(spec.drives), np.asarray(spec.pose, float)
-        self.spec, self.code, self.parameters = spec, code, parameters
+        joints = len(spec.drives)
+        pose = np.asarray(spec.pose, float)
+        self.spec = spec
+        self.code = code
+        self.parameters = parameters
         try:
             self._parsed = _parse(spec, code, parameters.friction)
         except ValueError as error:
@@ -118,9 +122,11 @@ class RobotBody:
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the robot to a world, on a planar base and with its servos."""
-        given, name = self.spec, self.spec.name
+        given = self.spec
+        name = self.spec.name
         base = spec.worldbody.add_body(name=name, pos=[0.0, 0.0, float(given.pose[2])])
-        slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+        slide = mujoco.mjtJoint.mjJNT_SLIDE
+        hinge = mujoco.mjtJoint.mjJNT_HINGE
         axes = zip(_PLANAR, (slide, slide, hinge), np.eye(3), strict=True)
         for axis, kind, direction in axes:
             base.add_joint(name=f"{name}:{axis}", type=kind, axis=direction)
@@ -135,12 +141,15 @@ class RobotBody:
     def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
         """Find the robot's bodies and joints in a world that was compiled anew."""
         name = self.spec.name
-        driven, planar = [f"{name}/{drive.joint}" for drive in self.spec.drives], [f"{name}:{axis}" for axis in _PLANAR]
+        driven = [f"{name}/{drive.joint}" for drive in self.spec.drives]
+        planar = [f"{name}:{axis}" for axis in _PLANAR]
         joints, base = ([names.joint[joint] for joint in some] for some in (driven, planar))
-        self.q, self.v = m.jnt_qposadr[joints].astype(int), m.jnt_dofadr[joints].astype(int)
+        self.q = m.jnt_qposadr[joints].astype(int)
+        self.v = m.jnt_dofadr[joints].astype(int)
         self.inertia_index = (m.M_rowadr + m.M_rownnz - 1)[self.v]
         self.actuator = np.array([names.actuator[joint] for joint in driven], int)
-        self.base_q, self.base_v = m.jnt_qposadr[base].astype(int), m.jnt_dofadr[base].astype(int)
+        self.base_q = m.jnt_qposadr[base].astype(int)
+        self.base_v = m.jnt_dofadr[base].astype(int)
         self.base_actuator = np.array([names.actuator[joint] for joint in planar], int)
         mine = name + "/"
         self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
@@ -166,16 +175,28 @@ class RobotBody:
 
     def _bind_controls(self, d: mujoco.MjData, dt: float) -> None:
         """Bind the kernel that writes MuJoCo's controls: one call instead of twenty on arrays of ten numbers."""
-        self._controls_of, (stiffness, damping) = d, self.base_gains
+        self._controls_of = d
+        (stiffness, damping) = self.base_gains
         drives = SharedArrays(
-            joint_servos.JointDrives, stiffness=self.stiffness, damping_at_start=self.damping_at_start,
-            damping_at_end=self.damping_at_end, target=self.target, target_velocity=self.target_velocity,
-            feedforward=self.feedforward, v=self.v, actuator=self.actuator,
-        )  # fmt: skip
+            joint_servos.JointDrives,
+            stiffness=self.stiffness,
+            damping_at_start=self.damping_at_start,
+            damping_at_end=self.damping_at_end,
+            target=self.target,
+            target_velocity=self.target_velocity,
+            feedforward=self.feedforward,
+            v=self.v,
+            actuator=self.actuator,
+        )
         base = SharedArrays(
-            joint_servos.BaseDrive, stiffness=stiffness, damping=damping, velocity=self.base_velocity,
-            slip=self._base_slip, q=self.base_q, actuator=self.base_actuator,
-        )  # fmt: skip
+            joint_servos.BaseDrive,
+            stiffness=stiffness,
+            damping=damping,
+            velocity=self.base_velocity,
+            slip=self._base_slip,
+            q=self.base_q,
+            actuator=self.base_actuator,
+        )
         self._apply_controls = bind_launch(
             joint_servos.apply_controls,
             [dt, drives.struct, base.struct, share(d.qpos, wp.float64), share(d.qvel, wp.float64)],
@@ -192,13 +213,23 @@ class RobotBody:
     def take_over(self, other: RobotBody) -> None:
         """Go on as ``other``, the same robot with other shapes: its targets, gains, limits and sensors."""
         for name in (
-            "stiffness", "damping", "servo_limit", "target", "target_velocity", "feedforward", "control", "base_target",
-            "base_velocity", "has_exact_damping",
-        ):  # fmt: skip
+            "stiffness",
+            "damping",
+            "servo_limit",
+            "target",
+            "target_velocity",
+            "feedforward",
+            "control",
+            "base_target",
+            "base_velocity",
+            "has_exact_damping",
+        ):
             getattr(self, name)[:] = getattr(other, name)
-        self.base_slip, self.base_height = other.base_slip, other.base_height
+        self.base_slip = other.base_slip
+        self.base_height = other.base_height
         self.indicator_color = other.indicator_color
-        self.sensor_links, self.remote_wrenches = other.sensor_links, other.remote_wrenches
+        self.sensor_links = other.sensor_links
+        self.remote_wrenches = other.remote_wrenches
 
     # ------------------------------------------------------------------ commands
 
@@ -215,15 +246,19 @@ class RobotBody:
         self.command(position, velocity)
         # MuJoCo does not take a servo as implicit that reaches its limit at the start of the step: a light joint that
         # catches up would be thrown past its target
-        servo, most, weight = self.servo_limit, self.effort_limit, d.qfrc_gravcomp[self.v]
-        low, high = np.maximum(-servo, -most - weight), np.minimum(servo, most - weight)
+        servo = self.servo_limit
+        most = self.effort_limit
+        weight = d.qfrc_gravcomp[self.v]
+        low = np.maximum(-servo, -most - weight)
+        high = np.minimum(servo, most - weight)
         pull = self.stiffness * (self.target - d.qpos[self.q]) + self.damping * (self.target_velocity - d.qvel[self.v])
         excess = pull - np.clip(pull, COPY_EFFORT_SHARE * low, COPY_EFFORT_SHARE * high)
         self.target -= excess / np.where(self.stiffness > 0.0, self.stiffness, np.inf)
         yaw = frames.to_yaw(base_q[3:])
         turns = np.round((d.qpos[self.base_q[2]] - yaw) / (2.0 * np.pi))
         self.base_target[:] = base_q[0], base_q[1], yaw + 2.0 * np.pi * turns
-        c, s = np.cos(yaw), np.sin(yaw)
+        c = np.cos(yaw)
+        s = np.sin(yaw)
         self.base_velocity[:] = c * base_qd[0] + s * base_qd[1], c * base_qd[1] - s * base_qd[0], base_qd[5]
         self.base_slip = self.parameters.remote_base_slip
 
@@ -245,7 +280,8 @@ class RobotBody:
             self.servo_limit[:] = np.minimum(limit, self.effort_limit)
         if exact is not None:
             self.has_exact_damping[:] = exact
-        q, v = d.qpos[self.q], d.qvel[self.v]
+        q = d.qpos[self.q]
+        v = d.qvel[self.v]
         given = self.control - before * q - self.damping_at_end * v
         self._set_gains(m)
         self.control[:] = given + self.stiffness * q + self.damping_at_end * v
@@ -287,7 +323,8 @@ class RobotBody:
         """Joints that mimic another joint: name -> (source, coefficients of the polynomial [5])."""
         joints = {}
         for e in np.flatnonzero(m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
-            joint, source = m.joint(m.eq_obj1id[e]).name, m.joint(m.eq_obj2id[e]).name
+            joint = m.joint(m.eq_obj1id[e]).name
+            source = m.joint(m.eq_obj2id[e]).name
             if joint.startswith(self.spec.name + "/"):
                 joints[joint] = (source, m.eq_data[e, :5].copy())
         return joints
@@ -300,7 +337,8 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
     own_friction = link_friction(given.urdf)
     materials = {link: iter(found) for link, found in collision_materials(given.urdf).items()}
     for geom in child.geoms:
-        geom.contype, geom.conaffinity = code, ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
+        geom.contype = code
+        geom.conaffinity = ALL_BITS & ~code & ~GROUND & ~REMOTE_HAND
         own = own_friction.get(geom.parent.name)
         geom.friction = contact_friction(friction if own is None else min(max(own, MIN_FRICTION), MAX_FRICTION))
         material = next(materials.get(geom.parent.name, iter(())), Material.UNKNOWN)
@@ -339,10 +377,17 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
     gain = np.zeros(10)
     gain[0] = 1.0
     spec.add_actuator(
-        name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT,
-        gaintype=mujoco.mjtGain.mjGAIN_FIXED, gainprm=gain, biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=bias,
-        forcelimited=True, forcerange=[-effort, effort], ctrllimited=False,
-    )  # fmt: skip
+        name=joint,
+        target=joint,
+        trntype=mujoco.mjtTrn.mjTRN_JOINT,
+        gaintype=mujoco.mjtGain.mjGAIN_FIXED,
+        gainprm=gain,
+        biastype=mujoco.mjtBias.mjBIAS_AFFINE,
+        biasprm=bias,
+        forcelimited=True,
+        forcerange=[-effort, effort],
+        ctrllimited=False,
+    )
 
 
 def split_damping(

@@ -53,7 +53,8 @@ class SpeculativeContacts:
         velocity = d.qvel[self._dof]
         if not self._has_margins and not velocity.any():
             return False
-        linear, angular = velocity[:, :3], velocity[:, 3:]
+        linear = velocity[:, :3]
+        angular = velocity[:, 3:]
         step = m.opt.timestep * (np.linalg.norm(linear, axis=1) + np.linalg.norm(angular, axis=1) * self._radius)
         margin = np.zeros(len(step))
         for crate in np.flatnonzero(step > MAX_STEP).tolist():
@@ -66,7 +67,8 @@ class SpeculativeContacts:
 
     def _is_approaching(self, crate: int, velocity: np.ndarray, step: np.ndarray, position: np.ndarray) -> bool:
         """Whether a crate is near another in the next step, and not just passing it."""
-        offset, relative = position - position[crate], velocity - velocity[crate]
+        offset = position - position[crate]
+        relative = velocity - velocity[crate]
         distance = np.linalg.norm(offset, axis=1)
         closing = -(offset * relative).sum(1)
         is_met = closing > PASSING * distance * np.linalg.norm(relative, axis=1)
@@ -79,9 +81,11 @@ class SpeculativeContacts:
         slides along. MuJoCo computes stiffness and damping anew from ``solref`` whenever it solves. Without damping
         there is no friction either.
         """
-        contact, dt = d.contact, m.opt.timestep
+        contact = d.contact
+        dt = m.opt.timestep
         is_open = np.flatnonzero((contact.dist > 0.0) & (contact.efc_address >= 0))
-        row, gap = contact.efc_address[is_open], contact.dist[is_open]
+        row = contact.efc_address[is_open]
+        gap = contact.dist[is_open]
         is_closing = d.efc_vel[row] * dt < -gap
         d.efc_margin[row] = np.where(is_closing, d.efc_pos[row] - gap, -NEVER_REACHED)
         contact.solref[is_open] = -STIFFNESS / dt**2, 0.0

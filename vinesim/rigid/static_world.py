@@ -30,8 +30,10 @@ FIRST_FIXED_GEOM = 1
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 """Collision bits. Free bunches touch the deep bed of a crate, all others its thin floor. Robots do not touch hands of
 remote people: the person's own client computes with what force they push."""
-_ROBOT_BITS, _HUMAN_BITS = range(6, 18), range(18, 31)
-ROBOTS, HUMANS = sum(1 << bit for bit in _ROBOT_BITS), sum(1 << bit for bit in _HUMAN_BITS)
+_ROBOT_BITS = range(6, 18)
+_HUMAN_BITS = range(18, 31)
+ROBOTS = sum(1 << bit for bit in _ROBOT_BITS)
+HUMANS = sum(1 << bit for bit in _HUMAN_BITS)
 """Collision bits that codes of robots and of people consist of."""
 ALL_BITS = (1 << (_HUMAN_BITS[-1] + 1)) - 1
 _CODE_WEIGHT = 6
@@ -41,7 +43,8 @@ def _codes(bits: range) -> tuple[int, ...]:
     return tuple(sum(1 << bit for bit in code) for code in itertools.combinations(bits, _CODE_WEIGHT))
 
 
-ROBOT_CODES, HUMAN_CODES = _codes(_ROBOT_BITS), _codes(_HUMAN_BITS)
+ROBOT_CODES = _codes(_ROBOT_BITS)
+HUMAN_CODES = _codes(_HUMAN_BITS)
 """Collision codes: each actor has one of its own, so that it touches all others, and itself only where that is wanted.
 
 MuJoCo lets two geoms touch if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code
@@ -80,17 +83,28 @@ def build_static_world(
     spec.nuser_geom = len(geom_user(Material.UNKNOWN))
     friction = contact_friction(parameters.friction)
     spec.worldbody.add_geom(
-        name="ground", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=GROUND,
-        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH, friction=friction, userdata=geom_user(Material.SOIL),
-    )  # fmt: skip
-    radius, material = model.fixed_radius.mean(1), materials_of_organs(model.fixed_organ)
+        name="ground",
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 1],
+        contype=GROUND,
+        conaffinity=BOX | CRATE_FLOOR | FREE_BUNCH,
+        friction=friction,
+        userdata=geom_user(Material.SOIL),
+    )
+    radius = model.fixed_radius.mean(1)
+    material = materials_of_organs(model.fixed_organ)
     for piece in range(len(radius)):
         spec.worldbody.add_geom(
-            name=f"fixed/{piece}", type=mujoco.mjtGeom.mjGEOM_CAPSULE,
+            name=f"fixed/{piece}",
+            type=mujoco.mjtGeom.mjGEOM_CAPSULE,
             fromto=np.concatenate([model.fixed_start[piece], model.fixed_end[piece]]).astype(float),
-            size=[float(radius[piece]), 0, 0], contype=FIXED, conaffinity=0, friction=friction,
-            margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0), userdata=geom_user(material[piece]),
-        )  # fmt: skip
+            size=[float(radius[piece]), 0, 0],
+            contype=FIXED,
+            conaffinity=0,
+            friction=friction,
+            margin=max(MIN_STATIC_RADIUS - float(radius[piece]), 0.0),
+            userdata=geom_user(material[piece]),
+        )
     for number, box in (boxes_of(model) if boxes is None else boxes).items():
         turn = frames.to_wxyz(frames.normalize(box.pose[3:]))
         body = spec.worldbody.add_body(name=f"box/{number}", pos=box.pose[:3], quat=turn)
@@ -121,15 +135,25 @@ def _add_crate(body: mujoco.MjsBody, size: np.ndarray, mass: float, friction: li
     for wall, share in zip(walls, volume, strict=True):
         is_floor = wall is walls[0]
         body.add_geom(
-            type=mujoco.mjtGeom.mjGEOM_BOX, size=wall.size, pos=wall.pose[:3], friction=friction,
-            mass=mass * share / sum(volume), contype=CRATE_FLOOR if is_floor else BOX,
-            conaffinity=ALL_BITS & ~FREE_BUNCH if is_floor else ALL_BITS, userdata=geom_user(Material.PLASTIC),
-        )  # fmt: skip
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            size=wall.size,
+            pos=wall.pose[:3],
+            friction=friction,
+            mass=mass * share / sum(volume),
+            contype=CRATE_FLOOR if is_floor else BOX,
+            conaffinity=ALL_BITS & ~FREE_BUNCH if is_floor else ALL_BITS,
+            userdata=geom_user(Material.PLASTIC),
+        )
     body.add_geom(
-        type=mujoco.mjtGeom.mjGEOM_BOX, size=[*walls[0].size[:2], CRATE_BED_DEPTH / 2],
-        pos=[0.0, 0.0, CRATE_WALL - CRATE_BED_DEPTH / 2], friction=friction, mass=0.0, contype=0,
-        conaffinity=FREE_BUNCH, userdata=geom_user(Material.PLASTIC),
-    )  # fmt: skip
+        type=mujoco.mjtGeom.mjGEOM_BOX,
+        size=[*walls[0].size[:2], CRATE_BED_DEPTH / 2],
+        pos=[0.0, 0.0, CRATE_WALL - CRATE_BED_DEPTH / 2],
+        friction=friction,
+        mass=0.0,
+        contype=0,
+        conaffinity=FREE_BUNCH,
+        userdata=geom_user(Material.PLASTIC),
+    )
 
 
 def crate_shapes(size: np.ndarray) -> tuple[Shape, ...]:

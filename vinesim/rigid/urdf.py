@@ -184,7 +184,8 @@ def _shape(element: ElementTree.Element, paints: dict) -> Shape | None:
     elif form.tag == "sphere":
         size = (float(form.get("radius", 0)),)
     elif form.tag == "mesh":
-        size, file = tuple(_numbers(form, "scale", "1 1 1")), form.get("filename", "").removeprefix("file://")
+        size = tuple(_numbers(form, "scale", "1 1 1"))
+        file = form.get("filename", "").removeprefix("file://")
     else:
         return None
     return Shape(

@@ -21,8 +21,13 @@ WIRE_MASS = 0.02
 """[kg] of a piece of wire where it moves most. DERIVED: a third of 2 m of steel, 2.8 mm thick, weigh 0.03 kg."""
 MARGIN_LEVELS = (0.005, 0.02, 0.05, 0.1)
 """[m] by which contacts with wires are found early; that which is enough for the fastest body is taken."""
-_LEAST_IMPEDANCE, _MOST_IMPEDANCE = 1e-4, 0.9999  # MuJoCo's mjMINIMP, mjMAXIMP
-_WIDTH, _MIDPOINT, _POWER = 1.0, 0.5, 2.0  # of an impedance that is the same at all depths
+# MuJoCo's mjMINIMP, mjMAXIMP
+_LEAST_IMPEDANCE = 1e-4
+_MOST_IMPEDANCE = 0.9999
+# of an impedance that is the same at all depths
+_WIDTH = 1.0
+_MIDPOINT = 0.5
+_POWER = 2.0
 
 
 class SoftWires:
@@ -43,10 +48,13 @@ class SoftWires:
     def use_world(self, m: mujoco.MjModel) -> None:
         """Take over a world that was compiled anew, in which all wires are straight."""
         self._margin = m.geom_margin[: len(self._geoms)].copy()
-        self._body_margin, self._level = float(m.body_margin[0]), 0.0
+        self._body_margin = float(m.body_margin[0])
+        self._level = 0.0
         self._pos, self._quat = (values[: len(self._geoms)].copy() for values in (m.geom_pos, m.geom_quat))
-        self._at, self._moved = self._at[:0], np.zeros(0, int)
-        before, self._world = self._world, m
+        self._at = self._at[:0]
+        self._moved = np.zeros(0, int)
+        before = self._world
+        self._world = m
         self._wires.renumber_rigid(lambda key: self._renumber(key, before), m.ntree)
         measured = [(self._renumber(key, before), value) for key, value in self._measured.items()]
         self._measured = {key: value for (key, tree), value in measured if tree != NO_TREE}
@@ -69,7 +77,8 @@ class SoftWires:
         """Before ``mj_step1``: put the geoms of wires where they are. MuJoCo computes static poses only once."""
         wires = self._wires
         for piece in {*self._moved.tolist(), *wires.deflected.tolist()}:
-            geom, offset = FIRST_FIXED_GEOM + piece, wires.offset[piece]
+            geom = FIRST_FIXED_GEOM + piece
+            offset = wires.offset[piece]
             way = wires.end[piece] - wires.start[piece]
             mujoco.mju_mulQuat(m.geom_quat[geom], _turn(way, way + offset[1] - offset[0]), self._quat[geom])
             m.geom_pos[geom] = d.geom_xpos[geom] = self._pos[geom] + 0.5 * (offset[0] + offset[1])
@@ -101,16 +110,21 @@ class SoftWires:
         at = np.flatnonzero(is_wire.any(1) & (d.contact.efc_address >= 0))
         if len(at) == 0:
             return
-        contact, first = d.contact, is_wire[at, 0]
-        wire, other = np.where(first, *geom[at].T), np.where(first, *geom[at].T[::-1])
-        body, row = m.geom_bodyid[other], contact.efc_address[at]
+        contact = d.contact
+        first = is_wire[at, 0]
+        wire = np.where(first, *geom[at].T)
+        other = np.where(first, *geom[at].T[::-1])
+        body = m.geom_bodyid[other]
+        row = contact.efc_address[at]
         normal = np.where(first, 1.0, -1.0)[:, None] * contact.frame[at, :3]
         gap = contact.dist[at] - self._margin[wire]
         key = -1 - (wire * np.int64(m.ngeom) + other)
         self._contacts.find_springs(
             wire - FIRST_FIXED_GEOM, contact.pos[at], normal, gap, -d.efc_vel[row], key, -1 - m.body_treeid[body]
         )
-        self._at, self._row, self._gap = at, row, gap + self._contacts.shift
+        self._at = at
+        self._row = row
+        self._gap = gap + self._contacts.shift
         self._damping_time = np.where(self._gap > 0.0, 0.0, WIRE_DAMPING_TIME)  # nor does it damp before it is touched
         self._mobility = np.array([self._measured.get(k, 0.0) for k in key.tolist()])
         is_new = self._mobility == 0.0
@@ -144,7 +158,8 @@ class SoftWires:
         """After the second half of a step: tell the wires what has pressed on them."""
         if len(self._at):
             self._measure(d, dt)
-            force, stiffness = d.efc_force[self._row], self._contacts.stiffness
+            force = d.efc_force[self._row]
+            stiffness = self._contacts.stiffness
             # of the spring and damper: force = -stiffness (gap + dt v) - damping v
             velocity = -(force + stiffness * self._gap) / (stiffness * (dt + self._damping_time))
             self._contacts.add_presses(force, velocity)
@@ -158,10 +173,12 @@ def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
 
 def _widen_boxes(m: mujoco.MjModel, is_wire: np.ndarray) -> None:
     """Let MuJoCo's tree of boxes around static geoms hold wires wherever they may be."""
-    first, count = int(m.body_bvhadr[0]), int(m.body_bvhnum[0])
+    first = int(m.body_bvhadr[0])
+    count = int(m.body_bvhnum[0])
     if count == 0:
         return
-    child, geom = m.bvh_child[first : first + count], m.bvh_nodeid[first : first + count]
+    child = m.bvh_child[first : first + count]
+    geom = m.bvh_nodeid[first : first + count]
     holds = np.zeros(count, bool)
     leaf = (geom >= 0) & (geom < len(is_wire))
     holds[leaf] = is_wire[geom[leaf]]

@@ -50,7 +50,8 @@ def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
             length = path.stat().st_size
             path.unlink()
             lock.unlink()
-            removed, size = removed + 1, size + length
+            removed = removed + 1
+            size = size + length
     if removed:
         log.info("removed %d shared-memory segments (%.0f MB) that killed processes left", removed, size / 1e6)
     return removed

@@ -49,8 +49,11 @@ class FlowControl:
         behind = [topic for topic in topics if self._is_behind(topic)]
         log.warning(
             "a subscriber of %s does not answer for %.0f s: it is waited for no longer, and when it comes back it gets "
-            "the last %d messages", ", ".join(topic.name for topic in behind), SUBSCRIBER_TIMEOUT, HISTORY,
-        )  # fmt: skip
+            "the last %d messages",
+            ", ".join(topic.name for topic in behind),
+            SUBSCRIBER_TIMEOUT,
+            HISTORY,
+        )
         self._given_up.update(behind)
         self._waits_since = None
         return False

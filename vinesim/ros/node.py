@@ -42,9 +42,15 @@ class Node:
     """
 
     def __init__(
-        self, name: str, namespace: str, topics: Iterable[str], params_file: pathlib.Path | None = None,
-        parameters: Mapping[str, Any] | None = None, *, beside: Node | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        namespace: str,
+        topics: Iterable[str],
+        params_file: pathlib.Path | None = None,
+        parameters: Mapping[str, Any] | None = None,
+        *,
+        beside: Node | None = None,
+    ) -> None:
         """``topics``: names given by the user, checked before anything starts. ``params_file``: values of parameters
         (YAML, as ``--params-file`` of ROS 2 takes it); ``parameters``: those that were set in an earlier run.
         ``beside``: a node that is open longer, whose ROS context this one shares; a context of its own takes 8 MB and
@@ -159,7 +165,8 @@ class Node:
     def _advertise(self, message: type, name: str, qos: QoSProfile = RELIABLE) -> Topic:
         topic = Topic(name, self._node.create_publisher(message, name, qos), is_of_every_step=qos is EVERY_STEP)
         if (before := self._topics.get(name)) is not None:
-            topic.sent, topic.dropped = before.sent, before.dropped
+            topic.sent = before.sent
+            topic.dropped = before.dropped
         self._topics[name] = topic
         return topic
 

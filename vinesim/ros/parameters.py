@@ -43,7 +43,7 @@ class Parameters:
         A value that was set before counts, else that of the node's parameter file; :class:`ValueError` if that is none.
 
         ``between``: the least and the greatest value of a number. ``changed`` is called after it was set.
-        """  # fmt: skip
+        """
         descriptor = ParameterDescriptor(description=description)
         if between is not None and isinstance(default, int):
             descriptor.integer_range = [IntegerRange(from_value=int(between[0]), to_value=int(between[1]))]

@@ -39,8 +39,11 @@ log = logging.getLogger(__name__)
 
 FEEDBACK_PERIOD = 5
 """Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
-MAP_TO_ODOM, TRUTH, ENVIRONMENT_RATE = "publish_map_to_odom", "publish_truth", "environment_rate"
-EXACT_ODOMETRY, ODOM_FRAME_ID = "exact_odometry", "odom_frame_id"
+MAP_TO_ODOM = "publish_map_to_odom"
+TRUTH = "publish_truth"
+ENVIRONMENT_RATE = "environment_rate"
+EXACT_ODOMETRY = "exact_odometry"
+ODOM_FRAME_ID = "odom_frame_id"
 """Names of parameters."""
 LOOK_PERIOD = 1.0
 """Wall time between two looks for another robot under the same names, and for commands of another type [s]."""
@@ -79,9 +82,13 @@ class RobotNode(Node):
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
         message_packages.ensure_importable(OWN_MESSAGES)
-        self._urdf, self._static_transforms, self._base = urdf, static_transforms, base
-        self._has_clock, self._controllers = clock, controllers
-        self._imus, self._wrenches = imus, wrenches
+        self._urdf = urdf
+        self._static_transforms = static_transforms
+        self._base = base
+        self._has_clock = clock
+        self._controllers = controllers
+        self._imus = imus
+        self._wrenches = wrenches
         self._bunch_of_body = np.zeros(0, np.int32) if bunch_of_body is None else bunch_of_body
         self._interest_radius = interest_radius
         self._commands = CommandQueue()
@@ -188,9 +195,10 @@ class RobotNode(Node):
             own, others = (
                 {tuple(one.endpoint_gid[:4]) for one in found}
                 for found in (
-                    self._node.get_publishers_info_by_topic(name), self._node.get_subscriptions_info_by_topic(name)
+                    self._node.get_publishers_info_by_topic(name),
+                    self._node.get_subscriptions_info_by_topic(name),
                 )
-            )  # fmt: skip
+            )
             topic.is_local = others <= own
 
     def _topics_of_every_step(self) -> list[Topic]:
@@ -198,15 +206,19 @@ class RobotNode(Node):
 
     def _warn_if_shared(self) -> None:
         """Say once that another robot has this one's names."""
-        own, topic = self._node.get_fully_qualified_name(), self._node.resolve_topic_name(ODOMETRY)
+        own = self._node.get_fully_qualified_name()
+        topic = self._node.resolve_topic_name(ODOMETRY)
         publishers = self._node.get_publishers_info_by_topic(topic)
         nodes = {f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers if one.node_name != UNKNOWN}
         if others := nodes - {own}:
             self._shares_topics = True
             log.warning(
                 "%s and %s publish %s: frames, joints and commands of two robots mix; give each client a --namespace "
-                "of its own", own, ", ".join(sorted(others)), topic,
-            )  # fmt: skip
+                "of its own",
+                own,
+                ", ".join(sorted(others)),
+                topic,
+            )
 
     def _warn_of_types(self) -> None:
         """Say once of each topic of commands that it is published as a type that this robot does not take."""
@@ -216,9 +228,12 @@ class RobotNode(Node):
                 self._warned_topics.add(topic)
                 is_base = topic.endswith(BASE_COMMAND)
                 log.warning(
-                    "%s is published as %s, of which nothing arrives; publish %s%s", topic, ", ".join(types),
-                    self._subscriptions.types[topic], STAMPED_REMEDY if is_base else "",
-                )  # fmt: skip
+                    "%s is published as %s, of which nothing arrives; publish %s%s",
+                    topic,
+                    ", ".join(types),
+                    self._subscriptions.types[topic],
+                    STAMPED_REMEDY if is_base else "",
+                )
 
     def must_wait(self, now: float) -> bool:
         """Whether no step shall be published at ``now`` [s], as subscribers do not keep up; see :class:`FlowControl`.

@@ -41,7 +41,8 @@ class SensorNode(Node):
         ``parameters``: see :class:`Node`."""
         if cameras:
             message_packages.ensure_importable(["vision_msgs"])
-        self._camera_names, self._lidar_names = cameras, lidars
+        self._camera_names = cameras
+        self._lidar_names = lidars
         self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}
         """The newest message of each topic; the one that waits longest is the first."""

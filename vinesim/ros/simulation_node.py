@@ -38,18 +38,31 @@ RESET_TIMEOUT = 120.0
 STEP_TIMEOUT = 1.0
 """[s] More for each step that was asked for: the slowest simulation that is waited for."""
 UNSUPPORTED = (
-    "SpawnEntities", "SetEntityInfo", "LoadWorld", "UnloadWorld", "GetNamedPoses", "GetEntityBounds",
-)  # fmt: skip
+    "SpawnEntities",
+    "SetEntityInfo",
+    "LoadWorld",
+    "UnloadWorld",
+    "GetNamedPoses",
+    "GetEntityBounds",
+)
 """Services that answer that they are not supported."""
 _REMEDY = "not supported by vinesim; scene, robots and people are options of vinesim client and server"
 
 
 _CODES = {
-    Refusal.UNSUPPORTED: 0, Refusal.NOT_FOUND: 2, Refusal.INCORRECT_STATE: 3, Refusal.FAILED: 4,
-    Refusal.NAME_NOT_UNIQUE: 101, Refusal.NAME_INVALID: 102, Refusal.UNSUPPORTED_FORMAT: 103,
-    Refusal.NO_RESOURCE: 104, Refusal.RESOURCE_PARSE_ERROR: 106, Refusal.MISSING_ASSETS: 107,
-}  # fmt: skip
-INVALID_SPAWN_POSE, INVALID_POSE = 109, 101
+    Refusal.UNSUPPORTED: 0,
+    Refusal.NOT_FOUND: 2,
+    Refusal.INCORRECT_STATE: 3,
+    Refusal.FAILED: 4,
+    Refusal.NAME_NOT_UNIQUE: 101,
+    Refusal.NAME_INVALID: 102,
+    Refusal.UNSUPPORTED_FORMAT: 103,
+    Refusal.NO_RESOURCE: 104,
+    Refusal.RESOURCE_PARSE_ERROR: 106,
+    Refusal.MISSING_ASSETS: 107,
+}
+INVALID_SPAWN_POSE = 109
+INVALID_POSE = 101
 """Results of simulation_interfaces; an invalid pose has one for each service."""
 
 
@@ -88,7 +101,9 @@ class SimulationNode(Node):
         from simulation_interfaces.msg import EntityCategory as Category
         from simulation_interfaces.msg import Result, SimulationState, SimulatorFeatures
 
-        self._result, self._state, self._features = Result, SimulationState, SimulatorFeatures
+        self._result = Result
+        self._state = SimulationState
+        self._features = SimulatorFeatures
         self._categories = {
             EntityCategory.OBJECT: Category.CATEGORY_OBJECT,
             EntityCategory.ROBOT: Category.CATEGORY_ROBOT,
@@ -96,13 +111,21 @@ class SimulationNode(Node):
             EntityCategory.DYNAMIC_OBJECT: Category.CATEGORY_DYNAMIC_OBJECT,
         }
         served = {
-            "GetSimulatorFeatures": self._get_features, "GetSimulationState": self._get_state,
-            "SetSimulationState": self._set_state, "StepSimulation": self._step, "GetEntities": self._get_entities,
-            "GetEntitiesStates": self._get_states, "GetEntityState": self._get_entity_state,
-            "GetEntityInfo": self._get_entity_info, "GetSpawnables": self._get_spawnables,
-            "SpawnEntity": self._spawn, "DeleteEntity": self._delete, "SetEntityState": self._set_entity_state,
-            "ResetSimulation": self._reset, **dict.fromkeys(UNSUPPORTED, self._refuse),
-        }  # fmt: skip
+            "GetSimulatorFeatures": self._get_features,
+            "GetSimulationState": self._get_state,
+            "SetSimulationState": self._set_state,
+            "StepSimulation": self._step,
+            "GetEntities": self._get_entities,
+            "GetEntitiesStates": self._get_states,
+            "GetEntityState": self._get_entity_state,
+            "GetEntityInfo": self._get_entity_info,
+            "GetSpawnables": self._get_spawnables,
+            "SpawnEntity": self._spawn,
+            "DeleteEntity": self._delete,
+            "SetEntityState": self._set_entity_state,
+            "ResetSimulation": self._reset,
+            **dict.fromkeys(UNSUPPORTED, self._refuse),
+        }
         for name, serve in served.items():
             topic = re.sub(r"(?<!^)(?=[A-Z])", "_", name).lower()
             self._node.create_service(getattr(services, name), topic, serve)
@@ -113,12 +136,23 @@ class SimulationNode(Node):
     def _get_features(self, _: Any, response: Any) -> Any:
         known = self._features
         response.features.features = [
-            known.SPAWNING, known.DELETING, known.SPAWNABLES, known.ENTITY_STATE_SETTING,
-            known.SIMULATION_RESET, known.SIMULATION_RESET_STATE, known.SIMULATION_RESET_SPAWNED,
-            known.ENTITY_CATEGORIES, known.ENTITY_STATE_GETTING, known.ENTITY_INFO_GETTING,
-            known.SIMULATION_STATE_GETTING, known.SIMULATION_STATE_SETTING, known.SIMULATION_STATE_PAUSE,
-            known.STEP_SIMULATION_SINGLE, known.STEP_SIMULATION_MULTIPLE, known.STEP_SIMULATION_ACTION,
-        ]  # fmt: skip
+            known.SPAWNING,
+            known.DELETING,
+            known.SPAWNABLES,
+            known.ENTITY_STATE_SETTING,
+            known.SIMULATION_RESET,
+            known.SIMULATION_RESET_STATE,
+            known.SIMULATION_RESET_SPAWNED,
+            known.ENTITY_CATEGORIES,
+            known.ENTITY_STATE_GETTING,
+            known.ENTITY_INFO_GETTING,
+            known.SIMULATION_STATE_GETTING,
+            known.SIMULATION_STATE_SETTING,
+            known.SIMULATION_STATE_PAUSE,
+            known.STEP_SIMULATION_SINGLE,
+            known.STEP_SIMULATION_MULTIPLE,
+            known.STEP_SIMULATION_ACTION,
+        ]
         response.features.custom_info = (
             "only a client without a server pauses, steps, resets and changes entities; time goes on over a reset; "
             "get_spawnables lists the URIs that can be spawned"
@@ -204,9 +238,12 @@ class SimulationNode(Node):
             self._fail(response.result, self._result.RESULT_FEATURE_UNSUPPORTED, text)
             return response
         self._request(
-            SimulationAction.RESET, response.result, timeout=RESET_TIMEOUT,
-            keep_state=not scope & request.SCOPE_STATE, keep_spawned=not scope & request.SCOPE_SPAWNED,
-        )  # fmt: skip
+            SimulationAction.RESET,
+            response.result,
+            timeout=RESET_TIMEOUT,
+            keep_state=not scope & request.SCOPE_STATE,
+            keep_spawned=not scope & request.SCOPE_SPAWNED,
+        )
         return response
 
     def _refuse(self, _: Any, response: Any) -> Any:
@@ -222,7 +259,8 @@ class SimulationNode(Node):
 
         ``values``: fields of the request.
         """
-        number, done = next(self._numbers), threading.Event()
+        number = next(self._numbers)
+        done = threading.Event()
         self._waiting[number] = done
         try:
             self._ask(SimulationRequest(number, action, steps, **values))
@@ -248,7 +286,8 @@ class SimulationNode(Node):
         return self._result(result=self._result.RESULT_OK)
 
     def _fail(self, result: Any, code: int, text: str) -> None:
-        result.result, result.error_message = code, text
+        result.result = code
+        result.error_message = text
 
     def _filtered(self, filters: Any, result: Any) -> list[Entity]:
         """The entities that a filter leaves, none if it asks for what is not supported."""
@@ -265,9 +304,10 @@ class SimulationNode(Node):
         categories = {one.category for one in filters.categories}
         found: Iterable[Entity] = () if reply is None else reply.entities
         return [
-            entity for entity in found
+            entity
+            for entity in found
             if wanted.search(entity.name) and (not categories or self._categories[entity.category] in categories)
-        ]  # fmt: skip
+        ]
 
     def _named(self, name: str, result: Any) -> Entity | None:
         reply = self._request(SimulationAction.GET_ENTITIES, result)
@@ -289,7 +329,8 @@ class SimulationNode(Node):
 
 def _read_pose(header: Any, message: Pose) -> np.ndarray | None:
     """A pose [7]; None if it is in another frame than the map."""
-    x, q = message.position, message.orientation
+    x = message.position
+    q = message.orientation
     return np.array([x.x, x.y, x.z, q.x, q.y, q.z, q.w]) if header.frame_id in ("", MAP_FRAME) else None
 
 

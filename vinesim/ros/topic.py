@@ -50,7 +50,8 @@ class Topic:
         """Messages that were replaced by newer ones before their turn, or that could not be built or sent."""
         self.publisher = publisher
         self._is_muted = False
-        self._lock, self._is_closed = threading.Lock(), False
+        self._lock = threading.Lock()
+        self._is_closed = False
 
     def update_subscription_count(self) -> None:
         """Query the middleware for the number of subscribers."""

@@ -73,9 +73,14 @@ class _ShownRobot:
     """The topics of one robot."""
 
     def __init__(
-        self, advertise: Advertise, tf_message: type, namespace: str, urdf: str, base: str,
+        self,
+        advertise: Advertise,
+        tf_message: type,
+        namespace: str,
+        urdf: str,
+        base: str,
         static: Sequence[tuple[str, str, np.ndarray]],
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._base = base
         self._joints = advertise(JointState, f"{namespace}/joint_states", RELIABLE)
         self._tf = advertise(tf_message, f"{namespace}/tf", RELIABLE)

@@ -46,12 +46,13 @@ DENSITY = 1080.0
 
 VARIETIES = tuple(
     Variety(b.name, b.colour.value, b.radius.value, b.elongation.value) for b in plant_parameters.load_varieties()
-)  # fmt: skip
+)
 """Indexed by ``Model.bunch_variety``."""
 
 PROTOTYPE_BERRIES = (50, 64, 80, 97, 116, 140)
 """Berries of the prototypes; a bunch takes the next larger one and leaves berries off at its tip."""
-MIN_BERRIES, MAX_BERRIES = 40, PROTOTYPE_BERRIES[-1]
+MIN_BERRIES = 40
+MAX_BERRIES = PROTOTYPE_BERRIES[-1]
 _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
 """Taper and wings of the three prototypes of each count: conical, shouldered, cylindrical with two wings."""
 _ITERATIONS = 400
@@ -104,10 +105,13 @@ def mass_by_segment(
     """
     which = _prototype(count, seed)
     position, radius = _packed()
-    number, most = np.arange(MAX_BERRIES), int(np.max(pieces, initial=1))
-    count, pieces = np.asarray(count), np.asarray(pieces)
+    number = np.arange(MAX_BERRIES)
+    most = int(np.max(pieces, initial=1))
+    count = np.asarray(count)
+    pieces = np.asarray(pieces)
     length = _tables()[0][which, count]
-    position, radius = position[which] / length[:, None, None], radius[which] / length[:, None]
+    position = position[which] / length[:, None, None]
+    radius = radius[which] / length[:, None]
     weight = np.where(number < count[:, None], portable_math.power(radius, 3), 0.0)
     weight = weight / weight.sum(1, keepdims=True)
     piece = np.clip((position[..., 0] * pieces[:, None]).astype(int), 0, pieces[:, None] - 1)
@@ -128,9 +132,11 @@ def mass_by_segment(
 @functools.cache
 def _packed() -> tuple[np.ndarray, np.ndarray]:
     """Positions [prototype, MOST, 3] and radii [prototype, MOST]; rounded as :func:`_tables` is."""
-    position, radius = np.zeros((len(prototypes()), MAX_BERRIES, 3)), np.zeros((len(prototypes()), MAX_BERRIES))
+    position = np.zeros((len(prototypes()), MAX_BERRIES, 3))
+    radius = np.zeros((len(prototypes()), MAX_BERRIES))
     for i, bunch in enumerate(prototypes()):
-        position[i, : len(bunch.radius)], radius[i, : len(bunch.radius)] = bunch.position, bunch.radius
+        position[i, : len(bunch.radius)] = bunch.position
+        radius[i, : len(bunch.radius)] = bunch.radius
     return position.round(3), radius.round(3)
 
 
@@ -161,9 +167,13 @@ def _scaled(which: int, count: int, length: float, radius: float, variety: int) 
     near = np.where(unit.neighbours[:count] < count, unit.neighbours[:count], -1)
     order = np.argsort(near < 0, axis=1, kind="stable")
     return BerryLayout(
-        position=unit.position[:count] * scale, radius=unit.radius[:count] * (scale * thin), axis=unit.axis[:count],
-        foot=unit.foot[:count] * scale, rachis=unit.rachis * scale, neighbours=np.take_along_axis(near, order, 1),
-    )  # fmt: skip
+        position=unit.position[:count] * scale,
+        radius=unit.radius[:count] * (scale * thin),
+        axis=unit.axis[:count],
+        foot=unit.foot[:count] * scale,
+        rachis=unit.rachis * scale,
+        neighbours=np.take_along_axis(near, order, 1),
+    )
 
 
 @functools.cache
@@ -188,15 +198,20 @@ def _pack() -> list[BerryLayout]:
     ]
     position, foot, radius = (np.concatenate([d[k] for d in drafts]) for k in (0, 1, 2))
     position = _relax(position, foot, radius, [len(d[0]) for d in drafts])
-    library, first = [], 0
+    library = []
+    first = 0
     for _, foot, radius, rachis in drafts:
         p = position[first : first + len(foot)]
         first += len(foot)
         down = (p[:, 0] - radius).min()  # the topmost berry just reaches the peduncle's end
-        p, foot, rachis = p - [down, 0, 0], foot - [down, 0, 0], rachis - [down, 0, 0]
+        p = p - [down, 0, 0]
+        foot = foot - [down, 0, 0]
+        rachis = rachis - [down, 0, 0]
         rachis[0, 0] = 0.0
         order = np.argsort(p[:, 0], kind="stable")
-        p, foot, radius = p[order], foot[order], radius[order]
+        p = p[order]
+        foot = foot[order]
+        radius = radius[order]
         distance = np.linalg.norm(p[:, None] - p[None], axis=2) + np.diag(np.full(len(p), np.inf))
         near = np.argsort(distance, axis=1, kind="stable")[:, :8].astype(np.int32)
         axis = normalize(normalize(p - foot) + np.array([0.35, 0.0, 0.0]))
@@ -231,8 +246,10 @@ def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray,
 
 def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: list[int]) -> np.ndarray:
     """Pack several bunches at once: pedicels pull for three quarters of the time, neighbours push all the time."""
-    p, total = position.copy(), len(position)
-    first, second = np.zeros(0, np.int64), np.zeros(0, np.int64)
+    p = position.copy()
+    total = len(position)
+    first = np.zeros(0, np.int64)
+    second = np.zeros(0, np.int64)
     for iteration in range(_ITERATIONS):
         if iteration % 8 == 0:
             first, second = _near(p, sizes, 2.9)
@@ -253,7 +270,9 @@ def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: li
 
 def _near(p: np.ndarray, sizes: list[int], reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of one bunch closer than ``reach``."""
-    firsts, seconds, start = [], [], 0
+    firsts = []
+    seconds = []
+    start = 0
     for size in sizes:
         own = p[start : start + size]
         square = (own * own).sum(1)

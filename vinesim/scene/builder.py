@@ -79,9 +79,14 @@ class BunchSegments:
 
 
 def segment_bunches(
-    mass: np.ndarray, length: np.ndarray, radius: np.ndarray, berry_count: np.ndarray, seed: np.ndarray,
-    rachis: plant_parameters.Rachis, stem_share: float,
-) -> BunchSegments:  # fmt: skip
+    mass: np.ndarray,
+    length: np.ndarray,
+    radius: np.ndarray,
+    berry_count: np.ndarray,
+    seed: np.ndarray,
+    rachis: plant_parameters.Rachis,
+    stem_share: float,
+) -> BunchSegments:
     """Cut bunches [n] into segments that weigh what their own berries and stems weigh: a head and four to eight
     clusters.
 
@@ -99,7 +104,8 @@ def segment_bunches(
     number = np.arange(share.shape[1])
     here = number < count[:, None]
     h = length / count
-    juice, stem = mass * (1.0 - stem_share), np.where(here, (mass * stem_share / count)[:, None], 0.0)
+    juice = mass * (1.0 - stem_share)
+    stem = np.where(here, (mass * stem_share / count)[:, None], 0.0)
     fruit = juice[:, None] * share
     com = com * length[:, None, None] - (h[:, None] * number)[..., None] * [1.0, 0.0, 0.0]
     inertia = juice[:, None, None] * inertia * (length * length)[:, None, None]
@@ -117,9 +123,14 @@ def segment_bunches(
     thick = 0.5 * rachis.diameter.at(number / count[:, None])
     stiffness = 0.5 * segment_properties(h[:, None], thick, thick, rachis.modulus.value, 1.0)[2]
     return BunchSegments(
-        count, h, np.where(here, fruit + stem, 0.0), both, np.where(here[..., None], inertia, 0.0),
-        np.where(here[..., None], hull, 0.0), np.where(here[..., None], stiffness, 0.0),
-    )  # fmt: skip
+        count,
+        h,
+        np.where(here, fruit + stem, 0.0),
+        both,
+        np.where(here[..., None], inertia, 0.0),
+        np.where(here[..., None], hull, 0.0),
+        np.where(here[..., None], stiffness, 0.0),
+    )
 
 
 class TreeBuilder:
@@ -200,10 +211,9 @@ class TreeBuilder:
         above = self.bodies[parent] if 0 <= parent < len(self.bodies) else {}
         if offset is None:
             offset = (above.get("length", 0.0), 0.0, 0.0)
-        slack, damped = (
-            1.0 / near,
-            material.damping / near,
-        )  # [rad/N m] of the lower halves, and with the wood's damping
+        # [rad/N m] of the lower halves, and with the wood's damping
+        slack = 1.0 / near
+        damped = material.damping / near
         slack[1:] += 1.0 / far[:-1]
         damped[1:] += material.damping / far[:-1]
         if "far" in above:
@@ -222,10 +232,20 @@ class TreeBuilder:
             else:
                 at = (h, 0.0, 0.0)
             parent = self.add_body(
-                parent, offset=at, rest=turn, organ=int(organ), mass=masses[i], com=(h / 2, 0, 0), length=h,
-                radius=(edges[i], edges[i + 1]), inertia=inertias[i], stiffness=stiffnesses[i],
-                damping=dampings[i], far=far[i], beta=material.damping,
-            )  # fmt: skip
+                parent,
+                offset=at,
+                rest=turn,
+                organ=int(organ),
+                mass=masses[i],
+                com=(h / 2, 0, 0),
+                length=h,
+                radius=(edges[i], edges[i + 1]),
+                inertia=inertias[i],
+                stiffness=stiffnesses[i],
+                damping=dampings[i],
+                far=far[i],
+                beta=material.damping,
+            )
             numbers.append(parent)
         return numbers
 
@@ -277,34 +297,62 @@ class TreeBuilder:
         size = berry.volume_radius * math.cbrt(mass * (1.0 - share) / (count * berry.mass))
         length, radius = berries.hull_size(np.array(count), np.array(seed)) * size
         one = segment_bunches(
-            np.array([mass]), np.array([length]), np.array([radius]), np.array([count]), np.array([seed]),
-            parameters.rachis, share,
-        )  # fmt: skip
+            np.array([mass]),
+            np.array([length]),
+            np.array([radius]),
+            np.array([count]),
+            np.array([seed]),
+            parameters.rachis,
+            share,
+        )
         whole, com, inertia = (value[0] for value in one.compound())
         offset = (above["length"], 0.0, 0.0) if offset is None else offset
         body = self.add_body(
-            parent, offset=offset, rest=rest, organ=int(Organ.BUNCH), mass=whole, com=com, inertia=inertia,
-            length=length, radius=(radius, radius),
+            parent,
+            offset=offset,
+            rest=rest,
+            organ=int(Organ.BUNCH),
+            mass=whole,
+            com=com,
+            inertia=inertia,
+            length=length,
+            radius=(radius, radius),
             stiffness=above["stiffness"] if stiffness is None else stiffness,
             damping=above["damping"] if damping is None else damping,
-        )  # fmt: skip
+        )
         bunch = {
-            "body": body, "length": length, "radius": radius, "berries": count, "seed": seed, "variety": variety,
+            "body": body,
+            "length": length,
+            "radius": radius,
+            "berries": count,
+            "seed": seed,
+            "variety": variety,
             **fields,
-        }  # fmt: skip
+        }
         if clusters:
             n = int(one.count[0]) - 1
             bunch |= {
-                "clusters": n, "head_mass": one.mass[0, 0], "head_com": one.com[0, 0],
+                "clusters": n,
+                "head_mass": one.mass[0, 0],
+                "head_com": one.com[0, 0],
                 "head_inertia": one.inertia[0, 0],
-            }  # fmt: skip
+            }
             for i in range(1, n + 1):
-                self.clusters.append({
-                    "parent": None if i > 1 else body, "offset": np.array([one.length[0], 0.0, 0.0]),
-                    "rest": frames.IDENTITY, "organ": int(Organ.BUNCH), "mass": one.mass[0, i], "com": one.com[0, i],
-                    "inertia": one.inertia[0, i], "length": one.length[0], "radius": one.radius[0, i],
-                    "stiffness": one.stiffness[0, i], "damping": parameters.rachis.damping.value * one.stiffness[0, i],
-                })  # fmt: skip
+                self.clusters.append(
+                    {
+                        "parent": None if i > 1 else body,
+                        "offset": np.array([one.length[0], 0.0, 0.0]),
+                        "rest": frames.IDENTITY,
+                        "organ": int(Organ.BUNCH),
+                        "mass": one.mass[0, i],
+                        "com": one.com[0, i],
+                        "inertia": one.inertia[0, i],
+                        "length": one.length[0],
+                        "radius": one.radius[0, i],
+                        "stiffness": one.stiffness[0, i],
+                        "damping": parameters.rachis.damping.value * one.stiffness[0, i],
+                    }
+                )
         self.bunches.append(bunch)
         return body
 
@@ -391,8 +439,10 @@ def solve_rest_pose(model: Model) -> Model:
         )
     drawn = frames.normalize(model.body_rest.astype(float))
     world = model.forward_kinematics(np.broadcast_to(frames.IDENTITY, drawn.shape))
-    depth, parent = model.depth(), model.body_parent
-    mass, com = model.body_mass.astype(float), model.body_com.astype(float)
+    depth = model.depth()
+    parent = model.body_parent
+    mass = model.body_mass.astype(float)
+    com = model.body_com.astype(float)
     fine = model.bunch_clusters > 0
     mass[model.bunch_body[fine]] = model.bunch_head_mass[fine]
     com[model.bunch_body[fine]] = model.bunch_head_com[fine]
@@ -447,9 +497,13 @@ def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
     model = Model.allocate(**counts)
     first = bunch = leaf = 0
     for number, tree in enumerate(trees):
-        size, core = len(tree.bodies) + len(tree.clusters), len(tree.bodies)
-        model.tree_first[number], model.tree_size[number], model.tree_core[number] = first, size, core
-        model.tree_pose[number], model.tree_vine[number] = tree.pose, tree.vine
+        size = len(tree.bodies) + len(tree.clusters)
+        core = len(tree.bodies)
+        model.tree_first[number] = first
+        model.tree_size[number] = size
+        model.tree_core[number] = core
+        model.tree_pose[number] = tree.pose
+        model.tree_vine[number] = tree.vine
         for i, body in enumerate([*tree.bodies, *tree.clusters]):
             at = first + i
             parent = i - 1 if body["parent"] is None else body["parent"]

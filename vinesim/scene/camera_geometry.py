@@ -44,10 +44,12 @@ def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
     """Pixels [..., 2] (column, row) of points [..., 3] m in the optical frame; NaN behind the camera."""
     points = np.asarray(points, float)
     z = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
-    across, down = points[..., 0] / z, points[..., 1] / z
+    across = points[..., 0] / z
+    down = points[..., 1] / z
     if info.distortion:
         bent = lens_distortion.distort(np.stack([across, down], -1), info.distortion)
-        across, down = bent[..., 0], bent[..., 1]
+        across = bent[..., 0]
+        down = bent[..., 1]
     return np.stack([across * info.fx + info.cx, down * info.fy + info.cy], -1)
 
 

@@ -94,7 +94,8 @@ class CaneBuilder:
             raise ValueError("cane: base is 'pinned', so it has no bending mode; give base 'clamped', or beta")
         joint = np.arange(self.segments) * (self.length / self.segments)
         com = joint + np.array([body["com"][0] for body in bodies])
-        mass, inertia = np.array([body["mass"] for body in bodies]), np.array([body["inertia"][2] for body in bodies])
+        mass = np.array([body["mass"] for body in bodies])
+        inertia = np.array([body["inertia"][2] for body in bodies])
         outer = np.tril(np.ones((self.segments, self.segments)))  # [segment, joint]: the joint lies inside of it
         way = outer * (com[:, None] - joint)
         matrix = way.T @ (mass[:, None] * way) + outer.T @ (inertia[:, None] * outer)
@@ -157,7 +158,9 @@ def _is_finite(value: object) -> bool:
 
 def _add_point_mass(body: dict, mass: float) -> None:
     """Add a point mass [kg] at the tip of a segment: mass, centre and moments of inertia of both together."""
-    own, com, tip = body["mass"], body["com"][0], body["length"]
+    own = body["mass"]
+    com = body["com"][0]
+    tip = body["length"]
     together = (own * com + mass * tip) / (own + mass)
     across = own * (com - together) ** 2 + mass * (tip - together) ** 2
     body["mass"], body["com"] = own + mass, (together, 0.0, 0.0)

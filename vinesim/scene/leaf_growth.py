@@ -52,7 +52,9 @@ def grow_leaves(
     """
     forward, rise, droop, swing, *lean, ageing = normal[..., None]
     fate, turned, far, large = uniform
-    turn, share, hand = nodes.turn, nodes.share, nodes.hand
+    turn = nodes.turn
+    share = nodes.share
+    hand = nodes.hand
 
     tendone = scene.training == "tendone"
     axis = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
@@ -77,15 +79,24 @@ def grow_leaves(
     age = np.where(turned < scene.season.yellow, 0.75, 0.05 + 0.45 * (1.0 - share)) + 0.08 * ageing[..., 0]
     mass = leaf.mass_per_area.value * area + leaf.petiole_mass.value * np.sqrt(shrink)
     return {
-        "present": fate < scene.season.leafiness, "base": base, "pose": pose, "area": area,
-        "age": np.clip(age, 0.0, 1.0), "mass": mass, "drag": leaf.drag.value * area,
-    }  # fmt: skip
+        "present": fate < scene.season.leafiness,
+        "base": base,
+        "pose": pose,
+        "area": area,
+        "age": np.clip(age, 0.0, 1.0),
+        "mass": mass,
+        "drag": leaf.drag.value * area,
+    }
 
 
 def add_point_masses(
-    mass: np.ndarray, com: np.ndarray, inertia: np.ndarray, at: tuple[np.ndarray, ...], weight: np.ndarray,
+    mass: np.ndarray,
+    com: np.ndarray,
+    inertia: np.ndarray,
+    at: tuple[np.ndarray, ...],
+    weight: np.ndarray,
     where: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Bodies with point masses; products of inertia are dropped.
 
     Args:
@@ -99,7 +110,9 @@ def add_point_masses(
     Returns:
         Mass, centre of mass and moments of inertia.
     """
-    total, first, second = mass.copy(), mass[..., None] * com, inertia + mass[..., None] * _squared_distances(com)
+    total = mass.copy()
+    first = mass[..., None] * com
+    second = inertia + mass[..., None] * _squared_distances(com)
     np.add.at(total, at, weight)
     np.add.at(first, at, weight[..., None] * where)
     np.add.at(second, at, weight[..., None] * _squared_distances(where))

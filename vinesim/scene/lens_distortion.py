@@ -23,14 +23,17 @@ _TOLERANCE = 1e-9
 def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
     """The radial factor and its derivative by r2."""
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
-    above, below = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3)), 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
-    slope_above, slope_below = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3), k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6)
+    above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    slope_above = k1 + r2 * (2.0 * k2 + r2 * 3.0 * k3)
+    slope_below = k4 + r2 * (2.0 * k5 + r2 * 3.0 * k6)
     return above / below, (slope_above * below - above * slope_below) / below**2
 
 
 def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
     """Where points [..., 2] of the plane at depth 1 appear in it [..., 2]."""
-    x, y = points[..., 0], points[..., 1]
+    x = points[..., 0]
+    y = points[..., 1]
     r2 = x * x + y * y
     p1, p2 = coefficients[2:4]
     radial, _ = _polynomials(r2, coefficients)
@@ -45,7 +48,8 @@ def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 def _jacobian(points: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Derivatives of :func:`distort`: of x by x, of x by y (and of y by x, which is equal), of y by y."""
-    x, y = points[..., 0], points[..., 1]
+    x = points[..., 0]
+    y = points[..., 1]
     p1, p2 = coefficients[2:4]
     radial, slope = _polynomials(x * x + y * y, coefficients)
     return (

@@ -89,7 +89,8 @@ def _listed(quantity: str, name: str) -> dict[tuple[int, int], float]:
     known = {material.name.lower(): int(material) for material in Material if material}
     pairs: dict[tuple[int, int], float] = {}
     for text, number in pair_numbers(name)[quantity].items():
-        place, words = f"{path}: {quantity}.{text}", text.split("-")
+        place = f"{path}: {quantity}.{text}"
+        words = text.split("-")
         if len(words) != 2 or not known.keys() >= set(words):
             raise DataError(f"{place} is no pair of materials; give two of {', '.join(known)} with a hyphen between")
         if number.unit != _UNITS[quantity]:

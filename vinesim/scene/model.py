@@ -168,7 +168,8 @@ class Model(StructOfArrays):
         body = self.body_parent[self.bunch_body]
         while len(body):
             stalk = (body >= 0) & (self.body_organ[body] == int(Organ.PEDUNCLE))
-            body, bunch = body[stalk], bunch[stalk]
+            body = body[stalk]
+            bunch = bunch[stalk]
             owner[body] = bunch
             body = self.body_parent[body]
         return owner

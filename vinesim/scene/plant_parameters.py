@@ -287,7 +287,8 @@ def _check_axis(specimen: Specimen, path: str) -> None:
 def _check_units(part: msgspec.Struct, place: str) -> None:
     hints = typing.get_type_hints(type(part), include_extras=True)
     for name in part.__struct_fields__:
-        value, unit = getattr(part, name), getattr(hints[name], "__metadata__", None)
+        value = getattr(part, name)
+        unit = getattr(hints[name], "__metadata__", None)
         if isinstance(value, _Part):
             _check_units(value, f"{place}: {name}" if ":" not in place else f"{place}.{name}")
         elif unit and isinstance(value, Number | Range | Colour) and value.unit != unit[0]:

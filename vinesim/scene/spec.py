@@ -199,7 +199,8 @@ def _find_error(scene: Scene) -> str:
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
-    rows, vines = scene.layout.rows, scene.layout.vines
+    rows = scene.layout.rows
+    vines = scene.layout.vines
     for i, (row, place) in enumerate(scene.layout.missing):
         if not (0 <= row < rows and 0 <= place < vines):
             return f"layout.missing[{i}] is [{row}, {place}]; give [0 to {rows - 1}, 0 to {vines - 1}]: row, place"

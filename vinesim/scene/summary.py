@@ -12,7 +12,8 @@ from vinesim.scene.spec import Scene
 
 def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
     """Rows of (quantity, value, unit)."""
-    counts, layout = model.counts(), scene.layout
+    counts = model.counts()
+    layout = scene.layout
     places = layout.rows * layout.vines
     ground = places * layout.row_spacing * layout.vine_spacing
     vines = places - len(set(layout.missing)) + len(scene.imported)

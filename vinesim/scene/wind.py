@@ -36,7 +36,8 @@ class Wind:
             raise ValueError(f"mean wind {mean}: give three finite numbers, m/s")
         if not 0.0 <= gusts < np.inf or not 0.0 < scale < np.inf:
             raise ValueError(f"gusts {gusts} m/s, scale {scale} m: need gusts of 0 or more and a positive scale")
-        self.gusts, self.scale = gusts, scale
+        self.gusts = gusts
+        self.scale = scale
         rng = np.random.Generator(np.random.PCG64(seed))
         # wave numbers at equal shares of the energy; shuffled, since directions are drawn by number
         grid = np.geomspace(1e-2, 1e2, 4000) / scale

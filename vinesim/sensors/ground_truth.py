@@ -45,11 +45,14 @@ def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
     rows, columns = np.nonzero(frame.labels // LABEL_STRIDE == int(Organ.BUNCH))
     index = frame.labels[rows, columns] % LABEL_STRIDE
     order = np.argsort(index, kind="stable")
-    index, rows, columns = index[order], rows[order], columns[order]
+    index = index[order]
+    rows = rows[order]
+    columns = columns[order]
     edges = np.flatnonzero(np.diff(index, prepend=-1, append=-1))
     sightings = []
     for first, last in itertools.pairwise(edges):
-        r, c = rows[first:last], columns[first:last]
+        r = rows[first:last]
+        c = columns[first:last]
         depth = frame.depth[r, c]
         depth = depth[np.isfinite(depth)]
         sightings.append(
@@ -124,8 +127,10 @@ def bunch_truths(
 
     ``primitives`` as posed by ``snapshot`` when ``seen`` was taken; ``caster`` saves building one.
     """
-    info, drawn = seen.info, lens_map(seen.info).pinhole
-    alone, lens = CameraRasterizer(drawn.width, drawn.height, primitives.device), pinhole(drawn, seen.pose)
+    info = seen.info
+    drawn = lens_map(seen.info).pinhole
+    alone = CameraRasterizer(drawn.width, drawn.height, primitives.device)
+    lens = pinhole(drawn, seen.pose)
     near = primitives.label[primitives.cluster_first][alone.cluster_distances(primitives, lens) < float(FAR)]
     bunches = np.unique(near[near // LABEL_STRIDE == int(Organ.BUNCH)]) % LABEL_STRIDE
     cuts = _cut_points(primitives.model, snapshot, bunches)
@@ -183,14 +188,17 @@ class _Look:
 
         ``cuts``: points [3] m by bunch; ``clear``: bunches whose cut point nothing hides.
         """
-        p, snapshot, model = self.primitives, self.snapshot, self.primitives.model
+        p = self.primitives
+        snapshot = self.snapshot
+        model = self.primitives.model
         view = lens_map(self.info)
         lens = pinhole(view.pinhole, self.pose)
         named = p.label[p.cluster_first]
         fruit = np.flatnonzero((named // LABEL_STRIDE == int(Organ.BUNCH)) & p.clusters_shown())
         fruit = fruit[np.isin(named[fruit] % LABEL_STRIDE, bunches)]
         count = np.bincount(self.primitive[self.primitive >= 0], minlength=p.count)
-        a, b = p.shapes.a.numpy(), p.shapes.b.numpy()
+        a = p.shapes.a.numpy()
+        b = p.shapes.b.numpy()
         loose = {one.index: k for k, one in enumerate(snapshot.visuals) if one.organ == Organ.BUNCH}
         for bunch in np.unique(named[fruit] % LABEL_STRIDE).tolist():
             mine = fruit[named[fruit] % LABEL_STRIDE == bunch]
@@ -234,7 +242,8 @@ def _cut_points(model: Model, snapshot: Snapshot, bunches: np.ndarray) -> dict[i
 
 def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
     """Middle of a hanging bunch's peduncle [3] m, along its axis, for world poses of the bodies [body, 7]."""
-    stalk, body = [], int(model.body_parent[model.bunch_body[bunch]])
+    stalk = []
+    body = int(model.body_parent[model.bunch_body[bunch]])
     while body >= 0 and model.body_organ[body] == int(Organ.PEDUNCLE):
         stalk.insert(0, body)
         body = int(model.body_parent[body])
@@ -257,9 +266,11 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     """
     if first.layout_version != second.layout_version:
         raise ValueError("things came or went between the two looks; flow needs the same ones in both")
-    info, other = first.info, second.info
+    info = first.info
+    other = second.info
     v, u = np.nonzero(np.isfinite(first.depth))
-    primitive, z = first.primitive[v, u], first.depth[v, u].astype(float)
+    primitive = first.primitive[v, u]
+    z = first.depth[v, u].astype(float)
     across, down = (
         ((u - info.cx) / info.fx, (v - info.cy) / info.fy)
         if not info.distortion
@@ -300,7 +311,8 @@ def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray
     """Pose [7] and edges [3] m of the tightest box of this orientation around spheroids and cones [k]."""
     back = frames.conjugate(np.asarray(turn, float))
     start, end = (frames.rotate(back, v[:, :3].astype(float)) for v in (a, b))  # of a spheroid, end is its axis
-    radius, other = a[:, 3:].astype(float), b[:, 3:].astype(float)
+    radius = a[:, 3:].astype(float)
+    other = b[:, 3:].astype(float)
     round_one = (kind == SPHEROID)[:, None]
     half = radius * np.sqrt(1.0 + np.where(round_one, (other**2 - 1.0) * end**2, 0.0))
     cone = (kind == CONE)[:, None]
@@ -311,7 +323,8 @@ def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray
 
 def _box_of(mask: np.ndarray, window: Box) -> Box | None:
     """Box in the picture of a mask [rows, columns] of a window of it; None for an empty mask."""
-    rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
+    rows = np.flatnonzero(mask.any(1))
+    columns = np.flatnonzero(mask.any(0))
     if not len(rows):
         return None
     left, top = window[:2]

@@ -24,7 +24,8 @@ LEVEL_POSE = np.array([0.0, 0.0, 0.0, -np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """[7] Optical frame of a level camera that looks along the world's y: x to the right, z up."""
 PAIR_TIME = 0.01
 """[s] Most between the stamps of a picture's colours and its depth."""
-IMAGE, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
+IMAGE = "sensor_msgs/msg/Image"
+INFO = "sensor_msgs/msg/CameraInfo"
 _COLOURS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0])}
 """Channels of an encoding, and which of them are red, green and blue."""
 _DEPTHS = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}
@@ -36,9 +37,13 @@ class RecordedPicturesError(ValueError):
 
 
 def read_pictures(
-    path: pathlib.Path, *, image: str | None = None, depth: str | None = None, pose: np.ndarray | None = None,
+    path: pathlib.Path,
+    *,
+    image: str | None = None,
+    depth: str | None = None,
+    pose: np.ndarray | None = None,
     rate: float | None = None,
-) -> Iterator[CameraFrame]:  # fmt: skip
+) -> Iterator[CameraFrame]:
     """The pictures of an MCAP file, a rosbag2 folder of such, or a data set, in the order of time, one at a time.
 
     A picture of colours without its depth has depth NaN.
@@ -87,9 +92,14 @@ def _dataset(folder: pathlib.Path, pose: np.ndarray | None, rate: float | None) 
         rgb = _png(folder / "images" / f"{file.stem}.png", cv2.IMREAD_COLOR)[..., ::-1]
         millimetres = _png(folder / "measured" / f"{file.stem}.png", cv2.IMREAD_UNCHANGED)
         yield CameraFrame(
-            float(time), folder.name, info, own if pose is None else pose, rgb, _metres(millimetres),
+            float(time),
+            folder.name,
+            info,
+            own if pose is None else pose,
+            rgb,
+            _metres(millimetres),
             np.zeros((0, 0), np.int32),
-        )  # fmt: skip
+        )
 
 
 def _png(file: pathlib.Path, flags: int) -> np.ndarray:
@@ -119,7 +129,9 @@ def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: 
         raise RecordedPicturesError(
             f"{name}: no topic {beside}, which has the focal length of {image}; record it with the pictures"
         )
-    info, waiting, depths = None, collections.deque(), collections.deque()
+    info = None
+    waiting = collections.deque()
+    depths = collections.deque()
     for topic, data in _messages(files, [image, depth, beside]):
         try:
             if topic == beside:
@@ -182,9 +194,14 @@ def _messages(files: list[pathlib.Path], topics: list[str]) -> Iterator[tuple[st
 
 
 def _pair(
-    name: str, image: str, waiting: collections.deque, depths: collections.deque, info: CameraInfo, pose: np.ndarray,
+    name: str,
+    image: str,
+    waiting: collections.deque,
+    depths: collections.deque,
+    info: CameraInfo,
+    pose: np.ndarray,
     last: bool,
-) -> Iterator[CameraFrame]:  # fmt: skip
+) -> Iterator[CameraFrame]:
     """Pictures of colours that have met their depth, or can no more."""
     while waiting:
         time, rgb = waiting[0]
@@ -239,8 +256,12 @@ class _Cdr:
 def _read_image(data: bytes) -> tuple[float, np.ndarray]:
     """Stamp [s], and colours uint8 or depth [m]."""
     cdr = _Cdr(data)
-    time, height, width, encoding = cdr.stamp(), cdr.number("I"), cdr.number("I"), cdr.text()
-    order, step = "><"[not cdr.number("B")], cdr.number("I")
+    time = cdr.stamp()
+    height = cdr.number("I")
+    width = cdr.number("I")
+    encoding = cdr.text()
+    order = "><"[not cdr.number("B")]
+    step = cdr.number("I")
     rows = np.frombuffer(cdr.block(), np.uint8).reshape(height, step)
     if encoding in _COLOURS:
         channels, order = _COLOURS[encoding]
@@ -254,7 +275,9 @@ def _read_image(data: bytes) -> tuple[float, np.ndarray]:
 def _read_info(data: bytes) -> CameraInfo:
     cdr = _Cdr(data)
     cdr.stamp()
-    height, width, model = cdr.number("I"), cdr.number("I"), cdr.text()
+    height = cdr.number("I")
+    width = cdr.number("I")
+    model = cdr.text()
     lens = tuple(cdr.number("d") for _ in range(cdr.number("I")))
     k = [cdr.number("d") for _ in range(9)]
     if k[0] <= 0.0:

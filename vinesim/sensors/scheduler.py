@@ -75,9 +75,14 @@ class SensorScheduler:
     """Renders the sensors of one robot, in the caller's thread."""
 
     def __init__(
-        self, model: Model, sensors: Sequence[ScheduledSensor], *, primitives: Primitives | None = None,
-        pacing: SensorPacing = SensorPacing(), on_taken: Callable[[], None] = lambda: None,
-    ) -> None:  # fmt: skip
+        self,
+        model: Model,
+        sensors: Sequence[ScheduledSensor],
+        *,
+        primitives: Primitives | None = None,
+        pacing: SensorPacing = SensorPacing(),
+        on_taken: Callable[[], None] = lambda: None,
+    ) -> None:
         """``on_taken`` is called when it is known what a snapshot is needed for, before that is rendered."""
         names = [m.name for m in sensors]
         if len(set(names)) != len(names):
@@ -93,7 +98,8 @@ class SensorScheduler:
         self._is_first = dict.fromkeys(names, True)
         """Whether a sensor has delivered at most one frame since it became wanted; the first may take longer."""
         self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
-        self._pacing, self._on_taken = pacing, on_taken
+        self._pacing = pacing
+        self._on_taken = on_taken
         self._taken: dict[str, float] = {}
         """Simulated time of the newest snapshot that each wanted sensor has taken [s]."""
         self._costs: dict[str, float] = {}
@@ -203,7 +209,8 @@ class SensorScheduler:
         """Render what a sensor has to deliver of a snapshot that the primitives show."""
         now = snapshot.time
         if isinstance(scheduled.sensor, Camera):
-            camera, outputs = scheduled.sensor, scheduled.wanted()
+            camera = scheduled.sensor
+            outputs = scheduled.wanted()
             frame = camera.render(self.primitives, pose, now, outputs=outputs)
             if CameraOutput.BUNCHES in outputs:
                 bunches = visible_bunches(self.primitives, snapshot, camera.info, frame.pose, camera.rasterizer)
@@ -231,13 +238,15 @@ class SensorScheduler:
         self._taken.setdefault(name, now)
         if name in self._scans:
             return self._scans[name].is_due(now)
-        due, period = self._next_time[name], scheduled.period
+        due = self._next_time[name]
+        period = scheduled.period
         if now < due - 2.0 * period:  # time was set back
             due = -np.inf
         if now < due - 1e-6:
             return False
         if not np.isfinite(due):
-            self._next_time[name], self._is_first[name] = now + period, True
+            self._next_time[name] = now + period
+            self._is_first[name] = True
             return True
         late = int((now - due + 1e-6) / period)
         if not self._is_first[name]:

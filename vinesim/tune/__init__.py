@@ -22,6 +22,18 @@ from vinesim.tune.trajectory import Trajectory, TrajectoryError, read_trajectory
 from vinesim.tune.tuning import tune
 
 __all__ = [
-    "Experiment", "Features", "Fit", "Specimen", "Trajectory", "TrajectoryError", "extract_features",
-    "load_specimen", "measure", "read_trajectory", "track_marker", "tune", "with_cloud", "with_values",
-]  # fmt: skip
+    "Experiment",
+    "Features",
+    "Fit",
+    "Specimen",
+    "Trajectory",
+    "TrajectoryError",
+    "extract_features",
+    "load_specimen",
+    "measure",
+    "read_trajectory",
+    "track_marker",
+    "tune",
+    "with_cloud",
+    "with_values",
+]

@@ -63,7 +63,8 @@ class SampledMotion:
     def __init__(self, time: np.ndarray, position: np.ndarray) -> None:
         self._ends = float(time[0]), float(time[-1])
         curve = make_interp_spline(time, position, k=SPLINE_DEGREE)
-        self._slope, self._bend = curve.derivative(1), curve.derivative(2)
+        self._slope = curve.derivative(1)
+        self._bend = curve.derivative(2)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
         """[k] or [k, 3] m/s at times [k] s; outside of the samples that of the nearest one."""

@@ -64,7 +64,10 @@ class Candidates:
     def __init__(
         self, specimen: Specimen, markers: tuple[str, ...] = (TIP,), *, dt: float, device: str = "cpu", least: int = 1
     ) -> None:
-        self.specimen, self.markers, self.dt, self.device = specimen, markers, dt, device
+        self.specimen = specimen
+        self.markers = markers
+        self.dt = dt
+        self.device = device
         self._tree = build_tree(specimen)
         self._body, self._point = place_markers(specimen, markers)
         tip_body, tip_point = place_markers(specimen, (TIP,))
@@ -99,7 +102,8 @@ class Candidates:
             base_velocity: [tick, 3] m/s of the base in the world, up to the tick after the last of ``ticks``; none: it
                 rests. The motion that comes back is relative to the base.
         """
-        count, candidates = len(candidates), self._padded(candidates)
+        count = len(candidates)
+        candidates = self._padded(candidates)
         still, plants = self._solvers[len(candidates)]
         self._write(still, candidates, 0.0)
         self._write(plants, candidates, 1.0)
@@ -133,7 +137,8 @@ class Candidates:
 
     def shape(self, candidates: np.ndarray) -> np.ndarray:
         """Markers [n, marker, 3] m of candidates [n, 7] in equilibrium under their pull."""
-        count, candidates = len(candidates), self._padded(candidates)
+        count = len(candidates)
+        candidates = self._padded(candidates)
         still, _ = self._solvers[len(candidates)]
         self._write(still, candidates, 0.0)
         self._settle(still, candidates, count)
@@ -175,12 +180,14 @@ class Candidates:
 
     def _write(self, plants: ArticulationSolver, candidates: np.ndarray, damped: float) -> None:
         """Give each tree its stiffness, damping, masses and slack shape."""
-        model, count = plants.model, len(candidates)
+        model = plants.model
+        count = len(candidates)
         modulus, damping, mass = np.exp(candidates[:, :3]).T.repeat(self.size, axis=1)[..., None]
         plants.joint_stiffness[:] = model.joint_stiffness * modulus
         plants.joint_damping[:] = model.joint_damping * modulus * damping * damped
         own_mass, own_inertia, own_product = self._own[count]
-        plants.body_inertia[:], plants.body_product[:] = own_inertia * mass, own_product * mass
+        plants.body_inertia[:] = own_inertia * mass
+        plants.body_product[:] = own_product * mass
         plants.body_mass[:] = own_mass * mass[:, 0]
         rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
         if self._sag is None:

@@ -104,7 +104,8 @@ def measure(
 ) -> Trajectory:
     """The track of an experiment on a specimen, simulated in steps of ``step`` [s]; ``exact``: without noise."""
     experiment.check()
-    e, rng = experiment, np.random.default_rng(experiment.seed)
+    e = experiment
+    rng = np.random.default_rng(experiment.seed)
     specimen = msgspec.structs.replace(specimen, segments=max(TRUTH_SEGMENTS, specimen.segments))
     candidates = Candidates(specimen, e.markers, dt=step)
     row = np.zeros((1, len(COLUMNS)))
@@ -138,7 +139,8 @@ def measure(
 
 def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
     """How the base is shaken."""
-    e, angle = experiment, math.radians(experiment.angle)
+    e = experiment
+    angle = math.radians(experiment.angle)
     direction = np.array([math.cos(angle), math.sin(angle)]) @ candidates.pull_axes()
     direction[np.abs(direction) < 1e-12] = 0.0  # no column of rounding errors
     frequencies = e.number("from_frequency"), e.number("to_frequency")

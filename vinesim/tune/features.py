@@ -88,7 +88,8 @@ def _gross_outliers(column: np.ndarray) -> np.ndarray:
 
 def find_onset(track: Trajectory) -> float:
     """[s] The last time before the motion: the first sample unless the track begins with a hold."""
-    values, time = columns_of(track), track.time
+    values = columns_of(track)
+    time = track.time
     noise = max(_hold_noise(values), 1e-9)
     start = np.nanmedian(values[: max(3, min(5, len(values) // 8))], axis=0)
     off = np.max(np.abs(np.nan_to_num(values - start)), axis=1)
@@ -162,7 +163,8 @@ def extract_features(track: Trajectory, onset: float | None = None) -> Features:
 def _free_features(track: Trajectory, onset: float) -> Features:
     """Those of the damped sinusoid nearest to the track after ``onset`` [s]."""
     here = track.time >= onset
-    time, values = track.time[here] - onset, columns_of(track)[here]
+    time = track.time[here] - onset
+    values = columns_of(track)[here]
     duration = float(time[-1] - time[0])
     step = 1.0 / (FREQUENCIES_PER_BIN * duration)
     grid = np.arange(0.5 / duration, max(0.45 * track.rate, 1.0 / duration), step)
@@ -173,12 +175,14 @@ def _free_features(track: Trajectory, onset: float) -> Features:
 def _find_release(track: Trajectory, features: Features) -> float:
     """[s] The turning point of the sinusoid before which the track holds still best: that of ``features``, unless
     another half period is clearly better."""
-    values, time = columns_of(track), track.time
+    values = columns_of(track)
+    time = track.time
     half = 0.5 / features.frequency
     first = min(features.release, float(time[0]))
     count = int((0.5 * (time[0] + time[-1]) - first) / half)
     places = features.release + half * np.arange(-1, max(count, 1) + 1)
-    omega, ratio = 2.0 * np.pi * features.frequency, features.damping_ratio
+    omega = 2.0 * np.pi * features.frequency
+    ratio = features.damping_ratio
     after = np.maximum(time, places[:, None]) - features.release  # [place, sample]
     wave = np.exp(-ratio / math.sqrt(1.0 - ratio**2) * omega * after) * np.cos(omega * after)
     off = values - features.rest - wave[..., None] * features.displacement
@@ -200,10 +204,14 @@ def _shaken_features(track: Trajectory) -> Features:
     best, found, off = _search(basis, values, grid, lambda frequency: RELATIVE_STEP * frequency, 0.1 * lowest)
     response = basis(*(np.array([x]) for x in best))[0, :, 1]
     return Features(
-        frequency=best[0], damping_ratio=best[1], release=float(track.time[0]), rest=found[0],
-        displacement=np.abs(response).max() * found[1], noise=max(robust_deviation(off), 1e-9),
+        frequency=best[0],
+        damping_ratio=best[1],
+        release=float(track.time[0]),
+        rest=found[0],
+        displacement=np.abs(response).max() * found[1],
+        noise=max(robust_deviation(off), 1e-9),
         explained=_explained(off, values),
-    )  # fmt: skip
+    )
 
 
 def _direction(base: np.ndarray) -> np.ndarray:
@@ -212,9 +220,12 @@ def _direction(base: np.ndarray) -> np.ndarray:
 
 
 def _search(
-    basis: Callable[[np.ndarray, np.ndarray], np.ndarray], values: np.ndarray, grid: np.ndarray,
-    step_at: Callable[[float], float], lowest: float,
-) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:  # fmt: skip
+    basis: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    values: np.ndarray,
+    grid: np.ndarray,
+    step_at: Callable[[float], float],
+    lowest: float,
+) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:
     """Frequency and damping ratio whose curves explain values [sample, column] best.
 
     Args:
@@ -227,7 +238,9 @@ def _search(
     Returns frequency and ratio, coefficients [3, column], and what is left [sample, column].
     """
     weight = np.isfinite(values).astype(float)
-    ratio, best, step = DAMPING_RATIOS, (0.0, 0.0), 0.0
+    ratio = DAMPING_RATIOS
+    best = (0.0, 0.0)
+    step = 0.0
     for turn in range(7):  # each finer; outliers weigh less once something is known
         trials = [x.ravel() for x in np.meshgrid(grid, ratio, indexing="ij")]
         curves = basis(*trials)
@@ -267,7 +280,11 @@ def _describe(
         shift -= 0.5 / frequency
     basis = _basis(np.array([shift]), np.array([frequency]), np.array([ratio]))[0, 0]
     return Features(
-        frequency=frequency, damping_ratio=ratio, release=onset + shift, rest=rest,
-        displacement=basis[1:] @ found[1:], noise=max(robust_deviation(off), 1e-9),
+        frequency=frequency,
+        damping_ratio=ratio,
+        release=onset + shift,
+        rest=rest,
+        displacement=basis[1:] @ found[1:],
+        noise=max(robust_deviation(off), 1e-9),
         explained=_explained(off, values),
-    )  # fmt: skip
+    )

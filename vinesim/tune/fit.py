@@ -130,7 +130,8 @@ class Fit:
 
     def lines(self) -> list[str]:
         """The fit in words, one fact a line."""
-        f, lines = self.features, []
+        f = self.features
+        lines = []
         lines.append(f"{'fitted' if self.ok else 'FAILED'}: {self.track.source}, {len(self.track.time)} samples")
         for e in self.estimates:
             note = "" if e.known else "  NOT DECIDED BY THE DATA"
@@ -154,7 +155,8 @@ class Fit:
 
     def _noise_words(self) -> str:
         """The noise of each column, once if all are alike."""
-        low, high = float(self.column_noise.min()), float(self.column_noise.max())
+        low = float(self.column_noise.min())
+        high = float(self.column_noise.max())
         if high < 2.0 * low:
             return f"{1e3 * self.noise:.2f} mm"
         names = (

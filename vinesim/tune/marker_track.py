@@ -49,7 +49,9 @@ def track_marker(
     :class:`~vinesim.tune.trajectory.TrajectoryError` for fewer pictures than a track has samples, or if none shows it.
     """
     colours = dict(colour) if isinstance(colour, Mapping) else {TIP: colour}
-    time, position, patches = [], [], np.zeros(len(colours), int)
+    time = []
+    position = []
+    patches = np.zeros(len(colours), int)
     for picture in pictures:
         time.append(picture.time)
         found = [find_marker(picture.rgb, one) for one in colours.values()]
@@ -73,7 +75,8 @@ def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
     None if it is too small or touches the edge.
     """
     wanted = _off_grey(np.array(colour))
-    tint, size = _off_grey(rgb), np.linalg.norm(wanted)
+    tint = _off_grey(rgb)
+    size = np.linalg.norm(wanted)
     along = tint @ (wanted / size)
     alike = (along > np.cos(MAX_TURN) * np.linalg.norm(tint, axis=-1)) & (along > LEAST_SATURATION * size)
     alike &= rgb.sum(-1, dtype=np.int32) > DARKEST

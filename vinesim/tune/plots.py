@@ -49,7 +49,8 @@ def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
     spread[seen] = np.einsum("oi,ij,oj->o", fit.jacobian, fit.posterior.covariance, fit.jacobian)
     half = Z90 * np.sqrt(spread[:, column] + fit.column_noise[column] ** 2)
     data = fit.track.position[:, fit.track.tracked][:, column]
-    time, model = fit.track.time, fit.model[:, column]
+    time = fit.track.time
+    model = fit.model[:, column]
     axes.fill_between(time, 1e3 * (model - half), 1e3 * (model + half), color="C0", alpha=0.25, lw=0, label="90 %")
     axes.plot(time, 1e3 * model, color="C0", lw=1.0, label="fitted")
     axes.plot(time, 1e3 * data, ".", color="k", ms=3.0, label="track")
@@ -72,7 +73,8 @@ def draw_residuals(fit: Fit, axes: Axes) -> None:
 
 def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
     """Posterior of the plant's numbers, one against the other [k, k], with the prior where it fits the picture."""
-    posterior, count = fit.posterior, fit.posterior.physical
+    posterior = fit.posterior
+    count = fit.posterior.physical
     names = posterior.names[:count]
     labels = [f"ln {name}" if name in _ORDER else name for name in names]
     deviation = posterior.deviation

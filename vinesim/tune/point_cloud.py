@@ -76,7 +76,8 @@ def trace_axis(points: np.ndarray, source: str = "the point cloud") -> np.ndarra
             f"{source}: {(~reached).sum()} of {len(thin)} points are cut off from the base by gaps of more than "
             f"{1e3 * GAP:g} mm; give the points of one cane, in metres, without gaps"
         )
-    thin, graph = thin[reached], graph[reached][:, reached]
+    thin = thin[reached]
+    graph = graph[reached][:, reached]
     end = int(np.argmax(_ways(graph, int(np.argmin(np.linalg.norm(thin, axis=1))))))
     other = int(np.argmax(_ways(graph, end)))
     base = min(end, other, key=lambda one: float(np.linalg.norm(thin[one])))

@@ -40,9 +40,11 @@ def physical_priors(specimen: Specimen, plant: str = "vine") -> dict[str, Prior]
         )
     }
     if specimen.organ == "cane":
-        spread, source = DENSITY_DEVIATION, f"{part.density.grade}: {part.density.source}"
+        spread = DENSITY_DEVIATION
+        source = f"{part.density.grade}: {part.density.source}"
     else:
-        spread, source = known.bunch.mass_variation.value, f"{known.bunch.mass_variation.grade}: variation of bunches"
+        spread = known.bunch.mass_variation.value
+        source = f"{known.bunch.mass_variation.grade}: variation of bunches"
     priors["mass"] = Prior(0.0, spread, source)
     for i, axis in enumerate("yz"):
         priors[f"bow_{axis}"] = Prior(specimen.bow[i], BOW_DEVIATION, "GUESSED: canes are bent by up to a radian")

@@ -63,11 +63,22 @@ class Problem:
     """
 
     def __init__(
-        self, specimen: Specimen, track: Trajectory, features: Features, fitted: tuple[str, ...],
-        priors: dict[str, Prior], dt: float, device: str = "cpu", pushed: bool = False,
-    ) -> None:  # fmt: skip
-        self.specimen, self.track, self.features, self.fitted = specimen, track, features, fitted
-        self._device, self.pushed = device, pushed
+        self,
+        specimen: Specimen,
+        track: Trajectory,
+        features: Features,
+        fitted: tuple[str, ...],
+        priors: dict[str, Prior],
+        dt: float,
+        device: str = "cpu",
+        pushed: bool = False,
+    ) -> None:
+        self.specimen = specimen
+        self.track = track
+        self.features = features
+        self.fitted = fitted
+        self._device = device
+        self.pushed = pushed
         self.candidates = Candidates(specimen, track.markers, dt=dt, device=device, least=9)
         self.observed = columns_of(track)
         self.seen = np.isfinite(self.observed)
@@ -160,11 +171,16 @@ class Problem:
         comes out differs from ``theta`` by the bias, of second order in both. From now on :meth:`row` and
         :meth:`samples` add it to what they are given.
         """
-        coarse, observed, priors, force = self.candidates, self.observed, self.priors, self.force
+        coarse = self.candidates
+        observed = self.observed
+        priors = self.priors
+        force = self.force
         self.candidates = Candidates(
-            msgspec.structs.replace(self.specimen, segments=FINER * self.specimen.segments), self.track.markers,
-            dt=coarse.dt / FINER, device=self._device,
-        )  # fmt: skip
+            msgspec.structs.replace(self.specimen, segments=FINER * self.specimen.segments),
+            self.track.markers,
+            dt=coarse.dt / FINER,
+            device=self._device,
+        )
         fine, _ = self.samples(theta[None], self.row(theta)[None])
         self.candidates = coarse
         self.observed = np.where(self.seen, fine[0], np.nan)
@@ -172,7 +188,9 @@ class Problem:
         if force is not None:
             self.force = (force[1] * float(self._extra(theta)[0][-1]) + force[0], force[1])
         biased, _ = self.minimise(theta, noise)
-        self.observed, self.priors, self.force = observed, priors, force
+        self.observed = observed
+        self.priors = priors
+        self.force = force
         self.shift = (biased - theta) * FINER**2 / (FINER**2 - 1.0)
         return theta - self.shift
 
@@ -187,7 +205,8 @@ class Problem:
     def evaluate(self, theta: np.ndarray, end: float = math.inf) -> Evaluation:
         """Model, Jacobian and what is not of the track, at one point, for the samples up to ``end`` [s]."""
         self.evaluations += 1
-        base, steps = self.row(theta), [self.step(name) for name in self.simulated]
+        base = self.row(theta)
+        steps = [self.step(name) for name in self.simulated]
         rows = [base]
         for name, h in zip(self.simulated, steps, strict=True):
             for sign in (h, -h):
@@ -208,7 +227,8 @@ class Problem:
 
     def _extra(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows of priors and of the force reading."""
-        values, rows = [], []
+        values = []
+        rows = []
         for i, prior in enumerate(self.priors):
             if math.isfinite(prior.deviation):
                 values.append((theta[i] - prior.mean) / prior.deviation)
@@ -234,7 +254,8 @@ class Problem:
         """The parameters of least loss near ``theta``, evaluated, for a noise [m] and samples up to ``end`` [s]."""
         known: dict[bytes, Evaluation] = {}
         table = self.observed[: int((self.track.time <= end).sum())]
-        data, noise = table[np.isfinite(table)], np.broadcast_to(noise, table.shape)[np.isfinite(table)]
+        data = table[np.isfinite(table)]
+        noise = np.broadcast_to(noise, table.shape)[np.isfinite(table)]
 
         def at(point: np.ndarray) -> Evaluation:
             key = point.tobytes()
@@ -259,9 +280,17 @@ class Problem:
 
         options: Any = {"jac": jacobian, "loss": loss}  # scipy's stubs know names only
         found = least_squares(
-            residuals, theta, method="trf", x_scale=self._scales(), f_scale=SOFT, max_nfev=most, ftol=tolerance,
-            xtol=1e-6, gtol=1e-8, **options,
-        )  # fmt: skip
+            residuals,
+            theta,
+            method="trf",
+            x_scale=self._scales(),
+            f_scale=SOFT,
+            max_nfev=most,
+            ftol=tolerance,
+            xtol=1e-6,
+            gtol=1e-8,
+            **options,
+        )
         return found.x, at(found.x)
 
     def residuals(self, model: np.ndarray) -> np.ndarray:

@@ -72,11 +72,17 @@ def build_tree(specimen: Specimen) -> TreeBuilder:
     bends = hanging_bends(specimen) if specimen.axis else rest_bends(specimen, np.array(specimen.bow))
     if specimen.organ == "cane":
         return CaneBuilder(
-            length=specimen.length.value, radius=radius, youngs_modulus=specimen.modulus.value,
-            density=specimen.density.value, segments=specimen.segments, beta=specimen.damping.value,
-            tip_mass=0.0 if specimen.tip_mass is None else specimen.tip_mass.value, pose=base_pose(specimen),
-            bends=bends, shape="equilibrium" if specimen.axis else "slack",
-        ).tree()  # fmt: skip
+            length=specimen.length.value,
+            radius=radius,
+            youngs_modulus=specimen.modulus.value,
+            density=specimen.density.value,
+            segments=specimen.segments,
+            beta=specimen.damping.value,
+            tip_mass=0.0 if specimen.tip_mass is None else specimen.tip_mass.value,
+            pose=base_pose(specimen),
+            bends=bends,
+            shape="equilibrium" if specimen.axis else "slack",
+        ).tree()
     tree = TreeBuilder(base_pose(specimen))
     material = RodMaterial(specimen.modulus.value, specimen.density.value, specimen.damping.value)
     last = tree.add_rod(
@@ -94,7 +100,8 @@ def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarra
     :class:`UsageError` for a marker that the specimen does not have.
     """
     segment = specimen.length.value / specimen.segments
-    bodies, points = [], []
+    bodies = []
+    points = []
     for name in names:
         if name == TIP and specimen.organ == "bunch":
             tree = build_tree(specimen)

@@ -50,7 +50,8 @@ class Trajectory:
     at all."""
 
     def __post_init__(self) -> None:
-        count, trouble = len(self.time), None
+        count = len(self.time)
+        trouble = None
         if self.position.shape != (count, len(self.markers), 3):
             trouble = f"position has the shape {self.position.shape}; give [{count}, {len(self.markers)}, 3]"
         elif self.force is not None and self.force.shape != (count,):
@@ -157,7 +158,8 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
 
 def _assemble(path: pathlib.Path, columns: list[_Column], table: np.ndarray, clock: int) -> Trajectory:
     markers = tuple(dict.fromkeys(column.marker for column in columns if column.kind == "position"))
-    position, force = np.full((len(table), len(markers), 3), np.nan), None
+    position = np.full((len(table), len(markers), 3), np.nan)
+    force = None
     base = np.zeros((len(table), 3)) if any(column.kind == "base" for column in columns) else None
     for i, column in enumerate(columns):
         if column.kind == "force":
@@ -198,16 +200,25 @@ def _read_name(place: str, text: str) -> _Column:
         if ";" in text or "\t" in text:
             raise TrajectoryError(f"{place} holds several names; separate the columns by commas, decimals by points")
         raise TrajectoryError(f"{place} has no unit; name it with its unit, e.g. 'time [s]', 'x [mm]', 'force [N]'")
-    name, unit = found["name"].strip(), found["unit"].strip()
+    name = found["name"].strip()
+    unit = found["unit"].strip()
     words = name.replace(".", " ").replace("_", " ").split()
     if name.lower() in ("time", "t"):
-        kind, marker, axis = "time", "", 0
+        kind = "time"
+        marker = ""
+        axis = 0
     elif name.lower() in ("force", "f"):
-        kind, marker, axis = "force", "", 0
+        kind = "force"
+        marker = ""
+        axis = 0
     elif len(words) == 2 and words[0].lower() == BASE and words[1].lower() in ("x", "y", "z"):
-        kind, marker, axis = "base", "", "xyz".index(words[1].lower())
+        kind = "base"
+        marker = ""
+        axis = "xyz".index(words[1].lower())
     elif words and words[-1].lower() in ("x", "y", "z"):
-        kind, marker, axis = "position", " ".join(words[:-1]) or TIP, "xyz".index(words[-1].lower())
+        kind = "position"
+        marker = " ".join(words[:-1]) or TIP
+        axis = "xyz".index(words[-1].lower())
     else:
         raise TrajectoryError(
             f"{place} is not known; name it time, x, y, z, 'MARKER x', 'base x' or force, with its unit"

@@ -37,10 +37,16 @@ MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
 
 
 def tune(
-    specimen: Specimen, track: Trajectory, parameters: Sequence[str] = ("modulus", "damping"), *,
-    release: float | None = None, samples: int = 0, seed: int = 0, device: str = "cpu",
+    specimen: Specimen,
+    track: Trajectory,
+    parameters: Sequence[str] = ("modulus", "damping"),
+    *,
+    release: float | None = None,
+    samples: int = 0,
+    seed: int = 0,
+    device: str = "cpu",
     pushed: bool = False,
-) -> Fit:  # fmt: skip
+) -> Fit:
     """Fit a specimen to a track of a pull and release, or of a base that is shaken.
 
     Args:
@@ -69,9 +75,11 @@ def tune(
         features = dataclasses.replace(features, release=release)
     _check_track(specimen, track, features)
     dt = float(np.clip(STEP_PHASE / (2.0 * math.pi * features.frequency), 5e-4, 0.01))
-    chain, coarse = specimen, "modulus" in fitted
+    chain = specimen
+    coarse = "modulus" in fitted
     if not coarse:  # a coarse chain swings up to 1 % too slowly, which only a fitted modulus can make good
-        chain, dt = msgspec.structs.replace(specimen, segments=FINER * specimen.segments), dt / FINER
+        chain = msgspec.structs.replace(specimen, segments=FINER * specimen.segments)
+        dt = dt / FINER
     problem = Problem(chain, track, features, fitted, physical_priors(specimen), dt, device, pushed)
     theta, found, noise = _minimise(problem, start_values(problem))
     minima: tuple[Minimum, ...] = ()
@@ -86,12 +94,23 @@ def tune(
     model[problem.seen] = found.model
     swing = _fitted_features(problem, theta, model)
     return Fit(
-        specimen=specimen, track=track, features=features, posterior=posterior, sample=sample,
-        noise=_left(problem, found), column_noise=noise,
-        frequency=swing.frequency, damping_ratio=swing.damping_ratio, model=model, jacobian=found.jacobian,
-        minima=minima, faults=faults, dt=dt,
-        force=problem.force, priors=dict(zip(problem.names, problem.priors, strict=True)),
-    )  # fmt: skip
+        specimen=specimen,
+        track=track,
+        features=features,
+        posterior=posterior,
+        sample=sample,
+        noise=_left(problem, found),
+        column_noise=noise,
+        frequency=swing.frequency,
+        damping_ratio=swing.damping_ratio,
+        model=model,
+        jacobian=found.jacobian,
+        minima=minima,
+        faults=faults,
+        dt=dt,
+        force=problem.force,
+        priors=dict(zip(problem.names, problem.priors, strict=True)),
+    )
 
 
 def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
@@ -103,7 +122,8 @@ def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
 
 def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> None:
     """Refuse what cannot be a track of this plant."""
-    duration, shaken = float(track.time[-1] - features.release), track.base is not None
+    duration = float(track.time[-1] - features.release)
+    shaken = track.base is not None
     if duration * features.frequency < 1.0 and not shaken:
         raise TrajectoryError(
             f"{track.source}: {duration:.2g} s after the release at {features.release:.2f} s are less than one period "
@@ -171,7 +191,8 @@ def _look_for_minima(
     thetas[1:, at] += np.log(MINIMA)
     x, _ = problem.samples(thetas, np.array([problem.row(t) for t in thetas]))
     losses = np.array([problem.loss(t, y, noise) for t, y in zip(thetas, x, strict=True)])
-    here, scan = losses[0], losses[1:]
+    here = losses[0]
+    scan = losses[1:]
     lower = np.flatnonzero((scan[1:-1] < scan[:-2]) & (scan[1:-1] < scan[2:])) + 1
     lower = lower[np.abs(np.log(MINIMA[lower])) > 0.1]
     if len(lower) and scan[lower].min() < here:
@@ -195,7 +216,8 @@ def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> 
 def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, ...]:
     """Why the fit is not to be believed; empty if nothing speaks against it."""
     faults = []
-    features, curve = problem.features, "sinusoid" if problem.shaking is None else "oscillator"
+    features = problem.features
+    curve = "sinusoid" if problem.shaking is None else "oscillator"
     if noise > UNEXPLAINED * features.noise:
         faults.append(
             f"the fit leaves {1e3 * noise:.3g} mm, a damped {curve} only {1e3 * features.noise:.3g} mm: another "
@@ -216,8 +238,10 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
 def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> list[str]:
     """What the user gave beside the track and the fit denies."""
     faults = []
-    features, specimen = problem.features, problem.specimen
-    reach, length = float(np.abs(features.displacement).max()), specimen.length.value
+    features = problem.features
+    specimen = problem.specimen
+    reach = float(np.abs(features.displacement).max())
+    length = specimen.length.value
     failed = _left(problem, found) > UNEXPLAINED * features.noise
     if reach > WIDE * length and failed:
         faults.append(f"the swing is {reach:.3g} m wide, the plant {length:.3g} m long: is the unit right (m, cm, mm)?")

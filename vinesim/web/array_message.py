@@ -24,7 +24,8 @@ def encode(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes
     for name, block in blocks.items():
         if block.dtype.kind not in "iuf" or (block.dtype.kind != "f" and block.dtype.itemsize == 8):
             raise ValueError(f"array {name!r} of {block.dtype}: browsers read integers to 32 bits and floats")
-    places, size = {}, 0
+    places = {}
+    size = 0
     for name, block in blocks.items():
         places[name] = [block.dtype.str[1:], list(block.shape), size]
         size = _aligned(size + block.nbytes)

@@ -16,7 +16,9 @@ log = logging.getLogger(__name__)
 
 _HANDSHAKE = b"\x16"
 """First byte of every connection by TLS (RFC 8446, section 5.1)."""
-_FIRST_BYTE, _REQUEST, _POLL = 10.0, 2.0, 0.01
+_FIRST_BYTE = 10.0
+_REQUEST = 2.0
+_POLL = 0.01
 """[s] In which a connection has to begin, and in which a plain request is read; between two looks for the former."""
 _MAX_OPENING = 256
 """Connections that have not begun yet; further ones are closed."""
@@ -27,7 +29,9 @@ class HttpsSite:
 
     def __init__(self, server: web.Server, tls: ssl.SSLContext, sentence: str) -> None:
         """``sentence`` is the answer to plain http."""
-        self._server, self._tls, self._sentence = server, tls, sentence
+        self._server = server
+        self._tls = tls
+        self._sentence = sentence
         self._listener: socket.socket | None = None
         self._accepting: asyncio.Task[None] | None = None
         self._opening: set[asyncio.Task[None]] = set()
@@ -84,7 +88,8 @@ class HttpsSite:
 
     async def _answer(self, connection: socket.socket) -> None:
         """Read a plain request, as closing before it is read would take the answer back, and answer."""
-        loop, body = asyncio.get_running_loop(), f"{self._sentence}\n".encode()
+        loop = asyncio.get_running_loop()
+        body = f"{self._sentence}\n".encode()
         await loop.sock_recv(connection, 1 << 16)
         head = (
             "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n"

@@ -36,10 +36,15 @@ _NEEDS_HTTPS = "this page needs https: open the address that the client has prin
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _POLICY = "; ".join(
     (
-        "default-src 'self'", "style-src 'self' 'unsafe-inline'", "img-src 'self' data:", "media-src 'self' blob:",
-        "worker-src 'self' blob:", "object-src 'none'", "base-uri 'none'",
+        "default-src 'self'",
+        "style-src 'self' 'unsafe-inline'",
+        "img-src 'self' data:",
+        "media-src 'self' blob:",
+        "worker-src 'self' blob:",
+        "object-src 'none'",
+        "base-uri 'none'",
     )
-)  # fmt: skip
+)
 """Content Security Policy: browsers load nothing from other hosts for the page, whatever its scripts ask for."""
 
 
@@ -75,17 +80,26 @@ class PageServer:
     """A context: the page is served until it is left."""
 
     def __init__(
-        self, world: World, port: int = 0, host: str = "127.0.0.1", *, tls: ssl.SSLContext | None = None,
-        token: str | None = None, sound: Sound | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        world: World,
+        port: int = 0,
+        host: str = "127.0.0.1",
+        *,
+        tls: ssl.SSLContext | None = None,
+        token: str | None = None,
+        sound: Sound | None = None,
+    ) -> None:
         """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in;
         ``sound``: what pages hear and say.
 
         Raises :class:`UsageError` if the page lacks anything or the port is taken.
         """
         page_files.check()
-        self._world, self._host, self._asked = world, host, port
-        self._tls, self._token = tls, token
+        self._world = world
+        self._host = host
+        self._asked = port
+        self._tls = tls
+        self._token = token
         self.voice = None if sound is None else VoiceSocket(sound)
         """The socket of sound."""
         self.port = 0
@@ -220,7 +234,8 @@ class PageServer:
         self._fresh.add(fresh)
         fresh.set()
         flight: collections.deque[int] = collections.deque()
-        page, self._pages = self._pages, self._pages + 1
+        page = self._pages
+        self._pages = self._pages + 1
         reader = asyncio.ensure_future(self._read(page, socket, flight, fresh))
         tick = -1
         try:
@@ -244,7 +259,7 @@ class PageServer:
 
     async def _read(
         self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take what a page sends; ``flight`` are the ticks of the states that it has not drawn yet."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:

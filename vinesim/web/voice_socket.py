@@ -52,7 +52,8 @@ class PageVoice:
     """The connection to one page, as the client sees it; may be used from any thread."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._loop, self._fresh = loop, asyncio.Event()
+        self._loop = loop
+        self._fresh = asyncio.Event()
         self._waiting: collections.deque[bytes | str] = collections.deque()
         self.ears: PageEars | None = None
         """None until the page has said what it can."""
@@ -109,11 +110,13 @@ class VoiceSocket:
         self._sockets.add(socket)
         page = PageVoice(asyncio.get_running_loop())
         pump = asyncio.ensure_future(page.pump(socket))
-        credit, credited = _BURST, time.monotonic()
+        credit = _BURST
+        credited = time.monotonic()
         try:
             async for message in socket:
                 now = time.monotonic()
-                credit, credited = min(_BURST, credit + _PACE * (now - credited)), now
+                credit = min(_BURST, credit + _PACE * (now - credited))
+                credited = now
                 if credit < 1.0 or not self._take(page, message.type, message.data):
                     self.refused += 1
                     if self.refused == 1:
@@ -142,14 +145,16 @@ class VoiceSocket:
                 ears = _ears.decode(data)
             except (msgspec.MsgspecError, RecursionError, UnicodeError):
                 return False
-            is_new, page.ears = page.ears is None, ears
+            is_new = page.ears is None
+            page.ears = ears
             if is_new:
                 self._sound.join(page)
             return True
         if kind is not WSMsgType.BINARY or not data or page.ears is None:
             return False
         assert isinstance(data, bytes)
-        codec, sound = data[0] & ~EXTRA, data[1:]
+        codec = data[0] & ~EXTRA
+        sound = data[1:]
         if find_fault(codec, sound):
             return False
         self._sound.speak(page, Codec(codec), sound, data[0] < EXTRA)

@@ -34,8 +34,10 @@ class WindOnPlants:
     """Sets ``plants.tree_air`` before each step, and wakes sleepers near actors that the wind moves."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        self.plants, self.parameters = plants, parameters
-        model, first = plants.model, plants.model.tree_first
+        self.plants = plants
+        self.parameters = parameters
+        model = plants.model
+        first = plants.model.tree_first
         number = np.arange(len(model.body_mass)) - first[model.body_tree]
         core = number < model.tree_core[model.body_tree]  # a bunch's mass has its clusters in it
         self._foot = model.tree_pose[:, :3].astype(float)
@@ -44,7 +46,10 @@ class WindOnPlants:
         """0: the motion of a tree in the wind is drawn, 1: it is simulated [tree]."""
         self._drag: TreeDrag | None = None
         self._wind: Wind | None = None
-        self._strength, self._time, self._round, self._steps = 0.0, 0.0, 0, 0
+        self._strength = 0.0
+        self._time = 0.0
+        self._round = 0
+        self._steps = 0
 
     def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
         """Before a step at a ``time`` [s] of the wind; None for calm. Without ``observers`` all trees are simulated.
@@ -52,7 +57,8 @@ class WindOnPlants:
         A wind that is there in the first step has always blown; a later one grows, and one that ends dies away.
         """
         self._follow(wind)
-        self._time, self._steps = time, self._steps + 1
+        self._time = time
+        self._steps = self._steps + 1
         if self._wind is None:
             return
         plants = self.plants
@@ -114,14 +120,16 @@ class WindOnPlants:
 
     def _wake_stirred(self, observers: Observers | None) -> None:
         """All sleepers are looked at once in a period, an equal number in each step."""
-        plants, parameters = self.plants, self.parameters
+        plants = self.plants
+        parameters = self.parameters
         rounds = parameters.steps(parameters.wind_check_period)
         self._round = (self._round + 1) % rounds
         some = np.arange(self._round, len(self._foot), rounds)
         assert self._drag is not None
         area = self._drag.area
         some = self._near(some[~plants.state.tree_awake[some] & (area[some] > 0.0)], observers)
-        air, felt = self._air(some), plants.tree_air[some].astype(float)
+        air = self._air(some)
+        felt = plants.tree_air[some].astype(float)
         change = air * np.linalg.norm(air, axis=-1, keepdims=True) - felt * np.linalg.norm(felt, axis=-1, keepdims=True)
         force = 0.5 * AIR_DENSITY * area[some] * np.linalg.norm(change, axis=-1)
         plants.wake(some[force > parameters.wind_wake_load * self._weight[some]])
@@ -130,7 +138,8 @@ class WindOnPlants:
         """Those of some trees whose foot is near one of the points."""
         if observers is None:
             return trees
-        points, distance = np.atleast_2d(np.asarray(observers[0], float)), observers[1]
+        points = np.atleast_2d(np.asarray(observers[0], float))
+        distance = observers[1]
         near = np.zeros(len(trees), bool)
         for point in points:  # a handful of robots and people
             near |= ((self._foot[trees] - point) ** 2).sum(-1) < distance * distance

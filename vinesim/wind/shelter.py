@@ -20,7 +20,8 @@ from vinesim.scene.model import Model
 
 ATTENUATION = 0.4
 """[1] Of the exponential profile below the top of the canopy. GUESSED: in use for orchards; cereals have 2 to 3."""
-DISPLACEMENT, ROUGHNESS = 0.65, 0.1
+DISPLACEMENT = 0.65
+ROUGHNESS = 0.1
 """[1] Zero-plane displacement and roughness length as shares of the canopy's height. READ: usual for tall crops."""
 RECOVERY_DEPTHS = 10.0
 """[1] Length L in which mixing restores the wind, in depths of the canopy. GUESSED: wakes of windbreaks are 10 to 20
@@ -54,7 +55,8 @@ class TreeDrag:
     @classmethod
     def of(cls, model: Model, body_q: np.ndarray) -> TreeDrag:
         """``body_q`` [body, 7]: poses at rest."""
-        first, area = model.tree_first, model.body_drag.astype(float)
+        first = model.tree_first
+        area = model.body_drag.astype(float)
         point = body_q[:, :3] + frames.rotate(body_q[:, 3:].astype(float), model.body_com.astype(float))
         total = np.add.reduceat(area, first)
         centre = model.tree_pose[:, :3].astype(float)

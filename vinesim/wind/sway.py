@@ -30,7 +30,8 @@ from vinesim.wires.elastic_supports import ElasticSupports
 
 MAX_TREES = 120
 """Trees that are posed for one frame where there is no time for all. TUNED: within 0.5 ms."""
-_LOAD_STEPS, _NEWTON_STEPS = 4, 80
+_LOAD_STEPS = 4
+_NEWTON_STEPS = 80
 _CONVERGED = 1e-4
 """[m] Distance from equilibrium at which a tree is in it; where it is not found, a tree does not sway."""
 _ENOUGH = 0.99
@@ -84,7 +85,8 @@ class Sway:
         changed[self._most_urgent(drawn, state.time, np.asarray(eye, np.float32)) if is_limited else drawn] = True
         trees = np.flatnonzero(changed)
         self._table.pose(trees, state, np.ascontiguousarray(snapshot.body_q, np.float32), self._body_q)
-        self._is_drawn[trees], self._drawn_at[trees] = drawn[trees], state.time
+        self._is_drawn[trees] = drawn[trees]
+        self._drawn_at[trees] = state.time
         return dataclasses.replace(snapshot, body_q=self._body_q, moved_trees=trees)
 
     def _most_urgent(self, drawn: np.ndarray, time: float, eye: np.ndarray) -> np.ndarray:
@@ -141,11 +143,18 @@ class _Table:
         blown = b"".join(x.astype(float).tobytes() for x in numbers)
         digest = disk_cache.source_digest(*code, model.digest(), blown)
         made = disk_cache.load_or_make("sway", digest, lambda: _Response(model, wind).arrays())
-        trees, reach = len(model.tree_first), made["tree_reach"]
+        trees = len(model.tree_first)
+        reach = made["tree_reach"]
         table = cls(
-            wind, reach, reach > 0.0, np.zeros((trees, 3), np.float32), np.zeros(trees, np.float32),
-            np.zeros(trees, np.int32), np.zeros(2 * len(wind.wave_phase), np.float32), {},
-        )  # fmt: skip
+            wind,
+            reach,
+            reach > 0.0,
+            np.zeros((trees, 3), np.float32),
+            np.zeros(trees, np.float32),
+            np.zeros(trees, np.int32),
+            np.zeros(2 * len(wind.wave_phase), np.float32),
+            {},
+        )
         table.arrays = {
             "tree_first": wp.array(model.tree_first, dtype=wp.int32, device="cpu"),
             "tree_size": wp.array(model.tree_size, dtype=wp.int32, device="cpu"),
@@ -156,7 +165,7 @@ class _Table:
             "tree_steady": wp.array(made["tree_steady"], dtype=wp.vec3, device="cpu"),
             "tree_gust": wp.array(made["tree_gust"], dtype=wp.vec3, device="cpu"),
             "turned": wp.zeros(len(model.body_mass), dtype=wp.quat, device="cpu"),
-        }  # fmt: skip
+        }
         for name, dtype in (("tree_air", wp.vec3), ("tree_drawn", float), ("trees", wp.int32), ("waves", float)):
             table.arrays[name] = wp.array(getattr(table, name), dtype=dtype, device="cpu", copy=False)
         return table
@@ -165,7 +174,8 @@ class _Table:
         """Pose trees [k] at the time of ``state``, from their simulated poses ``body_q`` [body, 7]."""
         if not len(trees):
             return
-        self.tree_air[trees], self.tree_drawn[trees] = state.tree_air[trees], state.tree_drawn[trees]
+        self.tree_air[trees] = state.tree_air[trees]
+        self.tree_drawn[trees] = state.tree_drawn[trees]
         self.tree_drawn[trees] *= self.sways[trees]
         self.trees[: len(trees)] = trees
         turned = self.wind.wave_number @ self.wind.mean * state.time
@@ -175,28 +185,36 @@ class _Table:
             if name not in a or a[name].ptr != poses.ctypes.data:
                 a[name] = wp.array(poses, dtype=wp.transform, device="cpu", copy=False)
         wp.launch(
-            sway_trees, len(trees),
+            sway_trees,
+            len(trees),
             inputs=[
                 *(a[name] for name in ("tree_first", "tree_size", "body_parent", "body_offset", "body_steady")),
                 *(a[name] for name in ("body_gain", "tree_steady", "tree_gust", "trees", "waves")),
-                float(state.strength), a["tree_air"], a["tree_drawn"], a["from"],
+                float(state.strength),
+                a["tree_air"],
+                a["tree_drawn"],
+                a["from"],
             ],
-            outputs=[a["turned"], a["to"]], device="cpu",
-        )  # fmt: skip
+            outputs=[a["turned"], a["to"]],
+            device="cpu",
+        )
 
 
 class _Response:
     """Computes what the trees of a model do in a wind, all trees at once."""
 
     def __init__(self, model: Model, wind: Wind) -> None:
-        self.model, self.wind, self.state = model, wind, State.at_rest(model)
+        self.model = model
+        self.wind = wind
+        self.state = State.at_rest(model)
         drag = TreeDrag.of(model, self.state.body_q)
         self.steady = drag.air_share(wind.mean)[:, None] * wind.mean
         self.share = drag.air_share(wind.mean)
         self.plants = ArticulationSolver(model, self.state)
         self._finder, self._supports = EquilibriumFinder(self.plants), ElasticSupports(self.plants)
         self.plants.wake(np.arange(len(model.tree_first)))
-        number, tree = np.arange(len(model.body_mass)), model.body_tree
+        number = np.arange(len(model.body_mass))
+        tree = model.body_tree
         self._core = number - model.tree_first[tree] < model.tree_core[tree]
         self._area = 0.5 * AIR_DENSITY * np.where(self._core, model.body_drag, 0.0).astype(float)
         parent = model.body_parent
@@ -206,14 +224,17 @@ class _Response:
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Arrays of the table, see the kernel."""
-        model, trees = self.model, np.arange(len(self.model.tree_first), dtype=np.int32)
-        at_rest, joint_q = self.state.body_q.copy(), self.state.joint_q.astype(float).copy()
+        model = self.model
+        trees = np.arange(len(self.model.tree_first), dtype=np.int32)
+        at_rest = self.state.body_q.copy()
+        joint_q = self.state.joint_q.astype(float).copy()
         good = self._move_to_equilibrium(trees)
         steady = frames.log(frames.multiply(self.state.joint_q.astype(float), frames.conjugate(joint_q)))
         steady = frames.rotate(self._joint_axes, steady)
         reach = np.linalg.norm(self.state.body_q[:, :3] - at_rest[:, :3], axis=1)
         gain = np.zeros((len(model.body_mass), 3, 3))
-        rate, ratio = np.ones((len(trees), 3)), np.ones((len(trees), 3))
+        rate = np.ones((len(trees), 3))
+        ratio = np.ones((len(trees), 3))
         turn_before = self._residual_turn(trees, self.steady)
         for axis in range(3):
             turn = self._residual_turn(trees, self.steady, np.eye(3)[axis]) - turn_before
@@ -222,13 +243,17 @@ class _Response:
         bad = ~good[model.body_tree] | ~np.isfinite(gain).all((1, 2)) | ~np.isfinite(steady).all(1)
         good &= np.bincount(model.body_tree, bad, minlength=len(trees)) == 0
         swaying = good[model.body_tree]
-        gain[~swaying], steady[~swaying] = 0.0, 0.0
+        gain[~swaying] = 0.0
+        steady[~swaying] = 0.0
         gusts = self.wind.gusts * np.linalg.norm(gain, axis=(1, 2))
         reach = np.maximum.reduceat(np.where(swaying, reach + 1e-3 * gusts, 0.0), model.tree_first)
         made = {
-            "tree_reach": np.where(good, np.maximum(reach, 1e-6), 0.0), "tree_steady": self.steady,
-            "tree_gust": self._filtered_gusts(rate, ratio), "body_steady": steady, "body_gain": gain,
-        }  # fmt: skip
+            "tree_reach": np.where(good, np.maximum(reach, 1e-6), 0.0),
+            "tree_steady": self.steady,
+            "tree_gust": self._filtered_gusts(rate, ratio),
+            "body_steady": steady,
+            "body_gain": gain,
+        }
         return {name: np.ascontiguousarray(values, np.float32) for name, values in made.items()}
 
     def _load(self, pressure: np.ndarray) -> None:
@@ -272,10 +297,12 @@ class _Response:
     def _oscillator(self, axis: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Angular frequency [tree] rad/s and damping ratio [tree] of the shape into which wind along an axis turns the
         joints [body, 3]."""
-        model, first = self.model, self.model.tree_first
+        model = self.model
+        first = self.model.tree_first
         body_q = self.state.body_q.astype(float)
         bend = frames.rotate(self._joint_axes, turn)
-        angle, shift = np.zeros_like(bend), np.zeros_like(bend)
+        angle = np.zeros_like(bend)
+        shift = np.zeros_like(bend)
         depth = model.depth()
         for level in range(int(depth.max(initial=-1)) + 1):
             here = np.flatnonzero(depth == level)

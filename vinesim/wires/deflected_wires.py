@@ -33,21 +33,25 @@ LEAST_DEFLECTION = 1e-6
 """[m] A wire that is nearer to where it was drawn is put there."""
 LEAST_SPREAD = 0.1
 """[1] Of a wire's length: contacts that are further apart tilt it; others move it as a whole. TUNED."""
-FOLLOWED, EXTRAPOLATED = 0.7, 0.5
+FOLLOWED = 0.7
+EXTRAPOLATED = 0.5
 """[1] What several contacts with wires know of each other in a step: so much of the deflections by the others' forces,
 and these extrapolated by so many steps; of the rest, its mean over :data:`MEMORY`. DERIVED: the largest share with
 which a mass on two such springs is stable whatever it weighs, with a wire's damping."""
-MEMORY, LEAST_WEIGHT = 0.5, 0.05
+MEMORY = 0.5
+LEAST_WEIGHT = 0.05
 """[s] over which the forces are averaged by which several contacts share a wire, and [1] the share of the largest with
 which one is taken to press at least. TUNED."""
 TOUCHING = 1e-3
 """[m] A contact with a larger gap to the geom of a wire does not touch it, however far others deflect it. TUNED."""
-MOST_ALONG, OUT_OF_REACH = 0.5, 1e3
+MOST_ALONG = 0.5
+OUT_OF_REACH = 1e3
 """[1] Largest cosine between a contact's normal and the wire; [m] where the wire is taken to be for others."""
 SAME_PLACE = 0.05
 """[m] Contacts of the same pair of shapes that are further apart in two steps are different ones. TUNED: less than any
 box is long, more than anything slides in a step."""
-ROOM, MOST_PRESSES = 32, 512
+ROOM = 32
+MOST_PRESSES = 512
 """Contacts with wires in one solve for which there is room at first; and those of both solvers that count."""
 NO_TREE = int(np.iinfo(np.int32).min)
 """Tree of presses that do not outlive a step: whose shape is gone, or that was put elsewhere."""
@@ -61,8 +65,10 @@ class DeflectedWires:
         self._supports = supports
         self.gives = model.fixed_tension > 0.0
         """[piece] Whether it is a wire under tension."""
-        self.start, self.end = model.fixed_start.astype(float), model.fixed_end.astype(float)
-        way, count = self.end - self.start, len(self.start)
+        self.start = model.fixed_start.astype(float)
+        self.end = model.fixed_end.astype(float)
+        way = self.end - self.start
+        count = len(self.start)
         self.offset = np.zeros((count, 2, 3))
         """[piece, 2, 3] m by which the start and the end of its geom are away from where they were drawn."""
         axis = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
@@ -72,7 +78,8 @@ class DeflectedWires:
         self.presses, self._found = (
             SharedArrays.zeros(kernels.WirePresses, MOST_PRESSES, count=np.zeros(1, np.int32)) for _ in range(2)
         )
-        self._numbers, self._load = _numbers(dt), share(supports.load, wp.vec3d)
+        self._numbers = _numbers(dt)
+        self._load = share(supports.load, wp.vec3d)
         self._tree_awake = share(tree_awake, wp.bool)
         self._is_loaded = share(np.zeros(supports.count, np.bool_), wp.bool)
         self.renumber_rigid(lambda _: (0, NO_TREE), 0)
@@ -156,9 +163,15 @@ class WireContacts:
         return self._arrays.key[: len(self)]
 
     def find_springs(
-        self, piece: np.ndarray, point: np.ndarray, normal: np.ndarray, gap: np.ndarray, closing: np.ndarray,
-        key: np.ndarray, tree: np.ndarray,
-    ) -> None:  # fmt: skip
+        self,
+        piece: np.ndarray,
+        point: np.ndarray,
+        normal: np.ndarray,
+        gap: np.ndarray,
+        closing: np.ndarray,
+        key: np.ndarray,
+        tree: np.ndarray,
+    ) -> None:
         """Find the springs of contacts with wires; poses of awake trees must be up to date.
 
         Args:
@@ -174,8 +187,13 @@ class WireContacts:
         if count > len(self._arrays.piece):
             self._make_room(2 * count)
         a = self._arrays
-        a.piece[:count], a.point[:count], a.normal[:count] = piece, point, normal
-        a.gap[:count], a.closing[:count], a.key[:count], a.tree[:count] = gap, closing, key, tree
+        a.piece[:count] = piece
+        a.point[:count] = point
+        a.normal[:count] = normal
+        a.gap[:count] = gap
+        a.closing[:count] = closing
+        a.key[:count] = key
+        a.tree[:count] = tree
         a.count[0] = count
         self._find(1)
 
@@ -192,10 +210,18 @@ class WireContacts:
 
 def _numbers(dt: float) -> kernels.WireNumbers:
     made = kernels.WireNumbers()
-    made.dt, made.followed, made.extrapolated = dt, FOLLOWED, EXTRAPOLATED
-    made.forgetting, made.recovery = dt / MEMORY, math.exp(-dt / WIRE_DAMPING_TIME)
-    made.least_weight, made.least_share = LEAST_WEIGHT, LEAST_SHARE
-    made.least_spread, made.least_deflection = LEAST_SPREAD, LEAST_DEFLECTION
-    made.max_deflection, made.touching, made.same_place = MAX_DEFLECTION, TOUCHING, SAME_PLACE
-    made.most_along, made.out_of_reach = MOST_ALONG, OUT_OF_REACH
+    made.dt = dt
+    made.followed = FOLLOWED
+    made.extrapolated = EXTRAPOLATED
+    made.forgetting = dt / MEMORY
+    made.recovery = math.exp(-dt / WIRE_DAMPING_TIME)
+    made.least_weight = LEAST_WEIGHT
+    made.least_share = LEAST_SHARE
+    made.least_spread = LEAST_SPREAD
+    made.least_deflection = LEAST_DEFLECTION
+    made.max_deflection = MAX_DEFLECTION
+    made.touching = TOUCHING
+    made.same_place = SAME_PLACE
+    made.most_along = MOST_ALONG
+    made.out_of_reach = OUT_OF_REACH
     return made

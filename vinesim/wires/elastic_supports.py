@@ -36,8 +36,10 @@ class ElasticSupports:
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         """``parameters``: ``sleep_distance`` says when a tree wakes."""
-        self._plants, model = plants, plants.model
-        wires, arms = _wire_nodes(plants), _arm_nodes(plants)
+        self._plants = plants
+        model = plants.model
+        wires = _wire_nodes(plants)
+        arms = _arm_nodes(plants)
         plants.ties.axis[wires["tie"]] = wires["axis"]
         nodes = {name: np.concatenate([wires[name], arms[name]]) for name in wires}
         first = np.flatnonzero(np.diff(nodes["support"], prepend=-1))
@@ -56,23 +58,34 @@ class ElasticSupports:
         self._piece = np.where(piece < len(model.fixed_start), piece, -1)
         """[support] The piece of wire that it is, -1 for an arm."""
         self._was_active = np.zeros(len(first), np.bool_)
-        self._active, self._is_moved = np.zeros(len(first), np.int32), np.zeros(trees, np.bool_)
-        self._active_count, self._moved_count = 0, np.zeros(1, np.int32)
+        self._active = np.zeros(len(first), np.int32)
+        self._is_moved = np.zeros(trees, np.bool_)
+        self._active_count = 0
+        self._moved_count = np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)
         """[tree] Whether another tree that is awake is on one of its supports."""
         self._is_placed = np.zeros(trees, np.bool_)
-        self._awake, self._placed, self._is_listed = _NO_TREES, _NO_TREES, False
+        self._awake = _NO_TREES
+        self._placed = _NO_TREES
+        self._is_listed = False
         self._loaded = self._unloaded = _NO_SUPPORTS
         self.load = np.zeros((len(self._tree), 3))
         """[node, 3] N on wires, but for ties."""
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
-        self._bind({
-            "first": np.append(first, len(self._tree)).astype(np.int32), "is_arm": nodes["is_arm"][first],
-            "stiffness": stiffness, "last_stiffness": last_stiffness, "tree": self._tree,
-            "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
-            "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
-        } | {name: nodes[name] for name in ("axis", "body", "point", "origin")}, self._wires(wires))  # fmt: skip
+        self._bind(
+            {
+                "first": np.append(first, len(self._tree)).astype(np.int32),
+                "is_arm": nodes["is_arm"][first],
+                "stiffness": stiffness,
+                "last_stiffness": last_stiffness,
+                "tree": self._tree,
+                "number": np.append(wires["tie"] - first_tie, 0 * arms["body"]).astype(np.int32),
+                "wake_distance": WAKE_SHARE * parameters.sleep_distance / nodes["response"],
+            }
+            | {name: nodes[name] for name in ("axis", "body", "point", "origin")},
+            self._wires(wires),
+        )
 
     def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """The pieces of wire, for :func:`kernels.wire_spring`; ``nodes``: those of wires."""
@@ -84,42 +97,71 @@ class ElasticSupports:
         along = np.zeros(len(self._tree))
         along[: len(nodes["support"])] = nodes["compliance"] * tension[nodes["support"]]
         return {
-            "tension": tension, "length": np.linalg.norm(way, axis=1), "support": support, "node_along": along,
-        }  # fmt: skip
+            "tension": tension,
+            "length": np.linalg.norm(way, axis=1),
+            "support": support,
+            "node_along": along,
+        }
 
     def _bind(self, nodes: dict[str, np.ndarray], wires: dict[str, np.ndarray]) -> None:
-        plants, count = self._plants, len(self._tree)
-        ties, rests, state = plants.ties, plants.root_rests, plants.state
+        plants = self._plants
+        count = len(self._tree)
+        ties = plants.ties
+        rests = plants.root_rests
+        state = plants.state
         shape = {
-            "load": self.load, "deflection": self.deflection, "reference": np.zeros((count, 3)),
-            "ratio": np.zeros(count), "velocity": np.zeros((count, 3)), "share": np.zeros(count),
-        }  # fmt: skip
+            "load": self.load,
+            "deflection": self.deflection,
+            "reference": np.zeros((count, 3)),
+            "ratio": np.zeros(count),
+            "velocity": np.zeros((count, 3)),
+            "share": np.zeros(count),
+        }
         bodies = {
-            "body_q": state.body_q, "body_qd": state.body_qd, "joint_q": state.joint_q, "joint_qd": state.joint_qd,
+            "body_q": state.body_q,
+            "body_qd": state.body_qd,
+            "joint_q": state.joint_q,
+            "joint_qd": state.joint_qd,
             "joint_stiffness": plants.joint_stiffness,
-        }  # fmt: skip
+        }
         springs = {
-            "span": ties.span, "stiffness": ties.stiffness, "anchor": ties.anchor,
-            "anchor_velocity": ties.anchor_velocity, "softening": ties.softening, "root_turn": rests.turn,
-            "root_turn_rate": rests.rate, "root_softening": rests.softening,
-        }  # fmt: skip
+            "span": ties.span,
+            "stiffness": ties.stiffness,
+            "anchor": ties.anchor,
+            "anchor_velocity": ties.anchor_velocity,
+            "softening": ties.softening,
+            "root_turn": rests.turn,
+            "root_turn_rate": rests.rate,
+            "root_softening": rests.softening,
+        }
         node_struct = SharedArrays(kernels.SupportNodes, **nodes).struct
         body_struct = SharedArrays(kernels.SupportedBodies, **bodies).struct
         spring_struct = SharedArrays(kernels.SupportedSprings, **springs).struct
         self._solve = bind_launch(
             kernels.balance_supports,
-            [node_struct, share(self._active, wp.int32), share(state.tree_awake, wp.bool),
-             share(self._is_placed, wp.bool), body_struct],
-            [SharedArrays(kernels.SupportState, **shape).struct, spring_struct, share(self._is_moved, wp.bool),
-             share(self._moved_count, wp.int32)],
-        )  # fmt: skip
+            [
+                node_struct,
+                share(self._active, wp.int32),
+                share(state.tree_awake, wp.bool),
+                share(self._is_placed, wp.bool),
+                body_struct,
+            ],
+            [
+                SharedArrays(kernels.SupportState, **shape).struct,
+                spring_struct,
+                share(self._is_moved, wp.bool),
+                share(self._moved_count, wp.int32),
+            ],
+        )
         self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
         """What :func:`kernels.wire_spring` asks for, but for the loads."""
 
     def set_loaded(self, supports: np.ndarray) -> None:
         """On which supports [k] there are loads from now on; :attr:`load` is theirs."""
         if not np.array_equal(supports, self._loaded):
-            self._unloaded, self._loaded, self._is_listed = self._loaded, supports.copy(), False
+            self._unloaded = self._loaded
+            self._loaded = supports.copy()
+            self._is_listed = False
 
     @property
     def active(self) -> np.ndarray:
@@ -140,10 +182,12 @@ class ElasticSupports:
     def update(self) -> None:
         """Bring the supports to where the trees hold them, and wake the trees that they move. Poses and velocities
         of awake trees must be up to date."""
-        plants, awake = self._plants, self._plants.awake
+        plants = self._plants
+        awake = self._plants.awake
         if awake is not self._awake:
             self.place(self._awake)  # what fell asleep was put to its resting place by that
-            self._awake, self._is_listed = awake, False
+            self._awake = awake
+            self._is_listed = False
         if not self._is_listed or len(self._placed):
             self._is_listed = len(self._placed) == 0 and len(self._unloaded) == 0
             self._list_supports()
@@ -152,7 +196,8 @@ class ElasticSupports:
         self._is_placed[self._placed] = True
         self._solve(self._active_count)
         self._is_placed[self._placed] = False
-        self._placed, self._unloaded = _NO_TREES, _NO_SUPPORTS
+        self._placed = _NO_TREES
+        self._unloaded = _NO_SUPPORTS
         if self._moved_count[0]:
             self._moved_count[0] = 0
             moved = np.flatnonzero(self._is_moved).astype(np.int32)
@@ -177,33 +222,46 @@ class ElasticSupports:
 
 def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     """Ties that are bound to wires that give, wire by wire, and along each."""
-    model, tied = plants.model, plants.ties.on_wire
+    model = plants.model
+    tied = plants.ties.on_wire
     piece = model.tie_wire[tied]
-    start, way = model.fixed_start[piece].astype(float), (model.fixed_end - model.fixed_start)[piece].astype(float)
+    start = model.fixed_start[piece].astype(float)
+    way = (model.fixed_end - model.fixed_start)[piece].astype(float)
     length = np.linalg.norm(way, axis=1)
     axis = way / length[:, None]
     along = np.clip(((model.tie_anchor[tied] - start) * axis).sum(1), 0.0, length)
     order = np.lexsort((along, piece))
-    tie, tension = tied[order], model.fixed_tension[piece[order]].astype(float)
+    tie = tied[order]
+    tension = model.fixed_tension[piece[order]].astype(float)
     return {
-        "support": piece[order], "tie": tie, "is_arm": np.zeros(len(tie), bool), "axis": axis[order],
-        "body": model.tie_body[tie].astype(np.int32), "point": model.tie_point[tie].astype(float),
-        "origin": model.tie_anchor[tie].astype(float), "response": np.ones(len(tie)),
-        "compliance": along[order] / tension, "whole": length[order] / tension,
-    }  # fmt: skip
+        "support": piece[order],
+        "tie": tie,
+        "is_arm": np.zeros(len(tie), bool),
+        "axis": axis[order],
+        "body": model.tie_body[tie].astype(np.int32),
+        "point": model.tie_point[tie].astype(float),
+        "origin": model.tie_anchor[tie].astype(float),
+        "response": np.ones(len(tie)),
+        "compliance": along[order] / tension,
+        "whole": length[order] / tension,
+    }
 
 
 def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     """Roots of trees that stand on arms that give, arm by arm, and along each."""
     model = plants.model
-    pieces, tree = np.flatnonzero(model.arm_gives()), np.flatnonzero(model.is_on_arm())
-    body, here = model.tree_first[tree], np.searchsorted(pieces, model.tree_piece[tree])
-    start, way = model.fixed_start[pieces].astype(float), (model.fixed_end - model.fixed_start)[pieces].astype(float)
+    pieces = np.flatnonzero(model.arm_gives())
+    tree = np.flatnonzero(model.is_on_arm())
+    body = model.tree_first[tree]
+    here = np.searchsorted(pieces, model.tree_piece[tree])
+    start = model.fixed_start[pieces].astype(float)
+    way = (model.fixed_end - model.fixed_start)[pieces].astype(float)
     length = np.linalg.norm(way, axis=1)
     axis = (way / length[:, None])[here]
     thick, thin = model.fixed_radius[pieces].astype(float).T
     modulus = model.fixed_shear_modulus[pieces].astype(float)
-    twist, arm = _twist(length, thick, thin, modulus), model.fixed_index[pieces]
+    twist = _twist(length, thick, thin, modulus)
+    arm = model.fixed_index[pieces]
     _, first, number = np.unique(arm, return_index=True, return_inverse=True)
     before = np.cumsum(twist) - twist
     before -= before[first][number]  # the pieces of an arm are neighbours
@@ -216,11 +274,17 @@ def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     axis = frames.rotate(frames.conjugate(frames.multiply(joint, frames.exp(0.5 * drawn))), axis)
     order = np.lexsort((compliance, arm[here]))
     nodes = {
-        "support": len(model.fixed_start) + arm[here], "tie": np.full(len(tree), -1),
-        "is_arm": np.ones(len(tree), bool), "axis": axis, "body": body.astype(np.int32),
-        "point": np.zeros((len(tree), 3)), "origin": drawn, "response": _tip_response(plants, tree, axis),
-        "compliance": compliance, "whole": np.bincount(number, twist)[number][here],
-    }  # fmt: skip
+        "support": len(model.fixed_start) + arm[here],
+        "tie": np.full(len(tree), -1),
+        "is_arm": np.ones(len(tree), bool),
+        "axis": axis,
+        "body": body.astype(np.int32),
+        "point": np.zeros((len(tree), 3)),
+        "origin": drawn,
+        "response": _tip_response(plants, tree, axis),
+        "compliance": compliance,
+        "whole": np.bincount(number, twist)[number][here],
+    }
     return {name: value[order] for name, value in nodes.items()}
 
 

@@ -20,29 +20,44 @@ class WireShapes:
     """The shapes of all wires of one model."""
 
     def __init__(self, model: Model, supports: ElasticSupports, wires: DeflectedWires) -> None:
-        self._supports, self._wires = supports, wires
-        segments, pieces = wire_segments(model), len(model.fixed_start)
+        self._supports = supports
+        self._wires = wires
+        segments = wire_segments(model)
+        pieces = len(model.fixed_start)
         count = len(segments)
         first = np.searchsorted(segments.piece, np.arange(pieces + 1)).astype(np.int32)
         self._shapes = SharedArrays.zeros(
-            kernels.SegmentShapes, count, first=first, start=segments.start, end=segments.end, rest_q=segments.rest_q,
-            q=segments.rest_q.astype(np.float32), is_moved=np.zeros(count, np.bool_),
-        )  # fmt: skip
-        self._first, self._piece = first, segments.piece
+            kernels.SegmentShapes,
+            count,
+            first=first,
+            start=segments.start,
+            end=segments.end,
+            rest_q=segments.rest_q,
+            q=segments.rest_q.astype(np.float32),
+            is_moved=np.zeros(count, np.bool_),
+        )
+        self._first = first
+        self._piece = segments.piece
         self._may_have_moved = np.zeros(pieces, np.bool_)
         self._listed = np.zeros(pieces, np.int32)
         self._poses = SegmentPoses()
         structs = supports.wire_structs
         self._pose = bind_launch(
             kernels.pose_wire_segments,
-            [*structs[:2], share(self._listed, wp.int32), share(supports.deflection, wp.vec3d), wires.presses.struct,
-             wires.geoms],
+            [
+                *structs[:2],
+                share(self._listed, wp.int32),
+                share(supports.deflection, wp.vec3d),
+                wires.presses.struct,
+                wires.geoms,
+            ],
             [self._shapes.struct],
-        )  # fmt: skip
+        )
 
     def poses(self) -> SegmentPoses:
         """The segments that are away from where they were drawn."""
-        marked, presses = self._may_have_moved, self._wires.presses
+        marked = self._may_have_moved
+        presses = self._wires.presses
         marked[self._supports.moved_pieces()] = True
         marked[presses.piece[: presses.count[0]]] = True
         pieces = np.flatnonzero(marked)

@@ -56,14 +56,27 @@ def demo(
         from vinesim.cli.demo.push_demo import run_push
 
         code = run_push(
-            seconds=seconds or 20.0, seed=seed, scene=scene or "demo", robot=robot or "vinebot", device=device,
-            real_time_factor=real_time_factor, headless=headless, out=out,
-        )  # fmt: skip
+            seconds=seconds or 20.0,
+            seed=seed,
+            scene=scene or "demo",
+            robot=robot or "vinebot",
+            device=device,
+            real_time_factor=real_time_factor,
+            headless=headless,
+            out=out,
+        )
     else:
         from vinesim.cli.demo.task_demo import run_job
 
         code = run_job(
-            job, seconds=seconds, seed=seed, scene=scene, robot=robot, device=device,
-            real_time_factor=real_time_factor, headless=headless, out=out,
-        )  # fmt: skip
+            job,
+            seconds=seconds,
+            seed=seed,
+            scene=scene,
+            robot=robot,
+            device=device,
+            real_time_factor=real_time_factor,
+            headless=headless,
+            out=out,
+        )
     raise typer.Exit(code)

@@ -53,9 +53,15 @@ def scene_import_plant(
     from vinesim.cli.scene import write_imported_plant
 
     code = write_imported_plant(
-        file, out, unit=unit, diameter_unit=diameter_unit, plants=plants, shape="slack" if slack else "drawn",
-        piece=piece, old_wood=old_wood,
-    )  # fmt: skip
+        file,
+        out,
+        unit=unit,
+        diameter_unit=diameter_unit,
+        plants=plants,
+        shape="slack" if slack else "drawn",
+        piece=piece,
+        old_wood=old_wood,
+    )
     raise typer.Exit(code)
 
 
@@ -102,9 +108,22 @@ def render(
     from vinesim.cli.render import run
 
     code = run(
-        scene, camera=camera, at=at, look=look, path=path, size=size, hour=hour, time=time, seed=seed, out=out,
-        renderer=renderer, device=device, robots=robot or (), people=person or (), crates=crate or (),
-    )  # fmt: skip
+        scene,
+        camera=camera,
+        at=at,
+        look=look,
+        path=path,
+        size=size,
+        hour=hour,
+        time=time,
+        seed=seed,
+        out=out,
+        renderer=renderer,
+        device=device,
+        robots=robot or (),
+        people=person or (),
+        crates=crate or (),
+    )
     raise typer.Exit(code)
 
 

@@ -39,7 +39,7 @@ RealTimeFactor = Annotated[
         help="Simulated time passes so many times as fast as real time. auto, unless given: as fast as every client "
         "can follow, at most 1, so that no step is skipped on a slow machine. In a world with a server, the server's.",
     ),
-]  # fmt: skip
+]
 Insecure = Annotated[
     bool,
     typer.Option(

@@ -160,8 +160,19 @@ def experiment(
     from vinesim.tune.experiment import Experiment
 
     what = Experiment(
-        kind=kind, displacement=displacement, angle=angle, amplitude=amplitude, from_frequency=from_frequency,
-        to_frequency=to_frequency, duration=duration, hold=hold, rate=rate, noise=noise, force_noise=force_noise,
-        markers=tuple(marker or ["tip"]), axes=axes, seed=seed,
-    )  # fmt: skip
+        kind=kind,
+        displacement=displacement,
+        angle=angle,
+        amplitude=amplitude,
+        from_frequency=from_frequency,
+        to_frequency=to_frequency,
+        duration=duration,
+        hold=hold,
+        rate=rate,
+        noise=noise,
+        force_noise=force_noise,
+        markers=tuple(marker or ["tip"]),
+        axes=axes,
+        seed=seed,
+    )
     raise typer.Exit(plan(what, model, out, fit, json))

@@ -16,7 +16,8 @@ from rich.table import Table
 from vinesim.client.processes.child_process import REPORT_TIMEOUT, Process
 from vinesim.net.pace import describe
 
-PICKER, VISITOR = "picker", "visitor"
+PICKER = "picker"
+VISITOR = "visitor"
 """The actors of a demo: the robot that touches or works, and the one that comes near."""
 
 Statuses = dict[str, dict[str, Any]]
@@ -24,9 +25,14 @@ Statuses = dict[str, dict[str, Any]]
 
 
 def show_progress(
-    picker: Process, visitor: Process | None, server: Process, newest: Statuses, console: Console, headless: bool,
+    picker: Process,
+    visitor: Process | None,
+    server: Process,
+    newest: Statuses,
+    console: Console,
+    headless: bool,
     is_over: Callable[[Statuses], bool] = lambda _: False,
-) -> None:  # fmt: skip
+) -> None:
     """Show the status of both clients until the picker ends, or ``is_over`` and then the picker is interrupted.
 
     :class:`ProcessFailed` if any process ends too early or the picker fails.
@@ -87,13 +93,18 @@ def status_table(newest: Statuses) -> Table:
     for name in newest:
         table.add_column(name, justify="right", min_width=14)
     rows = (
-        ("time [s]", "time", ".1f"), ("tick rate [Hz]", "tick_hz", ".2f"), ("tick p99 [ms]", "tick_p99_ms", ".2f"),
+        ("time [s]", "time", ".1f"),
+        ("tick rate [Hz]", "tick_hz", ".2f"),
+        ("tick p99 [ms]", "tick_p99_ms", ".2f"),
         ("real-time factor", "target_real_time_factor", ".2f"),
-        ("limited by", "pace_cause", "s"), ("awake plants", "awake", "d"),
-        ("contact force [N]", "force", ".2f"), ("bunch moved [mm]", "displacement_mm", ".1f"),
-        ("bytes in", "bytes_in", "d"), ("bytes out", "bytes_out", "d"),
+        ("limited by", "pace_cause", "s"),
+        ("awake plants", "awake", "d"),
+        ("contact force [N]", "force", ".2f"),
+        ("bunch moved [mm]", "displacement_mm", ".1f"),
+        ("bytes in", "bytes_in", "d"),
+        ("bytes out", "bytes_out", "d"),
         ("of these environment", "environment_bytes_out", "d"),
-    )  # fmt: skip
+    )
     for label, key, form in rows:
         table.add_row(label, *(format(status[key], form) for status in newest.values()))
     if any(status["phase"] for status in newest.values()):

@@ -49,9 +49,16 @@ class ListenedTopics:
 
 
 def run_push(
-    *, seconds: float, seed: int | None, scene: str, robot: str, device: str, real_time_factor: float | None,
-    headless: bool, out: pathlib.Path,
-) -> int:  # fmt: skip
+    *,
+    seconds: float,
+    seed: int | None,
+    scene: str,
+    robot: str,
+    device: str,
+    real_time_factor: float | None,
+    headless: bool,
+    out: pathlib.Path,
+) -> int:
     """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
     console = Console(stderr=True)
     begin = time.time()
@@ -110,7 +117,8 @@ class _RunTimer:
     """Measures from now until the picker's simulated time ``end`` [s], and then ends the demo."""
 
     def __init__(self, end: float, listener: RosListener | None) -> None:
-        self._end, self._listener = end, listener
+        self._end = end
+        self._listener = listener
         self.window = Window.begin()
         if listener is not None:
             listener.restart()
@@ -127,19 +135,29 @@ class _RunTimer:
 
 
 def _start_clients(
-    group: ProcessGroup, common: list[str], bunch: int, poses: tuple[list[str], list[str]], page: int | None,
+    group: ProcessGroup,
+    common: list[str],
+    bunch: int,
+    poses: tuple[list[str], list[str]],
+    page: int | None,
     out: pathlib.Path,
-) -> dict[str, Process]:  # fmt: skip
+) -> dict[str, Process]:
     """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it and shows all
     of it on the port ``page``."""
     common = ["-m", "vinesim", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],
         VISITOR: [
-            *poses[1], "--approach", str(APPROACH_DISTANCE), "--namespace", VISITOR, "--sensor-hz", VISITOR_SENSOR_HZ,
+            *poses[1],
+            "--approach",
+            str(APPROACH_DISTANCE),
+            "--namespace",
+            VISITOR,
+            "--sensor-hz",
+            VISITOR_SENSOR_HZ,
             *([] if page is None else ["--page", str(page)]),
         ],
-    }  # fmt: skip
+    }
     clients = {}
     for name, options in own.items():
         files = ["--out", str(out / name), "--tick-log", str(out / name / "ticks.npz")]
@@ -150,11 +168,19 @@ def _start_clients(
 def listened_topics(robot: RobotDescription) -> ListenedTopics:
     """All topics of the picker; of the visitor its joints, its first picture and its first scan."""
     always = [
-        "/clock", "/robot_description", "/joint_states", "/tf", "/tf_static", "/tf_environment",
-        "/tf_environment_static", "/mobile_base_controller/odom", "/diagnostics",
+        "/clock",
+        "/robot_description",
+        "/joint_states",
+        "/tf",
+        "/tf_static",
+        "/tf_environment",
+        "/tf_environment_static",
+        "/mobile_base_controller/odom",
+        "/diagnostics",
         f"/{VISITOR}/joint_states",
-    ]  # fmt: skip
-    once, owners = [], {f"/{VISITOR}/joint_states": VISITOR}
+    ]
+    once = []
+    owners = {f"/{VISITOR}/joint_states": VISITOR}
     for camera in robot.cameras:
         owner = f"{camera.name} of {PICKER}"
         always += [f"/{camera.name}/{topic}" for topic in CAMERA_TOPICS]

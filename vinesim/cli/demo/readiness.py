@@ -22,9 +22,14 @@ LINE_PERIOD = 5.0
 
 
 def wait_until_ready(
-    clients: Mapping[str, Process], others: list[Process], listener: RosListener | None, newest: Statuses,
-    describe: Callable[[str], str], console: Console, timeout: float,
-) -> dict[str, float]:  # fmt: skip
+    clients: Mapping[str, Process],
+    others: list[Process],
+    listener: RosListener | None,
+    newest: Statuses,
+    describe: Callable[[str], str],
+    console: Console,
+    timeout: float,
+) -> dict[str, float]:
     """Wait until every client steps and every topic of the listener had a message.
 
     Returns the wall time of each of these first events [s since the epoch], clients by name and topics by theirs.

@@ -66,9 +66,17 @@ def report_of(out: pathlib.Path, name: str) -> dict[str, Any]:
 
 
 def push_summary(
-    out: pathlib.Path, bunch: int, received: dict[str, Any], *, no_ros: str | None, scene: str, seed: int,
-    seconds: float, window: Window, starts: Mapping[str, float],
-) -> dict[str, Any]:  # fmt: skip
+    out: pathlib.Path,
+    bunch: int,
+    received: dict[str, Any],
+    *,
+    no_ros: str | None,
+    scene: str,
+    seed: int,
+    seconds: float,
+    window: Window,
+    starts: Mapping[str, float],
+) -> dict[str, Any]:
     """What was measured of a push; draws ``touch.png``.
 
     ``received``: statistics of the listener, by topic; ``starts``: times from the demo's start to the first event of
@@ -79,20 +87,29 @@ def push_summary(
     with writing(out / "touch.png"):
         contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
     touch_keys = (
-        "touch_to_motion_ticks", "force_peak_n", "environment_bytes_when_far", "ticks_touching_when_far",
+        "touch_to_motion_ticks",
+        "force_peak_n",
+        "environment_bytes_when_far",
+        "ticks_touching_when_far",
         "environment_bytes_out",
-    )  # fmt: skip
+    )
     loops = {name: TickLog.load(out / name / "ticks.npz").between(window.since, window.until) for name in reports}
     lost = lost_messages(received, reports[PICKER])
     simulated = loops[PICKER]["real_time_factor"] * (window.until - window.since)
     return {
-        "scene": scene, "seed": seed, "seconds": seconds, "bunch": bunch, "start_s": dict(starts),
-        **loops[PICKER], "pace_cause": reports[PICKER]["pace_cause"],
+        "scene": scene,
+        "seed": seed,
+        "seconds": seconds,
+        "bunch": bunch,
+        "start_s": dict(starts),
+        **loops[PICKER],
+        "pace_cause": reports[PICKER]["pace_cause"],
         "steps_skipped": sum(one["steps_skipped"] for one in reports.values()),
         "lost": lost["count"],
         "pictures_per_simulated_second": least_rate(received, PICTURES, simulated),
         "scans_per_simulated_second": least_rate(received, SCANS, simulated),
-        **{key: reports[PICKER][key] for key in touch_keys}, "loops": loops,
+        **{key: reports[PICKER][key] for key in touch_keys},
+        "loops": loops,
         "remote_displacement_error_mm": remote_error(traces[PICKER], traces[VISITOR]),
         "ros": no_ros or "used",
         "ros_received": {topic: entry["count"] for topic, entry in sorted(received.items())},
@@ -100,7 +117,7 @@ def push_summary(
         "ros_lost": lost,
         "ros_detail": received,
         "clients": reports,
-    }  # fmt: skip
+    }
 
 
 def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str, Any]) -> dict[str, Any]:
@@ -131,7 +148,8 @@ def least_rate(received: Mapping[str, Mapping[str, Any]], pattern: str, simulate
 
 def push_table(summary: dict[str, Any]) -> Table:
     """The most important values of :func:`push_summary`, to print."""
-    error, lost = summary["remote_displacement_error_mm"], summary["ros_lost"]["share"]
+    error = summary["remote_displacement_error_mm"]
+    lost = summary["ros_lost"]["share"]
     pictures, scans = (summary[f"{kind}_per_simulated_second"] for kind in ("pictures", "scans"))
     table = Table(title="what was measured", title_justify="left", show_header=False)
     for label, text in (
@@ -172,18 +190,33 @@ def push_table(summary: dict[str, Any]) -> Table:
 
 
 def job_summary(
-    out: pathlib.Path, job: str, done_key: str, *, scene: str, seed: int, robot: str, no_ros: str | None,
+    out: pathlib.Path,
+    job: str,
+    done_key: str,
+    *,
+    scene: str,
+    seed: int,
+    robot: str,
+    no_ros: str | None,
     with_visitor: bool,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """What was measured of a job; ``done_key`` names the boolean that tells whether it was done."""
     report = report_of(out, PICKER)
     done = bool(report["job"]["succeeded"])
     reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")
     summary = {
-        "scene": scene, "seed": seed, "robot": robot, "job": job, done_key: done, "reason": reason,
-        "seconds": report["time"], "ros": no_ros or "used", "detail": report["job"],
-        **{key: report[key] for key in LOOP_KEYS}, "bunches_picked": report["bunches_picked"],
-    }  # fmt: skip
+        "scene": scene,
+        "seed": seed,
+        "robot": robot,
+        "job": job,
+        done_key: done,
+        "reason": reason,
+        "seconds": report["time"],
+        "ros": no_ros or "used",
+        "detail": report["job"],
+        **{key: report[key] for key in LOOP_KEYS},
+        "bunches_picked": report["bunches_picked"],
+    }
     if with_visitor:
         visitor = report_of(out, VISITOR)
         sent = {family: report["network"][family]["bytes_out"] for family in ("environment", "event", "fact")}

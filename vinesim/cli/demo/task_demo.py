@@ -23,24 +23,35 @@ from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import Scene, load_scene, with_seed
 
 JOBS = {
-    "pick": ("vinebot", "picked"), "exchange": ("logistic", "exchanged"), "meet": ("logistic", "handed_over"),
-}  # fmt: skip
+    "pick": ("vinebot", "picked"),
+    "exchange": ("logistic", "exchanged"),
+    "meet": ("logistic", "handed_over"),
+}
 """Jobs: the robot that does them unless another is named, and the key of ``summary.json`` for whether it was done."""
 TIME_LIMIT = 120.0
 """Simulated time that a job may take unless given [s]."""
 
 
 def run_job(
-    job: str, *, seconds: float | None, seed: int | None, scene: str | None, robot: str | None, device: str,
-    real_time_factor: float | None, headless: bool, out: pathlib.Path,
-) -> int:  # fmt: skip
+    job: str,
+    *,
+    seconds: float | None,
+    seed: int | None,
+    scene: str | None,
+    robot: str | None,
+    device: str,
+    real_time_factor: float | None,
+    headless: bool,
+    out: pathlib.Path,
+) -> int:
     """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
     console = Console(stderr=True)
     check_device(device)
     default_robot, done_key = JOBS[job]
-    robot, scene = robot or default_robot, scene or "harvest"
+    robot = robot or default_robot
+    scene = scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
     load_description(robot)  # refused once, and before any process starts
     with writing(out):
@@ -52,29 +63,55 @@ def run_job(
         client = ["-m", "vinesim", "client", "--connect", endpoint, "--scene", scene, "--seed", str(plan.seed)]
         client += ["--device", device, "--status", "json"]
         common = [*client, "--role", "robot", "--robot", robot]
-        visitor, newest = None, Statuses()
+        visitor = None
+        newest = Statuses()
         if job == "meet":
             person = [*client, "--role", "human", *_person_options(plan), "--out", str(out / VISITOR)]
             visitor = group.start(VISITOR, *person, "--name", VISITOR)
         elif (place := visitor_pose(plan)) is not None:
             visitor = group.start(
-                VISITOR, *common, "--name", VISITOR, *place, "--namespace", VISITOR, "--out", str(out / VISITOR),
-                "--sensor-hz", "0.5",
-            )  # fmt: skip
+                VISITOR,
+                *common,
+                "--name",
+                VISITOR,
+                *place,
+                "--namespace",
+                VISITOR,
+                "--out",
+                str(out / VISITOR),
+                "--sensor-hz",
+                "0.5",
+            )
         if visitor is not None:
             newest[VISITOR] = json.loads(visitor.next_line(START_TIMEOUT))
         picker = group.start(
-            PICKER, *common, "--name", PICKER, "--job", job, "--seconds", str(seconds or TIME_LIMIT),
-            "--out", str(out / PICKER), "--sensor-hz", "1",
-        )  # fmt: skip
+            PICKER,
+            *common,
+            "--name",
+            PICKER,
+            "--job",
+            job,
+            "--seconds",
+            str(seconds or TIME_LIMIT),
+            "--out",
+            str(out / PICKER),
+            "--sensor-hz",
+            "1",
+        )
         newest[PICKER] = json.loads(picker.next_line(START_TIMEOUT))
         show_progress(picker, visitor, server, newest, console, headless)
         if visitor is not None:
             visitor.finish()
     summary = job_summary(
-        out, job, done_key, scene=scene, seed=plan.seed, robot=robot, no_ros=middleware.unavailable_reason(),
+        out,
+        job,
+        done_key,
+        scene=scene,
+        seed=plan.seed,
+        robot=robot,
+        no_ros=middleware.unavailable_reason(),
         with_visitor=visitor is not None,
-    )  # fmt: skip
+    )
     write_summary(out, summary)
     done = summary[done_key]
     console.print(f"{done_key} after {summary['seconds']:.1f} s" if done else f"not {done_key}: {summary['reason']}")

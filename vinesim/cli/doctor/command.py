@@ -11,9 +11,19 @@ from vinesim.cli.doctor import machine, software
 from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding
 
 CHECKS: tuple[Callable[[], Finding], ...] = (
-    software.python, software.packages, machine.cpu, machine.gpu, software.ros, software.page, software.certificates,
-    machine.ports, machine.shared_memory, machine.datagrams, machine.clock, software.caches,
-)  # fmt: skip
+    software.python,
+    software.packages,
+    machine.cpu,
+    machine.gpu,
+    software.ros,
+    software.page,
+    software.certificates,
+    machine.ports,
+    machine.shared_memory,
+    machine.datagrams,
+    machine.clock,
+    software.caches,
+)
 
 
 def diagnose(checks: Sequence[Callable[[], Finding]] = CHECKS) -> list[Finding]:

@@ -7,7 +7,9 @@ import dataclasses
 import os
 import pathlib
 
-OK, WARNING, ERROR = "ok", "warning", "error"
+OK = "ok"
+WARNING = "warning"
+ERROR = "error"
 """States of a finding. An error is what an ordinary client (a robot on this machine, on the CPU) cannot do without."""
 
 

@@ -87,9 +87,11 @@ def gpu(driver: pathlib.Path = pathlib.Path("/proc/driver/nvidia/version")) -> F
     if count == 0:
         if driver.exists() or shutil.which("nvidia-smi"):
             return Finding(
-                "gpu", WARNING, "an NVIDIA driver is installed, but Warp finds no GPU",
+                "gpu",
+                WARNING,
+                "an NVIDIA driver is installed, but Warp finds no GPU",
                 "see 'nvidia-smi'; a container needs '--gpus all'; an old driver needs an update",
-            )  # fmt: skip
+            )
         return Finding("gpu", OK, "none of NVIDIA; everything runs on the CPU")
     names = [f"cuda:{number}" for number in range(count)]
     faults = {name: fault for name in names if (fault := device_fault(name))}
@@ -143,9 +145,11 @@ def ports(port: int = PORT) -> Finding:
                 busy.append(f"{name} ({error.strerror})")
     if busy:
         return Finding(
-            "ports", WARNING, f"{port} is used: {', '.join(busy)}",
+            "ports",
+            WARNING,
+            f"{port} is used: {', '.join(busy)}",
             f"if that is a server, join it: --connect tcp/127.0.0.1:{port}; else --listen tcp/127.0.0.1:0",
-        )  # fmt: skip
+        )
     return Finding("ports", OK, f"{port} is free for a server (tcp and udp)")
 
 
@@ -159,7 +163,8 @@ def datagrams(proc: pathlib.Path = NETWORK) -> Finding:
     except (OSError, ValueError):
         return Finding("datagrams", OK, f"what is dropped cannot be told on this {platform.system()}")
     counts = dict(zip(names, map(int, values), strict=True))
-    dropped, arrived = counts.get("RcvbufErrors", 0), counts.get("InDatagrams", 0)
+    dropped = counts.get("RcvbufErrors", 0)
+    arrived = counts.get("InDatagrams", 0)
     found = f"{dropped} of {dropped + arrived} dropped since boot; buffers of {buffer / 1e3:.0f} kB"
     if dropped <= MOST_DROPPED * (dropped + arrived):
         return Finding("datagrams", OK, found)
@@ -180,9 +185,11 @@ def clock() -> Finding:
         return Finding("clock", OK, f"{found}; whether NTP runs cannot be told here")
     if status & _UNSYNCHRONISED:
         return Finding(
-            "clock", WARNING, f"{found}; the time of day is not synchronised",
+            "clock",
+            WARNING,
+            f"{found}; the time of day is not synchronised",
             "only for several machines: run an NTP service such as chrony, for certificates, logs and recordings",
-        )  # fmt: skip
+        )
     return Finding("clock", OK, f"{found}; the time of day is synchronised")
 
 

@@ -18,9 +18,14 @@ from vinesim.core.version import __version__
 FREE_SPACE = 1 << 30
 """[B] Compiled kernels and tables take up to this."""
 EXTRAS = {
-    "ros": "ROS 2", "web": "the page in a browser", "tls": "certificates", "tune": "fits",
-    "tiago": "the robot tiago_pro", "perception": "point clouds from depth", "voice": "voices",
-}  # fmt: skip
+    "ros": "ROS 2",
+    "web": "the page in a browser",
+    "tls": "certificates",
+    "tune": "fits",
+    "tiago": "the robot tiago_pro",
+    "perception": "point clouds from depth",
+    "voice": "voices",
+}
 """Extras of the package that users install, and what for."""
 
 
@@ -83,18 +88,22 @@ def ros() -> Finding:
     from vinesim.ros.messages import message_packages as messages
 
     missing = [
-        package for package in messages.available_packages()
+        package
+        for package in messages.available_packages()
         if messages.place_of_official(package) is None
-        and not messages.is_installed(package) and not messages.is_built(package)
-    ]  # fmt: skip
+        and not messages.is_installed(package)
+        and not messages.is_built(package)
+    ]
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     found = f"{middleware.WHEEL_MIDDLEWARE if _wheels() else os.environ.get('ROS_DISTRO', '?')}, domain {domain}"
     if not missing:
         return Finding("ros", OK, f"{found}, all message packages")
     return Finding(
-        "ros", WARNING, f"{found}, without messages of {', '.join(missing)}",
+        "ros",
+        WARNING,
+        f"{found}, without messages of {', '.join(missing)}",
         "vinesim ros build-interfaces (needs g++); a client does so at its first start",
-    )  # fmt: skip
+    )
 
 
 def _wheels() -> bool:
@@ -140,15 +149,18 @@ def certificates(folders: Iterable[pathlib.Path] | None = None) -> Finding:
 
 def caches() -> Finding:
     """Folders of compiled kernels and of tables: size, whether they can be written, whether there is room."""
-    tables, kernels = disk_cache.folder(), kernel_folder()
+    tables = disk_cache.folder()
+    kernels = kernel_folder()
     sizes = [f"kernels {amount(size_of(kernels))} in {kernels}", f"tables {amount(size_of(tables))} in {tables}"]
     found = ", ".join(sizes)
     for folder, variable in ((kernels, "WARP_CACHE_PATH"), (tables, "VINESIM_CACHE")):
         if (fault := _write_fault(folder)) is not None:
             return Finding(
-                "caches", WARNING, f"{folder}: {fault}",
+                "caches",
+                WARNING,
+                f"{folder}: {fault}",
                 f"set {variable} to a folder that can be written; every start computes anew until then",
-            )  # fmt: skip
+            )
     return Finding("caches", OK, found)
 
 

@@ -29,7 +29,8 @@ from vinesim.world import Physics
 ROBOT_NAMES = ("vinebot", "logistic")
 FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
 """Radius of the ground that each covers [m], arms and hands included: GUESSED."""
-MIN_DISTANCE, MAX_DISTANCE = 0.5, 3.5
+MIN_DISTANCE = 0.5
+MAX_DISTANCE = 3.5
 """Distance on the ground from the bunch in view to an actor or crate [m]."""
 CRATE_HEIGHTS = (0.15, 0.20, 0.24, 0.30)
 """Heights of crates [m]."""
@@ -82,7 +83,9 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
     taken += [(spot, FOOTPRINT_RADIUS["crate"]) for spot in model.box_pose[:, :2].astype(float)]
     kinds = [ROBOT_NAMES[rng.integers(len(ROBOT_NAMES))] for _ in range(rng.integers(0, 2))]
     kinds += ["person"] * int(rng.integers(0, 3)) + ["crate"] * int(rng.integers(0, 3))
-    robots, people, crates = [], [], []
+    robots = []
+    people = []
+    crates = []
     for kind in kinds or ["person"]:
         spot = _free_place(middle, taken, FOOTPRINT_RADIUS[kind], rng)
         yaw = float(rng.uniform(-np.pi, np.pi))
@@ -106,7 +109,8 @@ def _free_place(
 ) -> np.ndarray | None:
     """A place [2] m for a disc that overlaps no other; None if none is found."""
     for _ in range(_MAX_TRIES):
-        away, around = rng.uniform(MIN_DISTANCE, MAX_DISTANCE), rng.uniform(0.0, 2.0 * np.pi)
+        away = rng.uniform(MIN_DISTANCE, MAX_DISTANCE)
+        around = rng.uniform(0.0, 2.0 * np.pi)
         spot = middle + away * np.array([np.cos(around), np.sin(around)])
         if all(np.hypot(*(spot - other)) > radius + reach for other, reach in taken):
             return spot
@@ -115,8 +119,10 @@ def _free_place(
 
 def _simulate_wind(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
     """Step physics with a random wind; returns its parameters, as JSON."""
-    speed, heading = float(rng.uniform(*WIND_SPEED)), float(rng.uniform(-np.pi, np.pi))
-    ticks, seed = int(rng.integers(*WIND_STEPS)), int(rng.integers(1 << 31))
+    speed = float(rng.uniform(*WIND_SPEED))
+    heading = float(rng.uniform(-np.pi, np.pi))
+    ticks = int(rng.integers(*WIND_STEPS))
+    seed = int(rng.integers(1 << 31))
     mean = np.array([speed * np.cos(heading), speed * np.sin(heading), 0.0])
     physics.wind = Wind(mean, gusts=0.4 * speed, seed=seed)
     for _ in range(ticks):

@@ -32,11 +32,14 @@ if TYPE_CHECKING:
 
 HEAP_DENSITY = 330.0
 """Bulk density of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
-CRATE_WALL, CRATE_MASS = 0.012, 1.6
+CRATE_WALL = 0.012
+CRATE_MASS = 1.6
 """Thickness of the walls [m] and mass of an empty crate [kg]: GUESSED."""
 MAX_PENETRATION = 0.01
 """Actors must not penetrate anything deeper than this [m]."""
-FALL_STEPS, SETTLE_STEPS, MAX_REFILLS = 25, 100, 3
+FALL_STEPS = 25
+SETTLE_STEPS = 100
+MAX_REFILLS = 3
 """Steps between bunches that fall into a crate; steps for the heap to settle; tries to put back what rolled out."""
 
 
@@ -109,7 +112,8 @@ class SceneComposer:
     def with_crates(self, model: Model) -> Model:
         """The model with the crates after its own boxes."""
         count = len(self.crates)
-        pose, size = np.array([c.pose for c in self.crates]), np.array([c.size for c in self.crates])
+        pose = np.array([c.pose for c in self.crates])
+        size = np.array([c.size for c in self.crates])
         return dataclasses.replace(
             model,
             box_pose=np.concatenate([model.box_pose, pose.reshape(count, 7)]).astype(model.box_pose.dtype),
@@ -140,8 +144,10 @@ class SceneComposer:
         """All robots, people and boxes, as JSON: kind, label, placement."""
         records = []
         for organ, things, start in (
-            (Organ.ROBOT, self.robots, 0), (Organ.HUMAN, self.people, 0), (Organ.BOX, self.crates, len(model.box_size)),
-        ):  # fmt: skip
+            (Organ.ROBOT, self.robots, 0),
+            (Organ.HUMAN, self.people, 0),
+            (Organ.BOX, self.crates, len(model.box_size)),
+        ):
             for number, one in enumerate(things, start):
                 records.append({"kind": organ.name.lower(), "label": label(organ, number), **dataclasses.asdict(one)})
         return records
@@ -159,7 +165,8 @@ def bunch_masses(model: Model) -> np.ndarray:
 def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int]:
     """Let the bunches that hang nearest to a crate fall into it until its ``fill`` is reached; returns their
     indices."""
-    model, rigid = physics.model, physics.rigid
+    model = physics.model
+    rigid = physics.rigid
     inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
     wanted = crate.fill * HEAP_DENSITY * float(np.prod(inside))
     where = physics.state.body_q[model.bunch_body, :3]
@@ -172,7 +179,8 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
             f"crate {number} wants {wanted:.1f} kg of bunches, more than the vineyard bears; fill it less"
         )
     rng = np.random.default_rng([number, model.bunch_seed[0] if len(model.bunch_seed) else 0])
-    waiting, inside_it = chosen.tolist(), []
+    waiting = chosen.tolist()
+    inside_it = []
     for _ in range(MAX_REFILLS):
         for bunch in waiting:
             if physics.state.bunch_attached[bunch]:
@@ -195,7 +203,8 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
 
 def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
     """Pose [7] of a bunch just above the height ``top`` [m] of a heap, in the crate's frame."""
-    length, radius = float(model.bunch_length[bunch]), float(model.bunch_radius[bunch])
+    length = float(model.bunch_length[bunch])
+    radius = float(model.bunch_radius[bunch])
     room = np.maximum(0.5 * inside[:2] - [0.5 * length + 0.02, radius + 0.01], 0.0)
     yaw = rng.choice([0.0, np.pi]) + rng.uniform(-0.35, 0.35)
     start = rng.uniform(-room, room) - 0.5 * length * np.array([np.cos(yaw), np.sin(yaw)])

@@ -33,7 +33,8 @@ MOST_HIDING = 3
 """So many parts of plants may hide an actor far away. GUESSED."""
 LARGE = 8.0
 """Vines count for a picture up to this distance [m]. GUESSED."""
-FIELD, COLUMNS = 0.78, 24
+FIELD = 0.78
+COLUMNS = 24
 """Of a picture that is judged: half of its horizontal angle [rad], and parts side by side."""
 
 

@@ -34,7 +34,8 @@ def network_access() -> NetworkAccess:
     The certificate is signed by an authority of this machine's own, kept in the folder for caches: browsers warn of it
     once, or never where its ``ca.pem`` is installed. Raises :class:`certificates.CryptographyMissing`.
     """
-    host, folder = own_address(), disk_cache.folder() / "page-certificate"
+    host = own_address()
+    folder = disk_cache.folder() / "page-certificate"
     certificates.create(folder, SERVER, Role.SERVER, (host,))
     tls = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)
     tls.load_cert_chain(folder / f"{SERVER}.pem", folder / f"{SERVER}.key")

@@ -23,15 +23,20 @@ class PageReplay:
     """A spectator in a recording, and its pages. One loop calls :meth:`step`; pages ask in the server's thread."""
 
     def __init__(
-        self, make: Callable[[float, np.ndarray | None], tuple[Spectator, ReplayBus]], length: float,
-        start: float = 0.0, speed: float = 1.0,
-    ) -> None:  # fmt: skip
+        self,
+        make: Callable[[float, np.ndarray | None], tuple[Spectator, ReplayBus]],
+        length: float,
+        start: float = 0.0,
+        speed: float = 1.0,
+    ) -> None:
         """``make(start, eyes)`` gives a spectator at a time [s] of a recording of a ``length`` [s], which looks from
         ``eyes`` [7], or, None, from where it begins."""
-        self._make, self._length = make, length
+        self._make = make
+        self._length = length
         self._lock = threading.Lock()
         self._command: ReplayCommand | None = None
-        self._speed, self.is_paused = speed, False
+        self._speed = speed
+        self.is_paused = False
         self._jumps = self._idle_steps = 0
         self._has_begun = False
         self._spectator, self._bus = make(start, None)
@@ -50,9 +55,12 @@ class PageReplay:
     def status(self) -> dict[str, float | bool]:
         """What pages are told with every state."""
         return {
-            "position": round(self.position, 3), "length": round(self._length, 3), "speed": self._speed,
-            "paused": self.is_paused, "jumps": self._jumps,
-        }  # fmt: skip
+            "position": round(self.position, 3),
+            "length": round(self._length, 3),
+            "speed": self._speed,
+            "paused": self.is_paused,
+            "jumps": self._jumps,
+        }
 
     def take(self, command: ReplayCommand) -> None:
         """What a page asks for; it replaces what was asked for since the last step. From any thread."""
@@ -65,7 +73,8 @@ class PageReplay:
         """Do what was asked for, and play one step once the first page is there; whether it plays."""
         self._has_begun |= server.has_viewers
         with self._lock:
-            command, self._command = self._command, None
+            command = self._command
+            self._command = None
         was_paused = self.is_paused
         if command is not None:
             self._obey(command)
@@ -83,7 +92,8 @@ class PageReplay:
         goal = command.seek
         if goal is None and self._bus.ended and not command.paused:
             goal = 0.0  # again from the beginning
-        self._speed, self.is_paused = command.speed, command.paused
+        self._speed = command.speed
+        self.is_paused = command.paused
         if goal is None:
             return
         self._spectator, self._bus = self._make(max(min(goal, self._length) - LEAD, 0.0), self._spectator.pose)

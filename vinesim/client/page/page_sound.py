@@ -20,7 +20,8 @@ class PageSound:
     listener of each page."""
 
     def __init__(self, client: Client) -> None:
-        self._client, self._name = client, client.name
+        self._client = client
+        self._name = client.name
         self._kind = client.replicator.hello.kind
         self._pages: dict[PageVoice, _Page] = {}
         self._speaker: PageVoice | None = None
@@ -60,10 +61,14 @@ class PageSound:
         voice = self._client.sound.voice_of(self._name)
         objection = self.objection(page)
         send = [] if objection else ["main"] * voice.is_heard + ["pcm"] * voice.is_heard_plain
-        return json.dumps({
-            "objection": objection, "send": send, "tones": tones,
-            "law": [REFERENCE, REACH, FADE],
-        })  # fmt: skip
+        return json.dumps(
+            {
+                "objection": objection,
+                "send": send,
+                "tones": tones,
+                "law": [REFERENCE, REACH, FADE],
+            }
+        )
 
 
 class _Page:
@@ -72,7 +77,8 @@ class _Page:
     is_open = True
 
     def __init__(self, sound: PageSound, page: PageVoice) -> None:
-        self._sound, self._page = sound, page
+        self._sound = sound
+        self._page = page
         self._told = ""
 
     @property

@@ -70,13 +70,19 @@ class PageWorld:
     """
 
     def __init__(
-        self, client: Client, person: TrackedHuman | None = None, most: int = MAX_PRIMITIVES,
+        self,
+        client: Client,
+        person: TrackedHuman | None = None,
+        most: int = MAX_PRIMITIVES,
         replay: Replay | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
         and ground that a page has at a time, those nearest to where it looks from; ``replay``: the recording that the
         client is in, if it is in one."""
-        self._client, self._person, self._most, self._replay = client, person, most, replay
+        self._client = client
+        self._person = person
+        self._most = most
+        self._replay = replay
         self._ticks_before = 0
         """Of earlier clients, so that ticks of states rise: see :meth:`show`."""
         self._at_rest = client.physics.snapshot().body_q.copy()
@@ -93,7 +99,8 @@ class PageWorld:
         """None until a page asks."""
         self._lock = threading.Lock()
         self._snapshot: tuple[int, Snapshot] | None = None
-        self._rigid_version, self._rigid = 0, b""
+        self._rigid_version = 0
+        self._rigid = b""
         self._lamps: dict[str, np.ndarray] = {}
         """Rows of primitives that have shone, counted from those of the rigid bodies; their surfaces and materials."""
         self._laid_out: dict[str, np.ndarray] = {}
@@ -123,7 +130,8 @@ class PageWorld:
         """From now on show another client of the same vineyard, at another time of it: all trees are told anew."""
         with self._lock:
             self._ticks_before += self._client.physics.tick + 1
-            self._client, self._snapshot = client, None
+            self._client = client
+            self._snapshot = None
             self._moved_at[self._moved_at >= 0] = self._tick
             self._wire_moved_at[self._wire_moved_at >= 0] = self._tick
         client.after_reset.append(self._follow_reset)
@@ -180,7 +188,9 @@ class PageWorld:
         which = np.union1d(self._wires_away, wires.segment).astype(int)
         now = self._wires.poses(which, wires)
         moved = which[(now != self._wire_q[which]).any(1)]
-        self._wire_q[which], self._wire_moved_at[moved], self._wires_away = now, self._tick, wires.segment
+        self._wire_q[which] = now
+        self._wire_moved_at[moved] = self._tick
+        self._wires_away = wires.segment
 
     def _follow_reset(self) -> None:
         """All trees are at rest again: pages are told of those that had moved."""
@@ -193,7 +203,8 @@ class PageWorld:
 
     def scene(self) -> bytes:
         """Everything that stands or grows, at rest; tables of leaves' outlines; light of the ground."""
-        primitives, scene = self._lay_out(), self._client.scene
+        primitives = self._lay_out()
+        scene = self._client.scene
         outline, hull = textures.leaf_outlines()
         leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes have both signs
         ground = primitives.materials
@@ -203,9 +214,15 @@ class PageWorld:
         reach, plants = _nearest(primitives, start[:3], self._most)
         return array_message.encode(
             {
-                "scene": scene.name, "seed": scene.seed, "sun": list(sun), "light": _light(sun[2]),
-                "rows": list(row_layout(model)), "room": min(primitives.plant_count, self._most), "reach": reach,
-                "bodies": len(model.body_mass) + len(self._wires), "dt": self._client.physics.dt,
+                "scene": scene.name,
+                "seed": scene.seed,
+                "sun": list(sun),
+                "light": _light(sun[2]),
+                "rows": list(row_layout(model)),
+                "room": min(primitives.plant_count, self._most),
+                "reach": reach,
+                "bodies": len(model.body_mass) + len(self._wires),
+                "dt": self._client.physics.dt,
                 "interest": self._client.replicator.interest_radius,
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
@@ -220,10 +237,15 @@ class PageWorld:
             | {
                 "tree_first": model.tree_first.astype(np.uint32),
                 "poses": np.concatenate([self._at_rest, self._wires.rest_q]).astype(np.float32),
-                "outline": outline, "hull": hull, "noise": _bytes(textures.noise_texture()), "leaf": _bytes(leaf),
-                "ground_sky": ground.ground_sky.numpy(), "start": np.asarray(start, np.float32),
-            } | ({} if self._person is None else _within_reach(model)),
-        )  # fmt: skip
+                "outline": outline,
+                "hull": hull,
+                "noise": _bytes(textures.noise_texture()),
+                "leaf": _bytes(leaf),
+                "ground_sky": ground.ground_sky.numpy(),
+                "start": np.asarray(start, np.float32),
+            }
+            | ({} if self._person is None else _within_reach(model)),
+        )
 
     def plants(self, place: np.ndarray) -> bytes:
         """Of a vineyard that is too large for a page the part around a ``place`` [3] m, as in :meth:`scene`."""
@@ -256,7 +278,8 @@ class PageWorld:
         pose = np.concatenate([snapshot.body_q[body], self._wires.poses(wire, snapshot.wires)])
         body = np.concatenate([body, len(self._client.model.body_mass) + wire])
         rigid = np.asarray(snapshot.visual_q).reshape(-1, 7)
-        haptics, self._haptics = self._haptics, {}
+        haptics = self._haptics
+        self._haptics = {}
         shown: dict[str, Any] = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
         if self._replay is not None:
             shown["replay"] = self._replay.status()
@@ -264,35 +287,46 @@ class PageWorld:
             shown["shears"] = self._shears
         state = array_message.encode(
             {
-                **shown, "pace": self._client.pace_text(),
-                "tick": tick, "time": snapshot.time, "rigid": self._rigid_version,
+                **shown,
+                "pace": self._client.pace_text(),
+                "tick": tick,
+                "time": snapshot.time,
+                "rigid": self._rigid_version,
                 "haptics": {hand: [one.amplitude, one.duration] for hand, one in haptics.items()},
             },
             {
-                "body": body.astype(np.uint32), "place": pose[:, :3].astype(np.float32), "turn": _turns(pose),
-                "rigid_place": rigid[:, :3].astype(np.float32), "rigid_turn": _turns(rigid),
-                "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32), **self._lamps,
-                **self._hands, **page_overlays.contact_arrays(self._contacts),
+                "body": body.astype(np.uint32),
+                "place": pose[:, :3].astype(np.float32),
+                "turn": _turns(pose),
+                "rigid_place": rigid[:, :3].astype(np.float32),
+                "rigid_turn": _turns(rigid),
+                "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32),
+                **self._lamps,
+                **self._hands,
+                **page_overlays.contact_arrays(self._contacts),
             },
-        )  # fmt: skip
+        )
         return tick, state
 
     def _follow_visuals(self, primitives: Primitives, snapshot: Snapshot) -> None:
         """Lay the rigid bodies out for pages, unless only lights have changed: those are part of every state."""
         primitives.update(snapshot)
-        before, self._visuals = self._visuals, snapshot.visuals
+        before = self._visuals
+        self._visuals = snapshot.visuals
         rows = slice(primitives.plant_count, primitives.count)
         columns = _columns(primitives, rows)
         if before is None or not _differ_in_lights_only(before, snapshot.visuals):
             self._lay_out_rigid(primitives, snapshot, rows)
-            self._laid_out, self._has_shone = columns, np.zeros(len(columns["material"]), bool)
+            self._laid_out = columns
+            self._has_shone = np.zeros(len(columns["material"]), bool)
         self._has_shone |= (columns["surface"] != self._laid_out["surface"]).any(1)
         self._has_shone |= columns["material"] != self._laid_out["material"]
         lamps = np.flatnonzero(self._has_shone)
         self._lamps = {
-            "lamp": lamps.astype(np.uint32), "lamp_surface": columns["surface"][lamps],
+            "lamp": lamps.astype(np.uint32),
+            "lamp_surface": columns["surface"][lamps],
             "lamp_material": columns["material"][lamps],
-        }  # fmt: skip
+        }
 
     def _lay_out_rigid(self, primitives: Primitives, snapshot: Snapshot, rows: slice) -> None:
         self._rigid_version += 1
@@ -326,7 +360,8 @@ class PageWorld:
     def _bodies(self, trees: np.ndarray) -> np.ndarray:
         """Bodies of some trees, one tree after the other."""
         model = self._client.model
-        first, size = model.tree_first[trees], model.tree_size[trees]
+        first = model.tree_first[trees]
+        size = model.tree_size[trees]
         return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum())
 
     def _start_view(self) -> np.ndarray:
@@ -373,10 +408,13 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
     hands = person.left, person.right
     left, right = (None if hand is None else np.array(hand.pose) for hand in hands)
     return TrackedPoints(
-        np.array(person.head), left, right, (bool(hands[0] and hands[0].closed), bool(hands[1] and hands[1].closed)),
+        np.array(person.head),
+        left,
+        right,
+        (bool(hands[0] and hands[0].closed), bool(hands[1] and hands[1].closed)),
         (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
         person.shears,
-    )  # fmt: skip
+    )
 
 
 def _within_reach(model: Model) -> dict[str, np.ndarray]:
@@ -385,11 +423,14 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
     stalk = model.body_parent[model.bunch_body]
     return {
-        "wood": wood.astype(np.uint32), "wood_length": model.body_length[wood].astype(np.float32),
-        "bunch_body": model.bunch_body.astype(np.uint32), "bunch_length": model.bunch_length.astype(np.float32),
-        "bunch_radius": model.bunch_radius.astype(np.float32), "bunch_stalk": stalk.astype(np.uint32),
+        "wood": wood.astype(np.uint32),
+        "wood_length": model.body_length[wood].astype(np.float32),
+        "bunch_body": model.bunch_body.astype(np.uint32),
+        "bunch_length": model.bunch_length.astype(np.float32),
+        "bunch_radius": model.bunch_radius.astype(np.float32),
+        "bunch_stalk": stalk.astype(np.uint32),
         "stalk_length": model.body_length[stalk].astype(np.float32),
-    }  # fmt: skip
+    }
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:
@@ -405,14 +446,14 @@ def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.n
     light = np.round(255.0 * np.clip(columns["sky"], 0.0, 1.0))
     surface = np.column_stack([colour, light]).astype(np.uint8)
     return {
-        "shape": shape, "surface": surface, "material": columns["material"].astype(np.uint8),
+        "shape": shape,
+        "surface": surface,
+        "material": columns["material"].astype(np.uint8),
         "carrier": columns["carrier"].astype(np.uint32),
-    }  # fmt: skip
+    }
 
 
-def _nearest(
-    primitives: Primitives, place: np.ndarray, most: int
-) -> tuple[float | None, dict[str, np.ndarray]]:  # fmt: skip
+def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> tuple[float | None, dict[str, np.ndarray]]:
     """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``, and the clusters;
     before them how far from there no berry is missing [m], None: nothing is missing anywhere. :data:`LOADED` says how
     far other things are loaded."""
@@ -420,7 +461,8 @@ def _nearest(
     clusters = _clusters(primitives, slice(0, count))
     if primitives.plant_count <= most:
         return None, _columns(primitives, slice(0, primitives.plant_count)) | clusters
-    first, size = clusters["first"].astype(int), clusters["size"].astype(int)
+    first = clusters["first"].astype(int)
+    size = clusters["size"].astype(int)
     material = primitives.local_columns(first)["material"]
     share = np.select([material == one for one in LOADED], list(LOADED.values()), ELSE_LOADED)
     away = np.linalg.norm(clusters["ball"][:, :3] - place, axis=1) / share

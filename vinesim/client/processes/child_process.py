@@ -47,9 +47,14 @@ class Process:
         """Run ``python ARGUMENTS`` in a session of its own, so that Ctrl-C reaches it only through its parent."""
         started = time.time()
         child = subprocess.Popen(
-            [sys.executable, *arguments], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-            text=True, start_new_session=True, env={**os.environ, **environ},
-        )  # fmt: skip
+            [sys.executable, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            env={**os.environ, **environ},
+        )
         process = cls(name, child, started, queue.Queue(), [])
         threading.Thread(target=process._read_stdout, daemon=True).start()
         threading.Thread(target=process._read_stderr, daemon=True).start()

@@ -29,4 +29,5 @@ class PictureKeeper:
 
     def keep(self, frame: CameraFrame, score: float) -> None:
         """Keep this one instead."""
-        self.frame, self._score = frame, score
+        self.frame = frame
+        self._score = score

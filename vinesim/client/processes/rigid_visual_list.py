@@ -49,7 +49,8 @@ class VisualListSender:
         if visuals is self._visuals:
             return None
         self._visuals = visuals
-        known, new = {}, {}
+        known = {}
+        new = {}
         for visual in visuals:
             key = (visual.name, int(visual.organ), visual.index, id(visual.shapes))
             if key in self._known:
@@ -61,7 +62,8 @@ class VisualListSender:
         numbers = tuple(number for number, _ in known.values())
         if numbers == self._numbers and self.version:
             return None
-        self._known, self._numbers = known, numbers
+        self._known = known
+        self._numbers = numbers
         self.version += 1
         memory = None
         if self._memory is None or len(visuals) > self.capacity:

@@ -26,9 +26,17 @@ log = logging.getLogger(__name__)
 BEHIND = 0.95
 """A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
 _LOOP_VALUES = (
-    "tick_hz", "tick_p99_ms", "overruns", "steps_skipped", "real_time_factor", "target_real_time_factor", "pace_cause",
-    "awake", "unfinished_solves", "sound_dropped",
-)  # fmt: skip
+    "tick_hz",
+    "tick_p99_ms",
+    "overruns",
+    "steps_skipped",
+    "real_time_factor",
+    "target_real_time_factor",
+    "pace_cause",
+    "awake",
+    "unfinished_solves",
+    "sound_dropped",
+)
 """Values of a client's status that /diagnostics shows with the loop."""
 _NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
 """The same with the network."""
@@ -38,12 +46,24 @@ class RobotProcesses:
     """Starts the processes of one robot; a context: they end with it."""
 
     def __init__(
-        self, name: str, scene: Scene, model: Model, description: RobotDescription, *, namespace: str = "",
-        params_file: pathlib.Path | None = None, interest_radius: float | None = None,
-        ros: bool = True, clock: bool = True, keep_pictures: bool = False, sensor_hz: float | None = None,
-        renderer: str = "warp", device: str = "cpu", pacing: SensorPacing | None = None,
+        self,
+        name: str,
+        scene: Scene,
+        model: Model,
+        description: RobotDescription,
+        *,
+        namespace: str = "",
+        params_file: pathlib.Path | None = None,
+        interest_radius: float | None = None,
+        ros: bool = True,
+        clock: bool = True,
+        keep_pictures: bool = False,
+        sensor_hz: float | None = None,
+        renderer: str = "warp",
+        device: str = "cpu",
+        pacing: SensorPacing | None = None,
         standby: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
         nodes; ``interest_radius``: see :class:`RosProcess`. For the others see :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
@@ -52,17 +72,32 @@ class RobotProcesses:
         with contextlib.ExitStack() as stack:
             self.sensors = stack.enter_context(
                 SensorProcess(
-                    name, scene, model, description, namespace=namespace, params_file=params_file, ros=ros,
-                    keep_pictures=keep_pictures, sensor_hz=sensor_hz, renderer=renderer, device=device, pacing=pacing,
+                    name,
+                    scene,
+                    model,
+                    description,
+                    namespace=namespace,
+                    params_file=params_file,
+                    ros=ros,
+                    keep_pictures=keep_pictures,
+                    sensor_hz=sensor_hz,
+                    renderer=renderer,
+                    device=device,
+                    pacing=pacing,
                     standby=standby,
                 )
-            )  # fmt: skip
+            )
             self.ros = None
             if ros:
                 process = RosProcess(
-                    name, model, description, namespace=namespace, params_file=params_file, clock=clock,
+                    name,
+                    model,
+                    description,
+                    namespace=namespace,
+                    params_file=params_file,
+                    clock=clock,
                     interest_radius=interest_radius,
-                )  # fmt: skip
+                )
                 self.ros = stack.enter_context(process)
             self._stack = stack.pop_all()
         self._restarts = RecentCounts()
@@ -94,7 +129,8 @@ class RobotProcesses:
 
     def status(self) -> dict[str, Any]:
         """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
-        report, awaited = self.sensors.report(), self.awaited()
+        report = self.sensors.report()
+        awaited = self.awaited()
         pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
         if (standby := self.sensors.worker.standby_pid) is not None:
             pids[f"standby of {self.sensors.name}"] = standby
@@ -121,7 +157,8 @@ class RobotProcesses:
         """Publish a client's status on /diagnostics, with that of the sensors."""
         if self.ros is None:
             return
-        report, awaited = self.report() | {"sound_lost": self.ros.sound_lost}, self.sensors.awaited()
+        report = self.report() | {"sound_lost": self.ros.sound_lost}
+        awaited = self.sensors.awaited()
         restarts = {"sensor process": report["sensor_restarts"], "ROS node": report["ros_restarts"]}
         restarted = self._restarts.update(restarts, status["time"])
         self.ros.publish_diagnostics(

@@ -17,9 +17,13 @@ class RosListener:
     """Subscribes to named topics as they appear. Raises :class:`ProcessFailed` if its process ends."""
 
     def __init__(
-        self, group: ProcessGroup, topics: Sequence[str], once: Sequence[str] = (), events: Sequence[str] = (),
+        self,
+        group: ProcessGroup,
+        topics: Sequence[str],
+        once: Sequence[str] = (),
+        events: Sequence[str] = (),
         arrivals: pathlib.Path | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``once``: topics that it leaves after their first message; ``events``: topics that may stay silent;
         ``arrivals``: file for the times of every message, see :attr:`TopicStats.arrivals`."""
         self.topics = (*topics, *once)

@@ -54,9 +54,16 @@ class RosProcess:
     """The ROS node of one robot of the client, in a process of its own. A context: the process ends with it."""
 
     def __init__(
-        self, name: str, model: Model, description: RobotDescription, *, namespace: str = "",
-        params_file: pathlib.Path | None = None, clock: bool = True, interest_radius: float | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        model: Model,
+        description: RobotDescription,
+        *,
+        namespace: str = "",
+        params_file: pathlib.Path | None = None,
+        clock: bool = True,
+        interest_radius: float | None = None,
+    ) -> None:
         """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
         serves simulation_interfaces. ``params_file``: ROS parameters of its node. ``interest_radius`` [m]: of the
         client, to be shown; None without a server."""
@@ -87,12 +94,22 @@ class RosProcess:
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
         self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
-            name, description.urdf, description.base, namespace, clock, tuple((p, c, q) for (p, c), q in fixed),
-            frames.pose(model.fixed_start[poles]), self._records, len(model.bunch_body),
+            name,
+            description.urdf,
+            description.base,
+            namespace,
+            clock,
+            tuple((p, c, q) for (p, c), q in fixed),
+            frames.pose(model.fixed_start[poles]),
+            self._records,
+            len(model.bunch_body),
             model.bunch_of_body(),
-            description.controllers, tuple(mount.name for mount in description.imus),
-            tuple(mount.name for mount in description.wrenches), interest_radius, params_file,
-        )  # fmt: skip
+            description.controllers,
+            tuple(mount.name for mount in description.imus),
+            tuple(mount.name for mount in description.wrenches),
+            interest_radius,
+            params_file,
+        )
         self._visuals: tuple[RigidVisual, ...] | None = None
         """All rigid bodies when the list of those in the truth was made."""
         self._truth_rows = np.zeros(0, np.intp)
@@ -111,25 +128,33 @@ class RosProcess:
         """When the process's rate was last measured [s], how many steps it had taken then, and its rate as a factor of
         real time."""
         self.worker = WorkerProcess(
-            f"the ROS process of {name}", ROS_MODULES, run_ros_worker, config,
-            lambda context: RosChannel(config, context), self._receive,
-        )  # fmt: skip
+            f"the ROS process of {name}",
+            ROS_MODULES,
+            run_ros_worker,
+            config,
+            lambda context: RosChannel(config, context),
+            self._receive,
+        )
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:
         """Publish a robot of the client from now on, the first unless ``robot`` is given, and obey its commands.
 
         Waits until the process is ready; :class:`WorkerError` if it fails.
         """
-        self.client, self.robot = client, robot or client.robot
+        self.client = client
+        self.robot = robot or client.robot
         self.worker.wait_until_ready(START_TIMEOUT)
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         client.holds.append(self.held)
         client.pace_limits.append(self.limit)
         self.handler = RosCommandHandler(
-            self.robot, self._take_commands, self._finish, client.world_time,
+            self.robot,
+            self._take_commands,
+            self._finish,
+            client.world_time,
             lambda pcm: client.sound.play(self.robot.name, pcm),
-        )  # fmt: skip
+        )
         client.faults_elsewhere.append(lambda: {"commands_refused": self.commands_refused})
         client.sound.listen(self.robot.name, _Microphone(self))
         client.pre_step.insert(0, self._control)
@@ -155,9 +180,11 @@ class RosProcess:
             return ""
         if self._hold is None or self._hold.run is not run:
             self._hold = Hold(
-                run, self.worker.title, "its messages are lost, and counted",
+                run,
+                self.worker.title,
+                "its messages are lost, and counted",
                 lambda: int(run.shared.wanted["turns"][0]),
-            )  # fmt: skip
+            )
         return "" if self._hold.is_over() else cause
 
     @property
@@ -168,7 +195,8 @@ class RosProcess:
 
     def limit(self) -> Limit:
         """The largest real-time factor at which the process takes every step; infinite unless steps pile up."""
-        now, steps = time.monotonic(), self.worker.current().shared.steps
+        now = time.monotonic()
+        steps = self.worker.current().shared.steps
         since, before, factor = self._taken
         if now - since >= RATE_PERIOD:
             taken = steps.put_count - steps.waiting_count
@@ -198,7 +226,8 @@ class RosProcess:
 
     def _after_step(self, client: Client) -> None:
         """Pass the state to the process, as far as its topics have subscribers."""
-        physics, channel = client.physics, self.worker.current().shared
+        physics = client.physics
+        channel = self.worker.current().shared
         wanted = channel.wanted["steps"]
         has_goals = channel.wanted["goals"][0]
         if has_goals or wanted.any():
@@ -209,7 +238,7 @@ class RosProcess:
                 reference = JointReference(controllers.desired, controllers.desired_velocity)
                 sample = self.robot.measure(
                     physics.time, physics.contacts, body_sensors=body_sensors, reference=reference
-                )  # fmt: skip
+                )
             with channel.steps.put() as record:
                 if record is None:
                     self._lost += wanted
@@ -227,8 +256,10 @@ class RosProcess:
         people: dict[str, LocalHuman | RemoteHuman] = dict(client.humans)
         people |= {name: one for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
         run = self.worker.current()
-        is_new, self._told_run = run is not self._told_run, run
-        had_people, self._had_people = self._had_people, bool(people)
+        is_new = run is not self._told_run
+        self._told_run = run
+        had_people = self._had_people
+        self._had_people = bool(people)
         if not (is_new or people or had_people):
             return
         now = client.physics.time + client.world_time.offset
@@ -246,9 +277,11 @@ class RosProcess:
 
     def _write_truth(self, client: Client) -> None:
         """Pass true poses to the process: of bunches, boxes and people."""
-        physics, run = client.physics, self.worker.current()
+        physics = client.physics
+        run = self.worker.current()
         if run is not self._run:  # a new run knows nothing yet
-            self._run, self._visuals = run, None
+            self._run = run
+            self._visuals = None
             self._truth_list.close()
             self._truth_list = VisualListSender()
         physics.update_kinematics()
@@ -290,7 +323,8 @@ class RosProcess:
         elif kind == "simulation" and self._simulation is not None:
             self._simulation.put(value)
         elif kind == "statistics":
-            self._sent, self._dropped = value["sent"], value["dropped"]
+            self._sent = value["sent"]
+            self._dropped = value["dropped"]
             self._losses = collections.Counter({kind: value[kind] for kind in ("sound_lost", "commands_refused")})
         elif kind == "parameters":
             self._parameters.update(value)
@@ -298,8 +332,10 @@ class RosProcess:
             self._is_restarted = True
             self._sent_before.update(self._sent)
             self._dropped_before.update(self._dropped)
-            self._losses_before, self._losses = self._losses_before + self._losses, collections.Counter()
-            self._sent, self._dropped = dict.fromkeys(self._sent, 0), {}
+            self._losses_before = self._losses_before + self._losses
+            self._losses = collections.Counter()
+            self._sent = dict.fromkeys(self._sent, 0)
+            self._dropped = {}
 
     def sent_messages(self) -> dict[str, int]:
         """Messages sent so far, by topic."""

@@ -96,11 +96,13 @@ class RosChannel:
         self.steps = SharedQueue(config.records.dtype, QUEUE_CAPACITY, context)
         self.truth = SharedSnapshot(
             {
-                "time": ((1,), "f8"), "attached": ((config.bunch_count,), "?"),
-                "bunch_q": ((config.bunch_count, 7), "f4"), "version": ((1,), "i8"),  # of the list of rigid bodies
+                "time": ((1,), "f8"),
+                "attached": ((config.bunch_count,), "?"),
+                "bunch_q": ((config.bunch_count, 7), "f4"),
+                "version": ((1,), "i8"),  # of the list of rigid bodies
             },
             context,
-        )  # fmt: skip
+        )
         self.wanted = SharedArrays(
             {
                 "steps": ((len(config.step_topics),), "?"),
@@ -136,13 +138,24 @@ class RosWorker:
         from vinesim.ros.simulation_node import SimulationNode
 
         middleware.configure(large_messages=False)
-        self.config, self.channel, self.pipe = config, channel, pipe
+        self.config = config
+        self.channel = channel
+        self.pipe = pipe
         self.node = RobotNode(
-            ros_name(config.name), config.urdf, namespace=config.namespace, static_transforms=config.static_transforms,
-            controllers=config.controllers, imus=config.imus, wrenches=config.wrenches,
-            bunch_of_body=config.bunch_of_body, interest_radius=config.interest_radius, base=config.base,
-            clock=config.clock, params_file=config.params_file, parameters=config.parameters,
-        )  # fmt: skip
+            ros_name(config.name),
+            config.urdf,
+            namespace=config.namespace,
+            static_transforms=config.static_transforms,
+            controllers=config.controllers,
+            imus=config.imus,
+            wrenches=config.wrenches,
+            bunch_of_body=config.bunch_of_body,
+            interest_radius=config.interest_radius,
+            base=config.base,
+            clock=config.clock,
+            params_file=config.params_file,
+            parameters=config.parameters,
+        )
         self._requests: queue.SimpleQueue[SimulationRequest] = queue.SimpleQueue()
         self.simulation = None
         if config.clock:
@@ -185,7 +198,8 @@ class RosWorker:
 
     def _next_record(self) -> Any | None:
         """The next step to publish; None if none comes for a while, or subscribers are behind."""
-        steps, wanted = self.channel.steps, self.channel.wanted
+        steps = self.channel.steps
+        wanted = self.channel.wanted
         begin = time.monotonic()
         while steps.waiting_count and self.node.must_wait(now := time.monotonic()):
             wanted["waits"][0] = True
@@ -234,20 +248,24 @@ class RosWorker:
     def _publish_truth(self) -> None:
         """True poses of rigid bodies, and of the bunches that hang on their plants."""
         with self.channel.truth.reading() as truth:
-            version, memory = int(truth["version"][0]), self._rigid.memory
+            version = int(truth["version"][0])
+            memory = self._rigid.memory
             if memory is None or version != self._rigid.version:  # the list has not arrived: the next poses will do
                 return
-            now, attached = float(truth["time"][0]), np.flatnonzero(truth["attached"])
+            now = float(truth["time"][0])
+            attached = np.flatnonzero(truth["attached"])
             rigid_q = memory["visual_q"][: len(self._rigid.visuals)]
             poses = np.concatenate([rigid_q, truth["bunch_q"][attached]])
         if (named := (version, attached.tobytes())) != self._named:
             rigid = map(truth_frame, self._rigid.visuals)
-            self._named, self._truth_names = named, (*rigid, *(self._bunch_names[i] for i in attached))
+            self._named = named
+            self._truth_names = (*rigid, *(self._bunch_names[i] for i in attached))
         self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
         """Tell the client what is subscribed to, and now and then what was sent."""
-        wanted, now = self.channel.wanted, time.monotonic()
+        wanted = self.channel.wanted
+        now = time.monotonic()
         wanted["turns"][0] += 1
         wanted["goals"][0] = self.node.has_goals
         if now >= self._next_count:
@@ -264,9 +282,11 @@ class RosWorker:
 
     def _send_statistics(self) -> None:
         statistics: dict[str, Any] = {
-            "sent": self.node.sent, "dropped": self.node.dropped, "sound_lost": self._microphone.missed,
+            "sent": self.node.sent,
+            "dropped": self.node.dropped,
+            "sound_lost": self._microphone.missed,
             "commands_refused": self.node.refused_commands,
-        }  # fmt: skip
+        }
         self.pipe.send(("statistics", statistics))
 
 
@@ -296,7 +316,8 @@ class Pace:
         now = time.monotonic()
         if (passed := now - self._since) > self.PERIOD:
             rate = self.SPEED * (put_count - self._count) / passed
-            self._since, self._count = now, put_count
+            self._since = now
+            self._count = put_count
             self._interval = 1.0 / max(rate, self.LEAST)
         return max(self._due - now, 0.0)
 

@@ -94,9 +94,20 @@ class SensorProcess:
         self._is_overdue = False
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
-            name, model, description, scene.sun.direction, namespace, ros, keep_pictures, sensor_hz, renderer,
-            device, pacing=pacing or description.sensor_pacing, wind=wind_of(scene), params_file=params_file,
-        )  # fmt: skip
+            name,
+            model,
+            description,
+            scene.sun.direction,
+            namespace,
+            ros,
+            keep_pictures,
+            sensor_hz,
+            renderer,
+            device,
+            pacing=pacing or description.sensor_pacing,
+            wind=wind_of(scene),
+            params_file=params_file,
+        )
         self._pacing = config.pacing
         self._digests: dict[str, str] = {}
         self._counted = threading.Event()
@@ -104,10 +115,14 @@ class SensorProcess:
         self._frames = tuple(config.sensor_frames.values())
         self._parameters = config.parameters
         self.worker = WorkerProcess(
-            f"the sensor process of {name}", sensor_modules(ros), run_sensor_worker, config,
-            lambda context: SensorChannel(config, context), self._receive,
+            f"the sensor process of {name}",
+            sensor_modules(ros),
+            run_sensor_worker,
+            config,
+            lambda context: SensorChannel(config, context),
+            self._receive,
             rehearsal=SENSOR_REHEARSAL if standby else "",
-        )  # fmt: skip
+        )
         self._run: Run[SensorChannel] | None = None
         """The run of the process that snapshots were last written for."""
         self._visuals = VisualListSender()
@@ -119,7 +134,8 @@ class SensorProcess:
         Waits until the process has rendered a first picture of every sensor; :class:`WorkerError` if it fails. Without
         ``wait`` the client may step meanwhile, and the error comes from the step after the failure.
         """
-        self.client, self.robot = client, robot or client.robot
+        self.client = client
+        self.robot = robot or client.robot
         self._write(client)
         self._wake()
         if wait:
@@ -138,7 +154,8 @@ class SensorProcess:
 
         A process that is not ready, or has done nothing for three seconds, holds only the steps of lockstep.
         """
-        run, physics = self.worker.current(), self.client.physics
+        run = self.worker.current()
+        physics = self.client.physics
         wanted = run.shared.wanted
         if self.is_lockstep:
             is_behind = not self.worker.is_ready or run is not self._run or wanted["shown"][0] != self._snapshot_count
@@ -154,9 +171,11 @@ class SensorProcess:
             return ""
         if self._hold is None or self._hold.run is not run:
             self._hold = Hold(
-                run, self.worker.title, "simulated time goes on without its pictures",
+                run,
+                self.worker.title,
+                "simulated time goes on without its pictures",
                 lambda: cpu_use(run.process.pid or 0)[0],
-            )  # fmt: skip
+            )
         return "" if self._hold.is_over() and not self.is_lockstep else "sensors"
 
     @property
@@ -186,7 +205,8 @@ class SensorProcess:
 
     def _write(self, client: Client) -> None:
         """Write a snapshot of the world."""
-        physics, run = client.physics, self.worker.current()
+        physics = client.physics
+        run = self.worker.current()
         if run is not self._run:  # a new run knows nothing yet
             self._run = run
             self._visuals.close()

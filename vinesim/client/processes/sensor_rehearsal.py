@@ -13,7 +13,9 @@ from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
 
-SCENE, CAMERA, LIDAR = "demo", "d435", "vlp16"
+SCENE = "demo"
+CAMERA = "d435"
+LIDAR = "vlp16"
 SIZE = (64, 48)
 """Of the picture: it is the first call of each kernel that takes its time."""
 
@@ -21,11 +23,13 @@ SIZE = (64, 48)
 def rehearse() -> None:
     """Render with sensors of a small vineyard on the CPU, and release their memory."""
     load_kernels()
-    scene, spec = load_scene(SCENE), CameraSpec.load(CAMERA)
+    scene = load_scene(SCENE)
+    spec = CameraSpec.load(CAMERA)
     model = generate(scene)
     camera = Camera(spec, spec.info("camera", size=SIZE), "camera", scene.sun.direction)
     sensors = [ScheduledSensor(sensor, lambda _: None) for sensor in (camera, Lidar(LidarSpec.load(LIDAR), "lidar"))]
-    state, trees = State.at_rest(model), np.arange(len(model.tree_first))
+    state = State.at_rest(model)
+    trees = np.arange(len(model.tree_first))
     pose = frames.pose(np.array([0.0, 0.0, 1.0]))
     snapshot = Snapshot(0.0, 0, state.body_q, state.bunch_attached, (), np.zeros((0, 7)), trees)
     for _ in SensorScheduler(model, sensors).warm_up(snapshot, {sensor.name: pose for sensor in sensors}):

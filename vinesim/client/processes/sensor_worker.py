@@ -108,24 +108,37 @@ class SensorChannel:
     """What the client and the process share: the newest snapshot of the world, and what is wanted."""
 
     def __init__(self, config: SensorConfig, context: BaseContext) -> None:
-        model, sensors = config.model, len(config.sensor_frames)
-        bodies, trees, bunches = len(model.body_mass), len(model.tree_first), len(model.bunch_body)
+        model = config.model
+        sensors = len(config.sensor_frames)
+        bodies = len(model.body_mass)
+        trees = len(model.tree_first)
+        bunches = len(model.bunch_body)
         wires = len(wire_segments(model))
         self.snapshot = SharedSnapshot(
             {
-                "time": ((1,), "f8"), "frame_score": ((1,), "f8"),
-                "tick": ((1,), "i8"), "number": ((1,), "i8"),  # counts snapshots from 1
-                "visuals_version": ((1,), "i8"), "visual_count": ((1,), "i8"),
-                "body_q": ((bodies, 7), "f4"), "bunch_attached": ((bunches,), "?"),
-                "wire_count": ((1,), "i8"), "wire_segment": ((wires,), "i8"), "wire_q": ((wires, 7), "f4"),
+                "time": ((1,), "f8"),
+                "frame_score": ((1,), "f8"),
+                "tick": ((1,), "i8"),
+                "number": ((1,), "i8"),  # counts snapshots from 1
+                "visuals_version": ((1,), "i8"),
+                "visual_count": ((1,), "i8"),
+                "body_q": ((bodies, 7), "f4"),
+                "bunch_attached": ((bunches,), "?"),
+                "wire_count": ((1,), "i8"),
+                "wire_segment": ((wires,), "i8"),
+                "wire_q": ((wires, 7), "f4"),
                 "tree_number": ((trees,), "i8"),  # the snapshot in which each tree moved last
-                "wind_time": ((1,), "f8"), "wind_strength": ((1,), "f8"),  # 0: calm
-                "tree_air": ((trees, 3), "f4"), "tree_drawn": ((trees,), "f4"),
-                "pose_count": ((1,), "i8"), "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
-                "pose": ((POSE_HISTORY, sensors, 7), "f8"), "pose_world_offset": ((POSE_HISTORY,), "f8"),
+                "wind_time": ((1,), "f8"),
+                "wind_strength": ((1,), "f8"),  # 0: calm
+                "tree_air": ((trees, 3), "f4"),
+                "tree_drawn": ((trees,), "f4"),
+                "pose_count": ((1,), "i8"),
+                "pose_time": ((POSE_HISTORY,), "f8"),  # a ring of sensor poses
+                "pose": ((POSE_HISTORY, sensors, 7), "f8"),
+                "pose_world_offset": ((POSE_HISTORY,), "f8"),
             },
             context,
-        )  # fmt: skip
+        )
         self.wanted = SharedArrays(
             {"world": ((1,), "?"), "horizon": ((1,), "f8"), "factor": ((1,), "f8"), "shown": ((1,), "i8")}
         )
@@ -158,7 +171,9 @@ class SensorWorker:
         self, config: SensorConfig, channel: SensorChannel, pipe: Connection, stack: contextlib.ExitStack
     ) -> None:
         """Starts the node and the sensors in ``stack``."""
-        self.config, self.channel, self.pipe = config, channel, pipe
+        self.config = config
+        self.channel = channel
+        self.pipe = pipe
         self.frames_skipped = 0
         """Snapshots that could not be shown as their list of bodies had not arrived."""
         self._state = State.at_rest(config.model)
@@ -199,21 +214,27 @@ class SensorWorker:
     def _open_node(self, stack: contextlib.ExitStack) -> SensorNode:
         from vinesim.ros.sensor_node import SensorNode
 
-        config, description = self.config, self.config.description
+        config = self.config
+        description = self.config.description
         return stack.enter_context(
             SensorNode(
-                f"{ros_name(config.name)}_sensors", namespace=config.namespace,
-                cameras=[m.name for m in description.cameras], lidars=[m.name for m in description.lidars],
-                rates=self._rates(), params_file=config.params_file, parameters=config.parameters,
+                f"{ros_name(config.name)}_sensors",
+                namespace=config.namespace,
+                cameras=[m.name for m in description.cameras],
+                lidars=[m.name for m in description.lidars],
+                rates=self._rates(),
+                params_file=config.params_file,
+                parameters=config.parameters,
             )
-        )  # fmt: skip
+        )
 
     def _rates(self) -> dict[str, float]:
         """Rates of all sensors at the start [Hz]."""
         from vinesim.sensors.camera.camera import CameraSpec
         from vinesim.sensors.lidar.lidar import LidarSpec
 
-        given, description = self.config.sensor_hz, self.config.description
+        given = self.config.sensor_hz
+        description = self.config.description
         cameras = {m.name: given or m.rate or CameraSpec.load(m.type).rate.value for m in description.cameras}
         return cameras | {m.name: given or LidarSpec.load(m.type).rate.value for m in description.lidars}
 
@@ -233,14 +254,16 @@ class SensorWorker:
         self._awaits("kernels and scene")
         if device == "cpu":
             load_kernels()
-        config, sensors = self.config, []
+        config = self.config
+        sensors = []
         seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
         for i, mount in enumerate(config.description.cameras):
             spec = CameraSpec.load(mount.type)
             info = spec.info(mount.frame, size=mount.size)
             camera = Camera(spec, info, mount.name, config.sun, quality=mount.quality, seed=seed, device=device)
             wanted = self._camera_demand(mount.name, self._keeper if i == 0 else None)
-            rate, present = config.sensor_hz or mount.rate, self._present_rate(mount.name)
+            rate = config.sensor_hz or mount.rate
+            present = self._present_rate(mount.name)
             sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, rate, present))
         for mount in config.description.lidars:
             lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
@@ -358,7 +381,8 @@ class SensorWorker:
         with self.channel.snapshot.reading() as shared:
             if shared["number"][0] == self._last_number:
                 return None
-            memory, version = self._visuals.memory, int(shared["visuals_version"][0])
+            memory = self._visuals.memory
+            version = int(shared["visuals_version"][0])
             if memory is None or version != self._visuals.version:
                 self.frames_skipped += 1
                 self._missing_version = version
@@ -374,25 +398,37 @@ class SensorWorker:
             wind = None
             if self.config.wind is not None and shared["wind_strength"][0] > 0.0:
                 wind = WindState(
-                    self.config.wind, float(shared["wind_time"][0]), float(shared["wind_strength"][0]),
-                    shared["tree_air"].copy(), shared["tree_drawn"].copy(),
-                )  # fmt: skip
+                    self.config.wind,
+                    float(shared["wind_time"][0]),
+                    float(shared["wind_strength"][0]),
+                    shared["tree_air"].copy(),
+                    shared["tree_drawn"].copy(),
+                )
             self._state.bunch_attached[:] = shared["bunch_attached"]
             self._frame_score = float(shared["frame_score"][0])
             self._time = time = float(shared["time"][0])
             tick = int(shared["tick"][0])
             count = int(shared["pose_count"][0])
             rows = np.arange(max(self._pose_count, count - POSE_HISTORY), count) % POSE_HISTORY
-            times, poses = shared["pose_time"][rows], shared["pose"][rows]
+            times = shared["pose_time"][rows]
+            poses = shared["pose"][rows]
             offsets = shared["pose_world_offset"][rows]
             self._pose_count = count
         for t, offset in zip(times, offsets, strict=True):
             self._offsets.add(float(t), float(offset))
-        state, names = self._state, tuple(self.config.sensor_frames)
+        state = self._state
+        names = tuple(self.config.sensor_frames)
         snapshot = Snapshot(
-            time, tick, state.body_q, state.bunch_attached, self._visuals.visuals, visual_q,
-            np.flatnonzero(has_moved), wind, wire_poses,
-        )  # fmt: skip
+            time,
+            tick,
+            state.body_q,
+            state.bunch_attached,
+            self._visuals.visuals,
+            visual_q,
+            np.flatnonzero(has_moved),
+            wind,
+            wire_poses,
+        )
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 
     def _statistics(self) -> dict[str, Any]:

@@ -37,7 +37,8 @@ class SharedArrays:
 
     def _offsets(self) -> dict[str, int]:
         """First byte of each array, and of what would follow the last under the empty name."""
-        offsets, end = {}, 0
+        offsets = {}
+        end = 0
         for name, (shape, dtype) in self.layout.items():
             offsets[name] = end
             end += -(-math.prod(shape) * np.dtype(dtype).itemsize // _ALIGNMENT) * _ALIGNMENT
@@ -66,7 +67,8 @@ class SharedArrays:
         return {"layout": self.layout, "name": self._memory.name}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.layout, self._is_owner = state["layout"], False
+        self.layout = state["layout"]
+        self._is_owner = False
         self._memory = SharedMemory(name=state["name"])
         self._arrays = self._views()
 

@@ -32,20 +32,33 @@ class StepRecords:
         self._imus = tuple((mount.name, mount.frame) for mount in description.imus)
         self._wrenches = tuple((mount.name, mount.frame) for mount in description.wrenches)
         self._moving = description.moving_joints
-        joints, imus, wrenches = len(self.joints), len(self._imus), len(self._wrenches)
+        joints = len(self.joints)
+        imus = len(self._imus)
+        wrenches = len(self._wrenches)
         shapes = (
-            *(((joints,),) * 6), (7,), (6,), (7,), (6,), (2, 3, 3), *(((10,),) * imus), *(((6,),) * wrenches),
-        )  # fmt: skip
+            *(((joints,),) * 6),
+            (7,),
+            (6,),
+            (7,),
+            (6,),
+            (2, 3, 3),
+            *(((10,),) * imus),
+            *(((6,),) * wrenches),
+        )
         ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
         self._parts = tuple((slice(e - math.prod(shape), e), shape) for e, shape in zip(ends, shapes, strict=True))
         """Place in ``state`` and shape of each part of it, in the order in which :meth:`write` puts them there."""
         self._body_sensors_start = ends[10]
         self.dtype = np.dtype(
             [
-                ("time", "f8"), ("has_state", "?"), ("has_body_sensors", "?"), ("contact_count", "i4"),
-                ("state", "f8", (ends[-1],)), ("contacts", _CONTACT, (MAX_CONTACTS,)),
+                ("time", "f8"),
+                ("has_state", "?"),
+                ("has_body_sensors", "?"),
+                ("contact_count", "i4"),
+                ("state", "f8", (ends[-1],)),
+                ("contacts", _CONTACT, (MAX_CONTACTS,)),
             ]
-        )  # fmt: skip
+        )
 
     def write(self, record: Any, time: float, sample: RobotSample | None) -> int:
         """Fill a record: the time [s], and the state unless None. Returns the number of contacts left out.
@@ -58,9 +71,18 @@ class StepRecords:
         joints = sample.joints
         desired: JointSample | JointReference = joints if sample.reference is None else sample.reference
         parts = [
-            joints.position, joints.velocity, joints.effort, joints.contact, desired.position, desired.velocity,
-            sample.base_q, sample.base_qd, sample.odom_q, sample.odom_qd, sample.odom_covariance.ravel(),
-        ]  # fmt: skip
+            joints.position,
+            joints.velocity,
+            joints.effort,
+            joints.contact,
+            desired.position,
+            desired.velocity,
+            sample.base_q,
+            sample.base_qd,
+            sample.odom_q,
+            sample.odom_qd,
+            sample.odom_covariance.ravel(),
+        ]
         has_body_sensors = bool(sample.imus or sample.wrenches)  # they are read when they have subscribers
         if has_body_sensors:
             for imu in sample.imus:
@@ -82,27 +104,41 @@ class StepRecords:
 
     def read(self, record: Any) -> RobotSample:
         """The state in a record that has one."""
-        now, state = float(record["time"]), record["state"]
+        now = float(record["time"])
+        state = record["state"]
         parts = [state[place].reshape(shape) for place, shape in self._parts]
         position, velocity, effort, contact, desired, desired_velocity = parts[:6]
         base_q, base_qd, odom_q, odom_qd, covariance = parts[6:11]
         joints = JointSample(now, self.joints, position, velocity, effort, contact)
         rows = record["contacts"][: int(record["contact_count"])]
         contacts = tuple(
-            Contact(self.actor, self.links[row["link"]] if row["link"] >= 0 else "", int(row["body"]), row["position"],
-                    row["force"], float(row["distance"]))
+            Contact(
+                self.actor,
+                self.links[row["link"]] if row["link"] >= 0 else "",
+                int(row["body"]),
+                row["position"],
+                row["force"],
+                float(row["distance"]),
+            )
             for row in rows
-        )  # fmt: skip
+        )
         first_wrench = 11 + len(self._imus)
-        imus, wrenches = parts[11:first_wrench], parts[first_wrench:]
+        imus = parts[11:first_wrench]
+        wrenches = parts[first_wrench:]
         read = slice(None if record["has_body_sensors"] else 0)
         deflection = effort / self.series_stiffness
         return RobotSample(
-            self.actor, joints, base_q, base_qd, odom_q, odom_qd, covariance, self.transforms,
-            self._moving.poses(position), contacts,
-            elements=ElasticSample(
-                now, self.joints, self.series_stiffness, position + deflection, deflection, effort
-            ),
+            self.actor,
+            joints,
+            base_q,
+            base_qd,
+            odom_q,
+            odom_qd,
+            covariance,
+            self.transforms,
+            self._moving.poses(position),
+            contacts,
+            elements=ElasticSample(now, self.joints, self.series_stiffness, position + deflection, deflection, effort),
             wrenches=tuple(
                 Wrench(now, name, frame, row[:3], row[3:])
                 for (name, frame), row in zip(self._wrenches[read], wrenches[read], strict=True)
@@ -112,4 +148,4 @@ class StepRecords:
                 for (name, frame), row in zip(self._imus[read], imus[read], strict=True)
             ),
             reference=JointReference(desired, desired_velocity),
-        )  # fmt: skip
+        )

@@ -77,11 +77,14 @@ class IdleTime:
 
     def __init__(self, pid: int) -> None:
         self.seconds = 0.0
-        self._pid, self._used, self._looked = pid, 0.0, time.monotonic()
+        self._pid = pid
+        self._used = 0.0
+        self._looked = time.monotonic()
 
     def end(self) -> None:
         """The process has done something."""
-        self.seconds, self._looked = 0.0, time.monotonic()
+        self.seconds = 0.0
+        self._looked = time.monotonic()
 
     def look(self) -> float:
         """Add the time since the last look; the sum."""
@@ -89,7 +92,8 @@ class IdleTime:
         passed = min(now - self._looked, 1.0)
         used, wants_cpu = cpu_use(self._pid)
         self.seconds += min(used - self._used, passed) if wants_cpu else passed
-        self._used, self._looked = used, now
+        self._used = used
+        self._looked = now
         return self.seconds
 
 
@@ -149,7 +153,8 @@ class Run(Generic[S]):
 
     def __init__(self, spawned: SpawnedProcess, target: Callable[..., None], config: Any, shared: S) -> None:
         self.shared = shared
-        self.pipe, self.process = spawned.pipe, spawned.process
+        self.pipe = spawned.pipe
+        self.process = spawned.process
         self.ready_since: float | None = None
         """Time at which the process was ready [s]."""
         spawned.run(target, config, shared)
@@ -182,7 +187,9 @@ class Hold:
         """``progress()`` changes whenever the process has done something. ``consequence``: what follows if it does
         nothing for :data:`HOLD_TIMEOUT`, for the log."""
         self.run = run
-        self._title, self._consequence, self._progress = title, consequence, progress
+        self._title = title
+        self._consequence = consequence
+        self._progress = progress
         self._idle = IdleTime(run.process.pid or 0)
         self._seen = progress()
         self._next_look = 0.0
@@ -221,17 +228,27 @@ class WorkerProcess(Generic[S]):
     """
 
     def __init__(
-        self, title: str, modules: Sequence[str], target: Callable[..., None], config: Any,
-        share: Callable[[BaseContext], S], receive: Callable[[str, Any], None],
-        *, rehearsal: str = "",
-    ) -> None:  # fmt: skip
+        self,
+        title: str,
+        modules: Sequence[str],
+        target: Callable[..., None],
+        config: Any,
+        share: Callable[[BaseContext], S],
+        receive: Callable[[str, Any], None],
+        *,
+        rehearsal: str = "",
+    ) -> None:
         self.title = title
         self.restarts = 0
         """How often the process was started again."""
         self.restart_time = 0.0
         """From the start of the last further run until it was ready [s]."""
-        self._modules, self._target, self._config = modules, target, config
-        self._share, self._receive, self._rehearsal = share, receive, rehearsal
+        self._modules = modules
+        self._target = target
+        self._config = config
+        self._share = share
+        self._receive = receive
+        self._rehearsal = rehearsal
         self._standby: SpawnedProcess | None = None
         self._standby_due = 0.0
         """When another process may stand by, at the earliest [s]."""
@@ -250,7 +267,8 @@ class WorkerProcess(Generic[S]):
     def current(self) -> Run[S]:
         """The run to share memory with; call it in one thread only, as memory of a former run is released here."""
         if self._newest is not self._current:
-            former, self._current = self._current, self._newest
+            former = self._current
+            self._current = self._newest
             former.shared.close()
         return self._current
 
@@ -307,7 +325,8 @@ class WorkerProcess(Generic[S]):
 
     def _start(self) -> Run[S]:
         """A run by the process that stands by, or by a new one."""
-        shared, standby = self._share(CONTEXT), self._standby
+        shared = self._share(CONTEXT)
+        standby = self._standby
         self._standby = None
         if standby is not None:
             standby.look()
@@ -340,7 +359,8 @@ class WorkerProcess(Generic[S]):
         while True:
             run = self._newest
             reason = self._serve(run)
-            was_ready, run.ready_since = run.ready_since, None
+            was_ready = run.ready_since
+            run.ready_since = None
             run.end()
             if self._closing.is_set():
                 return

@@ -24,8 +24,10 @@ class Trace:
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
         # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
-        self._clock, self._time = np.full(capacity, 0.0), np.full(capacity, 0.0)
-        self._force, self._position = np.full((capacity, 3), 0.0), np.full((capacity, 3), 0.0)
+        self._clock = np.full(capacity, 0.0)
+        self._time = np.full(capacity, 0.0)
+        self._force = np.full((capacity, 3), 0.0)
+        self._position = np.full((capacity, 3), 0.0)
         self._is_remote = np.full(capacity, False)
         self.length = 0
 

@@ -64,7 +64,8 @@ class Recorder:
 
         ``digest``: of the scene to record; without one that of the first actor. ``clock``: own clock [s].
         """
-        self.bus, self.recording = bus, recording
+        self.bus = bus
+        self.recording = recording
         self.digest = digest
         self.observers: set[str] = set()
         """Names of the own observers: they are no part of the recording."""
@@ -72,7 +73,9 @@ class Recorder:
         """Hellos of the actors, by name."""
         self.malformed = 0
         """Messages that were recorded but cannot be decoded."""
-        self._families, self._everything, self._clock = frozenset(only), everything, clock
+        self._families = frozenset(only)
+        self._everything = everything
+        self._clock = clock
         now = clock()
         self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._is_subscribed = False
@@ -256,7 +259,8 @@ def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, 
     x0, y0, x1, y1 = area
     if not (all(map(math.isfinite, area)) and x0 < x1 and y0 < y1):
         raise AreaTooLarge(f"area {x0:g} {y0:g} {x1:g} {y1:g}: give X0 Y0 X1 Y1 [m] with X0 < X1 and Y0 < Y1")
-    columns, rows = math.ceil((x1 - x0) / OBSERVER_SPACING), math.ceil((y1 - y0) / OBSERVER_SPACING)
+    columns = math.ceil((x1 - x0) / OBSERVER_SPACING)
+    rows = math.ceil((y1 - y0) / OBSERVER_SPACING)
     if columns * rows > MAX_OBSERVERS:
         raise AreaTooLarge(
             f"an area of {x1 - x0:g} x {y1 - y0:g} m needs {columns * rows} who stand in it, at most {MAX_OBSERVERS}: "

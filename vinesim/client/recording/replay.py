@@ -140,7 +140,8 @@ class ReplayBus:
         self.name = name
         self.bytes_in = 0
         self._playhead = Playhead(recording, start, end)
-        self._begun, self._played = self._playhead.time, 0.0
+        self._begun = self._playhead.time
+        self._played = 0.0
         self._store = SampleStore()
         self._subscriptions: list[_Subscription] = []
         self._answers: list[Reply] = []
@@ -204,7 +205,8 @@ class ReplayBus:
                     self._reply(f"snap/{x}/{y}", messages.encode_records(part))
 
     def replies(self) -> list[Reply]:
-        answers, self._answers = self._answers, []
+        answers = self._answers
+        self._answers = []
         return answers
 
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
@@ -235,7 +237,9 @@ class _Subscription:
     """See :class:`vinesim.net.transport.bus.Subscription`."""
 
     def __init__(self, among: list[_Subscription], pattern: str, depth: int) -> None:
-        self.pattern, self.depth, self._among = pattern, depth, among
+        self.pattern = pattern
+        self.depth = depth
+        self._among = among
 
     def close(self) -> None:
         if self in self._among:
@@ -263,7 +267,8 @@ def _split_records(records: list[messages.RetainedRecord]) -> Iterable[list[mess
         size += 64 + 4 * len(record.cut) + len(record.trees)
         if size > MAX_REPLY:
             yield part
-            part, size = [], 0
+            part = []
+            size = 0
     if part or not records:
         yield part
 
@@ -275,15 +280,24 @@ class Replay:
     """Replays a recording to a network; each actor has a live bus of its own. Call :meth:`step` often."""
 
     def __init__(
-        self, recording: Recording, bus: Bus, live_bus: Callable[[str], Bus], now: float, *,
-        speed: float = 1.0, start: float = 0.0, end: float | None = None,
-    ) -> None:  # fmt: skip
+        self,
+        recording: Recording,
+        bus: Bus,
+        live_bus: Callable[[str], Bus],
+        now: float,
+        *,
+        speed: float = 1.0,
+        start: float = 0.0,
+        end: float | None = None,
+    ) -> None:
         """``bus`` is not live: it queries the clock. ``live_bus(name)`` opens the bus of an actor, also of an absent
         one while its retained records are published. ``now`` is any clock [s], as in :meth:`step`."""
         self.playhead = Playhead(recording, start, end)
         self.sent = 0
         """Messages that had a subscriber."""
-        self._bus, self._live_bus, self._speed = bus, live_bus, speed
+        self._bus = bus
+        self._live_bus = live_bus
+        self._speed = speed
         self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._buses: dict[str, Bus] = {}
         self._absent: dict[str, Bus] = {}

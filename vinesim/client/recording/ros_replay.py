@@ -22,7 +22,8 @@ class RosReplay:
     """Publishes after every step of a client; ``time`` gives that of the recording [s]."""
 
     def __init__(self, client: Client, node: WorldNode, time: Callable[[], float]) -> None:
-        self._node, self._time = node, time
+        self._node = node
+        self._time = time
         self._period = max(round(ENVIRONMENT_PERIOD / client.physics.dt), 1)
         self._named: tuple[tuple[str, ...], bytes] | None = None
         self._names: tuple[str, ...] = ()
@@ -50,6 +51,7 @@ class RosReplay:
         attached = np.flatnonzero(physics.state.bunch_attached)
         rigid = tuple(truth_frame(visuals[i]) for i in rows)
         if (named := (rigid, attached.tobytes())) != self._named:
-            self._named, self._names = named, (*rigid, *(f"bunch_{i:05d}" for i in attached))
+            self._named = named
+            self._names = (*rigid, *(f"bunch_{i:05d}" for i in attached))
         bunches = physics.state.body_q[client.model.bunch_body[attached]]
         self._node.publish_environment(time, self._names, np.concatenate([physics.visual_q()[rows], bunches]))

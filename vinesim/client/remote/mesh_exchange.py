@@ -50,7 +50,8 @@ class _RobotMeshes:
         """None when :attr:`missing` is known."""
         self.missing: set[str] = set()
         self.received: dict[str, np.ndarray] = {}
-        self.retry_period, self.retry_at = RETRY_PERIOD, 0.0
+        self.retry_period = RETRY_PERIOD
+        self.retry_at = 0.0
         """Time from one round to the next [s], and when that is due (monotonic clock)."""
         self.is_changed = False
         """Meshes were received that :meth:`MeshExchange.changed` has not reported."""
@@ -75,7 +76,8 @@ class MeshExchange:
         self._changed: collections.deque[str] = collections.deque()
         self._refused: set[str] = set()
         self._lock = threading.Lock()
-        self._wakeup, self._closing = threading.Event(), threading.Event()
+        self._wakeup = threading.Event()
+        self._closing = threading.Event()
         self._thread: threading.Thread | None = None
 
     # ------------------------------------------------------------ called by the loop
@@ -183,7 +185,8 @@ class MeshExchange:
             robots = dict(self._robots)
         for name, robot in robots.items():
             if robot.urdf is not None:
-                robot.missing, robot.urdf = set(list_meshes(robot.urdf)), None
+                robot.missing = set(list_meshes(robot.urdf))
+                robot.urdf = None
             if time.monotonic() < robot.retry_at:
                 continue
             progress = False
@@ -242,7 +245,8 @@ def _ask(bus: Bus, part: MeshPart) -> messages.MeshWanted | None:
 
 def _fetch(bus: Bus, digest: str, is_closing: Callable[[], bool]) -> bytes:
     """A mesh from the server, part by part; :class:`_Missing`, or :class:`MessageError` if it has another digest."""
-    arrived, size = bytearray(), 1
+    arrived = bytearray()
+    size = 1
     while len(arrived) < size:
         if is_closing():
             raise _Missing

@@ -46,7 +46,9 @@ class ObjectSync:
     ) -> None:
         """``local_actors``: the names of all actors that this client simulates; ``is_present(name)``: whether another
         actor is in the world now."""
-        self.physics, self._local_actors, self._is_present = physics, local_actors, is_present
+        self.physics = physics
+        self._local_actors = local_actors
+        self._is_present = is_present
         self._remote_updates: dict[int, ObjectUpdate] = {}
         """Objects that remote actors move now."""
         self._resting: dict[int, RetainedRecord] = {}
@@ -89,7 +91,8 @@ class ObjectSync:
             if known is None or (holds, known[0].claim) == (True, record.claim) or wins(record.claim, known[0].claim):
                 newest.pop(record.object, None)
                 newest[record.object] = record, holds
-        dormant, trees = [], []
+        dormant = []
+        trees = []
         for record, holds in newest.values():
             if is_tree(record.object):
                 trees += self._apply_tree_record(record) if holds and record.trees else []
@@ -101,9 +104,11 @@ class ObjectSync:
             bunches = [split_object_id(record.object)[1] for record in dormant]
             self._changed_trees.update(self._tree_of(bunch) for bunch in bunches)
             self.physics.dormant_bunches.add(
-                bunches, [record.parent for record in dormant], np.array([record.pose for record in dormant]),
+                bunches,
+                [record.parent for record in dormant],
+                np.array([record.pose for record in dormant]),
                 np.array([record.place or record.pose for record in dormant]),
-            )  # fmt: skip
+            )
 
     def _apply_object_record(self, record: RetainedRecord, holds: bool) -> bool:
         """Put a box or a bunch where a record says; True if it is a bunch that has no body here and needs none yet."""
@@ -126,7 +131,8 @@ class ObjectSync:
     def _let_fall(self, record: RetainedRecord, *, is_known: bool) -> None:
         """Let a box or a bunch move from where a record says; one with a body stays where it is if that ``is_known``
         better than from the record."""
-        number, tracker = record.object, self.physics.support_tracker
+        number = record.object
+        tracker = self.physics.support_tracker
         self._clear_resting(number)
         known_place = np.array(record.pose if record.place is None else record.place)
         pose, velocity = tracker.to_world(record.parent, np.array(record.pose)) or (known_place, np.zeros(6))
@@ -251,7 +257,8 @@ class ObjectSync:
     def blend_tree(self, update: TreeUpdate, blend: float, rate_blend: float = 1.0) -> None:
         """Move a tree, and what was cut off it, towards its owner's state by the share ``blend`` (0 to 1), its rates
         by ``rate_blend``."""
-        plants, state = self.physics.plants, self.physics.state
+        plants = self.physics.plants
+        state = self.physics.state
         first = int(self.physics.model.tree_first[update.tree])
         for body, x, xd in zip((first + update.root).tolist(), update.root_x, update.root_xd, strict=True):
             if not state.body_cut[body]:
@@ -292,7 +299,8 @@ class ObjectSync:
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
         """All that moves and that a local actor touches, itself or by an object of ``mine``, or that slips off it."""
-        tracker, touched = self.physics.support_tracker, self.physics.touched
+        tracker = self.physics.support_tracker
+        touched = self.physics.touched
         found: set[int] = set()
         if moving := tracker.moving:
             found = {number for number in moving if self._supporting_actor(number) == name}
@@ -340,7 +348,8 @@ class ObjectSync:
         """State of an object, as :meth:`Replicator.send` takes it."""
         if not is_tree(number):
             return self.physics.support_tracker.object_state(number)
-        here, state = self.physics.model.bodies_of(number), self.physics.state
+        here = self.physics.model.bodies_of(number)
+        state = self.physics.state
         return state.joint_q[here], state.joint_qd[here]
 
     def cut_roots(self, tree: int) -> DetachedRoots:
@@ -348,7 +357,8 @@ class ObjectSync:
         bodies = self._cut_bodies.get(tree)
         if not bodies:
             return NO_ROOTS
-        state, first = self.physics.state, int(self.physics.model.tree_first[tree])
+        state = self.physics.state
+        first = int(self.physics.model.tree_first[tree])
         return np.array(bodies) - first, state.joint_x[bodies].astype(float), state.joint_xd[bodies].astype(float)
 
     def is_changed(self, tree: int) -> bool:

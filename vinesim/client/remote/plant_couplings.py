@@ -63,7 +63,8 @@ class PlantCouplings:
 
     def of_actor(self, actor: str, trees: Collection[int]) -> list[Coupling]:
         """Couplings [N] of a local actor's contacts of the last step with ``trees``."""
-        model, found = self.physics.model, {}
+        model = self.physics.model
+        found = {}
         for contact in self.physics.contacts if trees else ():
             if contact.actor == actor and int(model.body_tree[contact.body]) in trees:
                 found.setdefault(self._carrier(contact.body), []).append(contact)

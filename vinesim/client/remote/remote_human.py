@@ -13,7 +13,8 @@ class RemoteHuman:
 
     def __init__(self, rigid: RigidWorld, name: str) -> None:
         """``name`` of a person who was added to ``rigid`` already; see :func:`human_spec`."""
-        self.rigid, self.name = rigid, name
+        self.rigid = rigid
+        self.name = name
         self.intention = ""
         """What the person indicates to do."""
         self.pose: HumanPose | None = None
@@ -22,7 +23,8 @@ class RemoteHuman:
     def follow(self, update: HumanUpdate) -> None:
         """Be where ``update`` says at the end of the coming step."""
         self.rigid.move_human(self.name, update.pose)
-        self.intention, self.pose = update.intention, update.pose
+        self.intention = update.intention
+        self.pose = update.pose
 
     def remove(self) -> None:
         """Remove the copy."""

@@ -57,7 +57,8 @@ class RemoteSpawner:
         self._outdated: set[str] = set()
         """Robots of which meshes have arrived since their last compilation began."""
         self._renewing: concurrent.futures.Future[Prepared] | None = None
-        self.rigid, self.own = rigid, own
+        self.rigid = rigid
+        self.own = own
         self._executor = executor
         self._enqueued: dict[str, Hello] = {}
         self._leaving: dict[str, RemoteRobot | RemoteHuman] = {}
@@ -88,7 +89,8 @@ class RemoteSpawner:
 
     def removed(self) -> list[str]:
         """Actors whose copies were removed since the last call."""
-        names, self._removed = self._removed, []
+        names = self._removed
+        self._removed = []
         return names
 
     def spawn(self, updates: Mapping[str, RobotUpdate | HumanUpdate]) -> dict[str, RemoteRobot | RemoteHuman]:
@@ -107,7 +109,8 @@ class RemoteSpawner:
             self._compiling = self._submit(lambda: self._prepare(arrived, without))
         if not self._compiling.done():
             return {}
-        done, self._compiling = self._compiling, None
+        done = self._compiling
+        self._compiling = None
         prepared = done.result()
         for hello, error in prepared.refused:
             if self._enqueued.get(hello.name) is hello:
@@ -151,7 +154,8 @@ class RemoteSpawner:
             self._renewing = self._submit(lambda: self._prepare_again(hellos))
         if not self._renewing.done():
             return []
-        done, self._renewing = self._renewing, None
+        done = self._renewing
+        self._renewing = None
         prepared = done.result()
         for hello, error in prepared.refused:
             log.warning("the meshes of %s cannot be used, boxes stay in their place: %s", hello.name, error)
@@ -171,7 +175,10 @@ class RemoteSpawner:
 
     def _prepare_again(self, hellos: list[Hello]) -> Prepared:
         """Compile a world in which robots that are here have the meshes that were received."""
-        specs, actors, refused, world = [], [], [], None
+        specs = []
+        actors = []
+        refused = []
+        world = None
         for hello in hellos:
             try:
                 description = resolve_description(hello, self.own, self.meshes.received(hello.name))
@@ -210,7 +217,8 @@ class RemoteSpawner:
                     fine.append(one)
                 except ValueError as error:
                     refused.append((one[0], error))
-            loaded, world = fine, self._compile(fine, without) if fine or without else None
+            loaded = fine
+            world = self._compile(fine, without) if fine or without else None
         return Prepared(tuple((hello, description) for hello, description, _ in loaded), tuple(refused), world)
 
     def _compile(

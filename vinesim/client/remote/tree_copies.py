@@ -42,7 +42,8 @@ class TreeCopies:
     """
 
     def __init__(self, physics: Physics, objects: ObjectSync) -> None:
-        self.physics, self.objects = physics, objects
+        self.physics = physics
+        self.objects = objects
         self._copies: dict[int, _Copy] = {}
 
     def __contains__(self, tree: int) -> bool:
@@ -66,7 +67,8 @@ class TreeCopies:
 
         ``coupled_trees``: those that couplings of other clients hold here.
         """
-        solver, copies = self.physics.contact_solver, self._copies
+        solver = self.physics.contact_solver
+        copies = self._copies
         for update in updates:
             if (copy := copies.get(update.tree)) is None:
                 self.physics.plants.wake(update.tree)
@@ -74,7 +76,8 @@ class TreeCopies:
                 solver.remote_trees[update.tree] = True
                 copies[update.tree] = _Copy(update, False, np.zeros((len(update.joint_q), 3)))
             else:
-                copy.update, copy.is_new = update, True
+                copy.update = update
+                copy.is_new = True
         for tree in [tree for tree in copies if not is_owned_remotely(tree)]:
             update = copies.pop(tree).update
             solver.remote_trees[tree] = solver.trees_touched_by_copies[tree] = False
@@ -90,7 +93,8 @@ class TreeCopies:
 
     def _correct(self, copy: _Copy, now: float, touching: set[str], local_actors: Collection[str]) -> None:
         """Correct one copy, which actors and objects named ``touching`` pressed in the last step."""
-        update, objects = copy.update, self.objects
+        update = copy.update
+        objects = self.objects
         if update.owner in touching or any(parse_object_name(name) is not None for name in touching):
             copy.pressed_at = now
         is_pressed = now - copy.pressed_at <= CONTACT_MEMORY

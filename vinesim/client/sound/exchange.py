@@ -106,7 +106,8 @@ class _Speaker:
 
         None: it is one too many, of a page that stood still and sends all at once.
         """
-        began, expected = now - FRAME, self.next_time.get(is_main, -np.inf)
+        began = now - FRAME
+        expected = self.next_time.get(is_main, -np.inf)
         if RESTART <= expected - began < RESET:
             return None
         time = expected if abs(expected - began) < RESTART else began
@@ -190,7 +191,8 @@ class SoundExchange:
     def _exchange(self) -> None:
         """Send what was said, and hand on what has arrived."""
         is_open = any(listener.is_open for _, listener in self._listeners)
-        was_open, self._was_open = self._was_open, is_open
+        was_open = self._was_open
+        self._was_open = is_open
         if not (is_open or was_open or self._speakers or self._loudspeakers):
             return
         client = self._client
@@ -201,16 +203,18 @@ class SoundExchange:
         for actor, replicator in client.replicators.items():
             open_ = [one for name, one in self._listeners if name == actor and one.is_open]
             voices = replicator.voices
-            voices.listens, voices.decodes_opus = bool(open_), all(one.decodes_opus for one in open_)
+            voices.listens = bool(open_)
+            voices.decodes_opus = all(one.decodes_opus for one in open_)
             frames = [Spoken(heard.speaker.name, heard.frame, heard.place) for heard in voices.take()]
             if not open_:
                 continue
             setting = replicator.bus.spectators_speak_to
             frames += [
-                one for one in said
+                one
+                for one in said
                 if one.speaker != actor
                 and may_hear(client.replicators[one.speaker].hello.kind, replicator.hello.kind, setting)
-            ]  # fmt: skip
+            ]
             step = SoundStep(now, to_world, frames, [tone for tone in tones if tone.source != actor])
             for listener in open_:
                 listener.hear(step)
@@ -239,7 +243,8 @@ class SoundExchange:
 
     def _tones(self) -> list[Tone]:
         """Tones of all robots whose lights sound."""
-        client, tones = self._client, []
+        client = self._client
+        tones = []
         time = client.physics.time + client.world_time.offset
         for name, actor in (*client.robots.items(), *client.remote_actors.items()):
             if isinstance(actor, RobotInstance) and actor.lights.has_sound:

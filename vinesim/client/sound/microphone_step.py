@@ -34,7 +34,8 @@ def at_place(step: SoundStep, place: np.ndarray) -> MicrophoneStep:
 
     heard = ((spoken.speaker, spoken.frame, loudness(spoken.place)) for spoken in step.frames)
     return MicrophoneStep(
-        step.now, step.to_world,
+        step.now,
+        step.to_world,
         tuple(
             HeardFrame(speaker, frame.number, frame.time, frame.codec, frame.data, level)
             for speaker, frame, level in heard
@@ -44,4 +45,4 @@ def at_place(step: SoundStep, place: np.ndarray) -> MicrophoneStep:
             (tone.source, tone.frequency, TONE_LEVEL * loudness(tone.place) if tone.frequency else 0.0)
             for tone in step.tones
         ),
-    )  # fmt: skip
+    )

@@ -29,7 +29,8 @@ from vinesim.ros.commands.types import (
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import HumanSpec, RigidBox
 
-BOX_SIZE, BOX_MASS = (0.6, 0.4, 0.24), 1.6
+BOX_SIZE = (0.6, 0.4, 0.24)
+BOX_MASS = 1.6
 """[m] outer size and [kg] mass of a spawned crate, as a composed scene has them."""
 PERSON_HEIGHT = 1.75
 """[m]"""
@@ -38,22 +39,29 @@ BUNCH_REACH = 0.35
 MAX_DISTANCE = 10_000.0
 """[m] Poses further from the origin are refused: single precision would not resolve a millimetre there."""
 _UNKNOWN = np.full(6, np.nan)
-_BOX_URI, _PERSON_URI, _BUNCH_URI = "vinesim:box", "vinesim:person", "vinesim:bunch"
+_BOX_URI = "vinesim:box"
+_PERSON_URI = "vinesim:person"
+_BUNCH_URI = "vinesim:bunch"
 _SPAWNABLES = (
     Spawnable(
-        _BOX_URI, "an empty harvest crate of 60 x 40 x 24 cm; its pose is that of its underside's middle",
-        (-0.3, -0.2, 0.0), (0.3, 0.2, 0.24),
+        _BOX_URI,
+        "an empty harvest crate of 60 x 40 x 24 cm; its pose is that of its underside's middle",
+        (-0.3, -0.2, 0.0),
+        (0.3, 0.2, 0.24),
     ),
     Spawnable(
-        _PERSON_URI, "a person of 1.75 m who stands; x, y and yaw of the pose count",
-        (-0.3, -0.4, 0.0), (0.5, 0.4, 1.75),
+        _PERSON_URI,
+        "a person of 1.75 m who stands; x, y and yaw of the pose count",
+        (-0.3, -0.4, 0.0),
+        (0.5, 0.4, 1.75),
     ),
     Spawnable(
         _BUNCH_URI,
         f"the bunch that hangs furthest from all robots, taken off its vine; {_BUNCH_URI}/17 takes bunch 17",
-        (-BUNCH_REACH, -BUNCH_REACH, -BUNCH_REACH), (BUNCH_REACH, BUNCH_REACH, BUNCH_REACH),
+        (-BUNCH_REACH, -BUNCH_REACH, -BUNCH_REACH),
+        (BUNCH_REACH, BUNCH_REACH, BUNCH_REACH),
     ),
-)  # fmt: skip
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -87,7 +95,9 @@ class WorldEditor:
     def entities(self) -> Iterator[Entity]:
         """Robots, people, boxes and bunches as this client has them."""
         client = self._client
-        physics, rigid, tracker = client.physics, client.physics.rigid, client.physics.support_tracker
+        physics = client.physics
+        rigid = client.physics.rigid
+        tracker = client.physics.support_tracker
         physics.update_kinematics()
         for name in sorted(rigid.actors):
             if name in client.humans or isinstance(client.remote_actors.get(name), RemoteHuman):
@@ -104,13 +114,17 @@ class WorldEditor:
         yield from self._bunches(given)
 
     def _bunches(self, given: dict[tuple[EntityCategory, int], str]) -> Iterator[Entity]:
-        physics, model = self._client.physics, self._client.model
-        tracker, attached = physics.support_tracker, physics.state.bunch_attached
+        physics = self._client.physics
+        model = self._client.model
+        tracker = physics.support_tracker
+        attached = physics.state.bunch_attached
         dormant = {one.index: row for row, one in enumerate(physics.dormant_bunches.visuals())}
         dormant_q = physics.dormant_bunches.visual_q()
         for bunch in range(len(attached)):
-            body, number = model.bunch_body[bunch], object_id(ObjectKind.BUNCH, bunch)
-            name, frame = f"bunch_{bunch:05d}", f"picked_bunch_{bunch:05d}"
+            body = model.bunch_body[bunch]
+            number = object_id(ObjectKind.BUNCH, bunch)
+            name = f"bunch_{bunch:05d}"
+            frame = f"picked_bunch_{bunch:05d}"
             if attached[bunch]:
                 state = physics.state.body_q[body].astype(float), physics.state.body_qd[body].astype(float)
                 yield Entity(
@@ -155,7 +169,8 @@ class WorldEditor:
         """Remove a box, a loose bunch, or a person that was spawned."""
         self._require_alone("deletes nothing")
         entity, number = self._movable(name)
-        client, rigid = self._client, self._client.physics.rigid
+        client = self._client
+        rigid = self._client.physics.rigid
         if entity.category is EntityCategory.ROBOT:
             raise RequestRefused(Refusal.UNSUPPORTED, f"robot {name!r} stays: end its client instead")
         if entity.category is EntityCategory.HUMAN:
@@ -173,7 +188,8 @@ class WorldEditor:
         self._require_alone("moves nothing by services")
         entity, number = self._movable(given.name)
         pose = _checked_pose(given.pose)
-        client, rigid = self._client, self._client.physics.rigid
+        client = self._client
+        rigid = self._client.physics.rigid
         if entity.category is EntityCategory.ROBOT:
             rigid.place_robot(given.name, _upright(pose), rigid.joint_state(given.name)[0].copy())
             client.robots[given.name].stop()
@@ -198,7 +214,8 @@ class WorldEditor:
             raise RequestRefused(
                 Refusal.INCORRECT_STATE, f"what {script} has begun cannot begin anew; start without it"
             )
-        spawned, self._spawned = self._spawned, {}
+        spawned = self._spawned
+        self._spawned = {}
         for name, one in spawned.items():
             if one.kind is EntityCategory.HUMAN:
                 self._client.remove_human(name)
@@ -248,7 +265,8 @@ class WorldEditor:
 
     def _bunch_to_spawn(self, number: str) -> int:
         """The bunch of a URI, which must hang on its vine."""
-        physics, model = self._client.physics, self._client.model
+        physics = self._client.physics
+        model = self._client.model
         attached = physics.state.bunch_attached
         if number:
             if not (number.isdecimal() and len(number) < 10):
@@ -267,7 +285,8 @@ class WorldEditor:
 
     def _add(self, name: str, one: _Spawned) -> None:
         """Add what was or is spawned to the world, where it is spawned."""
-        client, physics = self._client, self._client.physics
+        client = self._client
+        physics = self._client.physics
         if one.kind is EntityCategory.DYNAMIC_OBJECT:
             physics.rigid.add_box(one.number, RigidBox(one.pose, np.array(BOX_SIZE), BOX_MASS))
         elif one.kind is EntityCategory.HUMAN:

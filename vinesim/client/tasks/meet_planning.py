@@ -55,7 +55,8 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
 
 def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
     """Whether a ``path`` [n, 2] m of a carrier leaves a person room, who goes some steps back from ``stand`` [2] m."""
-    start, way = path[:-1], np.diff(path, axis=0)
+    start = path[:-1]
+    way = np.diff(path, axis=0)
     share = np.clip(((stand - start) * way).sum(1) / np.maximum((way * way).sum(1), 1e-12), 0.0, 1.0)
     return bool(np.linalg.norm(start + share[:, None] * way - stand, axis=1).min() > KEPT_AWAY)
 

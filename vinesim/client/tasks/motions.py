@@ -20,7 +20,9 @@ class DriveTo:
         self, robot: Robot, place: np.ndarray, *, speed: float = 1.2, may_start: Callable[[], object] = lambda: True
     ) -> None:
         """``place`` [7]: pose of the base in the world; it stands until ``may_start()`` is true."""
-        self.robot, self.speed, self._may_start = robot, speed, may_start
+        self.robot = robot
+        self.speed = speed
+        self._may_start = may_start
         self._has_started = False
         self.is_done = False
         self._place = np.asarray(place, float)[:2]
@@ -51,7 +53,8 @@ class LookAt:
     def __init__(self, robot: Robot, point: Callable[[], np.ndarray]) -> None:
         """``point`` returns the place to look at [3] m in the world. Without a head and a camera nothing is done."""
         description = robot.description
-        self.robot, self.point = robot, point
+        self.robot = robot
+        self.point = point
         self._joints = (
             description.joint_indices("head") if "head" in description.groups and description.cameras else None
         )

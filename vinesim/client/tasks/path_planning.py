@@ -33,7 +33,8 @@ def find_path(model: Model, start: np.ndarray, goal: np.ndarray, clearance: floa
     if cells is None:
         return None
     points = [start, *(low + GRID_SIZE * np.array(cell) for cell in cells[1:-1]), goal]
-    kept, i = [points[0]], 0
+    kept = [points[0]]
+    i = 0
     while i < len(points) - 1:
         i = next(
             j
@@ -63,7 +64,8 @@ def search_grid(free: np.ndarray, first: Cell, last: Cell) -> list[Cell] | None:
                 continue
             price = cost[here] + length
             if price < cost.get(there, np.inf):
-                cost[there], previous[there] = price, here
+                cost[there] = price
+                previous[there] = here
                 ahead = float(np.hypot(there[0] - last[0], there[1] - last[1]))
                 heapq.heappush(queue, (price + ahead, there))
     if last not in previous:

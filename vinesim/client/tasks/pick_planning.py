@@ -17,9 +17,11 @@ from vinesim.robot.tasks.pick import PickPlan
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
-BUNCH_AHEAD, BUNCH_ASIDE = 0.88, 0.28
+BUNCH_AHEAD = 0.88
+BUNCH_ASIDE = 0.28
 """[m] Position of the bunch in the base's frame at the pick: ahead, and to the arm's side."""
-HAND_LOWER, HAND_UPPER = np.array([-0.45, -0.11, -0.05]), np.array([0.06, 0.11, 0.09])
+HAND_LOWER = np.array([-0.45, -0.11, -0.05])
+HAND_UPPER = np.array([0.06, 0.11, 0.09])
 """[m] Corners of the box that an open hand sweeps about the grasp; x along the hand, z up."""
 GRASP_HEIGHT = (1.3, 1.75)
 """[m] Heights of the grasp that arm and lift reach with the hand level."""
@@ -33,7 +35,9 @@ FULL_CLEARANCE = 0.03
 """[m] Wider gaps score no better. GUESSED"""
 BASE_CLEARANCE = 0.68
 """[m] A base with its arms tucked needs this distance around its centre."""
-BOX_AHEAD, BASE_HALF_WIDTH, BOX_GAP = 0.10, 0.35, 0.06
+BOX_AHEAD = 0.10
+BASE_HALF_WIDTH = 0.35
+BOX_GAP = 0.06
 """[m] Distance of a box ahead of the base's centre, half of the base's width, and the gap between both."""
 APPROACH_LENGTHS = (1.1, 0.8)
 """[m] Lengths of the straight approach along a box; the first for which there is room is taken."""
@@ -105,7 +109,9 @@ def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterato
     middle = hold[bunches].mean(0) if len(bunches) else np.zeros(3)
     reached = np.linalg.norm(hold[bunches] - middle, axis=1).max(initial=0.0) + OBSTACLE_RADIUS
     region = np.linalg.norm(points - middle, axis=1) < reached
-    points, radius, owner = points[region], radius[region], owner[region]
+    points = points[region]
+    radius = radius[region]
+    owner = owner[region]
     heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     turn = frames.from_yaw(heading)
     sides = np.stack(

@@ -67,7 +67,9 @@ class RosCommandHandler:
         """Kinds of refusals that the log has."""
         self._lights_color: tuple[float, float, float] | None = None
         """Of the indicator lights; None: that of the pattern."""
-        self._commands, self._finish, self._world_time = commands, finish, world_time
+        self._commands = commands
+        self._finish = finish
+        self._world_time = world_time
         self._play = play
 
     def __call__(self, time: float) -> None:
@@ -103,7 +105,8 @@ class RosCommandHandler:
         self.controllers.abort_all("the simulation was reset")
         for result in self.controllers.take_results():
             self._finish(_goal_result(result))
-        self.robot, self.controllers = robot, ControllerManager(robot)
+        self.robot = robot
+        self.controllers = ControllerManager(robot)
 
     def _apply(self, command: Command, time: float) -> None:
         controllers = self.controllers
@@ -144,11 +147,15 @@ def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
         return None if given is None else Tolerance(given.position, given.velocity)
 
     return Trajectory(
-        command.joints, command.times, command.positions, command.velocities,
+        command.joints,
+        command.times,
+        command.positions,
+        command.velocities,
         start_time=max(command.time - offset, 1e-9) if command.time > 0.0 else 0.0,
-        path_tolerance=tolerance(command.path_tolerance), goal_tolerance=tolerance(command.goal_tolerance),
+        path_tolerance=tolerance(command.path_tolerance),
+        goal_tolerance=tolerance(command.goal_tolerance),
         goal_time_tolerance=command.goal_time_tolerance,
-    )  # fmt: skip
+    )
 
 
 def _goal_result(result: controller_manager.GoalResult) -> GoalResult:

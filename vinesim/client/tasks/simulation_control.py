@@ -29,7 +29,8 @@ class SimulationControl:
     """
 
     def __init__(self, client: Client, reply: Callable[[SimulationReply | StepProgress], None]) -> None:
-        self._client, self._reply = client, reply
+        self._client = client
+        self._reply = reply
         self._editor = WorldEditor(client)
         self._requests: collections.deque[SimulationRequest] = collections.deque()
         self._stepping: SimulationRequest | None = None
@@ -52,7 +53,8 @@ class SimulationControl:
         if (request := self._stepping) is None:
             return
         done = request.steps - (self._client.steps_before_pause or 0)
-        self._stepping, self._client.steps_before_pause = None, 0
+        self._stepping = None
+        self._client.steps_before_pause = 0
         self._answer(request, refusal=f"{reason} after {done} of {request.steps} steps", kind=Refusal.FAILED)
 
     def _follow_steps(self) -> None:
@@ -83,7 +85,8 @@ class SimulationControl:
 
     def _do(self, request: SimulationRequest) -> dict[str, Any]:
         """Do what can be done at once; what the answer says beside time and pause."""
-        editor, arguments = self._editor, request.entity or EntityArguments("")
+        editor = self._editor
+        arguments = request.entity or EntityArguments("")
         match request.action:
             case SimulationAction.GET_ENTITIES:
                 return {"entities": tuple(editor.entities())}
@@ -104,7 +107,8 @@ class SimulationControl:
 
     def _play(self, request: SimulationRequest) -> None:
         """Play, pause, or begin to step."""
-        client, is_step = self._client, request.action is SimulationAction.STEP
+        client = self._client
+        is_step = request.action is SimulationAction.STEP
         if client.world_time.is_shared:
             text = "a client of a shared world cannot pause; start it without --connect"
             # StepSimulation and SimulateSteps define this code for a simulation that runs
@@ -119,7 +123,9 @@ class SimulationControl:
         elif not 1 <= request.steps <= MAX_STEPS:
             raise RequestRefused(Refusal.FAILED, f"{request.steps} steps; give 1 to {MAX_STEPS}")
         else:
-            client.steps_before_pause, self._stepping, self._reported_steps = request.steps, request, 0
+            client.steps_before_pause = request.steps
+            self._stepping = request
+            self._reported_steps = 0
 
     def _answer(self, request: SimulationRequest, **values: Any) -> None:
         client = self._client

@@ -105,7 +105,8 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
     solid = np.minimum(model.fixed_start[:, 2], model.fixed_end[:, 2]) < OVERHEAD
     clearance = np.full(len(points), np.inf)
     if solid.any():
-        start, radii = model.fixed_start[solid, :2], model.fixed_radius[solid].max(1)
+        start = model.fixed_start[solid, :2]
+        radii = model.fixed_radius[solid].max(1)
         along = model.fixed_end[solid, :2] - start
         offset = points[:, None] - start
         share = np.clip((offset * along).sum(-1) / np.maximum((along * along).sum(-1), 1e-12), 0.0, 1.0)
@@ -147,7 +148,8 @@ def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
 def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.ndarray:
     """A pose [7] 1.6 m from a robot at ``place`` [7] at the end of a free straight line of ``length`` [m]."""
     heading = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
-    best, most = place, -np.inf
+    best = place
+    most = -np.inf
     for side in heading:
         goal = place[:2] + 1.6 * np.array([np.cos(side), np.sin(side)])
         for angle in heading:
@@ -157,5 +159,6 @@ def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.nda
                 float(ground_clearance(model, line).min()), float(np.linalg.norm(line - place[:2], axis=1).min()) - 0.6
             )
             if clearance > most:
-                best, most = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle)), clearance
+                best = frames.pose(np.append(goal, 0.0), frames.from_yaw(angle))
+                most = clearance
     return best

@@ -26,7 +26,8 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
     it."""
     if max(full, empty) >= len(model.box_pose):
         raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
-    here, legs = start[:2], []
+    here = start[:2]
+    legs = []
     for box in (empty, full):
         ways = [find_path(model, here, place, TURNING_RADIUS) for place in turning_places(model, box)]
         ways = [points for points in ways if points is not None]
@@ -42,9 +43,11 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
 
 def turning_places(model: Model, box: int) -> list[np.ndarray]:
     """Places [2] m straight before the long sides of a box, with room to turn and a free lane to the box."""
-    pose, size = model.box_pose[box].astype(float), model.box_size[box].astype(float)
+    pose = model.box_pose[box].astype(float)
+    size = model.box_size[box].astype(float)
     across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])
-    normal, places = frames.rotate(pose[3:], across)[:2], []
+    normal = frames.rotate(pose[3:], across)[:2]
+    places = []
     for side in (1.0, -1.0):
         for far in TURNING_DISTANCES:
             place = pose[:2] + far * side * normal
@@ -64,14 +67,16 @@ def fill_box(physics: Physics, box: int, count: int = 6) -> None:
     Call it between steps. The bunches farthest from the box are taken, so that those around it stay.
     """
     model = physics.model
-    pose, size = model.box_pose[box].astype(float), model.box_size[box].astype(float)
+    pose = model.box_pose[box].astype(float)
+    size = model.box_size[box].astype(float)
     apart = np.linalg.norm(physics.state.body_q[model.bunch_body, :2] - pose[:2], axis=1)
     attached = np.flatnonzero(physics.state.bunch_attached)
     chosen = attached[np.argsort(-apart[attached], kind="stable")][:count]
     columns = BUNCHES_PER_LAYER // 2
     for i, bunch in enumerate(chosen.tolist()):
         layer, place = divmod(i, BUNCHES_PER_LAYER)
-        column, row = place % columns, place // columns
+        column = place % columns
+        row = place // columns
         x = (column - 0.5 * (columns - 1)) * (size[0] - 0.04) / columns
         y = (row - 0.5) * 0.5 * (size[1] - 0.04)
         # along y, centred at (x, y)

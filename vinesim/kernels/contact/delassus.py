@@ -42,10 +42,17 @@ wp.set_module_options({"enable_backward": False})
     }
 """)
 def solve_rigid_rows(
-    contact: int, first: int, end: int, start: wp.array(dtype=wp.int32), size: wp.array(dtype=wp.int32),
-    column: wp.array(dtype=wp.int32), entry: wp.array(dtype=wp.float64), inverse: wp.array(dtype=wp.float64),
-    jacobian: wp.array2d(dtype=wp.vec3d), response: wp.array2d(dtype=wp.vec3d),
-):  # fmt: skip
+    contact: int,
+    first: int,
+    end: int,
+    start: wp.array(dtype=wp.int32),
+    size: wp.array(dtype=wp.int32),
+    column: wp.array(dtype=wp.int32),
+    entry: wp.array(dtype=wp.float64),
+    inverse: wp.array(dtype=wp.float64),
+    jacobian: wp.array2d(dtype=wp.vec3d),
+    response: wp.array2d(dtype=wp.vec3d),
+):
     """Solve L^T D L x = j for the three rows j of a contact, within the degrees of freedom from ``first`` to ``end`` of
     one kinematic tree; ``entry`` of L, ``inverse`` of D."""
     ...
@@ -73,14 +80,30 @@ def respond_rigidly(
         end = first + factors.tree_dof_count[tree]
         if factors.implicit_inverse[last_dof] != wp.float64(0.0):
             solve_rigid_rows(
-                c, first, end, factors.row_start, factors.row_count, factors.column, factors.implicit,
-                factors.implicit_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
-            )  # fmt: skip
+                c,
+                first,
+                end,
+                factors.row_start,
+                factors.row_count,
+                factors.column,
+                factors.implicit,
+                factors.implicit_inverse,
+                rows_out.rigid_jacobian,
+                rows_out.rigid_response,
+            )
         else:
             solve_rigid_rows(
-                c, first, end, factors.row_start, factors.row_count, factors.column, factors.plain,
-                factors.plain_inverse, rows_out.rigid_jacobian, rows_out.rigid_response,
-            )  # fmt: skip
+                c,
+                first,
+                end,
+                factors.row_start,
+                factors.row_count,
+                factors.column,
+                factors.plain,
+                factors.plain_inverse,
+                rows_out.rigid_jacobian,
+                rows_out.rigid_response,
+            )
 
 
 @wp.func_native(
@@ -105,10 +128,20 @@ def respond_rigidly(
 """
 )
 def add_entries(
-    side: int, jacobian: wp.array2d(dtype=wp.float64), response: wp.array(dtype=float), number: int, width: int,
-    sides: wp.array(dtype=wp.int32), start: int, count: int, place: wp.array(dtype=wp.int32), first_place: int,
-    delassus: wp.array(dtype=wp.float64), at: int, pitch: int,
-):  # fmt: skip
+    side: int,
+    jacobian: wp.array2d(dtype=wp.float64),
+    response: wp.array(dtype=float),
+    number: int,
+    width: int,
+    sides: wp.array(dtype=wp.int32),
+    start: int,
+    count: int,
+    place: wp.array(dtype=wp.int32),
+    first_place: int,
+    delassus: wp.array(dtype=wp.float64),
+    at: int,
+    pitch: int,
+):
     """Add the velocities along the rows of a side by unit impulses along those of a group of ``count`` sides, listed from
     ``start`` on. ``number``: first one of the response of the side's body to them, in rows of ``width``; ``at``: entry of
     the first row."""
@@ -155,7 +188,18 @@ def assemble_delassus(
                 width = padded(3 * count)
                 number = groups.response[group] + (slot - tree) * 6 * width
                 add_entries(
-                    2 * c + k, rows_out.plant_jacobian, response, number, width, groups.side, start, count,
-                    contacts.place, first, rows_out.delassus, at, pitch,
-                )  # fmt: skip
+                    2 * c + k,
+                    rows_out.plant_jacobian,
+                    response,
+                    number,
+                    width,
+                    groups.side,
+                    start,
+                    count,
+                    contacts.place,
+                    first,
+                    rows_out.delassus,
+                    at,
+                    pitch,
+                )
                 group = group + 1

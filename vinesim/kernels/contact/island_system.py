@@ -88,9 +88,13 @@ def block_velocity(
     return value;
 """)
 def add_rigid_velocity(
-    value: wp.vec3d, jacobian: wp.array(dtype=wp.vec3d), at: int, velocity: wp.array(dtype=wp.float64), first: int,
+    value: wp.vec3d,
+    jacobian: wp.array(dtype=wp.vec3d),
+    at: int,
+    velocity: wp.array(dtype=wp.float64),
+    first: int,
     count: int,
-) -> wp.vec3d:  # fmt: skip
+) -> wp.vec3d:
     """Add the velocities [m/s] along three rows by those of ``count`` degrees of freedom."""
     ...
 
@@ -99,9 +103,13 @@ def add_rigid_velocity(
     for (int i = 0; i < count; ++i) velocity.data[first + i] += dot(response.data[at + i], impulse);
 """)
 def push_rigid_bodies(
-    impulse: wp.vec3d, response: wp.array(dtype=wp.vec3d), at: int, velocity: wp.array(dtype=wp.float64), first: int,
+    impulse: wp.vec3d,
+    response: wp.array(dtype=wp.vec3d),
+    at: int,
+    velocity: wp.array(dtype=wp.float64),
+    first: int,
     count: int,
-):  # fmt: skip
+):
     """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows."""
     ...
 
@@ -160,9 +168,13 @@ def contact_velocity(
     start = islands.row_start[block]
     value = block_velocity(matrix, islands.matrix_start[block] + k * pitch, pitch, system.impulse, start)
     return add_rigid_velocity(
-        value, system.jacobian, rigid_entry(place, island, islands), system.velocity, islands.first_dof[island],
+        value,
+        system.jacobian,
+        rigid_entry(place, island, islands),
+        system.velocity,
+        islands.first_dof[island],
         island_dofs(island, islands),
-    )  # fmt: skip
+    )
 
 
 @wp.func
@@ -177,9 +189,15 @@ def contact_residual(
 
 @wp.func
 def gather_rigid_rows(
-    c: int, place: int, island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows,
+    c: int,
+    place: int,
+    island: int,
+    geoms: Geoms,
+    contacts: Contacts,
+    islands: Islands,
+    rows: Rows,
     system_out: IslandSystem,
-):  # fmt: skip
+):
     """Gather J_r and G^T of a contact: zeros, unless its other side is a rigid body that moves."""
     moves = bool(False)
     if contacts.other[c] >= 0:
@@ -198,9 +216,15 @@ def gather_rigid_rows(
 
 @wp.func
 def gather_contact(
-    c: int, place: int, block: int, island: int, contacts: Contacts, islands: Islands, rows: Rows,
+    c: int,
+    place: int,
+    block: int,
+    island: int,
+    contacts: Contacts,
+    islands: Islands,
+    rows: Rows,
     system_out: IslandSystem,
-):  # fmt: skip
+):
     """Gather the numbers of a contact, and compute what it does to itself; its rigid rows must be there."""
     k = 3 * (place - islands.block_start[block])
     row = islands.row_start[block] + k
@@ -239,9 +263,13 @@ def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSyste
             for place in range(islands.block_start[block], islands.block_start[block + 1]):
                 row = contact_row(place, block, islands)
                 push_rigid_bodies(
-                    three(row, system_out.impulse), system_out.response, rigid_entry(place, island, islands),
-                    system_out.velocity, first, dofs,
-                )  # fmt: skip
+                    three(row, system_out.impulse),
+                    system_out.response,
+                    rigid_entry(place, island, islands),
+                    system_out.velocity,
+                    first,
+                    dofs,
+                )
 
 
 @wp.func
@@ -264,9 +292,15 @@ def gather_island(
     for (int i = 0; i < count; ++i) force.data[dof.data[first + i]] -= dot(jacobian.data[at + i], impulse) / dt;
 """)
 def add_rigid_force(
-    impulse: wp.vec3d, dt: wp.float64, jacobian: wp.array(dtype=wp.vec3d), at: int, dof: wp.array(dtype=wp.int32),
-    first: int, count: int, force: wp.array(dtype=wp.float64),
-):  # fmt: skip
+    impulse: wp.vec3d,
+    dt: wp.float64,
+    jacobian: wp.array(dtype=wp.vec3d),
+    at: int,
+    dof: wp.array(dtype=wp.int32),
+    first: int,
+    count: int,
+    force: wp.array(dtype=wp.float64),
+):
     """Add what impulses [N s] along three rows exert on ``count`` degrees of freedom, listed from ``first`` on."""
     ...
 

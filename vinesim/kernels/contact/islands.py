@@ -248,9 +248,12 @@ def list_side(slot: int, side: int, touched: TouchedBodies, groups_out: SideGrou
 
 @wp.func
 def group_sides(
-    counters_out: wp.array(dtype=wp.int32), touched: TouchedBodies, contacts: Contacts, islands: Islands,
+    counters_out: wp.array(dtype=wp.int32),
+    touched: TouchedBodies,
+    contacts: Contacts,
+    islands: Islands,
     groups_out: SideGroups,
-):  # fmt: skip
+):
     """List the sides of all contacts by trees, part those of each tree into groups, and place the responses to them."""
     for slot in range(counters_out[BODIES]):
         groups_out.listed[slot] = 0

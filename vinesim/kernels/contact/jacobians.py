@@ -224,9 +224,20 @@ def write_contact_rows(
             tree = rigid.dof_tree[last_dof]
             spans_out[c] = wp.vec2i(factors.tree_dof[tree], factors.tree_dof[tree] + factors.tree_dof_count[tree])
     write_rows(
-        c, contacts_out.source[c] // slots, contacts_out.source[c] % slots, parameters, pairs, capsules, geoms, bodies,
-        rigid, candidates, warm_start, contacts_out, rows_out,
-    )  # fmt: skip
+        c,
+        contacts_out.source[c] // slots,
+        contacts_out.source[c] % slots,
+        parameters,
+        pairs,
+        capsules,
+        geoms,
+        bodies,
+        rigid,
+        candidates,
+        warm_start,
+        contacts_out,
+        rows_out,
+    )
 
 
 @wp.func

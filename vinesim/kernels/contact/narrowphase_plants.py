@@ -123,9 +123,7 @@ def plant_candidate(
 
 
 @wp.func
-def may_touch_own_tree(
-    s: int, tree: int, low: wp.vec3, high: wp.vec3, capsules: Capsules, wood_boxes: Aabbs
-):  # fmt: skip
+def may_touch_own_tree(s: int, tree: int, low: wp.vec3, high: wp.vec3, capsules: Capsules, wood_boxes: Aabbs):
     """Whether a capsule, of which this is the box, may touch another of its tree: bunches touch wood, and later bunches."""
     clear = aabbs_disjoint(low, high, wood_boxes.low[tree], wood_boxes.high[tree])
     return capsules.bunch[s] >= 0 and (not clear or capsules.bunch[s] < capsules.tree_last_bunch[tree])
@@ -146,9 +144,11 @@ def touching_candidate(
 ):
     """The contact of two capsules whose boxes overlap, if they are near enough."""
     nearest = segment_segment_distance(
-        to_double(capsule_states.start[s]), to_double(capsule_states.end[s]), to_double(capsule_states.start[t]),
+        to_double(capsule_states.start[s]),
+        to_double(capsule_states.end[s]),
+        to_double(capsule_states.start[t]),
         to_double(capsule_states.end[t]),
-    )  # fmt: skip
+    )
     radii = capsules.radius[s] + capsules.radius[t]
     motion = (capsule_states.speed[s] + capsule_states.speed[t]) * wp.float32(parameters.dt)
     candidate = Candidate()

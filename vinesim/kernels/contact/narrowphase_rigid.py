@@ -215,9 +215,22 @@ def rigid_candidate(
         candidate.exists = candidate.gap + deflected + soonest < parameters.static_margin
     if candidate.exists:
         candidate = follow_contact(
-            is_round, parameters, candidate, pair, nearest, t, approach, relative, velocity, acceleration, bodies,
-            capsule_states, geoms, hulls, geom_states,
-        )  # fmt: skip
+            is_round,
+            parameters,
+            candidate,
+            pair,
+            nearest,
+            t,
+            approach,
+            relative,
+            velocity,
+            acceleration,
+            bodies,
+            capsule_states,
+            geoms,
+            hulls,
+            geom_states,
+        )
     return candidate
 
 
@@ -336,9 +349,20 @@ def add_pairs(
                         p = a + ends[end] * (b - a)
                         nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, p, p, FAR)
                     candidate = rigid_candidate(
-                        is_round, parameters, pair, nearest, ends[end], g >= geoms.count[0], acceleration, bodies,
-                        capsules, capsule_states, geoms, hulls, geom_states,
-                    )  # fmt: skip
+                        is_round,
+                        parameters,
+                        pair,
+                        nearest,
+                        ends[end],
+                        g >= geoms.count[0],
+                        acceleration,
+                        bodies,
+                        capsules,
+                        capsule_states,
+                        geoms,
+                        hulls,
+                        geom_states,
+                    )
                     if candidate.exists:
                         is_impact = is_impact or candidate.is_impact
                         store_candidate(row, total, 2 * s + end, g, candidate, candidates_out)
@@ -372,9 +396,16 @@ def overlaps_bunch(
                     capsules.level[s], trees.is_fine[tree], capsules.bunch[s], trees.bunch_attached
                 ):
                     nearest = segment_geom_distance(
-                        False, geoms, hulls, g, rigid.xmat[geoms.id[g]], geom_states.center[g],
-                        to_double(capsule_states.start[s]), to_double(capsule_states.end[s]), FAR,
-                    )  # fmt: skip
+                        False,
+                        geoms,
+                        hulls,
+                        g,
+                        rigid.xmat[geoms.id[g]],
+                        geom_states.center[g],
+                        to_double(capsule_states.start[s]),
+                        to_double(capsule_states.end[s]),
+                        FAR,
+                    )
                     overlaps = nearest[3] < wp.float64(capsules.radius[s])
     return overlaps
 
@@ -418,18 +449,36 @@ def find_rigid_contacts(
     row = order[wp.tid()]
     tree = trees.awake[row]
     near_count = list_near_geoms(
-        row, tree_boxes.low[tree], tree_boxes.high[tree], trees.is_remote[tree], max_static_geoms, geoms, geom_states,
-        static_blocks, candidates_out.near_geoms,
-    )  # fmt: skip
+        row,
+        tree_boxes.low[tree],
+        tree_boxes.high[tree],
+        trees.is_remote[tree],
+        max_static_geoms,
+        geoms,
+        geom_states,
+        static_blocks,
+        candidates_out.near_geoms,
+    )
     most = wp.min(geoms.count[0] + max_static_geoms, candidates_out.near_geoms.shape[1])
     candidates_out.skipped_geoms[row] = wp.max(near_count - most, 0)
     near_count = wp.min(near_count, most)
     for k in range(passing_out.by_tree.shape[1]):
         bunch = passing_out.by_tree[tree, k]
         if bunch >= 0 and not overlaps_bunch(
-            row, tree, bunch, near_count, capsules, geoms, trees, capsule_states, rigid, hulls, geom_states,
-            candidates_out.near_geoms, passing_out.of_geom,
-        ):  # fmt: skip
+            row,
+            tree,
+            bunch,
+            near_count,
+            capsules,
+            geoms,
+            trees,
+            capsule_states,
+            rigid,
+            hulls,
+            geom_states,
+            candidates_out.near_geoms,
+            passing_out.of_geom,
+        ):
             passing_out.by_tree[tree, k] = -1
     is_impact = bool(False)
     count = int(0)
@@ -449,16 +498,44 @@ def find_rigid_contacts(
                     pair_count = pair_count + 1
                     if pair_count == room:
                         count, hits = add_pairs(
-                            False, row, count, candidates_out.near_pairs, row * room, 1, pair_count, parameters,
-                            capsules, geoms, bodies, capsule_states, rigid, hulls, geom_states, candidates_out,
-                        )  # fmt: skip
+                            False,
+                            row,
+                            count,
+                            candidates_out.near_pairs,
+                            row * room,
+                            1,
+                            pair_count,
+                            parameters,
+                            capsules,
+                            geoms,
+                            bodies,
+                            capsule_states,
+                            rigid,
+                            hulls,
+                            geom_states,
+                            candidates_out,
+                        )
                         is_impact = is_impact or hits
                         pair_count = int(0)
     if pair_count > 0:
         count, hits = add_pairs(
-            False, row, count, candidates_out.near_pairs, row * room, 1, pair_count, parameters, capsules, geoms, bodies,
-            capsule_states, rigid, hulls, geom_states, candidates_out,
-        )  # fmt: skip
+            False,
+            row,
+            count,
+            candidates_out.near_pairs,
+            row * room,
+            1,
+            pair_count,
+            parameters,
+            capsules,
+            geoms,
+            bodies,
+            capsule_states,
+            rigid,
+            hulls,
+            geom_states,
+            candidates_out,
+        )
         is_impact = is_impact or hits
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count

@@ -75,9 +75,17 @@ def combine_rows(
 
 @wp.func
 def linearise_friction(
-    place: int, block: int, island: int, number: int, at: int, right: int, pitch: int, islands: Islands,
-    matrix: wp.array(dtype=wp.float64), system_out: IslandSystem,
-):  # fmt: skip
+    place: int,
+    block: int,
+    island: int,
+    number: int,
+    at: int,
+    right: int,
+    pitch: int,
+    islands: Islands,
+    matrix: wp.array(dtype=wp.float64),
+    system_out: IslandSystem,
+):
     """Make the friction rows of a sliding contact, which begin at ``at``, of those of a sticking one.
 
     Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the residual velocity along
@@ -151,9 +159,15 @@ def write_block(
         for axis in range(3):
             entry = at + axis * pitch
             gather_row(
-                matrix, islands.matrix_start[block] + (k + axis) * source_pitch, system_out.pressed, start, count,
-                system_out.matrix, entry + right, pitch - right,
-            )  # fmt: skip
+                matrix,
+                islands.matrix_start[block] + (k + axis) * source_pitch,
+                system_out.pressed,
+                start,
+                count,
+                system_out.matrix,
+                entry + right,
+                pitch - right,
+            )
             diagonal = entry + right + 3 * p + axis
             system_out.matrix[diagonal] = system_out.matrix[diagonal] + system_out.compliance[place]
             system_out.matrix[entry] = -system_out.free[row + axis]
@@ -163,9 +177,7 @@ def write_block(
                 system_out.matrix[entry + i] = wp.float64(0.0)
         x = three(row, system_out.impulse)
         if wp.sqrt(x[1] * x[1] + x[2] * x[2]) >= system_out.friction[place] * x[0] * SLIDING_SHARE:
-            linearise_friction(
-                place, block, island, p, at + pitch, right, pitch, islands, matrix, system_out
-            )  # fmt: skip
+            linearise_friction(place, block, island, p, at + pitch, right, pitch, islands, matrix, system_out)
 
 
 @wp.func_native(
@@ -229,9 +241,10 @@ def keep_solution(block: int, island: int, count: int, pitch: int, islands: Isla
             value = wp.vec3d()
             if presses:
                 value = wp.vec3d(
-                    system_out.matrix[entry + i], system_out.matrix[entry + pitch + i],
+                    system_out.matrix[entry + i],
+                    system_out.matrix[entry + pitch + i],
                     system_out.matrix[entry + 2 * pitch + i],
-                )  # fmt: skip
+                )
             system_out.solution[to + i] = value
         if presses:
             p = p + 1
@@ -241,9 +254,13 @@ def keep_solution(block: int, island: int, count: int, pitch: int, islands: Isla
     for (int i = 0; i < count; ++i) row.data[at + i] -= dot(response, solution.data[entry + i]);
 """)
 def subtract_products(
-    row: wp.array(dtype=wp.float64), at: int, response: wp.vec3d, solution: wp.array(dtype=wp.vec3d), entry: int,
+    row: wp.array(dtype=wp.float64),
+    at: int,
+    response: wp.vec3d,
+    solution: wp.array(dtype=wp.vec3d),
+    entry: int,
     count: int,
-):  # fmt: skip
+):
     """Subtract from ``count`` numbers the products of ``response`` with as many vectors."""
     ...
 
@@ -272,7 +289,7 @@ def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
                 system_out.rigid_matrix[first + i, 0] = value
                 subtract_products(
                     system_out.rigid_matrix[first + i], 1, response, system_out.solution, solution + 1, dofs
-                )  # fmt: skip
+                )
     for k in range(dofs):
         best = int(k)
         for i in range(k + 1, dofs):

@@ -61,9 +61,13 @@ def relax_contact(
     if change[0] != zero or change[1] != zero or change[2] != zero:
         set_three(row, wp.vec3d(normal, fu, fv), system_out.impulse)
         push_rigid_bodies(
-            change, system_out.response, rigid_entry(place, island, islands), system_out.velocity,
-            islands.first_dof[island], island_dofs(island, islands),
-        )  # fmt: skip
+            change,
+            system_out.response,
+            rigid_entry(place, island, islands),
+            system_out.velocity,
+            islands.first_dof[island],
+            island_dofs(island, islands),
+        )
     return wp.max(wp.abs(change[0]), wp.abs(change[1]) + wp.abs(change[2]))
 
 

@@ -90,9 +90,16 @@ def add_side(side: int, number: int, jacobian: wp.array2d(dtype=wp.float64), val
 """
 )
 def carry_inward(
-    values: wp.array(dtype=float), at: int, to: int, width: int, D: wp.mat33, DJ: wp.mat33, DH: wp.mat33,
-    lever: wp.vec3, root: wp.mat33,
-):  # fmt: skip
+    values: wp.array(dtype=float),
+    at: int,
+    to: int,
+    width: int,
+    D: wp.mat33,
+    DJ: wp.mat33,
+    DH: wp.mat33,
+    lever: wp.vec3,
+    root: wp.mat33,
+):
     """Carry the impulses at a body to its parent, whose memory begins at ``to``; what its joint takes of them stays.
 
     Without a parent (``to`` < 0) they move it: ``root`` is its inverse mass.
@@ -143,9 +150,16 @@ def keep_velocities(values: wp.array(dtype=float), at: int, width: int, response
 
 @wp.func
 def mark_paths(
-    first: int, bodies: int, row: int, start: int, end: int, place: wp.array(dtype=wp.int32),
-    touched: wp.array(dtype=wp.int32), model: ArticulationModel, scratch_out: ResponseScratch,
-):  # fmt: skip
+    first: int,
+    bodies: int,
+    row: int,
+    start: int,
+    end: int,
+    place: wp.array(dtype=wp.int32),
+    touched: wp.array(dtype=wp.int32),
+    model: ArticulationModel,
+    scratch_out: ResponseScratch,
+):
     """Mark the touched bodies of a tree, in slots ``start`` to ``end``, and all that carry them; clear their memory."""
     for k in range(bodies):
         scratch_out.is_on_path[row + k] = False
@@ -215,20 +229,30 @@ def respond_to_groups(
         k = last - i * model.pitch
         if scratch_out.is_on_path[row + bodies - 1 - i]:
             carry_inward(
-                scratch_out.values, memory_of(k, first, row, model.pitch),
-                memory_of(model.body_parent[k], first, row, model.pitch), width, factors.D[k], factors.DJ[k],
-                factors.DH[k], factors.lever[k], factors.root_inverse_mass[k],
-            )  # fmt: skip
+                scratch_out.values,
+                memory_of(k, first, row, model.pitch),
+                memory_of(model.body_parent[k], first, row, model.pitch),
+                width,
+                factors.D[k],
+                factors.DJ[k],
+                factors.DH[k],
+                factors.lever[k],
+                factors.root_inverse_mass[k],
+            )
     for i in range(bodies):
         k = first + i * model.pitch
         if scratch_out.is_on_path[row + i]:
             carry_outward(
-                scratch_out.values, memory_of(k, first, row, model.pitch),
-                memory_of(model.body_parent[k], first, row, model.pitch), width, factors.DJ[k], factors.DH[k],
+                scratch_out.values,
+                memory_of(k, first, row, model.pitch),
+                memory_of(model.body_parent[k], first, row, model.pitch),
+                width,
+                factors.DJ[k],
+                factors.DH[k],
                 factors.lever[k],
-            )  # fmt: skip
+            )
     for slot in range(start, end):
         at = memory_of(place[touched[slot]], first, row, model.pitch)
         keep_velocities(
             scratch_out.values, at, width, response_out, groups.response[group] + (slot - start) * 6 * width
-        )  # fmt: skip
+        )

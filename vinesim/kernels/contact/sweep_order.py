@@ -27,9 +27,14 @@ def widest_axis(count: int, trees: Trees, boxes: Aabbs):
 
 @wp.func
 def merge_runs(
-    count: int, width: int, axis: int, trees: Trees, boxes: Aabbs, rows: wp.array(dtype=wp.int32),
+    count: int,
+    width: int,
+    axis: int,
+    trees: Trees,
+    boxes: Aabbs,
+    rows: wp.array(dtype=wp.int32),
     rows_out: wp.array(dtype=wp.int32),
-):  # fmt: skip
+):
     """Merge each two neighbouring sorted runs of ``width`` rows into one; of equals the first stays first."""
     for start in range(0, count, 2 * width):
         left = int(start)

@@ -118,9 +118,20 @@ def write_tree_rows(
         contacts.body[c] = capsules.body[candidates.feature[tree, found] // 2]
         contacts.other_body[c] = -1
         write_rows(
-            c, tree, found, parameters, pairs, capsules, geoms, bodies, rigid, candidates,
-            view_warm_start(warm_start, tree, trees), contacts, view_rows(rows_out, tree, trees),
-        )  # fmt: skip
+            c,
+            tree,
+            found,
+            parameters,
+            pairs,
+            capsules,
+            geoms,
+            bodies,
+            rigid,
+            candidates,
+            view_warm_start(warm_start, tree, trees),
+            contacts,
+            view_rows(rows_out, tree, trees),
+        )
 
 
 @wp.func
@@ -266,9 +277,18 @@ def solve_trees(
     system = view_system(system_out, tree, trees, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
     sweeps = solve_few_rows(
-        count, max_sweeps, FIRST_SWEEPS, newton_end, tolerance, system.matrix, system.free, system.friction,
-        system.compliance, system.impulse, system.velocity,
-    )  # fmt: skip
+        count,
+        max_sweeps,
+        FIRST_SWEEPS,
+        newton_end,
+        tolerance,
+        system.matrix,
+        system.free,
+        system.friction,
+        system.compliance,
+        system.impulse,
+        system.velocity,
+    )
     busy = bool(False)
     if lanes == 1 and count > 0:
         search = view_search(search_out, tree, trees, width + 1)
@@ -313,9 +333,18 @@ def solve_busy_trees(
         system = view_system(system_out, tree, trees, width)
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
         sweeps = solve_many_rows(
-            count, max_sweeps, FIRST_SWEEPS, newton_end, tolerance, system.matrix, system.free, system.friction,
-            system.compliance, system.impulse, system.velocity,
-        )  # fmt: skip
+            count,
+            max_sweeps,
+            FIRST_SWEEPS,
+            newton_end,
+            tolerance,
+            system.matrix,
+            system.free,
+            system.friction,
+            system.compliance,
+            system.impulse,
+            system.velocity,
+        )
         if sweeps < 0:
             sweeps = tree_contacts_out.sweeps[tree]
             copy_system(lane, lanes, 3 * count, system, dense)
@@ -323,9 +352,7 @@ def solve_busy_trees(
                 update_velocities(lane, lanes, 3 * count, dense)
             copy_rows(lane, lanes, 3 * count, dense.impulse, search.before)
             copy_rows(lane, lanes, 3 * count, dense.impulse, search.first)
-            sweeps, _busy = solve_tree(
-                sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search
-            )  # fmt: skip
+            sweeps, _busy = solve_tree(sweeps, lane, lanes, count, max_sweeps, newton_end, tolerance, dense, search)
             copy_rows(lane, lanes, 3 * count, dense.impulse, system.impulse)
             copy_rows(lane, lanes, 3 * count, dense.velocity, system.velocity)
         if lane == 0:
@@ -390,6 +417,15 @@ def apply_tree_impulses(
         loaded[c] = body
         body_wrench_out[body] = body_wrench_out[body] + wrench_at(pose, point, contacts.force[c])
     apply_loaded_wrenches(
-        tree, count, wp.float32(parameters.dt), model, is_branching, loaded, body_wrench_out, factors, work_out,
-        scratch_out, prediction_out,
-    )  # fmt: skip
+        tree,
+        count,
+        wp.float32(parameters.dt),
+        model,
+        is_branching,
+        loaded,
+        body_wrench_out,
+        factors,
+        work_out,
+        scratch_out,
+        prediction_out,
+    )

@@ -152,9 +152,23 @@ def find_contacts_of_pairs(
         tree = tree_contacts_out.near[k][0] % trees
         i = tree_contacts_out.near_place[k]
         end, is_impact = add_pairs(
-            is_round, tree, 2 * i, tree_contacts_out.near, k, 1, 1, parameters, capsules, geoms, bodies, capsule_states,
-            rigid, hulls, geom_states, candidates_out,
-        )  # fmt: skip
+            is_round,
+            tree,
+            2 * i,
+            tree_contacts_out.near,
+            k,
+            1,
+            1,
+            parameters,
+            capsules,
+            geoms,
+            bodies,
+            capsule_states,
+            rigid,
+            hulls,
+            geom_states,
+            candidates_out,
+        )
         tree_contacts_out.found[i * trees + tree] = end - 2 * i
         if is_impact:
             tree_contacts_out.is_impact[tree] = True
@@ -180,9 +194,21 @@ def find_tree_contacts(
 ):
     """``threads`` threads: :func:`find_contacts_of_pairs` with geoms of any kind."""
     find_contacts_of_pairs(
-        wp.tid(), False, parameters, capsules, geoms, trees, threads, bodies, capsule_states, rigid, hulls,
-        geom_states, tree_contacts_out, candidates_out,
-    )  # fmt: skip
+        wp.tid(),
+        False,
+        parameters,
+        capsules,
+        geoms,
+        trees,
+        threads,
+        bodies,
+        capsule_states,
+        rigid,
+        hulls,
+        geom_states,
+        tree_contacts_out,
+        candidates_out,
+    )
 
 
 @wp.kernel(module="unique", enable_backward=False)
@@ -205,9 +231,21 @@ def find_round_tree_contacts(
 ):
     """``threads`` threads: :func:`find_contacts_of_pairs` where all geoms are planes, spheres and capsules."""
     find_contacts_of_pairs(
-        wp.tid(), True, parameters, capsules, geoms, trees, threads, bodies, capsule_states, rigid, hulls,
-        geom_states, tree_contacts_out, candidates_out,
-    )  # fmt: skip
+        wp.tid(),
+        True,
+        parameters,
+        capsules,
+        geoms,
+        trees,
+        threads,
+        bodies,
+        capsule_states,
+        rigid,
+        hulls,
+        geom_states,
+        tree_contacts_out,
+        candidates_out,
+    )
 
 
 @wp.kernel

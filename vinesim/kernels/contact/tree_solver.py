@@ -325,9 +325,15 @@ def copy_rows(
 
 @wp.func
 def search_on(
-    sweeps: int, newton_end: int, gradient: wp.float64, lane: int, lanes: int, count: int, system_out: TreeSystem,
+    sweeps: int,
+    newton_end: int,
+    gradient: wp.float64,
+    lane: int,
+    lanes: int,
+    count: int,
+    system_out: TreeSystem,
     search_out: TreeSearch,
-):  # fmt: skip
+):
     """What comes between two sweeps; returns the square of the gradient."""
     size = 3 * count
     if sweeps == newton_end + 1 and newton_end > 0:
@@ -354,9 +360,16 @@ def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, sys
 
 @wp.func
 def solve_tree(
-    sweeps: int, lane: int, lanes: int, count: int, max_sweeps: int, newton_end: int, tolerance: wp.float64,
-    system_out: TreeSystem, search_out: TreeSearch,
-):  # fmt: skip
+    sweeps: int,
+    lane: int,
+    lanes: int,
+    count: int,
+    max_sweeps: int,
+    newton_end: int,
+    tolerance: wp.float64,
+    system_out: TreeSystem,
+    search_out: TreeSearch,
+):
     """Solve for the impulses of ``count`` contacts of a tree that has had so many ``sweeps``; returns their number then, and
     whether the last one changed more than ``tolerance``.
 

@@ -124,7 +124,7 @@ def leaf_range(shapes: Shapes, i: int, leaf: LeafFrame, ray: wp.vec3, t: float) 
 
 
 @wp.kernel
-def raster_clusters(
+def raster_clusters(  # noqa: PLR0915 - one loop over all kinds of primitives keeps its state in registers
     # model
     shapes: Shapes,
     clusters: Clusters,

@@ -121,9 +121,17 @@ def assemble_eight(p: SolverParameters, phis: Lanes, top: Floats, own_out: Float
         rotation = wp.quat_to_matrix(q)
         inertia = world_inertia(rotation, vec3_at(own_out, INERTIA + lane), vec3_at(own_out, PRODUCT + lane))
         J, H, M, bias, tension, _steady = own_terms(
-            p, phis[lane], motion, own_out[MASS + lane], rotation * vec3_at(own_out, COM + lane), inertia,
-            spatial_at(own_out, LOAD + lane), vec3_at(own_out, CONTACT + lane), 0.0, wp.vec3(),
-        )  # fmt: skip
+            p,
+            phis[lane],
+            motion,
+            own_out[MASS + lane],
+            rotation * vec3_at(own_out, COM + lane),
+            inertia,
+            spatial_at(own_out, LOAD + lane),
+            vec3_at(own_out, CONTACT + lane),
+            0.0,
+            wp.vec3(),
+        )
         J_upper = upper_triangle(J)
         M_upper = upper_triangle(M)
         for c in range(6):
@@ -153,9 +161,13 @@ def add_drag_eight(p: SolverParameters, phis: Lanes, air: Floats, own_out: Float
     while lane < LANES:
         rotation = wp.quat_to_matrix(quat_at(own_out, POSE + 24 + lane))
         J, H, M, bias, tension = drag_terms(
-            p, phis[lane], own_out[DRAG + lane], vec3_at(air, lane), spatial_at(own_out, MOTION + lane),
+            p,
+            phis[lane],
+            own_out[DRAG + lane],
+            vec3_at(air, lane),
+            spatial_at(own_out, MOTION + lane),
             rotation * vec3_at(own_out, COM + lane),
-        )  # fmt: skip
+        )
         J_upper = upper_triangle(J)
         M_upper = upper_triangle(M)
         for c in range(6):
@@ -179,11 +191,16 @@ def add_ties(p: SolverParameters, phi: float, k: int, model: ArticulationModel, 
     ties = model.tie_span[k]
     for t in range(ties[0], ties[1]):
         J, H, M, bias, tension = tie_terms(
-            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
+            p.dt,
+            phi,
+            model.tie_stiffness[t],
+            model.tie_damping[t],
+            forces.tie_anchor[t],
             forces.tie_anchor_velocity[t],
-            wp.quat_to_matrix(quat_at(own_out, POSE + 24)) * model.tie_point[t], vec3_at(own_out, POSE),
+            wp.quat_to_matrix(quat_at(own_out, POSE + 24)) * model.tie_point[t],
+            vec3_at(own_out, POSE),
             spatial_at(own_out, MOTION),
-        )  # fmt: skip
+        )
         put_spatial(own_out, TERMS, spatial_at(own_out, TERMS) + upper_triangle(J))
         for r in range(3):
             at = TERMS + 8 * (6 + 3 * r)
@@ -202,9 +219,16 @@ def eliminate_eight(p: SolverParameters, phis: Lanes, top_out: Floats, own_out: 
     while lane < LANES:
         turning = vec3_at(top_out, MOTION + 24 + lane)
         metric, drive, _torque = joint_terms(
-            p.dt, phis[lane], quat_at(own_out, AXES + lane), quat_at(own_out, JOINT_Q + lane), vec3_at(own_out, JOINT_QD + lane),
-            vec3_at(own_out, STIFFNESS + lane), vec3_at(own_out, DAMPING + lane), turning, vec3_at(own_out, MOTION + 24 + lane),
-        )  # fmt: skip
+            p.dt,
+            phis[lane],
+            quat_at(own_out, AXES + lane),
+            quat_at(own_out, JOINT_Q + lane),
+            vec3_at(own_out, JOINT_QD + lane),
+            vec3_at(own_out, STIFFNESS + lane),
+            vec3_at(own_out, DAMPING + lane),
+            turning,
+            vec3_at(own_out, MOTION + 24 + lane),
+        )
         J = symmetric_at(own_out, TERMS + lane)
         H = mat33_at(own_out, TERMS + 8 * 6 + lane)
         M = symmetric_at(own_out, TERMS + 8 * 15 + lane)
@@ -254,11 +278,18 @@ def accelerate_eight(dt: float, top: Floats, own_out: Floats):
     lane = wp.int32(0)
     while lane < LANES:
         acceleration, rate, velocity = accelerate_body(
-            dt, spatial_at(top, END + lane), spatial_at(top, END + 8 * 6 + lane), vec3_at(top, MOTION + 24 + lane),
-            vec3_at(own_out, MOTION + 24 + lane), vec3_at(own_out, LEVER + lane), quat_at(own_out, AXES + lane),
-            vec3_at(own_out, JOINT_QD + lane), mat33_at(own_out, FACTORS + 8 * 6 + lane),
-            mat33_at(own_out, FACTORS + 8 * 15 + lane), vec3_at(own_out, FACTORS + 8 * 24 + lane),
-        )  # fmt: skip
+            dt,
+            spatial_at(top, END + lane),
+            spatial_at(top, END + 8 * 6 + lane),
+            vec3_at(top, MOTION + 24 + lane),
+            vec3_at(own_out, MOTION + 24 + lane),
+            vec3_at(own_out, LEVER + lane),
+            quat_at(own_out, AXES + lane),
+            vec3_at(own_out, JOINT_QD + lane),
+            mat33_at(own_out, FACTORS + 8 * 6 + lane),
+            mat33_at(own_out, FACTORS + 8 * 15 + lane),
+            vec3_at(own_out, FACTORS + 8 * 24 + lane),
+        )
         for c in range(6):
             end[8 * c + lane] = acceleration[c]
             end[8 * (6 + c) + lane] = velocity[c]
@@ -375,6 +406,14 @@ def predict_groups(
             tree = listed[lane]
             step = substep_parameters(p, tree_steps[tree])
             predict_tree(
-                step, trees_model, given, state, tree, phis[lane], bodies, factors, contiguous_scratch(scratch_out),
+                step,
+                trees_model,
+                given,
+                state,
+                tree,
+                phis[lane],
+                bodies,
+                factors,
+                contiguous_scratch(scratch_out),
                 prediction,
-            )  # fmt: skip
+            )

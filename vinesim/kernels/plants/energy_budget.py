@@ -210,9 +210,13 @@ def begin_budget(
     if budget_out.limit[tree] < NO_LIMIT and mark == budget_out.mark[tree]:
         return
     energy = tree_energy(
-        p, contiguous_model(model), contiguous_forces(forces), contiguous_joints(joints), tree,
+        p,
+        contiguous_model(model),
+        contiguous_forces(forces),
+        contiguous_joints(joints),
+        tree,
         contiguous_bodies(bodies_out),
-    )  # fmt: skip
+    )
     budget_out.limit[tree] = energy[0] + energy[1] + ROUNDING * energy[2]
     budget_out.last[tree] = energy[0] + energy[1]
     budget_out.scale[tree] = energy[0]
@@ -417,10 +421,21 @@ def keep_budget(
         if total > limit + band and gain > rounding:
             goal = limit + 0.5 * band - gain  # less by what the next step may gain again
             total = take_energy(
-                p, p.dt / float(tree_steps[tree]), goal, limit + BAND * budget_out.scale[tree] + rounding, dense, loads, tree, budget_out,
-                tree_euler_steps_out, state, bodies, contiguous_factors(factors_out), contiguous_scratch(scratch_out),
+                p,
+                p.dt / float(tree_steps[tree]),
+                goal,
+                limit + BAND * budget_out.scale[tree] + rounding,
+                dense,
+                loads,
+                tree,
+                budget_out,
+                tree_euler_steps_out,
+                state,
+                bodies,
+                contiguous_factors(factors_out),
+                contiguous_scratch(scratch_out),
                 contiguous_prediction(prediction_out),
-            )  # fmt: skip
+            )
         else:
             budget_out.scale[tree] = wp.max(FADE * budget_out.scale[tree], energy[0])
             budget_out.limit[tree] = wp.min(limit, total + rounding)

@@ -53,9 +53,15 @@ def integrate(
     pitch = model.pitch
     dt = p.dt / float(substeps)
     turning, falling = max_rate_and_speed(
-        prediction.joint_qd_free, joints.joint_x, prediction.joint_xd_free, model.body_parent, model.body_root, first,
-        size, pitch,
-    )  # fmt: skip
+        prediction.joint_qd_free,
+        joints.joint_x,
+        prediction.joint_xd_free,
+        model.body_parent,
+        model.body_root,
+        first,
+        size,
+        pitch,
+    )
     most = wp.length(wp.vec2(turning, falling))
     tree_rate_out[tree] = most
     steps = wp.max(tree_euler_steps_out[tree] - 1, 0)

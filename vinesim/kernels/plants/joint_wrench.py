@@ -55,9 +55,16 @@ def joint_wrench(
             own = model.body_mass[k] * (a - p.gravity)
             given = forces.body_load[k] + forces.body_wrench[k]
             given += tie_and_drag_wrench(
-                k, p.dt / float(tree_steps[tree]), tree_phi[tree], forces.tree_air[tree], model, forces, pose, bodies.body_qd[k],
+                k,
+                p.dt / float(tree_steps[tree]),
+                tree_phi[tree],
+                forces.tree_air[tree],
+                model,
+                forces,
+                pose,
+                bodies.body_qd[k],
                 body_acceleration[k],
-            )  # fmt: skip
+            )
             arm = wp.transform_get_translation(pose) - pivot
             force += own - wp.spatial_top(given)
             moment += wp.cross(arm + com, own) + inertia * alpha + wp.cross(omega, inertia * omega)

@@ -155,10 +155,16 @@ def load_tree(
             load = load + wp.spatial_vector(
                 wp.vec3(),
                 turned_rest_moment(
-                    dt, phi, wp.transform_get_rotation(pose) * model.body_rest[k], joints.joint_q[k],
-                    model.joint_stiffness[k], model.joint_damping[k], forces.root_turn[tree], forces.root_turn_rate[tree],
+                    dt,
+                    phi,
+                    wp.transform_get_rotation(pose) * model.body_rest[k],
+                    joints.joint_q[k],
+                    model.joint_stiffness[k],
+                    model.joint_damping[k],
+                    forces.root_turn[tree],
+                    forces.root_turn_rate[tree],
                 ),
-            )  # fmt: skip
+            )
         put_spatial(own, LOAD, load)
         put_vec3(own, CONTACT, wp.spatial_top(forces.body_wrench[k]))
         put_vec3(own, STIFFNESS, model.joint_stiffness[k])

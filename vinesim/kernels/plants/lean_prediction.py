@@ -116,7 +116,7 @@ def applied_terms(
             turned_rest_moment(
                 p.dt, phi, axes, q, stiffness, damping, forces.root_turn[tree], forces.root_turn_rate[tree]
             ),
-        )  # fmt: skip
+        )
     J, H, M, bias, tension, _steady = own_terms(p, phi, motion, mass, com, inertia, load, contact, falls, fall)
     if area > 0.0:
         J_more, H_more, M_more, bias_more, tension_more = drag_terms(p, phi, area, forces.tree_air[tree], motion, com)
@@ -127,9 +127,16 @@ def applied_terms(
         tension += tension_more
     for t in range(ties[0], ties[1]):
         J_more, H_more, M_more, bias_more, tension_more = tie_terms(
-            p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
-            forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
-        )  # fmt: skip
+            p.dt,
+            phi,
+            model.tie_stiffness[t],
+            model.tie_damping[t],
+            forces.tie_anchor[t],
+            forces.tie_anchor_velocity[t],
+            rotation * model.tie_point[t],
+            wp.transform_get_translation(pose),
+            motion,
+        )
         J += J_more
         H += H_more
         M += M_more
@@ -140,9 +147,17 @@ def applied_terms(
 
 @wp.func
 def eliminate_bodies(
-    p: SolverParameters, model: ArticulationModel, forces: AppliedForces, joints: JointState, bodies: BodyState,
-    is_branching: wp.array(dtype=wp.bool), tree: int, phi: float, factors_out: Factors, scratch_out: Scratch,
-):  # fmt: skip
+    p: SolverParameters,
+    model: ArticulationModel,
+    forces: AppliedForces,
+    joints: JointState,
+    bodies: BodyState,
+    is_branching: wp.array(dtype=wp.bool),
+    tree: int,
+    phi: float,
+    factors_out: Factors,
+    scratch_out: Scratch,
+):
     """From the tips to the root of one tree: each body's implicit inertia and bias, its joint's factors, and what is left."""
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
@@ -304,7 +319,5 @@ def predict_lean(
         predict_tree(step, model, forces, joints, tree, phi, bodies_out, factors_out, scratch_out, prediction_out)
     else:
         place_bodies(model, joints, is_branching, tree, bodies_out, factors_out, scratch_out)
-        eliminate_bodies(
-            step, model, forces, joints, bodies_out, is_branching, tree, phi, factors_out, scratch_out
-        )  # fmt: skip
+        eliminate_bodies(step, model, forces, joints, bodies_out, is_branching, tree, phi, factors_out, scratch_out)
         accelerate_tree(step.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)

@@ -100,10 +100,16 @@ def assemble_bodies(
             load = load + wp.spatial_vector(
                 wp.vec3(),
                 turned_rest_moment(
-                    p.dt, phi, axes, joints.joint_q[k], model.joint_stiffness[k], model.joint_damping[k],
-                    forces.root_turn[tree], forces.root_turn_rate[tree],
+                    p.dt,
+                    phi,
+                    axes,
+                    joints.joint_q[k],
+                    model.joint_stiffness[k],
+                    model.joint_damping[k],
+                    forces.root_turn[tree],
+                    forces.root_turn_rate[tree],
                 ),
-            )  # fmt: skip
+            )
         J, H, M, bias, tension, steady_force = own_terms(
             p, phi, motion, model.body_mass[k], com, inertia, load, contact, falls, fall
         )
@@ -121,9 +127,16 @@ def assemble_bodies(
         ties = model.tie_span[k]
         for t in range(ties[0], ties[1]):
             J, H, M, bias, tension = tie_terms(
-                p.dt, phi, model.tie_stiffness[t], model.tie_damping[t], forces.tie_anchor[t],
-                forces.tie_anchor_velocity[t], rotation * model.tie_point[t], wp.transform_get_translation(pose), motion,
-            )  # fmt: skip
+                p.dt,
+                phi,
+                model.tie_stiffness[t],
+                model.tie_damping[t],
+                forces.tie_anchor[t],
+                forces.tie_anchor_velocity[t],
+                rotation * model.tie_point[t],
+                wp.transform_get_translation(pose),
+                motion,
+            )
             add_terms(k, J, H, M, bias, tension, scratch_out)
 
 
@@ -184,9 +197,16 @@ def eliminate_joints(
             turning = wp.spatial_bottom(bodies.body_qd[parent])
         omega = wp.spatial_bottom(bodies.body_qd[k])
         metric, drive, torque = joint_terms(
-            p.dt, phi, factors_out.axes[k], joints.joint_q[k], joints.joint_qd[k], model.joint_stiffness[k],
-            model.joint_damping[k], turning, omega,
-        )  # fmt: skip
+            p.dt,
+            phi,
+            factors_out.axes[k],
+            joints.joint_q[k],
+            joints.joint_qd[k],
+            model.joint_stiffness[k],
+            model.joint_damping[k],
+            turning,
+            omega,
+        )
         bias = scratch_out.bias[k]
         J = symmetric(scratch_out.J[k])
         H = scratch_out.H[k]
@@ -252,9 +272,18 @@ def accelerate_bodies(
             prediction_out.joint_xd_free[k] = joints.joint_xd[k] + dt * falling
             motion = wp.spatial_vector(prediction_out.joint_xd_free[k], wp.vec3())
         acceleration, rate, velocity = accelerate_body(
-            dt, above, motion, turning, wp.spatial_bottom(bodies.body_qd[k]), factors.lever[k], factors.axes[k],
-            joints.joint_qd[k], factors.DJ[k], factors.DH[k], scratch.Du[k],
-        )  # fmt: skip
+            dt,
+            above,
+            motion,
+            turning,
+            wp.spatial_bottom(bodies.body_qd[k]),
+            factors.lever[k],
+            factors.axes[k],
+            joints.joint_qd[k],
+            factors.DJ[k],
+            factors.DH[k],
+            scratch.Du[k],
+        )
         prediction_out.body_acceleration[k] = acceleration
         prediction_out.joint_qd_free[k] = rate
         prediction_out.body_qd_free[k] = velocity
@@ -326,7 +355,14 @@ def predict(
     phi = chosen_phi(p, trees_model, state, tree, tree_phi[tree], tree_euler_steps[tree])
     tree_phi_out[tree] = phi
     predict_tree(
-        substep_parameters(p, tree_steps[tree]), trees_model, contiguous_forces(forces), state, tree, phi,
-        contiguous_bodies(bodies_out), contiguous_factors(factors_out), contiguous_scratch(scratch_out),
+        substep_parameters(p, tree_steps[tree]),
+        trees_model,
+        contiguous_forces(forces),
+        state,
+        tree,
+        phi,
+        contiguous_bodies(bodies_out),
+        contiguous_factors(factors_out),
+        contiguous_scratch(scratch_out),
         contiguous_prediction(prediction_out),
-    )  # fmt: skip
+    )

@@ -58,7 +58,7 @@ def world_inertia(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
     """Inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
     inertia = wp.mat33(
         moments[0], products[2], products[1], products[2], moments[1], products[0], products[1], products[0], moments[2]
-    )  # fmt: skip
+    )
     return rotation * inertia * wp.transpose(rotation)
 
 

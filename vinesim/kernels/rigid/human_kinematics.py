@@ -4,7 +4,10 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-HEAD, HIPS, LEFT_FOOT, RIGHT_FOOT = wp.constant(0), wp.constant(1), wp.constant(2), wp.constant(3)
+HEAD = wp.constant(0)
+HIPS = wp.constant(1)
+LEFT_FOOT = wp.constant(2)
+RIGHT_FOOT = wp.constant(3)
 
 
 @wp.func

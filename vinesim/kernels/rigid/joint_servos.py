@@ -4,7 +4,8 @@ import warp as wp
 
 wp.set_module_options({"enable_backward": False})
 
-VELOCITY, EFFORT = wp.constant(1), wp.constant(2)
+VELOCITY = wp.constant(1)
+EFFORT = wp.constant(2)
 """Command interfaces in which a set-point does not follow a position; see ``CommandInterface``."""
 MIN_INERTIA = wp.constant(wp.float64(1e-9))
 """[kg m^2 or kg] Inertia is taken to be at least this where it divides."""
@@ -45,7 +46,8 @@ def advance_setpoints(
 ):
     """One thread advances the set-point of one joint by a step, and the rate at which it moves."""
     i = wp.tid()
-    zero, fastest = wp.float64(0.0), limits.velocity[i]
+    zero = wp.float64(0.0)
+    fastest = limits.velocity[i]
     kind = int(interface[i])
     # a saturated servo gives no more when its error grows, but would overshoot when released: bound the error
     reach = limits.tracking_error[i]

@@ -51,7 +51,8 @@ def row_dot(a: wp.array2d(dtype=wp.float64), i: int, j: int, n: int):
 @wp.func
 def orthogonalize_rows(first: int, end: int, n: int, scratch_out: IkScratch):
     """Rotate rows ``first`` to ``end`` of basis, and with them the residual, until they are orthogonal."""
-    one, two = wp.float64(1.0), wp.float64(2.0)
+    one = wp.float64(1.0)
+    two = wp.float64(2.0)
     for _ in range(MAX_SWEEPS):
         rotations = int(0)
         for i in range(first, end):
@@ -99,7 +100,8 @@ def solve_task(
 ):
     """Add to the solution what one task, rows ``first`` to ``end``, asks for in the null space of those before it."""
     n = scratch_out.solution.shape[0]
-    half, one = wp.float64(0.5), wp.float64(1.0)
+    half = wp.float64(0.5)
+    one = wp.float64(1.0)
     for r in range(first, end):
         missing = velocity[r]
         for k in range(n):

@@ -292,9 +292,14 @@ def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
 
 @wp.func
 def load_nodes(
-    j: int, sign: wp.float64, wires: Wires, nodes: SupportNodes, presses: WirePresses,
-    loads_out: wp.array(dtype=wp.vec3d), is_loaded_out: wp.array(dtype=wp.bool),
-):  # fmt: skip
+    j: int,
+    sign: wp.float64,
+    wires: Wires,
+    nodes: SupportNodes,
+    presses: WirePresses,
+    loads_out: wp.array(dtype=wp.vec3d),
+    is_loaded_out: wp.array(dtype=wp.bool),
+):
     """Put a press on the two nodes beside it, by its shares of the distance; ``sign`` 0: clear these nodes instead."""
     piece = presses.piece[j]
     support = wires.support[piece]

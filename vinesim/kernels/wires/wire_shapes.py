@@ -25,9 +25,13 @@ class SegmentShapes:
 
 @wp.func
 def deflection_at(
-    piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes, deflection: wp.array(dtype=wp.vec3d),
+    piece: int,
+    x: wp.float64,
+    wires: Wires,
+    nodes: SupportNodes,
+    deflection: wp.array(dtype=wp.vec3d),
     presses: WirePresses,
-):  # fmt: skip
+):
     """By how much a point of a wire, ``x`` [m] from its start, is away from where it was drawn [m]."""
     node, low, high = interval_of(piece, x, wires, nodes)
     at_low = wp.vec3d()

@@ -254,9 +254,13 @@ class ClockMessage(NamedTuple):
 
 
 def encode_time(
-    asked: float, world: float = 0.0, factor: float = 1.0, real: float | None = None, cause: str = "",
+    asked: float,
+    world: float = 0.0,
+    factor: float = 1.0,
+    real: float | None = None,
+    cause: str = "",
     report: PaceReport | None = None,
-) -> bytes:  # fmt: skip
+) -> bytes:
     """Encode a :class:`ClockMessage`. ``real``: the ``world``'s time unless given, as in a world that runs in real
     time."""
     real = world if real is None else real

@@ -45,7 +45,8 @@ def decode_couplings(payload: bytes) -> CouplingMessage:
     with np.errstate(invalid="ignore"):  # of signalling NaNs, which are refused below
         rows = np.frombuffer(payload, _COUPLING, count, HEADER.size)
         _check(rows)
-        points, anchors = rows["point"].astype(float), rows["anchor"].astype(float)
+        points = rows["point"].astype(float)
+        anchors = rows["anchor"].astype(float)
     return CouplingMessage(time, tuple(map(Coupling, rows["body"].tolist(), points, anchors)))
 
 

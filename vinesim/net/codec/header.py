@@ -39,9 +39,15 @@ class MessageKind(enum.IntEnum):
 
 
 _RARE = (
-    MessageKind.CLAIMS, MessageKind.RETAINED, MessageKind.HELLO, MessageKind.CLOCK, MessageKind.WELCOME,
-    MessageKind.MESH_PART, MessageKind.MESH_REQUEST, MessageKind.MESH_WANTED,
-)  # fmt: skip
+    MessageKind.CLAIMS,
+    MessageKind.RETAINED,
+    MessageKind.HELLO,
+    MessageKind.CLOCK,
+    MessageKind.WELCOME,
+    MessageKind.MESH_PART,
+    MessageKind.MESH_REQUEST,
+    MessageKind.MESH_WANTED,
+)
 
 TIMESTAMPED = frozenset(MessageKind).difference(_RARE)
 """Kinds whose header holds the network time [s] at which the content was sampled."""

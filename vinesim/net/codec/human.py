@@ -42,7 +42,8 @@ MAX_SPEED = 40.0
 """Fastest point of a person [m/s]; the hand of one who throws reaches 25 m/s. GUESSED."""
 
 _POINTS = len(POINT_NAMES)
-_HIPS, _BODY = POINT_NAMES.index("hips"), slice(1, None)
+_HIPS = POINT_NAMES.index("hips")
+_BODY = slice(1, None)
 
 _HUMAN = struct.Struct(f"<3f{6 * _POINTS - 3}h2H{6 * _POINTS}bB10BB")
 
@@ -63,7 +64,8 @@ def decode_pose(payload: bytes, actor: str) -> RobotUpdate | HumanUpdate:
 def encode_human(update: HumanUpdate) -> bytes:
     """Encode a person's pose; :class:`MessageError` for wrong shapes, values that are not finite, or no unit
     quaternion."""
-    points, velocity = update.pose.points, np.asarray(update.velocity, float)
+    points = update.pose.points
+    velocity = np.asarray(update.velocity, float)
     fingers = (*update.pose.left_fingers, *update.pose.right_fingers)
     if velocity.shape != (_POINTS, 6) or len(fingers) != 10:
         raise MessageError(
@@ -105,10 +107,12 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
             f"human pose of {count} points ({_POINTS}) in {len(payload)} B ({HEADER.size + _HUMAN.size})"
         )
     fields = _HUMAN.unpack_from(payload, HEADER.size)
-    root, fields = np.array(fields[:3]), fields[3:]
+    root = np.array(fields[:3])
+    fields = fields[3:]
     if not (np.abs(root) < MAX_COORDINATE).all():
         raise MessageError(f"human pose with a root at {root}, not finite or too far away")
-    places, turns = fields[: 3 * _POINTS - 3], fields[3 * _POINTS - 3 : 6 * _POINTS - 3]
+    places = fields[: 3 * _POINTS - 3]
+    turns = fields[3 * _POINTS - 3 : 6 * _POINTS - 3]
     scales = fields[6 * _POINTS - 3 :]
     turn = np.array(turns, float).reshape(_POINTS, 3) * TURN_LSB
     if (turn * turn).sum(1).max() > (np.pi + 2.0 * TURN_LSB) ** 2:
@@ -116,13 +120,15 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
     points = np.empty((_POINTS, 7))
     points[0, :3], points[1:, :3] = root, root + POSITION_LSB * np.array(places, float).reshape(-1, 3)
     points[:, 3:] = quaternion(turn)
-    speeds, rest = np.array(scales[2 : 2 + 6 * _POINTS], float), scales[2 + 6 * _POINTS :]
+    speeds = np.array(scales[2 : 2 + 6 * _POINTS], float)
+    rest = scales[2 + 6 * _POINTS :]
     velocity = speeds.reshape(_POINTS, 2, 3) * (VELOCITY_LSB * np.array(scales[:2], float))[:, None]
     if np.linalg.norm(points[_BODY, :3] - points[_HIPS, :3], axis=1).max() > MAX_REACH:
         raise MessageError(f"human pose with a point more than {MAX_REACH} m from the hips")
     if np.linalg.norm(velocity[:, 0], axis=1).max() > MAX_SPEED:
         raise MessageError(f"human pose with a point faster than {MAX_SPEED} m/s")
-    flags, bends = rest[0], [bend / FINGER_SCALE for bend in rest[1:11]]
+    flags = rest[0]
+    bends = [bend / FINGER_SCALE for bend in rest[1:11]]
     if rest[11] >= len(INTENTIONS):
         raise MessageError(f"human pose with an unknown intention, {rest[11]}")
     if flags >= 1 << len(_FLAGS):
@@ -131,10 +137,16 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
         bool(flags >> bit & 1) for bit in range(len(_FLAGS))
     )
     pose = HumanPose(
-        *points, left_closed=left_closed, right_closed=right_closed, left_busy=left_busy, right_busy=right_busy,
-        left_fingers=tuple(bends[:5]), right_fingers=tuple(bends[5:]), left_shears=left_shears,
+        *points,
+        left_closed=left_closed,
+        right_closed=right_closed,
+        left_busy=left_busy,
+        right_busy=right_busy,
+        left_fingers=tuple(bends[:5]),
+        right_fingers=tuple(bends[5:]),
+        left_shears=left_shears,
         right_shears=right_shears,
-    )  # fmt: skip
+    )
     return HumanUpdate(actor, time, pose, velocity.reshape(_POINTS, 6), INTENTIONS[rest[11]])
 
 

@@ -30,9 +30,18 @@ MAX_EXPONENT = 9
 """Largest such power: what is faster than 64 m/s or 254 rad/s is clipped. Twice as fast as anything that is thrown."""
 
 _OBJECT = np.dtype(
-    [("object", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("scale", "u1"),
-     ("position", "<i2", 3), ("turn", "<u4"), ("velocity", "i1", 3), ("spin", "i1", 3)]
-)  # fmt: skip
+    [
+        ("object", "<u4"),
+        ("ownership", "<u2"),
+        ("authority", "<u2"),
+        ("flags", "u1"),
+        ("scale", "u1"),
+        ("position", "<i2", 3),
+        ("turn", "<u4"),
+        ("velocity", "i1", 3),
+        ("spin", "i1", 3),
+    ]
+)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -51,15 +51,18 @@ def encode_robot(update: RobotUpdate) -> bytes:
     32.7 m/s or rad/s, joint velocities at 83. Raises :class:`MessageError` for wrong sizes, values that are not finite
     or beyond 1e9, and a quaternion that is not of unit length.
     """
-    pose, twist = update.base_q.tolist(), update.base_qd.tolist()
-    position, velocity = np.asarray(update.position, float), np.asarray(update.velocity, float)
+    pose = update.base_q.tolist()
+    twist = update.base_qd.tolist()
+    position = np.asarray(update.position, float)
+    velocity = np.asarray(update.velocity, float)
     count = len(position)
     if count > MAX_JOINTS or len(velocity) != count or len(pose) != 7 or len(twist) != 6:
         raise MessageError(
             f"{update.actor!r}: pose of {len(pose)} numbers (7), velocity of {len(twist)} (6), {count} joint positions "
             f"and {len(velocity)} velocities (equal, at most {MAX_JOINTS})"
         )
-    distance, speed = np.abs(position), np.abs(velocity)
+    distance = np.abs(position)
+    speed = np.abs(velocity)
     if not (all(-1e9 < number < 1e9 for number in (*pose, *twist)) and (distance < 1e9).all() and (speed < 1e9).all()):
         raise MessageError(f"state of {update.actor!r} has a number that is not finite or beyond 1e9")
     x, y, z, w = pose[3:]
@@ -76,13 +79,15 @@ def encode_robot(update: RobotUpdate) -> bytes:
     if not all(0 <= number <= 255 for number in lights):
         raise MessageError(f"lights {lights} of {update.actor!r}: each of four numbers must be 0 to 255")
     turn = _to_lsb([x * factor, y * factor, z * factor], TURN_LSB)
-    return b"".join((
-        pack_header(MessageKind.ROBOT, count, update.time),
-        _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale, *lights),
-        steps.astype("<i2").tobytes(),
-        rates.astype("i1").tobytes(),
-        position[~near].astype("<f4").tobytes(),
-    ))  # fmt: skip
+    return b"".join(
+        (
+            pack_header(MessageKind.ROBOT, count, update.time),
+            _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale, *lights),
+            steps.astype("<i2").tobytes(),
+            rates.astype("i1").tobytes(),
+            position[~near].astype("<f4").tobytes(),
+        )
+    )
 
 
 def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
@@ -106,6 +111,11 @@ def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     turn = check_rotation_vectors(np.array(base[3:6]) * TURN_LSB, "actor pose")
     velocity = np.frombuffer(payload, "i1", count, joints + 2 * count) * (base[12] * JOINT_RATE_LSB)
     return RobotUpdate(
-        actor, time, np.concatenate([base[:3], quaternion(turn)]), np.array(base[6:12]) * BASE_VELOCITY_LSB,
-        position, velocity, Lights(LightPattern(base[13] % _SOUND), base[14:17], base[13] >= _SOUND),
-    )  # fmt: skip
+        actor,
+        time,
+        np.concatenate([base[:3], quaternion(turn)]),
+        np.array(base[6:12]) * BASE_VELOCITY_LSB,
+        position,
+        velocity,
+        Lights(LightPattern(base[13] % _SOUND), base[14:17], base[13] >= _SOUND),
+    )

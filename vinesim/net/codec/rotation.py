@@ -24,7 +24,8 @@ _COMPONENT_STEPS = 1023.0 / np.sqrt(2.0)
 
 def rotation_vector(q: np.ndarray) -> np.ndarray:
     """Rotation vectors [..., 3] rad of unit quaternions [..., 4], of at most half a turn."""
-    v, w = q[..., :3], q[..., 3]
+    v = q[..., :3]
+    w = q[..., 3]
     sine = np.maximum(np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)
     return v * np.copysign(2.0 * np.arctan2(sine, np.abs(w)) / sine, w)[..., None]
 

@@ -26,7 +26,8 @@ from vinesim.net.codec.robot import BASE_VELOCITY_LSB, JOINT_RATE_LSB
 from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quaternion, rotation_vector
 from vinesim.scene.values import TreeUpdate
 
-TOUCHED, RESTING = 1, 2
+TOUCHED = 1
+RESTING = 2
 """Flags of a tree or an object: its owner is in contact with it; it is at rest and no further messages follow."""
 
 DETACHED_COUNT_UNIT = 4
@@ -91,13 +92,21 @@ class TreeStates:
         )
         return [
             TreeUpdate(
-                tree, owner, ownership, authority, self.time, bool(flags & RESTING),
+                tree,
+                owner,
+                ownership,
+                authority,
+                self.time,
+                bool(flags & RESTING),
                 bool(flags & TOUCHED),
-                self.joint_q[start:end], self.joint_qd[start:end],
-                self.root[first:last], self.root_x[first:last], self.root_xd[first:last],
+                self.joint_q[start:end],
+                self.joint_qd[start:end],
+                self.root[first:last],
+                self.root_x[first:last],
+                self.root_xd[first:last],
             )
             for tree, ownership, authority, flags, start, end, first, last in rows
-        ]  # fmt: skip
+        ]
 
 
 def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -161,10 +170,18 @@ def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
         roots["position"] = np.clip(trees.root_x, -LARGEST_COORDINATE, LARGEST_COORDINATE)
         roots["velocity"] = np.clip(np.rint(trees.root_xd / BASE_VELOCITY_LSB), -32767, 32767)
 
-    payloads, start, body, root = [], 0, 0, 0
-    head_bytes, body_bytes, root_bytes = heads.tobytes(), records.tobytes(), roots.tobytes()
+    payloads = []
+    start = 0
+    body = 0
+    root = 0
+    head_bytes = heads.tobytes()
+    body_bytes = records.tobytes()
+    root_bytes = roots.tobytes()
     while start < len(sizes):
-        end, last, end_root, room = start, body, root, MAX_DATAGRAM - HEADER.size
+        end = start
+        last = body
+        end_root = root
+        room = MAX_DATAGRAM - HEADER.size
         while end < len(sizes):
             room -= _TREE.itemsize + sizes[end] * _BODY.itemsize + cuts[end] * _ROOT.itemsize
             if room < 0 and end > start:
@@ -178,11 +195,16 @@ def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
             + body_bytes[body * _BODY.itemsize : last * _BODY.itemsize]
             + root_bytes[root * _ROOT.itemsize : end_root * _ROOT.itemsize]
         )
-        start, body, root = end, last, end_root
+        start = end
+        body = last
+        root = end_root
     decoded = dataclasses.replace(
-        trees, joint_q=quaternion(turn * TURN_LSB), joint_qd=rate * unit,
-        root_x=roots["position"].astype(float), root_xd=roots["velocity"] * BASE_VELOCITY_LSB,
-    )  # fmt: skip
+        trees,
+        joint_q=quaternion(turn * TURN_LSB),
+        joint_qd=rate * unit,
+        root_x=roots["position"].astype(float),
+        root_xd=roots["velocity"] * BASE_VELOCITY_LSB,
+    )
     return payloads, decoded
 
 
@@ -196,7 +218,8 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeSta
     if not 1 <= count <= MAX_TREES or len(payload) < at:
         raise MessageError(f"{count} trees announced (1 to {MAX_TREES}) in {len(payload)} B")
     heads = np.frombuffer(payload, _TREE, count, HEADER.size)
-    tree, bodies = heads["tree"].astype(np.int64), heads["bodies"].astype(np.int64)
+    tree = heads["tree"].astype(np.int64)
+    bodies = heads["bodies"].astype(np.int64)
     total = int(bodies.sum())
     cuts = heads["flags"].astype(np.int64) // DETACHED_COUNT_UNIT
     after = at + total * _BODY.itemsize
@@ -230,7 +253,8 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeSta
         return TreeStates(*known)
     roots = np.frombuffer(payload, _ROOT, int(cuts.sum()), after)
     with np.errstate(invalid="ignore"):  # of signalling NaNs, which are refused below
-        root, root_x = roots["body"].astype(np.int64), roots["position"].astype(float)
+        root = roots["body"].astype(np.int64)
+        root_x = roots["position"].astype(float)
     if (root >= np.repeat(bodies, cuts)).any() or not (np.abs(root_x) < MAX_COORDINATE).all():
         raise MessageError("a detached body that the tree does not have, or with a position out of range")
     if (np.diff(root)[np.diff(np.repeat(tree, cuts)) == 0] <= 0).any():

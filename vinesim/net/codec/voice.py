@@ -32,7 +32,8 @@ def decode_voice(payload: bytes) -> VoiceFrame:
     number, time = unpack_header(payload, MessageKind.VOICE, "frame of sound")
     if len(payload) <= HEADER.size:
         raise MessageError(f"frame of sound of {len(payload)} B without a codec")
-    codec, data = payload[HEADER.size], payload[HEADER.size + 1 :]
+    codec = payload[HEADER.size]
+    data = payload[HEADER.size + 1 :]
     if fault := find_fault(codec, data):
         raise MessageError(f"frame of sound: {fault}")
     return VoiceFrame(number, time, Codec(codec), data)

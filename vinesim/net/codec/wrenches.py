@@ -47,7 +47,8 @@ def decode_wrenches(payload: bytes) -> WrenchMessage:
     count, time = unpack_header(payload, MessageKind.WRENCHES, "wrenches")
     if count > MAX_LINKS:
         raise MessageError(f"wrenches on {count} links, at most {MAX_LINKS}")
-    at, wrenches = HEADER.size, {}
+    at = HEADER.size
+    wrenches = {}
     for _ in range(count):
         end = at + 1 + (payload[at] if at < len(payload) else 0)
         if end + _WRENCH.size > len(payload):

@@ -44,44 +44,63 @@ _THINGS = _list(_object("thing", "a box or a loose bunch", touched=_YES, pose=_P
 
 _LINKS = _list(
     _object(
-        "link", "one that is pushed", link=_TEXT,
+        "link",
+        "one that is pushed",
+        link=_TEXT,
         wrench={**_list(_NUMBER), "description": "force [N], moment about its centre of mass [N m], world axes"},
     )
-)  # fmt: skip
+)
 
 _COUPLINGS = _list(
     _object(
-        "coupling", "a spring that holds a body of a tree", body=_COUNT,
+        "coupling",
+        "a spring that holds a body of a tree",
+        body=_COUNT,
         point={**_list(_NUMBER), "description": "in the body's frame [m]"},
         anchor={**_list(_NUMBER), "description": "where it is pulled to, in the world [m]"},
     )
-)  # fmt: skip
+)
 
 _CLAIMS = _list(_object("claim", "who says to own a thing", owner=_TEXT, touched=_YES, **_THING))
 
 _FACTS = _list(
     _object(
-        "fact", "what stays true", author=_TEXT, parent=_TEXT, moving=_YES, pose=_POSE, cut=_list(_COUNT), **_THING,
+        "fact",
+        "what stays true",
+        author=_TEXT,
+        parent=_TEXT,
+        moving=_YES,
+        pose=_POSE,
+        cut=_list(_COUNT),
+        **_THING,
     )
-)  # fmt: skip
+)
 
 _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "a": (
         "foxglove.PoseInFrame",
         _object(
-            "foxglove.PoseInFrame", "Where an actor is, and its joints.", timestamp=_TIME, frame_id=_TEXT,
+            "foxglove.PoseInFrame",
+            "Where an actor is, and its joints.",
+            timestamp=_TIME,
+            frame_id=_TEXT,
             pose=_POSE,
             velocity={**_list(_NUMBER), "description": "of its base: m/s, rad/s, world axes"},
             joint_position={**_list(_NUMBER), "description": "rad or m"},
             joint_velocity={**_list(_NUMBER), "description": "rad/s or m/s"},
-            points=_object("points", "of a person", **dict.fromkeys(POINT_NAMES, _POSE)), intention=_TEXT,
-            lights=_object("lights", "of a robot, sRGB 0 to 255", pattern=_TEXT, color=_list(_COUNT)), **_COMMON,
+            points=_object("points", "of a person", **dict.fromkeys(POINT_NAMES, _POSE)),
+            intention=_TEXT,
+            lights=_object("lights", "of a robot, sRGB 0 to 255", pattern=_TEXT, color=_list(_COUNT)),
+            **_COMMON,
         ),
     ),
     "c": (
         "vinesim.Moving",
         _object(
-            "vinesim.Moving", "Boxes and bunches that an actor moves in a cell.", timestamp=_TIME, things=_THINGS,
+            "vinesim.Moving",
+            "Boxes and bunches that an actor moves in a cell.",
+            timestamp=_TIME,
+            things=_THINGS,
             **_COMMON,
         ),
     ),
@@ -101,8 +120,12 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "force": (
         "vinesim.Push",
         _object(
-            "vinesim.Push", "What an actor does to a robot, or to a tree that another touches, too.", timestamp=_TIME,
-            links=_LINKS, couplings=_COUPLINGS, **_COMMON,
+            "vinesim.Push",
+            "What an actor does to a robot, or to a tree that another touches, too.",
+            timestamp=_TIME,
+            links=_LINKS,
+            couplings=_COUPLINGS,
+            **_COMMON,
         ),
     ),
     "fact": ("vinesim.Facts", _object("vinesim.Facts", "What stays true.", facts=_FACTS, **_COMMON)),
@@ -110,13 +133,26 @@ _SCHEMAS: dict[str, tuple[str, dict[str, Any]]] = {
     "hello": (
         "vinesim.Greeting",
         _object(
-            "vinesim.Greeting", "How an actor introduced itself.", name=_TEXT, kind=_TEXT, robot=_TEXT, urdf=_TEXT,
-            sidecar=_TEXT, scene=_TEXT, digest=_TEXT, seed=_COUNT, protocol=_COUNT, index=_COUNT, joints=_COUNT,
-            height=_NUMBER, outfit=_TEXT, **_COMMON,
+            "vinesim.Greeting",
+            "How an actor introduced itself.",
+            name=_TEXT,
+            kind=_TEXT,
+            robot=_TEXT,
+            urdf=_TEXT,
+            sidecar=_TEXT,
+            scene=_TEXT,
+            digest=_TEXT,
+            seed=_COUNT,
+            protocol=_COUNT,
+            index=_COUNT,
+            joints=_COUNT,
+            height=_NUMBER,
+            outfit=_TEXT,
+            **_COMMON,
         ),
     ),
     "live": ("vinesim.Live", _object("vinesim.Live", "An actor came or went.", live=_YES, **_COMMON)),
-}  # fmt: skip
+}
 
 
 def schema_of(key: str) -> tuple[str, bytes]:

@@ -39,7 +39,8 @@ class RecordingStopped(WriteError):
 
 def free_path(path: pathlib.Path) -> pathlib.Path:
     """The path; if the file exists, NAME-2, NAME-3 ... before the suffix. No recording is ever overwritten."""
-    number, free = 1, path
+    number = 1
+    free = path
     while free.exists():
         number += 1
         free = path.with_name(f"{path.stem}-{number}{path.suffix}")

@@ -58,12 +58,16 @@ def _describe_trees(payload: bytes, _: str) -> dict[str, Any]:
         "timestamp": _stamp(trees.time),
         "trees": [
             {
-                "tree": tree, "ownership": ownership, "authority": authority, "bodies": bodies,
-                "touched": bool(flags & messages.TOUCHED), "resting": bool(flags & messages.RESTING),
+                "tree": tree,
+                "ownership": ownership,
+                "authority": authority,
+                "bodies": bodies,
+                "touched": bool(flags & messages.TOUCHED),
+                "resting": bool(flags & messages.RESTING),
             }
             for tree, ownership, authority, flags, bodies in rows
         ],
-    }  # fmt: skip
+    }
 
 
 def _describe_objects(payload: bytes, key: str) -> dict[str, Any]:
@@ -73,38 +77,49 @@ def _describe_objects(payload: bytes, key: str) -> dict[str, Any]:
         "timestamp": _stamp(objects.time),
         "things": [
             {
-                **_named(update.object), "ownership": update.ownership, "authority": update.authority,
-                "touched": bool(flags & messages.TOUCHED), "pose": _pose(update.pose),
+                **_named(update.object),
+                "ownership": update.ownership,
+                "authority": update.authority,
+                "touched": bool(flags & messages.TOUCHED),
+                "pose": _pose(update.pose),
                 "velocity": update.velocity.tolist(),
             }
             for update, flags in zip(objects.updates(sender_of(key)), objects.flags.tolist(), strict=True)
         ],
-    }  # fmt: skip
+    }
 
 
 def _describe_claims(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "claims": [
             {
-                **_named(object_id), "ownership": claim.ownership, "authority": claim.authority, "owner": claim.owner,
+                **_named(object_id),
+                "ownership": claim.ownership,
+                "authority": claim.authority,
+                "owner": claim.owner,
                 "touched": touching,
             }
             for object_id, claim, touching in messages.decode_claims(payload)
         ]
-    }  # fmt: skip
+    }
 
 
 def _describe_records(payload: bytes, _: str) -> dict[str, Any]:
     return {
         "facts": [
             {
-                **_named(record.object), "ownership": record.ownership, "authority": record.authority,
-                "author": record.author, "moving": record.moving, "pose": _pose(np.array(record.pose)),
-                "parent": record.parent, "cut": list(record.cut),
+                **_named(record.object),
+                "ownership": record.ownership,
+                "authority": record.authority,
+                "author": record.author,
+                "moving": record.moving,
+                "pose": _pose(np.array(record.pose)),
+                "parent": record.parent,
+                "cut": list(record.cut),
             }
             for record in messages.decode_records(payload)
         ]
-    }  # fmt: skip
+    }
 
 
 def _describe_wrenches(payload: bytes, _: str) -> dict[str, Any]:

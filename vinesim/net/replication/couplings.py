@@ -45,14 +45,21 @@ class CouplingSync:
 
     def __init__(self, bus: Bus, name: str, model: Model, counters: Counters) -> None:
         """The bus must be subscribed to ``force/<name>/*`` already."""
-        self._bus, self._name, self._model, self._counters = bus, name, model, counters
+        self._bus = bus
+        self._name = name
+        self._model = model
+        self._counters = counters
         self._partners: dict[str, _Partner] = {}
         self._received: dict[str, tuple[float, CouplingMessage]] = {}
 
     def receive(
-        self, payload: bytes, sender: Hello, pose: HumanUpdate | RobotUpdate | None, now: float,
+        self,
+        payload: bytes,
+        sender: Hello,
+        pose: HumanUpdate | RobotUpdate | None,
+        now: float,
         owner: Callable[[int], str | None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Take a message of ``sender``, whose last pose is ``pose`` (None: unknown or too old).
 
         ``owner(tree)``: name of a tree's owner. Couplings to trees that neither side owns, or farther away than an arm

@@ -42,8 +42,13 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
     ``omega`` is given in the frame that ``q`` rotates into (world axes for a base, joint-frame axes for a body).
     """
-    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    a, b, c = 0.5 * omega[..., 0], 0.5 * omega[..., 1], 0.5 * omega[..., 2]
+    x = q[..., 0]
+    y = q[..., 1]
+    z = q[..., 2]
+    w = q[..., 3]
+    a = 0.5 * omega[..., 0]
+    b = 0.5 * omega[..., 1]
+    c = 0.5 * omega[..., 2]
     rate = np.empty((*np.broadcast_shapes(q.shape[:-1], omega.shape[:-1]), 4), np.result_type(q, omega))
     rate[..., 0] = a * w + b * z - c * y
     rate[..., 1] = b * w + c * x - a * z
@@ -84,7 +89,8 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     Computed from the chord: the arccosine of the dot product would turn the rounding of single-precision states into
     0.04 degrees, and a chain of bodies sums that up to an unnecessary message.
     """
-    same, opposite = a - b, a + b
+    same = a - b
+    opposite = a + b
     chord = np.minimum(np.einsum("...i,...i->...", same, same), np.einsum("...i,...i->...", opposite, opposite))
     return 4.0 * np.arcsin(np.minimum(0.5 * np.sqrt(chord), 1.0))
 

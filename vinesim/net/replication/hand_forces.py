@@ -85,7 +85,8 @@ def limit_by_hands(
     is_limited = False
     for link, wrench in wrenches.items():
         reduced, is_reduced = limit({link: wrench}, len(reach[link]), hand_force)
-        wrenches, is_limited = wrenches | reduced, is_limited or is_reduced
+        wrenches = wrenches | reduced
+        is_limited = is_limited or is_reduced
     wrenches, is_reduced = limit(wrenches, len(frozenset().union(*reach.values())), hand_force)
     return wrenches, is_limited or is_reduced
 
@@ -96,7 +97,9 @@ class WrenchSync:
     def __init__(self, bus: Bus, name: str, counters: Counters, hand_force: float = HAND_FORCE) -> None:
         """``hand_force`` [N]: limit of each hand."""
         self._hand_force = hand_force
-        self._bus, self._name, self._counters = bus, name, counters
+        self._bus = bus
+        self._name = name
+        self._counters = counters
         self._pushed: dict[str, _PushedRobot] = {}
         self._received: dict[str, tuple[float, WrenchMessage]] = {}
         bus.subscribe(f"force/{name}/*", KEEP_LAST_64)  # couplings to trees come under the same keys
@@ -164,7 +167,9 @@ class WrenchSync:
             mean = {link: total / robot_state.ticks for link, total in robot_state.total.items()}
             payload = encode_wrenches(WrenchMessage(time, limit(mean, 2, self._hand_force)[0]))
             robot_state.due = max(robot_state.due, now - SEND_PERIOD) + SEND_PERIOD
-            robot_state.total, robot_state.ticks, robot_state.is_active = {}, 0, bool(mean)
+            robot_state.total = {}
+            robot_state.ticks = 0
+            robot_state.is_active = bool(mean)
             if robot_state.publisher.put(payload):
                 sent.append(payload)
         return sent

@@ -45,8 +45,11 @@ class PoseLayer(NamedTuple):
 
 
 POSE_LAYERS = (
-    PoseLayer("/far", 12, math.inf), PoseLayer("/mid", 4, 12.0), PoseLayer("/near", 2, 6.0), PoseLayer("", 1, 3.0),
-)  # fmt: skip
+    PoseLayer("/far", 12, math.inf),
+    PoseLayer("/mid", 4, 12.0),
+    PoseLayer("/near", 2, 6.0),
+    PoseLayer("", 1, 3.0),
+)
 """5 Hz for all, and 15, 30 and 60 Hz within 12, 6 and 3 m: the rate falls with the distance, so that what moves at a
 given speed moves by the same angle between two poses, seen from the receiver. Hands touch within 3 m."""
 
@@ -92,8 +95,10 @@ def tree_cells_within(position: np.ndarray, distance: float) -> set[Cell]:
     low, high = (np.floor((position[:2] + way * distance) / TREE_CELL_SIZE).astype(int) for way in (-1.0, 1.0))
     x, y = (np.arange(low[axis], high[axis] + 1) for axis in (0, 1))
     # how far the nearest edge of each column and row is away
-    away = [np.maximum(np.maximum(TREE_CELL_SIZE * k - p, p - TREE_CELL_SIZE * (k + 1)), 0.0)
-            for k, p in ((x, position[0]), (y, position[1]))]  # fmt: skip
+    away = [
+        np.maximum(np.maximum(TREE_CELL_SIZE * k - p, p - TREE_CELL_SIZE * (k + 1)), 0.0)
+        for k, p in ((x, position[0]), (y, position[1]))
+    ]
     column, row = np.nonzero(np.hypot(away[0][:, None], away[1][None, :]) <= distance)
     return set(zip(x[column].tolist(), y[row].tolist(), strict=True))
 
@@ -107,7 +112,8 @@ def move_window(middle: Cell | None, position: np.ndarray) -> Cell:
     """Middle cell of the window of an actor at ``position`` [m] whose middle cell was ``middle``, with hysteresis."""
     if middle is not None:
         x, y = position[:2].tolist()
-        low_x, low_y = CELL_SIZE * middle[0] - HYSTERESIS, CELL_SIZE * middle[1] - HYSTERESIS
+        low_x = CELL_SIZE * middle[0] - HYSTERESIS
+        low_y = CELL_SIZE * middle[1] - HYSTERESIS
         width = CELL_SIZE + 2.0 * HYSTERESIS
         if low_x <= x <= low_x + width and low_y <= y <= low_y + width:
             return middle

@@ -29,7 +29,8 @@ def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) 
 
 def _check_tree_record(record: RetainedRecord, model: Model) -> None:
     tree = record.object
-    first, core = int(model.tree_first[tree]), int(model.tree_core[tree])
+    first = int(model.tree_first[tree])
+    core = int(model.tree_core[tree])
     wrong = next((body for body in record.cut if not first <= body < first + core), None)
     if wrong is not None:
         raise MessageError(f"record of tree {tree} cut at body {wrong}; it has wood from {first} to {first + core - 1}")

@@ -58,7 +58,9 @@ class NetworkClock:
         """Network time minus own time [s]."""
         self.report: Callable[[], PaceReport | None] = lambda: None
         """How fast this client can follow, to be sent with the next ping; None: it slows no world."""
-        self._bus, self._now, self._started = bus, now, now
+        self._bus = bus
+        self._now = now
+        self._started = now
         self._own = 0.0 if now is None else now
         self._rate = 1.0
         """How fast own time passes, with slewing."""
@@ -66,7 +68,8 @@ class NetworkClock:
         """Real time of the server's clock, and the world's time then [s], by its last reply."""
         self._answered = -math.inf
         """Real time of the last question that the server has answered [s]."""
-        self._pinged, self._ping_count = -math.inf, 0
+        self._pinged = -math.inf
+        self._ping_count = 0
 
     @property
     def time(self) -> float:
@@ -98,7 +101,8 @@ class NetworkClock:
         """Go on to real time ``now`` [s]; the own time then [s]."""
         own = self.own(now)
         self.estimate = self.estimate.advanced(now - self._now if self._now is not None else 0.0)
-        self._now, self._own = now, own
+        self._now = now
+        self._own = own
         self._started = now if self._started is None else self._started
         self._slew()
         return own
@@ -107,7 +111,8 @@ class NetworkClock:
         """Query the server's clock when the last ping is old enough."""
         assert self._now is not None
         if self._now - self._pinged >= PING_PERIOD[self._ping_count >= 2 * PING_WINDOW]:
-            self._pinged, self._ping_count = self._now, self._ping_count + 1
+            self._pinged = self._now
+            self._ping_count = self._ping_count + 1
             self._bus.query(f"clock/{self._bus.name}", messages.encode_time(self._now, report=self.report()))
 
     def receive(self, payload: bytes, age: float) -> None:
@@ -117,7 +122,8 @@ class NetworkClock:
         received = self._now - age
         if reply.asked > received:
             return
-        is_first, settles = not self.estimate.pings, len(self.estimate.pings) < PING_WINDOW
+        is_first = not self.estimate.pings
+        settles = len(self.estimate.pings) < PING_WINDOW
         self.estimate = self.estimate.with_ping(Ping(reply.asked, reply.real, received))
         is_other = len(self.estimate.pings) == 1 and not is_first
         """Whether another server has replied, or one whose clock was set."""
@@ -126,8 +132,10 @@ class NetworkClock:
         ):
             return
         was_silent = reply.asked - self._answered > MAX_REPLY_AGE
-        self._known, self._answered = (reply.real, reply.world), reply.asked
-        self.factor, self.cause = reply.factor, reply.cause
+        self._known = (reply.real, reply.world)
+        self._answered = reply.asked
+        self.factor = reply.factor
+        self.cause = reply.cause
         # The first estimates are as wrong as their round trips are long, and what was extrapolated through a long
         # silence may be wrong by seconds: correct both at once.
         if settles or was_silent:
@@ -146,6 +154,7 @@ class NetworkClock:
         """Run faster or slower until network time is the world's time; what is farther away is another clock."""
         away = self._away()
         if abs(away) >= STEP_THRESHOLD:
-            self.offset, away = self.offset + away, 0.0
+            self.offset = self.offset + away
+            away = 0.0
         share = away / (SLEW_TIME * self.factor)
         self._rate = self.factor * (1.0 + min(max(share, -MAX_SLEW), MAX_SLEW))

@@ -126,7 +126,10 @@ class Ownership:
             theirs = sibling[object_id]
             known.previous = theirs.claim if theirs.announced else theirs.previous
             sibling._adopt(object_id, claim, True)
-        known.claim, known.touching, known.announced, known.silent = claim, True, False, False
+        known.claim = claim
+        known.touching = True
+        known.announced = False
+        known.silent = False
         known.listener_count = known.near_listener_count = 0
         self.owned.add(object_id)
 
@@ -135,7 +138,8 @@ class Ownership:
         known = self._known[object_id]
         held = known.claim
         self.owned.discard(object_id)
-        known.claim, known.touching = authority.release(held), False
+        known.claim = authority.release(held)
+        known.touching = False
         return held
 
     def increment(self, object_id: int) -> None:
@@ -166,7 +170,8 @@ class Ownership:
         if not fresh and claim == known.claim:
             return False
         self._adopt(object_id, claim, touching)
-        known.published_at, known.received_at = published_at, time
+        known.published_at = published_at
+        known.received_at = time
         return True
 
     def receive_claim(self, object_id: int, claim: Claim, touching: bool, sender: str, time: float) -> None:
@@ -192,7 +197,10 @@ class Ownership:
     def _adopt(self, object_id: int, claim: Claim, touching: bool) -> None:
         """Hold a claim that a peer made or repeated."""
         known = self._known[object_id]
-        known.claim, known.touching, known.announced, known.silent = claim, touching, True, False
+        known.claim = claim
+        known.touching = touching
+        known.announced = True
+        known.silent = False
         if claim.owner == self.name:
             self.owned.add(object_id)
             return
@@ -242,7 +250,8 @@ class Ownership:
 
     def corrections(self, time: float) -> list[int]:
         """Objects that were claimed with outdated sequences: repeating the claim restores agreement after a loss."""
-        losing, self._losing_claims = self._losing_claims, []
+        losing = self._losing_claims
+        self._losing_claims = []
         corrections = []
         for object_id, claim in losing:
             known = self._known[object_id]

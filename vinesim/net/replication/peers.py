@@ -45,7 +45,9 @@ class PeerRegistry:
 
     def __init__(self, bus: Bus, hello: Hello, counters: Counters, jitter_buffer: float = 0.0) -> None:
         """``jitter_buffer`` [s]: delay with which poses of peers are shown. Joins the world; see :meth:`Bus.join`."""
-        self.bus, self.hello, self.counters = bus, hello, counters
+        self.bus = bus
+        self.hello = hello
+        self.counters = counters
         self._jitter_buffer = JitterBuffer(jitter_buffer).delay
         self._local_actors: set[str] = set()
         self._alive: frozenset[str] | None = None
@@ -82,7 +84,8 @@ class PeerRegistry:
 
     @local_actors.setter
     def local_actors(self, names: set[str]) -> None:
-        self._local_actors, self._alive = names, None
+        self._local_actors = names
+        self._alive = None
 
     def poll_liveliness(self, now: float) -> list[str]:
         """Query new peers for their hello and the clock when due; the names of peers that have left."""
@@ -130,7 +133,8 @@ class PeerRegistry:
         """Take hellos and clock replies; the peers that joined, and the other replies."""
         joined: list[Hello] = []
         others: list[Reply] = []
-        answers, self._unread = (*self._unread, *self.bus.replies()), ()
+        answers = (*self._unread, *self.bus.replies())
+        self._unread = ()
         for answer in answers:
             key, payload, age = answer
             self.counters.control.count_in(payload)
@@ -212,7 +216,8 @@ class PeerRegistry:
 
     def publish_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
         """Publish the own pose, 60 times a second on one of the layers; encoded only if that has a subscriber."""
-        number, before = math.floor(now * interest.POSE_RATE + self._phase + 1e-6), self._pose_number
+        number = math.floor(now * interest.POSE_RATE + self._phase + 1e-6)
+        before = self._pose_number
         if number == before:
             return
         self._pose_number = number

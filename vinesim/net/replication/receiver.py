@@ -88,8 +88,11 @@ class Receiver:
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
-        state, step = self._state, _Step(now, now + offset, link_centre or _no_link)
-        inbox, peers, time = step.inbox, state.peers, step.time
+        state = self._state
+        step = _Step(now, now + offset, link_centre or _no_link)
+        inbox = step.inbox
+        peers = state.peers
+        time = step.time
         inbox.left = peers.poll_liveliness(now)
         for name in inbox.left:
             state.ownership.remove_actor(name, time, state.successor_of)
@@ -102,7 +105,8 @@ class Receiver:
         early = [message for hello in inbox.joined for message in self.early.take(hello.name)]
         for key, payload in early + state.bus.poll():
             self._dispatch(key, payload, step)
-        state.counters.lost, state.counters.network_failures = state.bus.dropped, state.bus.failures
+        state.counters.lost = state.bus.dropped
+        state.counters.network_failures = state.bus.failures
         state.counters.foreign = state.bus.foreign
         state.ownership.expire(time)
         inbox.released = state.ownership.released()
@@ -122,15 +126,19 @@ class Receiver:
 
     def _dispatch(self, key: str, payload: bytes, step: _Step) -> None:
         """Decode and apply one message. Its sender is read from the key, never from the payload."""
-        state, counters = self._state, self._state.counters
+        state = self._state
+        counters = self._state.counters
         family, _, rest = key.partition("/")
         chunks = rest.split("/")
         sender = chunks[0] if family in ("a", "voice") else chunks[-1]
         traffic = {
-            "a": counters.actor, "c": counters.environment, "fact": counters.retained, "force": counters.force,
+            "a": counters.actor,
+            "c": counters.environment,
+            "fact": counters.retained,
+            "force": counters.force,
             "voice": counters.voice,
             **dict.fromkeys(_TREE_FAMILIES, counters.environment),
-        }  # fmt: skip
+        }
         traffic.get(family, counters.event).count_in(payload)
         peer = state.peers.known.get(sender)
         if peer is None and not (family == "fact" and state.peers.was_admitted(sender)):
@@ -206,7 +214,8 @@ class Receiver:
             messages.check_object_id(update.object, state.object_counts)
         is_near = state.cells.is_within_radius(objects.pose[:, :3])
         for row, (update, flags) in enumerate(zip(updates, objects.flags.tolist(), strict=True)):
-            claim, touching = Claim(update.ownership, update.authority, sender), bool(flags & messages.TOUCHED)
+            claim = Claim(update.ownership, update.authority, sender)
+            touching = bool(flags & messages.TOUCHED)
             is_accepted = state.ownership.receive_state(update.object, claim, touching, objects.time, step.time)
             if is_accepted and is_near[row]:
                 state.object_stream.receive(update, cell)
@@ -252,7 +261,8 @@ class Receiver:
     def _publish_correction(self, object_id: int) -> None:
         """Repeat the winning claim to all subscribers of the object's cell."""
         state = self._state
-        entry, publisher = state.ownership[object_id], state.cells.event_publisher(state.cell_of(object_id))
+        entry = state.ownership[object_id]
+        publisher = state.cells.event_publisher(state.cell_of(object_id))
         if publisher is not None:
             payload = messages.encode_claims([(object_id, entry.claim, entry.touching)])
             put_counted(publisher, payload, state.counters.event)

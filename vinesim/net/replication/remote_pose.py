@@ -57,7 +57,8 @@ class RemotePose:
             if len(update.position) != self.joints:
                 raise MessageError(f"pose of {update.actor!r} with {len(update.position)} joints, it has {self.joints}")
         shown = None if self.update is None else self._shown(time)
-        self.update, self._cached = update, None
+        self.update = update
+        self._cached = None
         self._state, self._rate = _numbers(update)
         self._correction = np.zeros(0)
         if self._buffer.delay > 0.0:
@@ -87,7 +88,8 @@ class RemotePose:
         return self._cached
 
     def _at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
-        update, shown = self.update, self._shown(time)
+        update = self.update
+        shown = self._shown(time)
         assert update is not None
         moving = 1.0 if time - update.time <= dead_reckoning.MAX_EXTRAPOLATION else 0.0
         turn = shown[self._turns]
@@ -105,14 +107,19 @@ class RemotePose:
                 update.intention,
             )
         return dataclasses.replace(
-            update, time=now, base_q=shown[:7], base_qd=update.base_qd * moving, position=shown[7:],
+            update,
+            time=now,
+            base_q=shown[:7],
+            base_qd=update.base_qd * moving,
+            position=shown[7:],
             velocity=update.velocity * moving,
-        )  # fmt: skip
+        )
 
     def _buffer_sample(self, time: float) -> None:
         """Insert the newest pose into the jitter buffer, its quaternions on the same side as the previous ones."""
         if self._buffer.states:
-            before, turns = self._buffer.states[-1], self._turns
+            before = self._buffer.states[-1]
+            turns = self._turns
             side = np.copysign(1.0, (before[turns] * self._state[turns]).sum(1, keepdims=True))
             self._state[turns] *= side
             self._rate[turns] *= side

@@ -30,8 +30,10 @@ class ReplicationState:
 
     def __init__(
         self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float, hand_force: float
-    ) -> None:  # fmt: skip
-        self.bus, self.hello, self.model = bus, hello, model
+    ) -> None:
+        self.bus = bus
+        self.hello = hello
+        self.model = model
         self.cells = CellChannels(bus, interest_radius)
         self.tree_channels = TreeChannels(bus, interest_radius)
         self.counters = Counters()
@@ -63,7 +65,8 @@ class ReplicationState:
 
     def owner_candidates(self) -> dict[str, np.ndarray]:
         """Positions [3] m of all actors that can own objects: all but spectators."""
-        known, positions = self.peers.known, self.peers.positions()
+        known = self.peers.known
+        positions = self.peers.positions()
         positions = {name: place for name, place in positions.items() if known[name].hello.kind != SPECTATOR}
         for state in (self, *self.siblings):
             if state.cells.centre is not None and not state.is_spectator:

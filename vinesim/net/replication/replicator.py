@@ -45,9 +45,15 @@ class Replicator:
     """
 
     def __init__(
-        self, bus: Bus, hello: Hello, model: Model, *, interest_radius: float = interest.INTEREST_RADIUS,
-        jitter_buffer: float = 0.0, hand_force: float = HAND_FORCE,
-    ) -> None:  # fmt: skip
+        self,
+        bus: Bus,
+        hello: Hello,
+        model: Model,
+        *,
+        interest_radius: float = interest.INTEREST_RADIUS,
+        jitter_buffer: float = 0.0,
+        hand_force: float = HAND_FORCE,
+    ) -> None:
         """``interest_radius`` [m]: peers nearer than this to an object receive its states; at most 5 m.
 
         ``jitter_buffer`` [s]: delay with which poses of peers are shown (:mod:`vinesim.net.replication.jitter_buffer`).
@@ -56,7 +62,9 @@ class Replicator:
         """
         if hello.name != bus.name:
             raise ValueError(f"greeting of {hello.name!r} on the bus of {bus.name!r}: one actor has one name")
-        self.bus, self.hello, self.model = bus, hello, model
+        self.bus = bus
+        self.hello = hello
+        self.model = model
         self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer, hand_force)
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
@@ -231,10 +239,20 @@ class Replicator:
         )
         return self._sender.send(
             LocalStep(
-                now, time, touched, moving, grabbed, detached, read, detached_roots, pose_on_support, is_changed,
-                has_body, carried_on,
+                now,
+                time,
+                touched,
+                moving,
+                grabbed,
+                detached,
+                read,
+                detached_roots,
+                pose_on_support,
+                is_changed,
+                has_body,
+                carried_on,
             )
-        )  # fmt: skip
+        )
 
     def _own_time(self, now: float) -> float:
         """Own time [s] of the present step, which is made at the time ``now`` [s] of the client's clock."""

@@ -35,7 +35,8 @@ class RetainedState:
         if authority.wins(record.claim, held.claim):
             self._records[self._cell_of[record.object]].pop(record.object)
         elif cuts != held.cut:
-            cell, record = self._cell_of[record.object], held
+            cell = self._cell_of[record.object]
+            record = held
         else:
             return False
         self._put(cell, record if cuts == record.cut else msgspec.structs.replace(record, cut=cuts))

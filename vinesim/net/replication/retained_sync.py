@@ -30,7 +30,8 @@ class RetainedSync:
     """The retained state as one client knows it, and what it still has to publish."""
 
     def __init__(self, bus: Bus, counters: Counters) -> None:
-        self.bus, self.counters = bus, counters
+        self.bus = bus
+        self.counters = counters
         self.state = RetainedState()
         self._pending: dict[Cell, dict[int, RetainedRecord]] = {}
         self._authored: dict[int, tuple[Cell, RetainedRecord]] = {}
@@ -74,7 +75,8 @@ class RetainedSync:
             and len(self._publishers) == len(window)
         ):
             return
-        wanted, self._window_changes = set(window), changes
+        wanted = set(window)
+        self._window_changes = changes
         if self._is_disconnected and not is_disconnected:
             for object_id, (cell, record) in self._authored.items():
                 self._pending.setdefault(cell, {})[object_id] = record
@@ -109,7 +111,8 @@ class RetainedSync:
             if publisher is None:
                 publisher = self._publishers[cell] = self._publisher(cell)
             if waiting and publisher.matching:
-                batch, free_bytes = [], messages.MAX_DATAGRAM
+                batch = []
+                free_bytes = messages.MAX_DATAGRAM
                 for object_id in sorted(waiting):
                     free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees)
                     if free_bytes < 0 and batch:

@@ -68,7 +68,8 @@ class Sender:
 
     def send(self, step: LocalStep) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them."""
-        state, touched = self._state, set(step.touched)
+        state = self._state
+        touched = set(step.touched)
         for object_id in sorted(step.grabbed):
             state.ownership.grab(object_id)
             touched.add(object_id)
@@ -97,10 +98,8 @@ class Sender:
         """Take over objects that have moved without an owner for a while, if no candidate is nearer."""
         state = self._state
         orphans = {
-            object_id
-            for object_id in moving
-            if not is_tree(object_id) and state.ownership.owner(object_id) is None
-        }  # fmt: skip
+            object_id for object_id in moving if not is_tree(object_id) and state.ownership.owner(object_id) is None
+        }
         self._orphans = {object_id: self._orphans.get(object_id, step.now) for object_id in orphans}
         due = (object_id for object_id, since in self._orphans.items() if step.now - since >= ADOPTION_DELAY)
         for object_id in sorted(due):
@@ -123,14 +122,18 @@ class Sender:
 
     def _publish_trees(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
         """Publish, layer by layer and cell by cell, the states of trees of which the copies are wrong."""
-        state, stream, channels = self._state, self._state.tree_stream, self._state.tree_channels
+        state = self._state
+        stream = self._state.tree_stream
+        channels = self._state.tree_channels
         entries = [state.ownership[tree] for tree in active]
         contact = [tree in touched for tree in active]
         middles = stream.middle[list(active)]
         listeners = [state.count_listeners(middles, distance) for distance in channels.distances]
         if not listeners[0].any():
             for entry, touching in zip(entries, contact, strict=True):
-                entry.listener_count, entry.near_listener_count, entry.touching = 0, 0, touching
+                entry.listener_count = 0
+                entry.near_listener_count = 0
+                entry.touching = touching
             return
         stream.read(active, step.read, step.detached_roots)
         for layer, due in enumerate(self._find_due_trees(entries, listeners, contact, step)):
@@ -148,17 +151,20 @@ class Sender:
                     put_counted(publisher, payload, state.counters.environment)
                 for row in rows:
                     entry = entries[row]
-                    entry.announced, entry.published_at = True, step.time
+                    entry.announced = True
+                    entry.published_at = step.time
                     entry.near_listener_count = int(listeners[-1][row])
                     if layer == 0:
-                        entry.published_to_all_at, entry.listener_count = step.time, int(listeners[0][row])
+                        entry.published_to_all_at = step.time
+                        entry.listener_count = int(listeners[0][row])
 
     def _find_due_trees(
         self, entries: list[ObjectRecord], listeners: list[np.ndarray], contact: list[bool], step: LocalStep
     ) -> tuple[np.ndarray, np.ndarray]:
         """Which of the trees last read to publish on either layer, [k] bool each: the copies of its receivers are
         wrong, or a listener, claim or contact is new."""
-        stream, (all_, near) = self._state.tree_stream, listeners
+        stream = self._state.tree_stream
+        (all_, near) = listeners
         silence = step.time - np.array([(entry.published_to_all_at, entry.published_at) for entry in entries]).T
         errors = [stream.prediction_error(number, silence[number]) for number in range(len(TREE_LAYERS))]
         wrong = [
@@ -178,13 +184,15 @@ class Sender:
 
     def _publish_objects(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
         """Publish, cell by cell, the states of boxes and bunches of which the copies are wrong."""
-        state, stream = self._state, self._state.object_stream
+        state = self._state
+        stream = self._state.object_stream
         entries = [state.ownership[object_id] for object_id in active]
         listeners = state.count_listeners(stream.positions(active, step.read))
         contact = [object_id in touched for object_id in active]
         if not listeners.any():
             for entry, touching in zip(entries, contact, strict=True):
-                entry.listener_count, entry.touching = 0, touching
+                entry.listener_count = 0
+                entry.touching = touching
             return
         due = self._find_due_objects(active, entries, listeners, contact, step)
         cells = stream.cells(active)
@@ -203,12 +211,18 @@ class Sender:
                 put_counted(states, payload, state.counters.environment)
             for row in rows:
                 entry = entries[row]
-                entry.announced, entry.published_at, entry.listener_count = True, step.time, int(listeners[row])
+                entry.announced = True
+                entry.published_at = step.time
+                entry.listener_count = int(listeners[row])
 
     def _find_due_objects(
-        self, active: tuple[int, ...], entries: list[ObjectRecord], listeners: np.ndarray, contact: list[bool],
+        self,
+        active: tuple[int, ...],
+        entries: list[ObjectRecord],
+        listeners: np.ndarray,
+        contact: list[bool],
         step: LocalStep,
-    ) -> np.ndarray:  # fmt: skip
+    ) -> np.ndarray:
         """Which objects to publish [k] bool: the prediction is wrong, or a listener, claim or contact is new."""
         silence = step.time - np.array([entry.published_at for entry in entries])
         due = dead_reckoning.needs_update(*self._state.object_stream.prediction_error(active, silence), silence)
@@ -241,10 +255,12 @@ class Sender:
 
         If picks or cuts have changed the tree, the state is a retained record, too.
         """
-        state, is_changed = self._state, step.is_changed(tree)
+        state = self._state
+        is_changed = step.is_changed(tree)
         if is_changed:
             state.ownership.increment(tree)
-        entry, claim = state.ownership[tree], state.ownership.release(tree)
+        entry = state.ownership[tree]
+        claim = state.ownership.release(tree)
         cell = state.tree_stream.cell[tree]
         events = state.cells.event_publisher(cell)
         is_near = bool(state.count_listeners(state.tree_stream.middle[[tree]])[0])
@@ -261,7 +277,8 @@ class Sender:
             self._publish_tree_record(cell, record, step)
         if listened is not None:
             put_counted(listened, payload, state.counters.event)
-        entry.announced, entry.published_at = True, step.time
+        entry.announced = True
+        entry.published_at = step.time
         return update
 
     def _publish_object_at_rest(self, object_id: int, step: LocalStep) -> None:
@@ -316,9 +333,13 @@ class Sender:
         rate_factor = 0.0 if flags & messages.RESTING else 1.0
         columns = ClaimColumns([claim], [flags])
         batch = TreeStates(
-            step.time, np.array([tree]), *columns.columns(), np.array([len(q)]), np.asarray(q, float),
+            step.time,
+            np.array([tree]),
+            *columns.columns(),
+            np.array([len(q)]),
+            np.asarray(q, float),
             rate_factor * np.asarray(qd, float),
-        )  # fmt: skip
+        )
         (payload,), decoded = messages.encode_trees(with_roots(batch, [(numbers, x, rate_factor * xd)]))
         (update,) = decoded.updates(self._state.hello.name)
         return payload, update

@@ -54,7 +54,8 @@ class TreeStream:
         self.cell = [tuple(cell) for cell in interest.cells_of(self.middle).tolist()]
         self.layer_cell = [tuple(cell) for cell in interest.cells_of(self.middle, interest.TREE_CELL_SIZE).tolist()]
         """Cell under which the states of each tree leave."""
-        body_count, layers = len(model.body_mass), len(interest.TREE_LAYERS)
+        body_count = len(model.body_mass)
+        layers = len(interest.TREE_LAYERS)
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
         self._lever_arm = _lever_arms(model)
         self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (layers, body_count, 1))
@@ -82,7 +83,8 @@ class TreeStream:
         """Errors of the copies of peers who receive no further layer, [k] m and [k] rad, of the trees last read;
         ``silence`` [k] s since the last state that they got."""
         assert self._active is not None
-        bodies, horizon = self._order, dead_reckoning.clamp_age(silence)
+        bodies = self._order
+        horizon = dead_reckoning.clamp_age(silence)
         dt = np.repeat(dead_reckoning.faded_age(silence), self._sizes)[:, None]
         angle = dead_reckoning.angle_between(
             self._q,
@@ -180,7 +182,8 @@ class ObjectStream:
         """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
         unknown: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
         published = [self._published.get(object_id, unknown) for object_id in active]
-        pose, velocity = np.array([pose for pose, _ in published]), np.array([velocity for _, velocity in published])
+        pose = np.array([pose for pose, _ in published])
+        velocity = np.array([velocity for _, velocity in published])
         pose[:, 3:] = np.where(np.isfinite(pose[:, 3:]), pose[:, 3:], self._pose[:, 3:])
         predicted = _extrapolate_pose(pose, velocity, np.asarray(dead_reckoning.clamp_age(silence))[:, None])
         return np.linalg.norm(self._pose[:, :3] - predicted[:, :3], axis=1), dead_reckoning.angle_between(

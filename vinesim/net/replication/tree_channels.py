@@ -15,7 +15,8 @@ from vinesim.net.replication import interest
 from vinesim.net.replication.interest import TREE_LAYERS, Cell
 from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
 
-OPEN_MARGIN, CLOSE_MARGIN = 0.3, 0.8
+OPEN_MARGIN = 0.3
+CLOSE_MARGIN = 0.8
 """[m] A cell is opened this far beyond the distance of its layer, and closed that far: others know the own position
 late, and one who walks along an edge does not open and close in turn."""
 
@@ -44,7 +45,8 @@ class TreeChannels:
         moved = self._position is None or _distance(position, self._position) > STEP
         if not moved and owned == self._owned:
             return
-        self._position, self._owned = position.copy(), set(owned)
+        self._position = position.copy()
+        self._owned = set(owned)
         reach = self.distances[-1]
         touchable = interest.tree_cells_within(position, reach + OPEN_MARGIN) | owned
         kept_touchable = interest.tree_cells_within(position, reach + CLOSE_MARGIN) | owned

@@ -76,7 +76,9 @@ class VoiceSync:
     """Voices to and from one actor."""
 
     def __init__(self, bus: Bus, hello: Hello, counters: Counters) -> None:
-        self._bus, self._hello, self._counters = bus, hello, counters
+        self._bus = bus
+        self._hello = hello
+        self._counters = counters
         self.listens = False
         """Whether this actor wants to hear."""
         self.decodes_opus = True
@@ -129,7 +131,8 @@ class VoiceSync:
             self._drop(self._sources.keys())
         if not self.listens and not self._sources:
             return
-        setting, wanted = self._bus.spectators_speak_to, set()
+        setting = self._bus.spectators_speak_to
+        wanted = set()
         for name, peer in peers.items() if self.listens else ():
             if peer.update is None:
                 continue
@@ -145,7 +148,8 @@ class VoiceSync:
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
         """Take a frame at own time ``now`` and network ``time`` [s]; :class:`MessageError` if it is none, or nothing of
         the present."""
-        source, pose = self._sources.get(sender.hello.name), sender.update
+        source = self._sources.get(sender.hello.name)
+        pose = sender.update
         if source is None or pose is None or not source.admit(now):
             self._counters.dropped += 1
             return

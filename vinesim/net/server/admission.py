@@ -30,11 +30,14 @@ class AdmissionControl:
     """Decides about hellos. ``session`` distinguishes two programs with the same name."""
 
     def __init__(
-        self, scene: SceneId | None = None, max_actors: int | None = None,
+        self,
+        scene: SceneId | None = None,
+        max_actors: int | None = None,
         spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``scene``: the only one allowed, in every world. ``max_actors``: over all worlds. None: no such limit."""
-        self._required_scene, self._max_actors = scene, max_actors
+        self._required_scene = scene
+        self._max_actors = max_actors
         self._spectators_speak_to = spectators_speak_to
         self._scenes: dict[str, SceneId] = {}
         self._pinned: set[str] = set()

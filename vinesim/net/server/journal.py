@@ -53,7 +53,10 @@ class Journal:
     """The retained state of one world, in memory and on disk. A context manager; used by one thread."""
 
     def __init__(self, path: pathlib.Path, world: str, scene_id: SceneId, state: RetainedState) -> None:
-        self.path, self.world, self.scene_id, self.state = path, world, scene_id, state
+        self.path = path
+        self.world = world
+        self.scene_id = scene_id
+        self.state = state
         self._file: BinaryIO | None = None
         self._records = 0
         self.rewrite()
@@ -104,8 +107,12 @@ class Journal:
             _write(backup, content)
             log.warning(
                 "%s: torn after %d of %d bytes; %d facts before that hold, the file as it was is kept as %s",
-                path, valid_end, len(content), len(state), backup.name,
-            )  # fmt: skip
+                path,
+                valid_end,
+                len(content),
+                len(state),
+                backup.name,
+            )
         return cls(path, head.world, SceneId(head.scene, head.digest), state)
 
     def append(self, cell: Cell, retained: RetainedRecord) -> None:

@@ -60,7 +60,8 @@ class MeshStore:
     """Meshes by digest. All methods may be called from any thread."""
 
     def __init__(self, limits: MeshLimits = MeshLimits()) -> None:
-        self.limits, self.counters = limits, MeshCounters()
+        self.limits = limits
+        self.counters = MeshCounters()
         self._kept: dict[str, _Kept] = {}
         """Those asked for or offered last come last."""
         self._incomplete: dict[Actor, tuple[MeshPart, bytearray]] = {}

@@ -79,12 +79,14 @@ class _TokenBucket:
     """Token bucket of one actor: messages and bytes."""
 
     def __init__(self, quota: Quota, now: float) -> None:
-        self._quota, self._updated_at = quota, now
+        self._quota = quota
+        self._updated_at = now
         self._tokens = [BURST_TIME * rate for rate in quota]
 
     def spend(self, size: int, now: float) -> bool:
         """Take the tokens of a message of ``size`` [B]; False, and nothing is taken, if there are too few."""
-        elapsed, self._updated_at = now - self._updated_at, now
+        elapsed = now - self._updated_at
+        self._updated_at = now
         self._tokens = [
             min(tokens + elapsed * rate, BURST_TIME * rate)
             for tokens, rate in zip(self._tokens, self._quota, strict=True)
@@ -119,14 +121,16 @@ class RetainedStore:
     def __init__(self, folder: pathlib.Path | None = None, quota: Quota = Quota()) -> None:
         """Journals in ``folder``, or in memory only. Raises :class:`vinesim.net.server.journal.JournalError`."""
         self.counters = StoreCounters()
-        self._folder, self._quota = folder, quota
+        self._folder = folder
+        self._quota = quota
         journals = load_all(folder) if folder is not None else {}
         self._journals: dict[str, Journal] = {world: one for world, one in journals.items() if len(one.state)}
         self._states: dict[str, RetainedState] = {world: journal.state for world, journal in self._journals.items()}
         self._scenes: dict[str, SceneId] = {world: journal.scene_id for world, journal in self._journals.items()}
         self._queue: collections.deque[tuple[str, bytes]] = collections.deque()
         self._early: collections.deque[tuple[str, bytes]] = collections.deque()
-        self._early_bytes, self._queued_bytes = 0, _Sum()
+        self._early_bytes = 0
+        self._queued_bytes = _Sum()
         self._buckets: dict[tuple[str, str], _TokenBucket] = {}
         self._warned: set[tuple[str, str]] = set()
         self._lock = threading.Lock()
@@ -259,7 +263,9 @@ class RetainedStore:
     def _ingest(self, key: str, payload: bytes) -> str:
         """Merge the records of one message; the name of the world if it must be synced, else empty."""
         chunks = key.split("/")
-        world, where, actor = chunks[0], chunks[2:-1], chunks[-1]
+        world = chunks[0]
+        where = chunks[2:-1]
+        actor = chunks[-1]
         try:
             cell = (int(where[0]), int(where[1])) if len(where) == 2 else None
             if cell is None or not all(-(1 << 31) <= number < 1 << 31 for number in cell):

@@ -107,7 +107,8 @@ class Server:
                 f"a server linked to {linked[0]} only carries: give --state-dir, --scene, --max-clients and "
                 "--real-time-factor to the one server that connects to no other"
             )
-        self._certificates, self._linked = certificates, linked
+        self._certificates = certificates
+        self._linked = linked
         self._root = f"{ROOT}/{'*' if certificates is None else world}"
         """Key of all worlds; with certificates access control denies declarations beyond the one world."""
         self._watcher = self._new_watcher()  # before the files are read: a change meanwhile is noticed
@@ -201,7 +202,8 @@ class Server:
         """The clock of a world, kept from the first question of an actor that is live there; call it under the lock."""
         if (clock := self._clocks.get(world)) is not None:
             return clock
-        now, (real, begin) = time.monotonic(), self._start
+        now = time.monotonic()
+        (real, begin) = self._start
         clock = WorldClock(now, begin + (now - real) * (self._fixed_factor or 1.0), self._fixed_factor)
         if self._admission.has_actors(world):
             for name in [name for name in self._clocks if not self._admission.has_actors(name)][:-MAX_EMPTY_WORLDS]:
@@ -353,7 +355,8 @@ class Server:
     def _on_record(self, sample: zenoh.Sample) -> None:
         if sample.kind != zenoh.SampleKind.PUT or self.store is None:
             return
-        key, source = _strip_root(sample.key_expr), sample.source_info
+        key = _strip_root(sample.key_expr)
+        source = sample.source_info
         world, _, rest = key.partition("/")
         with self._lock:
             is_own = source is not None and self._admission.may_publish(
@@ -379,10 +382,13 @@ class Server:
                 return
             self.pings += 1
             with self._lock:
-                now, clock = time.monotonic(), self._clock(world)
+                now = time.monotonic()
+                clock = self._clock(world)
                 if question.report is not None and self._admission.may_slow(world, name):
                     clock.report(name, now, question.report)
-                world_time, factor, cause = clock.time(now), clock.factor, clock.cause
+                world_time = clock.time(now)
+                factor = clock.factor
+                cause = clock.cause
             query.reply(
                 str(query.key_expr), messages.encode_time(question.asked, world_time, factor, real=now, cause=cause)
             )

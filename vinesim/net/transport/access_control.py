@@ -39,9 +39,16 @@ FAMILIES = ("c", "tree", "near", "own", "fact")
 """First chunks of keys ``FAMILY/<cx>/<cy>/<actor>``."""
 
 _EVERYTHING = [
-    "put", "delete", "declare_subscriber", "query", "declare_queryable", "reply",
-    "liveliness_token", "liveliness_query", "declare_liveliness_subscriber",
-]  # fmt: skip
+    "put",
+    "delete",
+    "declare_subscriber",
+    "query",
+    "declare_queryable",
+    "reply",
+    "liveliness_token",
+    "liveliness_query",
+    "declare_liveliness_subscriber",
+]
 
 
 def authority_folder(folder: pathlib.Path) -> pathlib.Path:
@@ -88,15 +95,21 @@ def server_answers_config(root: str) -> dict[str, Any]:
     other program that connects to it answers."""
     questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**")]
     rule = {
-        "id": "answers of the server", "permission": "deny", "flows": ["ingress"],
-        "messages": ["declare_queryable", "reply"], "key_exprs": questions,
-    }  # fmt: skip
+        "id": "answers of the server",
+        "permission": "deny",
+        "flows": ["ingress"],
+        "messages": ["declare_queryable", "reply"],
+        "key_exprs": questions,
+    }
     return {
         "access_control": {
-            "enabled": True, "default_permission": "allow", "rules": [rule], "subjects": [{"id": "all"}],
+            "enabled": True,
+            "default_permission": "allow",
+            "rules": [rule],
+            "subjects": [{"id": "all"}],
             "policies": [{"rules": [rule["id"]], "subjects": ["all"]}],
         }
-    }  # fmt: skip
+    }
 
 
 def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
@@ -127,14 +140,15 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
             continue
         about_itself = (f"{root}/live/{name}/*", f"{root}/hello/{name}")
         own = [
+            rule(f"{name} is there", "ingress", ["liveliness_token", "declare_queryable", "reply"], *about_itself),
             rule(
-                f"{name} is there", "ingress", ["liveliness_token", "declare_queryable", "reply"], *about_itself
+                f"{name} asks to be let in, and the time",
+                "ingress",
+                ["query"],
+                f"{root}/join/{name}/*",
+                f"{root}/clock/{name}",
             ),
-            rule(
-                f"{name} asks to be let in, and the time", "ingress", ["query"],
-                f"{root}/join/{name}/*", f"{root}/clock/{name}",
-            ),
-        ]  # fmt: skip
+        ]
         if role == Role.ROBOT:
             own.append(rule(f"{name} offers its meshes", "ingress", ["query"], f"{root}/offer/{name}"))
         written = (f"{root}/a/{name}", *(f"{root}/a/{name}/{layer}" for layer in ("far", "mid", "near")))

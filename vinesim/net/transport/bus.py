@@ -196,7 +196,9 @@ class SampleStore:
     def take(self) -> list[tuple[str, bytes]]:
         """Remove and return all samples in order of arrival, without those beyond the depth of their key."""
         with self._lock:
-            taken, self._samples, self._bytes = self._samples, collections.deque(), 0
+            taken = self._samples
+            self._samples = collections.deque()
+            self._bytes = 0
         left: dict[str, int] = {}
         kept = []
         for depth, key, payload in reversed(taken):

@@ -31,7 +31,8 @@ class CertificateWatch:
 
         Certificate and key are two files: what was written a moment ago may be half of a change.
         """
-        seen, self._seen = self._seen, self._state()
+        seen = self._seen
+        self._seen = self._state()
         if self._seen != seen or self._seen == self._loaded:
             return False
         self._loaded = self._seen

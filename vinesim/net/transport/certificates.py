@@ -24,7 +24,7 @@ from vinesim.net.transport.access_control import (
     Role,
     authority_folder,
     refuse_authority_key,
-)  # fmt: skip
+)
 
 try:
     from cryptography import x509
@@ -55,9 +55,13 @@ class CryptographyMissing(RuntimeError):
 
 
 def create(
-    folder: pathlib.Path, name: str, role: Role = Role.ROBOT, hosts: Sequence[str] = (),
-    days: float = CERTIFICATE_DAYS, authority: pathlib.Path | None = None,
-) -> list[pathlib.Path]:  # fmt: skip
+    folder: pathlib.Path,
+    name: str,
+    role: Role = Role.ROBOT,
+    hosts: Sequence[str] = (),
+    days: float = CERTIFICATE_DAYS,
+    authority: pathlib.Path | None = None,
+) -> list[pathlib.Path]:
     """Create the certificate of an actor, and at first use those of the authority and the server; the paths written.
 
     ``hosts``: for ``server``, names and addresses under which clients reach it, besides those of this machine; its
@@ -105,9 +109,8 @@ def roles(folder: pathlib.Path) -> dict[str, Role]:
         certificate = _read(file)
         try:
             certificate.verify_directly_issued_by(authority)
-            name, role = _text(certificate, NameOID.COMMON_NAME), Role(
-                _text(certificate, NameOID.ORGANIZATIONAL_UNIT_NAME)
-            )  # fmt: skip
+            name = _text(certificate, NameOID.COMMON_NAME)
+            role = Role(_text(certificate, NameOID.ORGANIZATIONAL_UNIT_NAME))
         except (InvalidSignature, ValueError, TypeError) as error:
             raise CertificateError(
                 f"{file}: not signed by {CA_NAME}.pem beside it, or without a role: remove it, or make it anew with "
@@ -127,12 +130,14 @@ def check(folder: pathlib.Path, name: str) -> None:
     now = datetime.datetime.now(datetime.UTC)
     for file in (folder / f"{CA_NAME}.pem", folder / f"{name}.pem"):
         certificate = _read(file)
-        first, last = certificate.not_valid_before_utc, certificate.not_valid_after_utc
+        first = certificate.not_valid_before_utc
+        last = certificate.not_valid_after_utc
         if not first <= now <= last:
             remedy = (
-                f"make it anew with 'vinesim certs new {name} --dir {folder}'" if file.stem == name else
-                "make a new authority and all certificates anew, in empty folders"
-            )  # fmt: skip
+                f"make it anew with 'vinesim certs new {name} --dir {folder}'"
+                if file.stem == name
+                else "make a new authority and all certificates anew, in empty folders"
+            )
             raise CertificateError(f"{file}: not valid now, but from {first:%Y-%m-%d} to {last:%Y-%m-%d}: {remedy}")
     if _load_key(folder / f"{name}.key").public_key() != _read(folder / f"{name}.pem").public_key():
         raise CertificateError(f"{folder / name}.key: not the key of {name}.pem: copy both files of one certificate")
@@ -155,7 +160,8 @@ def expiring(folder: pathlib.Path) -> list[str]:
 
 def _authority_of(folder: pathlib.Path, authority: pathlib.Path) -> list[pathlib.Path]:
     """Create the authority if there is none, and copy its certificate to ``folder``; the paths written."""
-    own, public = authority / f"{CA_NAME}.pem", folder / f"{CA_NAME}.pem"
+    own = authority / f"{CA_NAME}.pem"
+    public = folder / f"{CA_NAME}.pem"
     has_key = (authority / f"{CA_NAME}.key").exists()
     if public.exists() and not (has_key and own.exists() and own.read_bytes() == public.read_bytes()):
         raise CertificateError(
@@ -172,9 +178,16 @@ def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "vinesim authority")])
     usage = x509.KeyUsage(
-        key_cert_sign=True, crl_sign=True, digital_signature=False, content_commitment=False, key_encipherment=False,
-        data_encipherment=False, key_agreement=False, encipher_only=False, decipher_only=False,
-    )  # fmt: skip
+        key_cert_sign=True,
+        crl_sign=True,
+        digital_signature=False,
+        content_commitment=False,
+        key_encipherment=False,
+        data_encipherment=False,
+        key_agreement=False,
+        encipher_only=False,
+        decipher_only=False,
+    )
     certificate = (
         _builder(name, name, key.public_key(), 365 * AUTHORITY_YEARS)
         .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
@@ -189,7 +202,8 @@ def _signed(
     folder: pathlib.Path, authority_at: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: float
 ) -> list[pathlib.Path]:
     """Create a key and its certificate, signed by the authority in ``authority_at``."""
-    authority, signer = _read(authority_at / f"{CA_NAME}.pem"), _load_key(authority_at / f"{CA_NAME}.key")
+    authority = _read(authority_at / f"{CA_NAME}.pem")
+    signer = _load_key(authority_at / f"{CA_NAME}.key")
     key = ec.generate_private_key(ec.SECP256R1())
     subject = x509.Name(
         [

@@ -31,7 +31,10 @@ class MemoryHub:
         if delay < 0.0 or jitter < 0.0 or not 0.0 <= loss <= 1.0:
             raise ValueError(f"delay {delay} s and jitter {jitter} s must not be negative, loss {loss} from 0 to 1")
         self.time = 0.0
-        self.delay, self.jitter, self.loss, self.duplicated = delay, jitter, loss, duplicated
+        self.delay = delay
+        self.jitter = jitter
+        self.loss = loss
+        self.duplicated = duplicated
         self.down = False
         """True: partitioned. Nothing passes, and every member sees only itself."""
         self.binds_names = True
@@ -169,7 +172,9 @@ class MemoryPublisher:
     """See :class:`vinesim.net.transport.bus.Publisher`."""
 
     def __init__(self, bus: MemoryBus, key: str, reliable: bool) -> None:
-        self._bus, self._key, self._reliable = bus, key, reliable
+        self._bus = bus
+        self._key = key
+        self._reliable = reliable
 
     @property
     def matching(self) -> bool:
@@ -190,7 +195,9 @@ class MemorySubscription:
     """See :class:`vinesim.net.transport.bus.Subscription`."""
 
     def __init__(self, bus: MemoryBus, pattern: str, depth: int) -> None:
-        self._bus, self.pattern, self.depth = bus, pattern, depth
+        self._bus = bus
+        self.pattern = pattern
+        self.depth = depth
 
     def close(self) -> None:
         self._bus.unsubscribe(self)
@@ -200,7 +207,8 @@ class MemoryBus:
     """See :class:`vinesim.net.transport.bus.Bus`; created by :meth:`MemoryHub.bus`."""
 
     def __init__(self, hub: MemoryHub, name: str) -> None:
-        self.hub, self.name = hub, name
+        self.hub = hub
+        self.name = name
         self.bytes_in = self.bytes_out = self.failures = self.foreign = 0
         self.queryables: dict[str, Callable[[bytes], bytes]] = {}
         self.pending_replies: list[tuple[str, bytes, float]] = []
@@ -264,7 +272,8 @@ class MemoryBus:
             self.hub.query(self, key, payload)
 
     def replies(self) -> list[Reply]:
-        pending_replies, self.pending_replies = self.pending_replies, []
+        pending_replies = self.pending_replies
+        self.pending_replies = []
         return [Reply(key, payload, self.hub.time - at) for key, payload, at in pending_replies]
 
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:

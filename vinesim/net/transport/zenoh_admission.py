@@ -27,13 +27,24 @@ class ServerAdmission:
     """Asks the server of a world to admit one actor, and watches whether that server is there."""
 
     def __init__(
-        self, session: zenoh.Session, prefix: str, *, name: str, world: str, endpoint: str, is_secured: bool,
+        self,
+        session: zenoh.Session,
+        prefix: str,
+        *,
+        name: str,
+        world: str,
+        endpoint: str,
+        is_secured: bool,
         submit: Callable[[Callable[[], object]], None],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``prefix``: key of the world with a trailing slash. ``submit`` runs a function in the bus's own thread."""
-        self._session, self._key = session, f"{prefix}join/{name}/{session.zid()}"
-        self._name, self._world, self._endpoint = name, world, endpoint
-        self._is_secured, self._submit = is_secured, submit
+        self._session = session
+        self._key = f"{prefix}join/{name}/{session.zid()}"
+        self._name = name
+        self._world = world
+        self._endpoint = endpoint
+        self._is_secured = is_secured
+        self._submit = submit
         self.is_served = True
         """The server of this world is there, or there never was one."""
         self.rejection = ""
@@ -70,12 +81,17 @@ class ServerAdmission:
         if not welcomes:
             log.info("%s: no vinesim server keeps world %r; actors check each other", self._name, self._world)
         elif len(welcomes) > 1:
-            log.warning("%s: %d servers keep world %r; link all but one to it with --connect", self._name,
-                        len(welcomes), self._world)  # fmt: skip
+            log.warning(
+                "%s: %d servers keep world %r; link all but one to it with --connect",
+                self._name,
+                len(welcomes),
+                self._world,
+            )
         self.count += bool(welcomes)
         self._was_announced = bool(welcomes)
         querier = self._session.declare_querier(self._key)
-        self._querier, self._hello = querier, hello
+        self._querier = querier
+        self._hello = hello
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
             self.is_served = status.matching
@@ -136,7 +152,8 @@ class ServerAdmission:
             for reply in replies
             if reply.ok is not None and reply.replier_id is not None
         }
-        known, routers = self._servers or frozenset(), {str(router) for router in self._session.info.routers_zid()}
+        known = self._servers or frozenset()
+        routers = {str(router) for router in self._session.info.routers_zid()}
         order = sorted(found, key=lambda zid: (zid not in routers, zid not in known, zid))
         self._servers = frozenset(order[:1]) or known
         welcomes = [self._decode(found[zid]) for zid in order]

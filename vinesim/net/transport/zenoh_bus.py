@@ -77,9 +77,14 @@ class ZenohBus:
     """See :class:`vinesim.net.transport.bus.Bus`. A context manager: an open session delays the exit of the program."""
 
     def __init__(
-        self, name: str, *, connect: str = CONNECT, world: str = WORLD, certificates: pathlib.Path | None = None,
+        self,
+        name: str,
+        *,
+        connect: str = CONNECT,
+        world: str = WORLD,
+        certificates: pathlib.Path | None = None,
         live: bool = True,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """Enter ``world`` as ``name`` through the server at ``connect`` (:func:`endpoints.client_links`).
 
         Not ``live``: without a liveliness token, invisible to others. ``certificates``: folder with ``ca.pem`` and this
@@ -95,7 +100,9 @@ class ZenohBus:
         links = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
         self._certificate_watch = None if certificates is None else watch_certificates(certificates, name)
-        self.name, self.world, self.endpoint = name, world, str(links.bulk)
+        self.name = name
+        self.world = world
+        self.endpoint = str(links.bulk)
         self.bytes_in = self.bytes_out = self._oversized = self.failures = self.foreign = 0
         self._put_count = self._put_bytes = self._sent_count = self._sent_bytes = 0
         self._prefix = f"{ROOT}/{world}/"
@@ -117,9 +124,14 @@ class ZenohBus:
         self.source = zenoh.SourceInfo(self._session.id, 0)
         """Stated with every sample, also of the session of poses: the session that holds the name."""
         self._admission = ServerAdmission(
-            self._session, self._prefix, name=name, world=world, endpoint=self.endpoint,
-            is_secured=certificates is not None, submit=self.submit,
-        )  # fmt: skip
+            self._session,
+            self._prefix,
+            name=name,
+            world=world,
+            endpoint=self.endpoint,
+            is_secured=certificates is not None,
+            submit=self.submit,
+        )
         try:
             liveliness = self._session.liveliness()
             self._declared: list[object] = [
@@ -149,15 +161,19 @@ class ZenohBus:
         except ServerUnreachable:
             log.warning(
                 "%s: no datagrams pass to %s: poses go over %s as well, where one lost packet delays all that follow",
-                self.name, endpoint, self.endpoint,
-            )  # fmt: skip
+                self.name,
+                endpoint,
+                self.endpoint,
+            )
             return self._session
         self._pose_watch = self._watch_connection(session, str(endpoint))
         if zenoh.Reliability.BEST_EFFORT not in [link.reliability for link in session.info.links()]:
             log.warning(
                 "%s: the router at %s offers no datagrams on that link: poses go in line there; "
-                "it is older than Zenoh 1.10, or listens without mixed_rel", self.name, endpoint,
-            )  # fmt: skip
+                "it is older than Zenoh 1.10, or listens without mixed_rel",
+                self.name,
+                endpoint,
+            )
         return session
 
     def session_for(self, reliable: bool) -> zenoh.Session:
@@ -237,7 +253,8 @@ class ZenohBus:
         If two sessions claim it at once, the one whose token the router took second sees the first: never both stay. If
         both look after both have declared, neither stays.
         """
-        liveliness, mine = self._session.liveliness(), str(self._session.zid())
+        liveliness = self._session.liveliness()
+        mine = str(self._session.zid())
         if self._name_holders() - {mine}:
             raise NameTaken(self.name, self.world)
         token = liveliness.declare_token(f"{self._prefix}live/{self.name}/{mine}")
@@ -280,8 +297,10 @@ class ZenohBus:
         if self.foreign == 1:
             log.warning(
                 "%s: dropped %s, of a session that does not hold the name %r, further ones only counted",
-                self.name, key[:100], name[:50],
-            )  # fmt: skip
+                self.name,
+                key[:100],
+                name[:50],
+            )
         return True
 
     # ------------------------------------------------------------ the bus
@@ -326,7 +345,9 @@ class ZenohBus:
         skip = len(self._prefix)
 
         def store(sample: zenoh.Sample) -> None:
-            size, source, key = len(sample.payload), sample.source_info, str(sample.key_expr)[skip:]
+            size = len(sample.payload)
+            source = sample.source_info
+            key = str(sample.key_expr)[skip:]
             self.bytes_in += size
             if size > messages.MAX_MESSAGE:
                 self._oversized += 1
@@ -348,7 +369,8 @@ class ZenohBus:
 
         def on_reply(reply: zenoh.Reply) -> None:
             if reply.ok is not None and len(reply.ok.payload) <= messages.MAX_MESSAGE:
-                arrived, reply_key = time.monotonic(), str(reply.ok.key_expr)[skip:]
+                arrived = time.monotonic()
+                reply_key = str(reply.ok.key_expr)[skip:]
                 if bound_name(reply_key):
                     is_foreign = self._is_foreign(reply_key, reply.replier_id)
                 else:
@@ -372,7 +394,8 @@ class ZenohBus:
         )
 
     def replies(self) -> list[Reply]:
-        now, found = time.monotonic(), []
+        now = time.monotonic()
+        found = []
         while self._replies:
             key, payload, arrived = self._replies.popleft()
             found.append(Reply(key, payload, now - arrived))
@@ -381,9 +404,12 @@ class ZenohBus:
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
         try:
             replies = self._session.get(
-                self._prefix + key, payload=payload, timeout=FETCH_TIMEOUT, priority=zenoh.Priority.BACKGROUND,
+                self._prefix + key,
+                payload=payload,
+                timeout=FETCH_TIMEOUT,
+                priority=zenoh.Priority.BACKGROUND,
                 consolidation=zenoh.ConsolidationMode.NONE,
-            )  # fmt: skip
+            )
             found = [reply.ok.payload for reply in replies if reply.ok is not None]
         except zenoh.ZError as error:
             self.count_failure(error)
@@ -500,7 +526,9 @@ class BusPublisher:
     """See :class:`vinesim.net.transport.bus.Publisher`. What the network refuses is counted, never raised."""
 
     def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
-        self._bus, self._declare, self._reliable = bus, declare, reliable
+        self._bus = bus
+        self._declare = declare
+        self._reliable = reliable
         self._publisher: zenoh.Publisher | None = None
         self._is_closed = self._is_renewing = False
         if not reliable:
@@ -540,7 +568,8 @@ class BusPublisher:
 
     def move_to(self, session: zenoh.Session) -> None:
         """Publish over another session from now on."""
-        before, self._publisher = self._publisher, self._declare(session)
+        before = self._publisher
+        self._publisher = self._declare(session)
         _undeclare(before)
 
     def close(self) -> None:
@@ -568,7 +597,8 @@ class BusSubscription:
     """See :class:`vinesim.net.transport.bus.Subscription`."""
 
     def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Subscriber], reliable: bool) -> None:
-        self._bus, self._declare = bus, declare
+        self._bus = bus
+        self._declare = declare
         self._declared: zenoh.Subscriber | None = None
         if not reliable:
             bus.unreliable.add(self)
@@ -576,7 +606,8 @@ class BusSubscription:
 
     def move_to(self, session: zenoh.Session) -> None:
         """Subscribe over another session from now on."""
-        before, self._declared = self._declared, self._declare(session)
+        before = self._declared
+        self._declared = self._declare(session)
         _undeclare(before)
 
     def close(self) -> None:

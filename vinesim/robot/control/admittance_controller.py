@@ -44,8 +44,11 @@ class AdmittanceController:
             raise CommandError(f"{robot.name} has no wrist sensor {sensor!r}; it has: {', '.join(known) or 'none'}")
         if not (mass > 0.0 and damping > 0.0):
             raise CommandError(f"mass {mass} and damping {damping} of an admittance must both be above 0")
-        self.robot, self.sensor = robot, sensor
-        self.mass, self.damping, self.force_deadband = mass, damping, force_deadband
+        self.robot = robot
+        self.sensor = sensor
+        self.mass = mass
+        self.damping = damping
+        self.force_deadband = force_deadband
         self.velocity = np.zeros(3)
         """[3] m/s, commanded velocity of the hand, world axes"""
         self._joints = robot.description.joint_indices(group)

@@ -61,16 +61,19 @@ class CartesianController:
         if arm is None or not arm.tool:
             raise CommandError(f"{robot.name} has no group 'arm_{side}' with a tool; name one in its TOML")
         lifts = description.groups["torso"].joints if use_lift and "torso" in description.groups else ()
-        self.robot, self.tool = robot, arm.tool
+        self.robot = robot
+        self.tool = arm.tool
         self.acceleration = acceleration
         self.gripper = f"gripper_{side}" if f"gripper_{side}" in description.groups else ""
         """The group of its fingers; empty if it has none."""
         self._tip_offset = tip_offset
         self._joints = robot.joint_indices([*lifts, *arm.joints])
         self._lifts = len(lifts)
-        lower, upper = robot.lower_limit[self._joints], robot.upper_limit[self._joints]
+        lower = robot.lower_limit[self._joints]
+        upper = robot.upper_limit[self._joints]
         margin = np.minimum(LIMIT_MARGIN, 0.25 * (upper - lower))
-        self._lower, self._upper = lower + margin, upper - margin
+        self._lower = lower + margin
+        self._upper = upper - margin
         self._fastest = robot.max_velocity[self._joints]
         self._largest_change = self._fastest * robot.rigid.dt / RATE_RAMP_TIME
         """[joint] Largest change of a rate in one step [rad/s or m/s]."""
@@ -124,14 +127,16 @@ class CartesianController:
         world, perpendicular to each other. The lift brings the shoulder to :data:`SHOULDER_DROP` below
         ``working_height`` [m].
         """
-        robot, dt = self.robot, self.robot.rigid.dt
+        robot = self.robot
+        dt = self.robot.rigid.dt
         pose = robot.frame_pose(self.tool)
         axes = axes_of_pose(pose)
         tip = pose[:3] + self._tip_offset * axes[0]
         jacobian = robot.rigid.jacobian(robot.name, self.tool, tip)[:, self._joints]
         move = self._advance_reference(goal, speed, dt) + _clip_norm(POSITION_GAIN * (self._reference - tip), speed)
         ik = self._pointing if z_axis is None else self._orienting
-        ik.jacobian[:3], ik.velocity[:3] = jacobian[:3], move
+        ik.jacobian[:3] = jacobian[:3]
+        ik.velocity[:3] = move
         if z_axis is None:
             ik.jacobian[3:] = axes[1:] @ jacobian[3:]
             ik.velocity[3:] = _clip_norm(POSITION_GAIN * _pointing_error(axes @ x_axis), MAX_TOOL_RATE)
@@ -140,13 +145,16 @@ class CartesianController:
             ik.jacobian[3:] = jacobian[3:]
             ik.velocity[3:] = _clip_norm(POSITION_GAIN * frames.log(frames.from_matrix(wanted.T @ axes)), MAX_TOOL_RATE)
 
-        now, home = robot.setpoint[self._joints], self._home.copy()
+        now = robot.setpoint[self._joints]
+        home = self._home.copy()
         if self._lifts:
             raised = working_height - SHOULDER_DROP - self.shoulder_position[2]
             home[: self._lifts] = now[: self._lifts] + raised / self._lifts
-        fastest, home = self._fastest, clip(home, self._lower, self._upper)
+        fastest = self._fastest
+        home = clip(home, self._lower, self._upper)
         ik.posture_rates[:] = clip(POSTURE_GAIN * (home - now), -0.8 * fastest, 0.8 * fastest)
-        ik.min_rates[:], ik.max_rates[:] = (self._lower - now) / dt, (self._upper - now) / dt
+        ik.min_rates[:] = (self._lower - now) / dt
+        ik.max_rates[:] = (self._upper - now) / dt
         rates = ik.solve()
         # all joints are slowed down by the same factor: the tip stays on its line
         rates = rates / max(1.0, float((np.abs(rates) / fastest).max()))
@@ -214,24 +222,36 @@ class InverseKinematics:
 
     def __init__(self, joint_weights: np.ndarray, task_rows: Sequence[int]) -> None:
         """``joint_weights`` [joint]: relative use of the joints; ``task_rows``: number of rows of each task."""
-        joints, rows = len(joint_weights), sum(task_rows)
-        self.jacobian, self.velocity = np.zeros((rows, joints)), np.zeros(rows)
+        joints = len(joint_weights)
+        rows = sum(task_rows)
+        self.jacobian = np.zeros((rows, joints))
+        self.velocity = np.zeros(rows)
         """[row, joint] and [row]: rows of all tasks, in order; velocities along them that are asked for."""
-        self.posture_rates, self.rates = np.zeros(joints), np.zeros(joints)
+        self.posture_rates = np.zeros(joints)
+        self.rates = np.zeros(joints)
         """[joint] rates towards a posture for what the tasks leave free, and the result; rad/s or m/s."""
-        self.min_rates, self.max_rates = np.zeros(joints), np.zeros(joints)
+        self.min_rates = np.zeros(joints)
+        self.max_rates = np.zeros(joints)
         """[joint] bounds of the rates [rad/s or m/s]."""
         scratch = SharedArrays(
-            inverse_kinematics.IkScratch, weights=np.zeros(joints), fixed=np.zeros(joints), solution=np.zeros(joints),
-            basis=np.zeros((rows + 1, joints)), residual=np.zeros(rows), is_used=np.zeros(rows, np.int32),
-        )  # fmt: skip
+            inverse_kinematics.IkScratch,
+            weights=np.zeros(joints),
+            fixed=np.zeros(joints),
+            solution=np.zeros(joints),
+            basis=np.zeros((rows + 1, joints)),
+            residual=np.zeros(rows),
+            is_used=np.zeros(rows, np.int32),
+        )
         inputs = (self.jacobian, self.velocity, self.posture_rates, self.min_rates, self.max_rates, joint_weights)
         self._launch = bind_launch(
             inverse_kinematics.solve_prioritized_ik,
-            [share(np.cumsum(task_rows, dtype=np.int32), wp.int32), *(share(array, wp.float64) for array in inputs),
-             MIN_SINGULAR_VALUE],
+            [
+                share(np.cumsum(task_rows, dtype=np.int32), wp.int32),
+                *(share(array, wp.float64) for array in inputs),
+                MIN_SINGULAR_VALUE,
+            ],
             [scratch.struct, share(self.rates, wp.float64)],
-        )  # fmt: skip
+        )
 
     def solve(self) -> np.ndarray:
         """Joint rates [joint] for the present inputs; the array is used again by the next call.

@@ -145,7 +145,8 @@ class ControllerManager:
 
     def take_results(self) -> list[GoalResult]:
         """The goals that have ended since the last call."""
-        results, self._results = self._results, []
+        results = self._results
+        self._results = []
         return results
 
     # ------------------------------------------------------------------ commands without a goal
@@ -209,7 +210,8 @@ class ControllerManager:
 
     def _take_desired(self, name: str) -> None:
         """Let :attr:`desired` be what a trajectory controller asks of its joints now."""
-        joints, controller = self._indices[name], self._trajectories[name]
+        joints = self._indices[name]
+        controller = self._trajectories[name]
         self.desired[joints], self.desired_velocity[joints] = controller.desired, controller.desired_velocity
 
     def _gripper_state(self, name: str, time: float) -> GripperState | None:

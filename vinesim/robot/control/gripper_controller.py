@@ -19,7 +19,8 @@ class GripperController:
     """One goal at a time; to hold what it holds, it keeps pressing when the goal has ended."""
 
     def __init__(self, robot: Robot, group: str) -> None:
-        self.robot, self.group = robot, group
+        self.robot = robot
+        self.group = group
         self._fingers = robot.description.joint_indices(group)
         self._goal = robot.gripper_opening(group)
         self._slow_since: float | None = None
@@ -28,13 +29,15 @@ class GripperController:
         """Go to an ``opening`` [m or rad] with at most ``effort`` [N or N m] a finger; see
         :meth:`Robot.command_gripper`."""
         self.robot.command_gripper(self.group, opening, effort)
-        self._goal, self._slow_since = opening, None
+        self._goal = opening
+        self._slow_since = None
 
     def state(self, time: float) -> GripperState:
         """How far it is at ``time`` [s]; call it in every step of a goal."""
         robot = self.robot
         _, velocity, effort, _ = robot.rigid.joint_measurements(robot.name)
-        opening, strongest = robot.gripper_opening(self.group), float(np.abs(effort[self._fingers]).max())
+        opening = robot.gripper_opening(self.group)
+        strongest = float(np.abs(effort[self._fingers]).max())
         if abs(opening - self._goal) <= GOAL_TOLERANCE:
             return GripperState(opening, strongest, reached_goal=True)
         if np.abs(velocity[self._fingers]).max() > STALL_SPEED:
@@ -50,7 +53,8 @@ class CutterController:
     in its mouth; no effort if there was nothing."""
 
     def __init__(self, robot: Robot, group: str) -> None:
-        self.robot, self.group = robot, group
+        self.robot = robot
+        self.group = group
         self._closures: tuple[int, ...] = ()
 
     def start(self, force: float | None) -> None:

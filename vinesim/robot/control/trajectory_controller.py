@@ -121,16 +121,20 @@ class _Spline:
 
     def sample(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
         """Positions and velocities [k] at ``elapsed`` [s]; at rest beyond its end."""
-        knots, points = self.times, self.positions
+        knots = self.times
+        points = self.positions
         if elapsed >= knots[-1]:
             return points[-1], np.zeros(points.shape[1])
         i = max(int(np.searchsorted(knots, elapsed, side="right")) - 1, 0)
         span = knots[i + 1] - knots[i]
-        s, change = (elapsed - knots[i]) / span, points[i + 1] - points[i]
+        s = (elapsed - knots[i]) / span
+        change = points[i + 1] - points[i]
         if self.velocities is None:
             return points[i] + s * change, change / span
-        first, last = span * self.velocities[i], span * self.velocities[i + 1]
-        square, cube = 3.0 * change - 2.0 * first - last, first + last - 2.0 * change
+        first = span * self.velocities[i]
+        last = span * self.velocities[i + 1]
+        square = 3.0 * change - 2.0 * first - last
+        cube = first + last - 2.0 * change
         place = points[i] + s * (first + s * (square + s * cube))
         return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
 
@@ -199,7 +203,9 @@ class TrajectoryController:
             here = np.where(moved[order], position[order], here)
             moving = np.where(moved[order], velocity[order], 0.0)
         self._end(Outcome.PREEMPTED, "a newer trajectory took over")
-        times, positions, velocities = trajectory.times, trajectory.positions, trajectory.velocities
+        times = trajectory.times
+        positions = trajectory.positions
+        velocities = trajectory.velocities
         if times[0] > 0.0:
             times = np.concatenate([[0.0], times])
             positions = np.concatenate([here[None], positions])
@@ -232,11 +238,13 @@ class TrajectoryController:
     def release(self, text: str) -> None:
         """End the goal, as another controller moves its joints from now on; ``text`` says which."""
         self._end(Outcome.PREEMPTED, text)
-        self.active_goal, self._splines = None, []
+        self.active_goal = None
+        self._splines = []
 
     def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
         """Indices [joint] of the trajectory's joints among the controller's; :class:`TrajectoryError` if invalid."""
-        name, t = self.robot.name, trajectory
+        name = self.robot.name
+        t = trajectory
         unknown = [joint for joint in t.joints if joint not in self.joints]
         if unknown or len(set(t.joints)) < len(t.joints) or not t.joints:
             raise TrajectoryError(
@@ -278,7 +286,8 @@ class TrajectoryController:
         """
         if not self._splines:
             return
-        goal, dt = self.active_goal, self.robot.rigid.dt
+        goal = self.active_goal
+        dt = self.robot.rigid.dt
         wanted, rate, _ = self._sample(time)
         ahead, ahead_rate, moved = self._sample(time, dt)
         self.desired[moved] = ahead[moved]
@@ -295,9 +304,12 @@ class TrajectoryController:
     def _judge(self, goal: GoalHandle, time: float, wanted: np.ndarray, rate: np.ndarray) -> bool:
         """Check the errors of a goal against the ``wanted`` positions and velocities [joint]; False if it failed."""
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
-        spline, elapsed = self._splines[-1], time - goal.start_time
-        order, active = spline.order, self.indices[spline.order]
-        error, slip = wanted[order] - position[active], rate[order] - velocity[active]
+        spline = self._splines[-1]
+        elapsed = time - goal.start_time
+        order = spline.order
+        active = self.indices[spline.order]
+        error = wanted[order] - position[active]
+        slip = rate[order] - velocity[active]
         if elapsed < spline.times[-1]:
             tolerance = goal.trajectory.path_tolerance or _reordered(self.path_tolerance, order)
             if len(off := tolerance.violated(error, slip)):
@@ -318,7 +330,8 @@ class TrajectoryController:
 
     def _sample(self, time: float, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions, velocities [joint] so far ``ahead`` of ``time`` [s], and whether each joint follows a spline."""
-        position, velocity = self.desired.copy(), np.zeros(len(self.joints))
+        position = self.desired.copy()
+        velocity = np.zeros(len(self.joints))
         moved = np.zeros(len(self.joints), bool)
         for spline in self._splines:
             if (elapsed := time - spline.start + ahead) >= 0.0:
@@ -339,11 +352,13 @@ class TrajectoryController:
         position = self.robot.rigid.joint_measurements(self.robot.name)[0][active]
         self.robot.command_position(position, active)
         self.desired[order], self.desired_velocity[order] = position, 0.0
-        self.active_goal, self._splines = None, []
+        self.active_goal = None
+        self._splines = []
 
     def _end(self, outcome: Outcome, text: str) -> None:
         if self.active_goal is not None:
-            self.active_goal.outcome, self.active_goal.text = outcome, text
+            self.active_goal.outcome = outcome
+            self.active_goal.text = text
 
 
 def _reordered(tolerance: Tolerance, order: np.ndarray) -> Tolerance:

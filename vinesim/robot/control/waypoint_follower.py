@@ -24,16 +24,23 @@ class WaypointFollower:
     """Drives a robot's base along points, one straight leg after the other, forwards or in reverse."""
 
     def __init__(
-        self, robot: Robot, points: np.ndarray, heading: float | None = None, *, speed: float = 0.5,
+        self,
+        robot: Robot,
+        points: np.ndarray,
+        heading: float | None = None,
+        *,
+        speed: float = 0.5,
         turn_rate: float = 0.4,
         reverse: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``points`` [n, 2] m in the world, ``heading`` [rad] at the end (that of the last leg unless
         given); ``speed`` [m/s] and ``turn_rate`` [rad/s]: the largest; ``reverse``: the base drives backwards.
         """
         self.robot = robot
         self.points = np.asarray(points, float).reshape(-1, 2)
-        self.heading, self.speed, self.turn_rate = heading, speed, turn_rate
+        self.heading = heading
+        self.speed = speed
+        self.turn_rate = turn_rate
         self.is_done = False
         self.is_stuck = False
         """Whether the base does not move although it should."""
@@ -48,7 +55,8 @@ class WaypointFollower:
         if self.is_done:
             return
         pose, _ = self.robot.rigid.base_state(self.robot.name)
-        here, yaw = pose[:2], 2.0 * math.atan2(pose[5], pose[6])
+        here = pose[:2]
+        yaw = 2.0 * math.atan2(pose[5], pose[6])
         self._detect_stall(time, here, yaw)
         linear = angular = 0.0
         if self._leg_start is None:
@@ -79,7 +87,8 @@ class WaypointFollower:
                 angular = float(np.clip(2.0 * _wrap_angle(course - yaw), -self.turn_rate, self.turn_rate))
                 return self._direction * min(self.speed, math.sqrt(2.0 * DECELERATION * left)), angular
         self._leg += 1
-        self._turning, self._leg_start = True, here.copy()
+        self._turning = True
+        self._leg_start = here.copy()
         return 0.0, 0.0
 
     def _turn_towards(self, course: float, yaw: float) -> float:

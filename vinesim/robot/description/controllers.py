@@ -57,7 +57,8 @@ def is_gripper(name: str, sidecar: Sidecar) -> bool:
 
 
 def _derived(sidecar: Sidecar, driven: Sequence[str]) -> list[ControllerSpec]:
-    specs, arms = [], []
+    specs = []
+    arms = []
     for name, group in sidecar.groups.items():
         if is_gripper(name, sidecar):
             specs.append(ControllerSpec(f"{name}_controller", ControllerKind.GRIPPER, group.joints, name))

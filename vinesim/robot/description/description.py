@@ -100,6 +100,14 @@ class RobotDescription:
         """The robot as physics needs it, under ``name``, with its base at ``pose`` [7] (the origin unless given)."""
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
-            name, index, self.urdf, self.base, pose, self.drives, self.home.copy(), self.base_limits.effort,
-            self.meshes, self.is_remote,
-        )  # fmt: skip
+            name,
+            index,
+            self.urdf,
+            self.base,
+            pose,
+            self.drives,
+            self.home.copy(),
+            self.base_limits.effort,
+            self.meshes,
+            self.is_remote,
+        )

@@ -128,7 +128,8 @@ def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[st
         centre[i] = frames.compose(poses[link], frames.pose(offset))[:3]
         own[i] = np.linalg.norm(inertial.inertia, 2) if inertial.inertia is not None else 0.0
     joints = {joint.name: joint for joint in robot.joints}
-    carried, weight = {}, {}
+    carried = {}
+    weight = {}
     for name, (_, child) in zip(description.moving_joints.names, description.moving_joints.frames, strict=True):
         distal = np.array([_is_distal(description.link_anchors[link][0], child, above) for link, _ in bodies])
         axis = frames.rotate(poses[child][3:], joints[name].axis / np.linalg.norm(joints[name].axis))

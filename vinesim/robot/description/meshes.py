@@ -116,7 +116,8 @@ def list_meshes(urdf: str) -> dict[str, MeshOffer]:
     except (etree.XMLSyntaxError, ValueError):
         return {}
     for mesh in root.iterfind("link//geometry/mesh"):
-        digest, faces = mesh.get("digest", ""), mesh.get("faces", "")
+        digest = mesh.get("digest", "")
+        faces = mesh.get("faces", "")
         if triangles.is_digest(digest) and faces.isascii() and faces.isdecimal() and len(faces) < 9:
             found.setdefault(digest, MeshOffer(mesh.get("filename", ""), int(faces) * triangles.FACE_BYTES))
     room = MAX_ROBOT_BYTES
@@ -150,7 +151,8 @@ def replace_unopened_meshes(
     the meshes, by the names that they have in ``root`` now.
     """
     links = list(root.iterfind("link"))
-    count, meshes = 0, {}
+    count = 0
+    meshes = {}
     for link in links:
         for shape in (*link.findall("visual"), *link.findall("collision")):
             mesh = shape.find("geometry/mesh")

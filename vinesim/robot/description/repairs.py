@@ -53,7 +53,9 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
     """Give every joint that moves an effort and a velocity above 0 and a range, and mimics a source that is driven."""
     joints = {joint.get("name"): joint for joint in root.iterfind("joint")}
     moving = {name: joint for name, joint in joints.items() if joint.get("type") in MOVABLE_JOINT_TYPES}
-    freed, filled, unbounded = [], [], []
+    freed = []
+    filled = []
+    unbounded = []
     for name, joint in moving.items():
         mimic = joint.find("mimic")
         if mimic is not None and mimic.get("joint") not in moving:
@@ -93,7 +95,8 @@ def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
     With q1 = m1 q2 + o1 and q2 = m2 q3 + o2: q1 = m1 m2 q3 + (m1 o2 + o1).
     """
     for joint in joints.values():
-        mimic, passed = joint.find("mimic"), set()
+        mimic = joint.find("mimic")
+        passed = set()
         while mimic is not None and mimic.get("joint") not in passed:
             passed.add(mimic.get("joint"))
             source = joints[mimic.get("joint")].find("mimic")

@@ -58,12 +58,17 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def arrays(self) -> dict[str, tuple[float, ...] | None]:
         """Everything that has one value a joint, by its key in the file."""
         return {
-            "stiffness": self.stiffness, "damping": self.damping, "rotor": self.armature,
-            "elastic": self.series_stiffness, "elastic_damping": self.series_damping, "home": self.home,
-        }  # fmt: skip
+            "stiffness": self.stiffness,
+            "damping": self.damping,
+            "rotor": self.armature,
+            "elastic": self.series_stiffness,
+            "elastic_damping": self.series_damping,
+            "home": self.home,
+        }
 
 
-MIN_CAMERA_SIZE, MAX_CAMERA_SIZE = 16, 4096
+MIN_CAMERA_SIZE = 16
+MAX_CAMERA_SIZE = 4096
 """Bounds of the width and height of a camera's picture [px]."""
 
 
@@ -192,8 +197,11 @@ def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str
     if not all(0.0 <= slip < 1.0 for slip in sidecar.base.slip):
         raise description_error(file, f"slip of {sidecar.base.slip}", "give shares from 0 to below 1")
     mounts: Iterable[SensorMount] = (
-        *(sidecar.cameras or ()), *(sidecar.lidars or ()), *sidecar.imus, *sidecar.wrenches
-    )  # fmt: skip
+        *(sidecar.cameras or ()),
+        *(sidecar.lidars or ()),
+        *sidecar.imus,
+        *sidecar.wrenches,
+    )
     for mount in mounts:
         if mount.frame not in links:
             raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")

@@ -112,7 +112,8 @@ def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
         inertial = link.inertial
         if inertial is None or inertial.mass is None:
             continue
-        mass, inertia = inertial.mass, inertial.inertia
+        mass = inertial.mass
+        inertia = inertial.inertia
         if mass < 0.0 or not math.isfinite(mass):
             raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give it its mass")
         if inertia is not None and mass > 0.0:

@@ -100,9 +100,16 @@ def parse_origin(element: etree._Element | None) -> np.ndarray | None:
     place = np.identity(4)
     place[:3, 3] = _numbers(element.get("xyz", "0 0 0"))
     roll, pitch, yaw = _numbers(element.get("rpy", "0 0 0"))
-    si, sj, sk = np.sin(roll), np.sin(pitch), np.sin(yaw)
-    ci, cj, ck = np.cos(roll), np.cos(pitch), np.cos(yaw)
-    cc, cs, sc, ss = ci * ck, ci * sk, si * ck, si * sk
+    si = np.sin(roll)
+    sj = np.sin(pitch)
+    sk = np.sin(yaw)
+    ci = np.cos(roll)
+    cj = np.cos(pitch)
+    ck = np.cos(yaw)
+    cc = ci * ck
+    cs = ci * sk
+    sc = si * ck
+    ss = si * sk
     turn = np.identity(4)
     turn[:3, :3] = [
         [cj * ck, sj * sc - cs, sj * cc + ss],
@@ -129,7 +136,8 @@ def parse_inertial(element: etree._Element | None) -> Inertial | None:
     """The content of an ``<inertial>``; None if there is none."""
     if element is None:
         return None
-    mass, inertia = element.find("mass"), element.find("inertia")
+    mass = element.find("mass")
+    inertia = element.find("inertia")
     tensor = None
     if inertia is not None:
         keys = (("ixx", "ixy", "ixz"), ("ixy", "iyy", "iyz"), ("ixz", "iyz", "izz"))

@@ -17,13 +17,21 @@ MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 SOLIDS = ("box", "sphere", "cylinder", "capsule", "mesh")
 """Elements of a geometry."""
 NUMBER_COUNTS = {
-    ("origin", "xyz"): 3, ("origin", "rpy"): 3, ("axis", "xyz"): 3, ("mass", "value"): 1,
+    ("origin", "xyz"): 3,
+    ("origin", "rpy"): 3,
+    ("axis", "xyz"): 3,
+    ("mass", "value"): 1,
     **{("inertia", key): 1 for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")},
     **{("limit", key): 1 for key in ("lower", "upper", "effort", "velocity")},
-    ("mimic", "multiplier"): 1, ("mimic", "offset"): 1, ("box", "size"): 3, ("sphere", "radius"): 1,
-    **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")}, ("mesh", "scale"): 3,
-    ("mesh", "bounds"): 6, ("mesh", "faces"): 1,
-}  # fmt: skip
+    ("mimic", "multiplier"): 1,
+    ("mimic", "offset"): 1,
+    ("box", "size"): 3,
+    ("sphere", "radius"): 1,
+    **{(solid, key): 1 for solid in ("cylinder", "capsule") for key in ("radius", "length")},
+    ("mesh", "scale"): 3,
+    ("mesh", "bounds"): 6,
+    ("mesh", "faces"): 1,
+}
 """Count of numbers in each attribute, by element and attribute."""
 
 MAX_NUMBER = 1e6

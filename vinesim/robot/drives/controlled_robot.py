@@ -51,9 +51,11 @@ class Robot(RobotInstance):
         self._physics: Physics | None = None
         self._body_sensors = BodySensors(rigid, self.name, description)
         self._servos = JointServos(rigid, self.name, description.drives)
-        self.lower_limit, self.upper_limit = self._servos.lower_limit, self._servos.upper_limit
+        self.lower_limit = self._servos.lower_limit
+        self.upper_limit = self._servos.upper_limit
         """[joint] limits of position [rad or m]"""
-        self.max_velocity, self.max_effort = self._servos.max_velocity, self._servos.max_effort
+        self.max_velocity = self._servos.max_velocity
+        self.max_effort = self._servos.max_effort
         """[joint] limits of velocity [rad/s or m/s] and effort [N m or N]"""
         self.series_stiffness = self._servos.series_stiffness
         """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
@@ -202,7 +204,8 @@ class Robot(RobotInstance):
 
     def _validated(self, values: Values, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
         """Indices [k] and finite values [k], or :class:`CommandError`."""
-        i, values = self.joint_indices(joints), np.asarray(values, float)
+        i = self.joint_indices(joints)
+        values = np.asarray(values, float)
         if values.shape != i.shape:
             raise CommandError(f"{self.name}: {values.size} values for {len(i)} joints; give one each")
         if not np.isfinite(values).all():
@@ -240,7 +243,7 @@ class Robot(RobotInstance):
 
     def measure(
         self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True, **more: Any
-    ) -> RobotSample:  # fmt: skip
+    ) -> RobotSample:
         """As :meth:`RobotInstance.measure`: series elastic elements are left out, too."""
         if body_sensors:
             own = self._own(contacts)

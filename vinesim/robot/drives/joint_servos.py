@@ -40,7 +40,9 @@ class JointServos:
 
     def __init__(self, rigid: RigidWorld, name: str, drives: Sequence[Drive]) -> None:
         """``name``: the robot's in ``rigid``."""
-        self._rigid, self._name, self._drives = rigid, name, tuple(drives)
+        self._rigid = rigid
+        self._name = name
+        self._drives = tuple(drives)
         self.lower_limit = np.array([drive.lower for drive in drives], float)
         self.upper_limit = np.array([drive.upper for drive in drives], float)
         """[joint] limits of position [rad or m]"""
@@ -61,21 +63,29 @@ class JointServos:
         self._finger_groups: dict[str, np.ndarray] = {}
         """Fingers that move together: a gripper that drifts with what it holds would be two fingers otherwise."""
         joints = len(drives)
-        self.setpoint, self.interface = np.zeros(joints), np.zeros(joints, np.int64)
+        self.setpoint = np.zeros(joints)
+        self.interface = np.zeros(joints, np.int64)
         """[joint] position that the servos are asked for [rad or m], and :class:`CommandInterface` by which each was
         commanded last; both are written in place."""
-        self._command, self._rate, self._target_velocity = np.zeros(joints), np.zeros(joints), np.zeros(joints)
+        self._command = np.zeros(joints)
+        self._rate = np.zeros(joints)
+        self._target_velocity = np.zeros(joints)
         self._position, self._middle, self._velocity_now, self._inertia = (np.zeros(joints) for _ in range(4))
-        self._max_tracking_error, self._max_impulse = np.zeros(joints), np.zeros(joints)
+        self._max_tracking_error = np.zeros(joints)
+        self._max_impulse = np.zeros(joints)
         self._launch = self._bind_launch()
         self.hold()
 
     def _bind_launch(self) -> Callable[..., None]:
         """Bind the kernel of :meth:`_advance_setpoints` to the arrays of this robot."""
         limits = SharedArrays(
-            joint_servos.ServoLimits, lower=self.lower_limit, upper=self.upper_limit, velocity=self.max_velocity,
-            tracking_error=self._max_tracking_error, impulse=self._max_impulse,
-        )  # fmt: skip
+            joint_servos.ServoLimits,
+            lower=self.lower_limit,
+            upper=self.upper_limit,
+            velocity=self.max_velocity,
+            tracking_error=self._max_tracking_error,
+            impulse=self._max_impulse,
+        )
         read = (self._command, self._position, self._middle, self._velocity_now, self._inertia)
         written = (self.setpoint, self._rate, self._target_velocity)
         return bind_launch(
@@ -108,7 +118,8 @@ class JointServos:
 
     def set_gains(self, joints: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
         """Impedance of ``joints`` [k]: gains [k] N m/rad or N/m, and N m s/rad or N s/m."""
-        self._stiffness[joints], self._damping[joints] = stiffness, damping
+        self._stiffness[joints] = stiffness
+        self._damping[joints] = damping
         self._is_compliant[joints] = True
         self._gains_changed = True
 
@@ -187,7 +198,8 @@ class JointServos:
         commanded effort: a saturated servo does not see how the velocity falls within the step.
         """
         sign = np.copysign(1.0, velocity)
-        brake, along = 10.0 * self.max_effort / self.max_velocity, sign * self._command
+        brake = 10.0 * self.max_effort / self.max_velocity
+        along = sign * self._command
         predicted = sign * (2.0 * velocity - self._velocity)
         is_near = (along > brake * (self.max_velocity - predicted)) | (
             self._is_speed_limited & (np.abs(velocity) > 0.5 * self.max_velocity)
@@ -199,7 +211,8 @@ class JointServos:
 
     def _apply_gains(self, is_limited: np.ndarray, limiter_damping: np.ndarray) -> None:
         """Give the servos in the physics the gains and efforts that the interfaces ask for."""
-        in_effort, in_motor_position = self._in_effort, self._in_motor_position
+        in_effort = self._in_effort
+        in_motor_position = self._in_motor_position
         damping = np.where(in_motor_position, self._series_damping, self._damping)
         effort = np.where(in_motor_position, -self._rigid.gravity_effort(self._name), 0.0)
         self._rigid.set_gains(

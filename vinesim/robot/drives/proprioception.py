@@ -17,7 +17,9 @@ class BodySensors:
     """Force-torque sensors and IMUs of one robot, at the frames that its description names."""
 
     def __init__(self, rigid: RigidWorld, name: str, description: RobotDescription) -> None:
-        self._rigid, self._name, self._description = rigid, name, description
+        self._rigid = rigid
+        self._name = name
+        self._description = description
         for mount in (*description.wrenches, *description.imus):
             rigid.add_link_sensor(name, mount.frame)
         self._distal_links = {mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches}

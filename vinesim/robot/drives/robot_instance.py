@@ -81,7 +81,8 @@ class RobotInstance:
         further values of the sample."""
         position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
-        odom_q, odom_qd = self._odometry(base_q), self._track_odometry.velocity(base_q, base_qd)
+        odom_q = self._odometry(base_q)
+        odom_qd = self._track_odometry.velocity(base_q, base_qd)
         return RobotSample(
             actor=self.name,
             joints=JointSample(time, self._joint_names, position, velocity, effort, contact),

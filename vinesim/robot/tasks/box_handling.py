@@ -121,8 +121,10 @@ class BoxHandling(Task):
 
     def _bunches_in(self, box: int) -> tuple[int, ...]:
         """The free bunches in a box."""
-        rigid, size = self.physics.rigid, self.physics.model.box_size[box].astype(float)
-        back, found = frames.inverse(self.box_pose(box)), []
+        rigid = self.physics.rigid
+        size = self.physics.model.box_size[box].astype(float)
+        back = frames.inverse(self.box_pose(box))
+        found = []
         for bunch in rigid.free_bunches:
             middle = frames.pose([0.5 * float(self.physics.model.bunch_length[bunch]), 0.0, 0.0])
             at = frames.compose(back, frames.compose(rigid.bunch_pose(bunch), middle))[:3]

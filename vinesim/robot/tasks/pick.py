@@ -91,15 +91,18 @@ class PickBunch(Task):
         Raises :class:`CommandError` if the arm of ``plan`` has no gripper with a cutter.
         """
         super().__init__(robot, timeout=timeout)
-        self.physics, self.plan = physics, plan
+        self.physics = physics
+        self.plan = plan
         self.arm = CartesianController(robot, plan.side)
         cutter = next((c for c in robot.description.cutters if c.group == self.arm.gripper), None)
         if cutter is None:
             raise CommandError(f"{robot.name} has no gripper with a cutter on its {plan.side} arm; give one that has")
         self._cutter = cutter.frame
-        model, bunch = physics.model, plan.bunch
+        model = physics.model
+        bunch = plan.bunch
         self._body = int(model.bunch_body[bunch])
-        self._length, self._radius = float(model.bunch_length[bunch]), float(model.bunch_radius[bunch])
+        self._length = float(model.bunch_length[bunch])
+        self._radius = float(model.bunch_radius[bunch])
         self._fingers = robot.description.joint_indices(self.arm.gripper)
         above = np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3])
         self._grasp_depth = min(float(above) - STALK_LENGTH, 0.6 * self._length)
@@ -172,12 +175,15 @@ class PickBunch(Task):
 
     def _close_gripper(self, ahead: np.ndarray) -> Iterator[str]:
         """Close the fingers with :data:`GRASP_FORCE` until all feel the bunch."""
-        rigid, name = self.robot.rigid, self.robot.name
+        rigid = self.robot.rigid
+        name = self.robot.name
         stiffness = np.array([self.robot.description.drives[i].stiffness for i in self._fingers])
-        end, steps = self.time + CLOSE_TIMEOUT, 0
+        end = self.time + CLOSE_TIMEOUT
+        steps = 0
         while steps < round(GRASP_TIME / rigid.dt):
             position, _, _, contact = rigid.joint_measurements(name)
-            here, felt = position[self._fingers], np.abs(contact[self._fingers])
+            here = position[self._fingers]
+            felt = np.abs(contact[self._fingers])
             steps = steps + 1 if (felt > MIN_GRASP_FORCE).all() else 0
             if self.time > end:
                 raise TaskFailed(
@@ -209,12 +215,14 @@ class PickBunch(Task):
 
     def _place_in_box(self) -> Iterator[str]:
         """Move over the box, turn the fingers down, descend, release and retreat."""
-        base, down = self._base_pose(), np.array([0.0, 0.0, -1.0])
+        base = self._base_pose()
+        down = np.array([0.0, 0.0, -1.0])
         along = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
         rim = float(self.physics.model.box_size[self.plan.box, 2])
         # with the fingers down, the bunch points backwards
         middle = self.box_pose[:3] + (0.5 * self._length - self._grasp_depth) * along
-        over, low = middle - (rim + CLEARANCE_ABOVE_RIM) * down, middle - (CRATE_WALL + RELEASE_HEIGHT) * down
+        over = middle - (rim + CLEARANCE_ABOVE_RIM) * down
+        low = middle - (CRATE_WALL + RELEASE_HEIGHT) * down
         yield from self._move_hand("over", lambda: over, along, speed=CARRY_SPEED, timeout=12.0)
         self._tool_z = along
         yield from self._move_hand("turn", lambda: over, down, timeout=6.0)
@@ -227,9 +235,15 @@ class PickBunch(Task):
     # ------------------------------------------------------------------ motions
 
     def _move_hand(
-        self, phase: str, goal: Callable[[], np.ndarray], ahead: np.ndarray, *, speed: float = 0.35, timeout: float,
+        self,
+        phase: str,
+        goal: Callable[[], np.ndarray],
+        ahead: np.ndarray,
+        *,
+        speed: float = 0.35,
+        timeout: float,
         near: float = POSITION_TOLERANCE,
-    ) -> Iterator[str]:  # fmt: skip
+    ) -> Iterator[str]:
         """Move the hand to ``goal`` [3] m in the world, its x axis along ``ahead`` [3], within ``timeout`` [s].
 
         ``near`` [m]: tolerance. Raises :class:`TaskFailed` if it does not arrive or loses the bunch.

@@ -80,8 +80,12 @@ class PushBunch:
             robot, side, tip_offset=FINGER_LENGTH, acceleration=acceleration, use_lift=use_lift
         )
         self.tool = self.arm.tool
-        self.radius, self.depth, self.clearance, self.hold_time = radius, depth, clearance, hold_time
-        self.speed, self.touch_speed = speed, touch_speed
+        self.radius = radius
+        self.depth = depth
+        self.clearance = clearance
+        self.hold_time = hold_time
+        self.speed = speed
+        self.touch_speed = touch_speed
         self.repeat = repeat
         self.phase = Phase.APPROACH
         self.push_count = 0
@@ -143,7 +147,8 @@ class PushBunch:
             self.robot.command_gripper(self.arm.gripper, CLOSED_OPENING)
 
     def _begin(self, phase: Phase, time: float) -> None:
-        self.phase, self._started = phase, time
+        self.phase = phase
+        self._started = time
         fast = phase in (Phase.APPROACH, Phase.RETREAT)
         self._phase_speed = self.speed if fast else self.touch_speed
         distance = np.linalg.norm(self.goal - self.arm.reference)

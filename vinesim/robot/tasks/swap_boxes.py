@@ -87,7 +87,8 @@ class SwapBoxes(BoxHandling):
 
     def _put_down(self, end: str, box: int) -> Iterator[str]:
         """Put the box in the clamp at ``end`` down where the full box stood, and return to where the base can turn."""
-        phase, here = "leave the empty box", self._base_pose()[:2].copy()
+        phase = "leave the empty box"
+        here = self._base_pose()[:2].copy()
         yield from self._align_clamp(phase, end, self._target_pose)
         down = float(self.robot.rigid.joint_measurements(self.robot.name)[0][self._lift_index(end)])
         yield from self._move_lift(

@@ -38,7 +38,8 @@ class Task(abc.ABC):
 
     def __init__(self, robot: Robot, *, timeout: float) -> None:
         """The task fails after ``timeout`` [s]."""
-        self.robot, self.timeout = robot, timeout
+        self.robot = robot
+        self.timeout = timeout
         self.time = 0.0
         """Start of the present step [s]."""
         self.phase = ""

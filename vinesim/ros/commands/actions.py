@@ -42,7 +42,9 @@ class ActiveGoal:
     """A goal between its acceptance and its result."""
 
     def __init__(self, server: ActionServer, handle: ServerGoalHandle, command: JointTrajectory | GripperGoal) -> None:
-        self.server, self.handle, self.command = server, handle, command
+        self.server = server
+        self.handle = handle
+        self.command = command
 
 
 class ControllerActions:
@@ -51,9 +53,11 @@ class ControllerActions:
     def __init__(self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue) -> None:
         from control_msgs.action import FollowJointTrajectory, GripperCommand
 
-        self._queue, self._lock = queue, threading.Lock()
+        self._queue = queue
+        self._lock = threading.Lock()
         self._goals: dict[bytes, ActiveGoal] = {}
-        self._trajectory_type, self._gripper_type = FollowJointTrajectory, GripperCommand
+        self._trajectory_type = FollowJointTrajectory
+        self._gripper_type = GripperCommand
         for spec in controllers:
             if spec.kind is ControllerKind.JOINT_TRAJECTORY:
                 take = partial(convert.trajectory_goal, controller=spec.name, known=spec.joints)
@@ -66,9 +70,14 @@ class ControllerActions:
         self, node: rclpy.node.Node, action: Any, name: str, take: Callable[..., JointTrajectory | GripperGoal]
     ) -> None:
         server = DeferredActionServer(
-            node, action, name, lambda _: action.Result(), goal_callback=partial(self._judge, take),
-            cancel_callback=self._cancel, result_timeout=RESULT_TIMEOUT,
-        )  # fmt: skip
+            node,
+            action,
+            name,
+            lambda _: action.Result(),
+            goal_callback=partial(self._judge, take),
+            cancel_callback=self._cancel,
+            result_timeout=RESULT_TIMEOUT,
+        )
         server.register_handle_accepted_callback(partial(self._begin, server, take))
 
     # ------------------------------------------------------------------ in the receiving thread
@@ -127,8 +136,10 @@ class ControllerActions:
         else:
             message = self._gripper_type.Result()
             if (gripper := result.gripper) is not None:
-                message.position, message.effort = gripper.position, gripper.effort
-                message.stalled, message.reached_goal = gripper.stalled, gripper.reached_goal
+                message.position = gripper.position
+                message.effort = gripper.effort
+                message.stalled = gripper.stalled
+                message.reached_goal = gripper.reached_goal
         goal.server.notify_execute(goal.handle, partial(end_goal, result.status, message))
 
 

@@ -36,7 +36,8 @@ class CommandError(ValueError):
 
 def base_velocity(message: TwistStamped) -> BaseVelocity:
     """A commanded velocity of the base; it must be finite."""
-    linear, angular = message.twist.linear, message.twist.angular
+    linear = message.twist.linear
+    angular = message.twist.angular
     velocity = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
     if not np.isfinite(velocity).all():
         raise CommandError(f"cmd_vel is not finite: {velocity.tolist()}")
@@ -94,7 +95,8 @@ def impedance_command(
 
 def elastic_command(message: JointState, controller: str, joint: str) -> ElasticCommand:
     """Position of one motor: the message's only one, or that of its ``joint``."""
-    names, positions = list(message.name), list(message.position)
+    names = list(message.name)
+    positions = list(message.position)
     place = names.index(joint) if joint in names else 0
     if place >= len(positions) or (names and joint not in names) or not np.isfinite(positions[place]):
         raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite one of {joint}")
@@ -136,16 +138,23 @@ def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: b
         raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the goal before it")
     late = request.goal_time_tolerance.sec + 1e-9 * request.goal_time_tolerance.nanosec
     return JointTrajectory(
-        controller, plain.time, plain.joints, plain.times, plain.positions, plain.velocities,
+        controller,
+        plain.time,
+        plain.joints,
+        plain.times,
+        plain.positions,
+        plain.velocities,
         path_tolerance=_tolerances(request.path_tolerance, plain.joints, controller),
         goal_tolerance=_tolerances(request.goal_tolerance, plain.joints, controller),
-        goal_time_tolerance=late if late > 0.0 else None, goal=goal,
-    )  # fmt: skip
+        goal_time_tolerance=late if late > 0.0 else None,
+        goal=goal,
+    )
 
 
 def _tolerances(given: Iterable[Any], joints: tuple[str, ...], controller: str) -> JointTolerances | None:
     """Tolerances in the order of ``joints``, None if none is given. 0 means none was given, below 0 no limit."""
-    position, velocity = np.full(len(joints), np.inf), np.full(len(joints), np.inf)
+    position = np.full(len(joints), np.inf)
+    velocity = np.full(len(joints), np.inf)
     said = False
     for one in given:
         if one.name not in joints:
@@ -155,7 +164,8 @@ def _tolerances(given: Iterable[Any], joints: tuple[str, ...], controller: str) 
             if np.isnan(limit):
                 raise CommandError(f"{controller}: the tolerance for {one.name!r} is not a number")
             if limit > 0.0:
-                values[place], said = limit, True
+                values[place] = limit
+                said = True
     return JointTolerances(position, velocity) if said else None
 
 

@@ -29,20 +29,30 @@ class StepAction:
     """The action server. Every goal is accepted: only an accepted one has a result that says why it was not done."""
 
     def __init__(
-        self, node: rclpy.node.Node, ask: Callable[[SimulationRequest], None], numbers: Iterator[int],
+        self,
+        node: rclpy.node.Node,
+        ask: Callable[[SimulationRequest], None],
+        numbers: Iterator[int],
         result: Callable[[SimulationReply], Any],
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``ask`` sends a request to the simulation, with the next of the ``numbers``; ``result`` makes a
         simulation_interfaces/Result of its answer, which :meth:`answer` takes."""
         from simulation_interfaces.action import SimulateSteps
 
-        self._type, self._ask, self._numbers, self._result = SimulateSteps, ask, numbers, result
+        self._type = SimulateSteps
+        self._ask = ask
+        self._numbers = numbers
+        self._result = result
         self._goals: dict[int, ServerGoalHandle] = {}
         """Goals that are being executed, by the number of their request."""
         self._server = DeferredActionServer(
-            node, SimulateSteps, NAME, lambda _: SimulateSteps.Result(), cancel_callback=self._cancel,
+            node,
+            SimulateSteps,
+            NAME,
+            lambda _: SimulateSteps.Result(),
+            cancel_callback=self._cancel,
             result_timeout=RESULT_TIMEOUT,
-        )  # fmt: skip
+        )
         self._server.register_handle_accepted_callback(self._begin)
 
     # ------------------------------------------------------------------ in the receiving thread

@@ -98,8 +98,9 @@ class CommandSubscriptions:
 
     def __init__(
         self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue, audio_data: type
-    ) -> None:  # fmt: skip
-        self._node, self._queue = node, queue
+    ) -> None:
+        self._node = node
+        self._queue = queue
         self.types: dict[str, str] = {}
         """By full name of each topic: the type that is taken, ``package/msg/Name``."""
         self._subscribe(TwistStamped, BASE_COMMAND, convert.base_velocity)
@@ -128,7 +129,8 @@ class CommandSubscriptions:
 
     def _subscribe(self, message: type, topic: str, take: Callable[[Any], Command]) -> None:
         self._node.create_subscription(message, topic, partial(self._receive, take), RELIABLE)
-        package, name = message.__module__.partition(".")[0], message.__name__
+        package = message.__module__.partition(".")[0]
+        name = message.__name__
         self.types[self._node.resolve_topic_name(topic)] = f"{package}/msg/{name}"
 
     def foreign_types(self) -> dict[str, list[str]]:

@@ -30,10 +30,19 @@ CLASS_ID = str(int(Organ.BUNCH))
 """Class of all detections; LabelInfo has its name."""
 BUNCH_POINT = np.dtype(
     [
-        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("u", "<f4"), ("v", "<f4"), ("seen", "<i4"), ("bunch", "<i4"),
-        ("berries", "<i4"), ("berries_seen", "<i4"), ("pixels", "<i4"), ("amodal_pixels", "<i4"),
+        ("x", "<f4"),
+        ("y", "<f4"),
+        ("z", "<f4"),
+        ("u", "<f4"),
+        ("v", "<f4"),
+        ("seen", "<i4"),
+        ("bunch", "<i4"),
+        ("berries", "<i4"),
+        ("berries_seen", "<i4"),
+        ("pixels", "<i4"),
+        ("amodal_pixels", "<i4"),
     ]
-)  # fmt: skip
+)
 """A bunch as a point of a cloud: where to cut [m], NaN once it is picked; the pixel of that point and whether it is
 seen; the bunch's index; its berries and how many are seen; its pixels and how many it would have if nothing hid it."""
 
@@ -86,7 +95,8 @@ def bunch_cloud(frame: CameraFrame) -> PointCloud2:
 def _hypothesis(frame: CameraFrame, one: BunchTruth) -> ObjectHypothesisWithPose:
     """Class, pose in the optical frame, and as score the share of the bunch's pixels that nothing hides."""
     result = ObjectHypothesisWithPose()
-    result.hypothesis.class_id, result.hypothesis.score = CLASS_ID, 1.0 - one.occlusion
+    result.hypothesis.class_id = CLASS_ID
+    result.hypothesis.score = 1.0 - one.occlusion
     result.pose.pose = _pose(frames.compose(frames.inverse(frame.pose), one.frame))
     return result
 
@@ -102,5 +112,6 @@ def _box_2d(box: Box) -> BoundingBox2D:
     """Pixel centres are whole numbers, so a box of one pixel has the size 1."""
     left, top, right, bottom = box
     message = BoundingBox2D(size_x=float(right - left + 1), size_y=float(bottom - top + 1))
-    message.center.position.x, message.center.position.y = 0.5 * (left + right), 0.5 * (top + bottom)
+    message.center.position.x = 0.5 * (left + right)
+    message.center.position.y = 0.5 * (top + bottom)
     return message

@@ -166,9 +166,11 @@ def gestures(time: float, shown: Iterable[HandGestures]) -> String:
 def elastic_state(sample: ElasticSample, joint: int) -> JointState:
     """One series elastic element: position of the motor, and the torque that its spring carries."""
     return JointState(
-        header=header(sample.time, ""), name=[sample.names[joint]], position=[float(sample.motor[joint])],
+        header=header(sample.time, ""),
+        name=[sample.names[joint]],
+        position=[float(sample.motor[joint])],
         effort=[float(sample.torque[joint])],
-    )  # fmt: skip
+    )
 
 
 def reference_points(sample: RobotSample, joints: np.ndarray) -> dict[str, JointTrajectoryPoint]:
@@ -185,10 +187,17 @@ def reference_points(sample: RobotSample, joints: np.ndarray) -> dict[str, Joint
 
 CONTACT_POINT = np.dtype(
     [
-        ("x", "f4"), ("y", "f4"), ("z", "f4"), ("force_x", "f4"), ("force_y", "f4"), ("force_z", "f4"),
-        ("body", "i4"), ("bunch", "i4"), ("link", "i4"),
+        ("x", "f4"),
+        ("y", "f4"),
+        ("z", "f4"),
+        ("force_x", "f4"),
+        ("force_y", "f4"),
+        ("force_z", "f4"),
+        ("body", "i4"),
+        ("bunch", "i4"),
+        ("link", "i4"),
     ]
-)  # fmt: skip
+)
 """A contact as a point of a cloud: where, the force on the robot [N], the plant's body, its bunch or -1, and the
 robot's link by its number in the URDF or -1."""
 
@@ -220,7 +229,8 @@ def depth_image_millimetres(frame: CameraFrame) -> Image:
     return _image(frame, depth_millimetres(frame.depth), "16UC1", np.uint16)
 
 
-QUANTIZATION, MAX_COMPRESSED_DEPTH = 100.0, 10.0
+QUANTIZATION = 100.0
+MAX_COMPRESSED_DEPTH = 10.0
 """Of compressed depth, [1] and [m]: the defaults of compressed_depth_image_transport."""
 
 
@@ -234,10 +244,12 @@ def compressed_depth(frame: CameraFrame, *, is_millimetres: bool = False) -> Com
 
     scale = offset = 0.0
     if is_millimetres:
-        encoding, pixels = "16UC1", depth_millimetres(frame.depth)
+        encoding = "16UC1"
+        pixels = depth_millimetres(frame.depth)
         pixels[pixels > 1000.0 * MAX_COMPRESSED_DEPTH] = 0
     else:
-        encoding, scale = "32FC1", QUANTIZATION * (QUANTIZATION + 1.0)
+        encoding = "32FC1"
+        scale = QUANTIZATION * (QUANTIZATION + 1.0)
         offset = 1.0 - scale / MAX_COMPRESSED_DEPTH
         is_known = np.isfinite(frame.depth) & (frame.depth < MAX_COMPRESSED_DEPTH) & (frame.depth > 0.0)
         inverse = scale / np.where(is_known, frame.depth, np.float32(MAX_COMPRESSED_DEPTH)) + offset
@@ -316,10 +328,13 @@ def laser_scan(scan: LidarScan) -> LaserScan:
         raise ValueError(f"lidar {scan.name}: no laser is named that looks level; give LidarScan.level")
     message = LaserScan(header=header(scan.time + level.delay + (level.count - 1) * level.period, scan.frame_id))
     step = 2.0 * np.pi / level.count
-    message.angle_min, message.angle_increment = level.azimuth + step, step
+    message.angle_min = level.azimuth + step
+    message.angle_increment = step
     message.angle_max = level.azimuth + 2.0 * np.pi
-    message.time_increment, message.scan_time = -level.period, level.count * level.period
-    message.range_min, message.range_max = level.nearest, level.farthest
+    message.time_increment = -level.period
+    message.scan_time = level.count * level.period
+    message.range_min = level.nearest
+    message.range_max = level.farthest
     ranges = np.full(level.count, np.inf, np.float32)
     intensities = np.zeros(level.count, np.float32)
     points = np.flatnonzero(scan.ring == level.ring)
@@ -327,8 +342,10 @@ def laser_scan(scan: LidarScan) -> LaserScan:
     found = np.hypot(scan.xyz[points, 0], scan.xyz[points, 1])
     far_first = np.argsort(-found, kind="stable")  # of two returns the nearer is written last
     rays = level.count - 1 - shot[far_first]
-    ranges[rays], intensities[rays] = found[far_first], scan.intensity[points][far_first]
-    message.ranges, message.intensities = _floats(ranges), _floats(intensities)
+    ranges[rays] = found[far_first]
+    intensities[rays] = scan.intensity[points][far_first]
+    message.ranges = _floats(ranges)
+    message.intensities = _floats(intensities)
     return message
 
 

@@ -22,7 +22,9 @@ class UnknownTypeError(LookupError):
 def message_definition(type_name: str) -> str:
     """The definition of ``package/msg/Name`` and, after it, those of all types in it; :class:`UnknownTypeError`."""
     package, _, name = type_name.split("/")
-    parts, known, open_types = [_text(package, name)], {(package, name)}, [(package, name)]
+    parts = [_text(package, name)]
+    known = {(package, name)}
+    open_types = [(package, name)]
     while open_types:
         inside, of = open_types.pop(0)
         for reference in _references(_text(inside, of), inside):

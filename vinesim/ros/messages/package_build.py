@@ -113,7 +113,8 @@ class PackageBuild:
         for generator in LIBRARIES:
             self.visibility_header(generator)
 
-        structures, python = self.output("rosidl_generator_c"), self.output("rosidl_generator_py")
+        structures = self.output("rosidl_generator_c")
+        python = self.output("rosidl_generator_py")
         return {
             "rosidl_generator_c": [
                 *self.together("functions.c", structures.rglob("*__functions.c")),

@@ -25,7 +25,8 @@ def distribution(package: str) -> str:
 def write(package: str, folder: pathlib.Path) -> pathlib.Path:
     """Write the wheel of ``package`` (built if need be) into ``folder``; returns its path."""
     place = message_packages.build([package])[package]
-    name, version = distribution(package).replace("-", "_"), f"1.0+{message_packages.key(package)}"
+    name = distribution(package).replace("-", "_")
+    version = f"1.0+{message_packages.key(package)}"
     tag = sys.implementation.cache_tag.replace("cpython-", "cp")
     platform_tag = f"{sys.platform}_{platform.machine()}"
     information = f"{name}-{version}.dist-info"

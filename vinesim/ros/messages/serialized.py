@@ -82,9 +82,12 @@ def odometry_writer(first: RobotSample, base: str, odom: str) -> Callable[[Robot
 
     def build(time: float, numbers: np.ndarray) -> Any:
         sample = dataclasses.replace(
-            first, joints=dataclasses.replace(first.joints, time=time), odom_q=numbers[:7], odom_qd=numbers[7:13],
+            first,
+            joints=dataclasses.replace(first.joints, time=time),
+            odom_q=numbers[:7],
+            odom_qd=numbers[7:13],
             odom_covariance=numbers[13:].reshape(2, 3, 3),
-        )  # fmt: skip
+        )
         return convert.odometry(sample, base, odom)
 
     template = SerializedMessage(build, 31)

@@ -22,7 +22,8 @@ class SerializedTransforms:
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
         body = bytearray(struct.pack("<I", len(frames)))
-        stamps, poses = [], []
+        stamps = []
+        poses = []
         for parent, child in frames:
             _align(body, 4)
             stamps.append(len(body) // 4)
@@ -36,7 +37,8 @@ class SerializedTransforms:
         self._bytes = np.frombuffer(HEADER + bytes(4) + body, np.uint8).copy()
         # The header is padded to eight bytes here, so that both views are aligned; message() leaves the padding out.
         inner = self._bytes[8:]
-        self._words, self._doubles = inner.view("<u4"), inner.view("<f8")
+        self._words = inner.view("<u4")
+        self._doubles = inner.view("<f8")
         self._stamps = np.array(stamps, np.intp)
         self._poses = np.array(poses, np.intp)[:, None] + np.arange(7)
         self._length = 4 if not frames else len(body)

@@ -13,7 +13,9 @@ from vinesim.ros.parameters import Parameters
 from vinesim.ros.topic import SENSOR_DATA, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import CameraFrame, CameraOutput
 
-RGB, DEPTH, LABELS = CameraOutput.RGB, CameraOutput.DEPTH, CameraOutput.LABELS
+RGB = CameraOutput.RGB
+DEPTH = CameraOutput.DEPTH
+LABELS = CameraOutput.LABELS
 
 
 class CameraPublisher:
@@ -30,7 +32,8 @@ class CameraPublisher:
 
         from vinesim.ros.messages import bunches
 
-        self._name, self._parameters = name, parameters
+        self._name = name
+        self._parameters = parameters
         advertise(LabelInfo, f"{name}/label_info", TRANSIENT_LOCAL).send(bunches.label_info())
         declare = parameters.declare
         declare(f"{name}.exact_depth", False, "Exact depth instead of depth with the errors of the sensor.")
@@ -51,9 +54,14 @@ class CameraPublisher:
             advertise(PointCloud2, f"{name}/bunches", SENSOR_DATA): bunches.bunch_cloud,
         }
         self._needs = {
-            self._rgb: RGB, self._depth: DEPTH, self._labels: LABELS, self._jpeg: RGB, self._png: DEPTH,
-            self._points: RGB | DEPTH, **dict.fromkeys(self._bunches, CameraOutput.BUNCHES),
-        }  # fmt: skip
+            self._rgb: RGB,
+            self._depth: DEPTH,
+            self._labels: LABELS,
+            self._jpeg: RGB,
+            self._png: DEPTH,
+            self._points: RGB | DEPTH,
+            **dict.fromkeys(self._bunches, CameraOutput.BUNCHES),
+        }
 
     def mute_truth(self, is_muted: bool) -> None:
         """Whether labels and detections are kept back."""

@@ -35,13 +35,16 @@ class ClockPublisher:
     """This node's part in /clock; its name is absolute under every namespace."""
 
     def __init__(self, node: rclpy.node.Node, advertise: Advertise, withdraw: Callable[[Topic], None]) -> None:
-        self._node, self._advertise, self._withdraw = node, advertise, withdraw
+        self._node = node
+        self._advertise = advertise
+        self._withdraw = withdraw
         self._topic: Topic | None = None
         self._sends = False
         self._write = stamp_writer(convert.clock)
         self._lone_looks = 0
         """Looks in a row that found no other publisher."""
-        self._looks, self._next_look = 0, 0.0
+        self._looks = 0
+        self._next_look = 0.0
 
     @property
     def has_subscribers(self) -> bool:
@@ -55,19 +58,24 @@ class ClockPublisher:
         if now < self._next_look:
             return
         self._next_look = now + LOOK_PERIOD
-        own, others = [], []
+        own = []
+        others = []
         for publisher in self._node.get_publishers_info_by_topic(CLOCK):
             is_own = (publisher.node_name, publisher.node_namespace) == (
-                self._node.get_name(), self._node.get_namespace()
-            )  # fmt: skip
+                self._node.get_name(),
+                self._node.get_namespace(),
+            )
             (own if is_own else others).append(tuple(publisher.endpoint_gid))
         self._looks += 1
         self._lone_looks = 0 if others else self._lone_looks + 1
         if self._topic is None:
             if self._lone_looks >= FREE_LOOKS and self._looks >= FIRST_LOOKS:
-                self._topic, self._lone_looks = self._advertise(ClockMessage, CLOCK, EVERY_STEP), 0
+                self._topic = self._advertise(ClockMessage, CLOCK, EVERY_STEP)
+                self._lone_looks = 0
         elif own and any(other < own[0] for other in others):
-            topic, self._topic, self._sends = self._topic, None, False
+            topic = self._topic
+            self._topic = None
+            self._sends = False
             self._withdraw(topic)
         elif self._lone_looks >= CLAIM_LOOKS:
             self._sends = True

@@ -30,14 +30,18 @@ class ContactPublisher:
     """``vine/contacts`` after every step, with or without contacts; ``vine/markers`` at 10 Hz."""
 
     def __init__(
-        self, advertise: Advertise, bunch_of_body: np.ndarray, links: dict[str, int] | None = None,
+        self,
+        advertise: Advertise,
+        bunch_of_body: np.ndarray,
+        links: dict[str, int] | None = None,
         interest_radius: float | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         """``bunch_of_body`` [body]: -1 for wood. ``links``: numbers of the robot's links by name. ``interest_radius``
         [m]: of the area of interest around the robot; None: there is none, as no other client is in the world."""
         self._contacts = advertise(PointCloud2, "vine/contacts", EVERY_STEP)
         self._markers = advertise(MarkerArray, "vine/markers", RELIABLE)
-        self._bunch_of_body, self._links = bunch_of_body, links or {}
+        self._bunch_of_body = bunch_of_body
+        self._links = links or {}
         self._edge = None if interest_radius is None else _circle(interest_radius)
         self._steps = 0
         self._write_none: Callable[[float], bytes] | None = None
@@ -84,9 +88,15 @@ def _arrow(number: int, contact: Contact, time: float) -> Marker:
     end = start + ARROW_SCALE * np.asarray(contact.force, float)
     points = [Point(x=float(x), y=float(y), z=float(z)) for x, y, z in (start, end)]
     return Marker(
-        header=convert.header(time, MAP_FRAME), ns="contacts", id=number, type=Marker.ARROW, action=Marker.ADD,
-        points=points, scale=Vector3(x=0.01, y=0.02, z=0.0), color=ColorRGBA(r=1.0, g=0.3, b=0.0, a=1.0),
-    )  # fmt: skip
+        header=convert.header(time, MAP_FRAME),
+        ns="contacts",
+        id=number,
+        type=Marker.ARROW,
+        action=Marker.ADD,
+        points=points,
+        scale=Vector3(x=0.01, y=0.02, z=0.0),
+        color=ColorRGBA(r=1.0, g=0.3, b=0.0, a=1.0),
+    )
 
 
 def _circle(radius: float) -> list[Point]:
@@ -99,7 +109,12 @@ def _interest(edge: list[Point], sample: RobotSample) -> Marker:
     """The edge of the area of interest, around the robot's base."""
     x, y, z = map(float, sample.base_q[:3])
     return Marker(
-        header=convert.header(sample.joints.time, MAP_FRAME), ns="interest", type=Marker.LINE_STRIP, action=Marker.ADD,
-        pose=Pose(position=Point(x=x, y=y, z=z)), points=edge, scale=Vector3(x=0.03),
+        header=convert.header(sample.joints.time, MAP_FRAME),
+        ns="interest",
+        type=Marker.LINE_STRIP,
+        action=Marker.ADD,
+        pose=Pose(position=Point(x=x, y=y, z=z)),
+        points=edge,
+        scale=Vector3(x=0.03),
         color=ColorRGBA(r=0.24, g=0.55, b=1.0, a=1.0),
-    )  # fmt: skip
+    )

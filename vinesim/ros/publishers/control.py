@@ -56,6 +56,9 @@ class ControlPublisher:
     def _state(self, sample: RobotSample, joints: tuple[str, ...], places: np.ndarray) -> Any:
         points = convert.reference_points(sample, places)
         return self._state_type(
-            header=convert.header(sample.joints.time, ""), joint_names=list(joints), reference=points["desired"],
-            feedback=points["actual"], error=points["error"],
-        )  # fmt: skip
+            header=convert.header(sample.joints.time, ""),
+            joint_names=list(joints),
+            reference=points["desired"],
+            feedback=points["actual"],
+            error=points["error"],
+        )

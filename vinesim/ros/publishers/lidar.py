@@ -18,7 +18,8 @@ class LidarPublisher:
     ``scan_topic``: its laser nearest to the horizontal. Its parameter: ``<name>.exact_ranges``."""
 
     def __init__(self, advertise: Advertise, name: str, scan_topic: str, parameters: Parameters) -> None:
-        self._parameters, self._exact = parameters, f"{name}.exact_ranges"
+        self._parameters = parameters
+        self._exact = f"{name}.exact_ranges"
         parameters.declare(
             self._exact, False, "What the middle of each beam meets, exactly, instead of what the sensor measures."
         )

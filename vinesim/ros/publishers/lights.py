@@ -49,18 +49,25 @@ def lamp_markers(urdf: str) -> list[Marker]:
     markers = []
     for link in ElementTree.fromstring(urdf).iterfind("link"):
         for visual in link.iterfind("visual"):
-            material, geometry = visual.find("material"), visual.find("geometry")
+            material = visual.find("material")
+            geometry = visual.find("geometry")
             words = "" if material is None else material.get("name", "")
             form = None if geometry is None else next(iter(geometry), None)
             if "indicator" not in words.lower().split("_") or form is None or form.tag not in _FORMS:
                 continue
-            kind, size = _FORMS[form.tag], _size(form)
+            kind = _FORMS[form.tag]
+            size = _size(form)
             markers.append(
                 Marker(
-                    ns="indicator_lights", id=len(markers), type=kind, action=Marker.ADD, frame_locked=True,
-                    pose=_pose(visual.find("origin")), scale=Vector3(**dict(zip("xyz", GROWTH * size, strict=True))),
+                    ns="indicator_lights",
+                    id=len(markers),
+                    type=kind,
+                    action=Marker.ADD,
+                    frame_locked=True,
+                    pose=_pose(visual.find("origin")),
+                    scale=Vector3(**dict(zip("xyz", GROWTH * size, strict=True))),
                 )
-            )  # fmt: skip
+            )
             markers[-1].header.frame_id = link.get("name", "")
     return markers
 

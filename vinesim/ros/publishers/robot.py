@@ -17,7 +17,8 @@ from vinesim.ros.messages.transforms import SerializedTransforms
 from vinesim.ros.topic import EVERY_STEP, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import JointSample, RobotSample
 
-MAP_FRAME, ODOM_FRAME = "map", "odom"
+MAP_FRAME = "map"
+ODOM_FRAME = "odom"
 ODOMETRY = "mobile_base_controller/odom"
 """Topic."""
 EXACT_VARIANCE = 1e-6
@@ -81,15 +82,17 @@ class RobotPublisher:
         if not self.has_exact_odometry:
             self._odom_q = None
             return sample
-        base_q, base_qd = np.asarray(sample.base_q, float), np.asarray(sample.base_qd, float)
+        base_q = np.asarray(sample.base_q, float)
+        base_qd = np.asarray(sample.base_qd, float)
         if self._odom_q is None:
             self._odom_q = frames.compose(base_q, frames.inverse(np.asarray(sample.odom_q, float)))
         to_base = frames.conjugate(base_q[3:])
         return dataclasses.replace(
-            sample, odom_q=frames.compose(frames.inverse(self._odom_q), base_q),
+            sample,
+            odom_q=frames.compose(frames.inverse(self._odom_q), base_q),
             odom_qd=np.concatenate([frames.rotate(to_base, base_qd[:3]), frames.rotate(to_base, base_qd[3:])]),
             odom_covariance=np.tile(EXACT_VARIANCE * np.eye(3), (2, 1, 1)),
-        )  # fmt: skip
+        )
 
     def _frames(self, sample: RobotSample) -> bytes:
         has_map = self.publishes_map_to_odom
@@ -98,7 +101,8 @@ class RobotPublisher:
             above = [(MAP_FRAME, self.odom_frame)] * has_map
             self._transforms = SerializedTransforms([*above, (self.odom_frame, self._base), *sample.transforms])
             self._pairs = *names, sample.transforms
-        base, odom = np.asarray(sample.base_q, float), np.asarray(sample.odom_q, float)
+        base = np.asarray(sample.base_q, float)
+        odom = np.asarray(sample.odom_q, float)
         above = [frames.compose(base, frames.inverse(odom))] * has_map
         poses = np.concatenate([[*above, odom], np.reshape(sample.transform_q, (-1, 7))])
         return self._transforms.message(sample.joints.time, poses)

@@ -71,7 +71,8 @@ def _play(reader: Any, node: Node, rate: float, is_stopped: Callable[[], bool]) 
         publishers[channel.topic] = node.create_publisher(message, channel.topic, qos)
     time.sleep(DISCOVERY_TIME)
     played: Counter[str] = Counter()
-    first, began = None, time.monotonic()
+    first = None
+    began = time.monotonic()
     for _, channel, message in reader.iter_messages():
         if is_stopped():
             break

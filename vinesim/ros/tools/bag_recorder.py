@@ -98,9 +98,11 @@ class BagRecorder:
             return
         qos = offered_qos(offered, QUEUE_DEPTH)
         channel = self._writer.register_channel(
-            topic=name, message_encoding="cdr", schema_id=schema,
+            topic=name,
+            message_encoding="cdr",
+            schema_id=schema,
             metadata={"offered_qos_profiles": _qos_text(qos)},
-        )  # fmt: skip
+        )
         self._subscriptions[name] = self._node.create_subscription(
             message, name, self._taker(name, channel), qos, raw=True
         )

@@ -74,7 +74,8 @@ class SimulationClock:
         if not self._messages:
             return None
         if self._line is None:
-            (first, begin), (last, end) = self._messages[0], self._messages[-1]
+            (first, begin) = self._messages[0]
+            (last, end) = self._messages[-1]
             rate = (end - begin) / (last - first) if last > first else 1.0
             self._line = rate, *max(self._messages, key=lambda one: one[1] - begin - rate * (one[0] - first))
         rate, quickest, its_stamp = self._line
@@ -87,7 +88,8 @@ class TopicStats:
     def __init__(
         self, type_name: str, type_hash: str, message: type, publishers: int, clock: SimulationClock | None = None
     ) -> None:
-        self.type_name, self.type_hash = type_name, type_hash
+        self.type_name = type_name
+        self.type_hash = type_hash
         self.publishers = publishers
         self.first: float | None = None
         """Wall time of the first message [s since the epoch]."""
@@ -172,9 +174,13 @@ class TopicMonitor:
     """Subscribes to topics as they appear."""
 
     def __init__(
-        self, topics: Sequence[str] = (), once: Sequence[str] = (),
-        announce: Callable[[str, float], None] | None = None, queue_depth: int | None = None, arrivals: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        topics: Sequence[str] = (),
+        once: Sequence[str] = (),
+        announce: Callable[[str, float], None] | None = None,
+        queue_depth: int | None = None,
+        arrivals: bool = False,
+    ) -> None:
         """``topics`` and ``once`` name the topics, all if both are empty; ``announce`` is called with each topic and
         the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node, None
         for :data:`QUEUE_DEPTH` and :data:`LARGE_QUEUE_DEPTH`; ``arrivals``: keep the times of every message."""
@@ -182,9 +188,11 @@ class TopicMonitor:
         from rclpy.node import Node
 
         self.stats: dict[str, TopicStats] = {}
-        self._topics, self._once = {*topics, *once}, set(once)
+        self._topics = {*topics, *once}
+        self._once = set(once)
         self._announce = announce
-        self._queue_depth, self._keeps_arrivals = queue_depth, arrivals
+        self._queue_depth = queue_depth
+        self._keeps_arrivals = arrivals
         self._unannounced: set[str] = set()
         self._clock = SimulationClock()
         self._context = Context()
@@ -218,7 +226,9 @@ class TopicMonitor:
     def _take(self) -> None:
         """Count all messages that wait. An executor would take one of them at a time, and look at all topics again."""
         for name, subscription in self._subscriptions.items():
-            take, message, add = subscription.handle.take_message, subscription.msg_type, self.stats[name].add
+            take = subscription.handle.take_message
+            message = subscription.msg_type
+            add = self.stats[name].add
             while (taken := take(message, True)) is not None:
                 add(*taken)
 
@@ -318,9 +328,7 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
     parser.add_argument("--arrivals", type=pathlib.Path, help="write the times of every message here (.npz)")
     given = parser.parse_args(arguments)
-    return Arguments(
-        given.topic, given.once, given.announce, given.queue, given.seconds, given.out, given.arrivals
-    )  # fmt: skip
+    return Arguments(given.topic, given.once, given.announce, given.queue, given.seconds, given.out, given.arrivals)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -48,32 +48,38 @@ class Crate(Table, frozen=True):
 def crate_shapes(size: tuple[float, float, float], number: int, name: str = "crate") -> tuple[Shape, ...]:
     """A slatted crate of this outer ``size`` [m], origin in the middle of its underside; its inside is free."""
     one = load_toml(find_data_file("figures", name, ".toml"), Crate, AppearanceError)
-    t, look = one.wall, surface_fields(one.paints[number % len(one.paints)])
+    t = one.wall
+    look = surface_fields(one.paints[number % len(one.paints)])
     length, width, height = size
     found: list[Shape] = []
 
     def add(low: ArrayLike, high: ArrayLike) -> None:
-        a, b = np.asarray(low, float), np.asarray(high, float)
+        a = np.asarray(low, float)
+        b = np.asarray(high, float)
         if (b - a > 1e-6).all():
             found.append(Shape("box", tuple(0.5 * (b - a)), frames.pose(0.5 * (a + b)), *look))
 
-    x, y = 0.5 * length, 0.5 * width
+    x = 0.5 * length
+    y = 0.5 * width
     for half, side, along in ((x, y, 0), (y, x, 1)):  # bars one way, and the other way on top of them
         count = max(round(2.0 * side / one.grid), 1) + 1
         for at in np.linspace(0.5 * one.bar - side, side - 0.5 * one.bar, count):
             order = [1, 0, 2] if along else [0, 1, 2]
-            low, high = (-half, at - 0.5 * one.bar, 0.5 * t * along), (half, at + 0.5 * one.bar, 0.5 * t * (along + 1))
+            low = (-half, at - 0.5 * one.bar, 0.5 * t * along)
+            high = (half, at + 0.5 * one.bar, 0.5 * t * (along + 1))
             add([low[k] for k in order], [high[k] for k in order])
     shelf = height - one.rim
 
     for half, side, along in ((x, y, 0), (y, x, 1)):  # two long walls, two ends between them
         for sign in (-1.0, 1.0):
-            outer, inner = sign * side, sign * (side - t)
+            outer = sign * side
+            inner = sign * (side - t)
             thin = sign * (side - 0.45 * t)
 
             def wall(a: float, b: float, low: float, high: float, depth: float, outer=outer, along=along) -> None:
                 """From a to b along the wall and from ``low`` to ``high``, out to the outer face."""
-                first, second = (a, min(outer, depth), low), (b, max(outer, depth), high)
+                first = (a, min(outer, depth), low)
+                second = (b, max(outer, depth), high)
                 order = [1, 0, 2] if along else [0, 1, 2]
                 add([first[k] for k in order], [second[k] for k in order])
 

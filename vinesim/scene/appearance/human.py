@@ -143,13 +143,17 @@ def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[s
                 r = one.radii[k], one.radii[k + 1]
                 bone = rod_shape((0, 0, 0), (length, 0, 0), r, scale, paint)
                 link = f"{side}_{FINGERS[number]}_{k + 1}"
-                parts[link], paints[link] = (bone,), [file.finger_paint]
+                parts[link] = (bone,)
+                paints[link] = [file.finger_paint]
     limbs = msgspec.convert(_scaled(msgspec.to_builtins(file.limbs), scale), Limbs)
     every = [file.fingers[finger] for finger in FINGERS] * 2
     model = HumanModel(
-        parts=parts, limbs=limbs, root=np.array(roots), length=scale * np.array([f.lengths for f in every]),
+        parts=parts,
+        limbs=limbs,
+        root=np.array(roots),
+        length=scale * np.array([f.lengths for f in every]),
         bent=np.array([f.bent for f in every]),
-    )  # fmt: skip
+    )
     return model, paints
 
 

@@ -18,7 +18,8 @@ def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror
     if spec.kind == "loft":
         return [shape for side in sides for shape in loft_shapes(spec, paints, scale, side)]
     assert isinstance(spec.paint, str)
-    paint, found = paints[spec.paint], []
+    paint = paints[spec.paint]
+    found = []
     for side in sides:
         over = np.array([1.0, -1.0 if side else 1.0, 1.0])
         if spec.kind in ("cone", "cylinder"):
@@ -38,7 +39,8 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
     first, last = (np.radians(arc) for arc in (spec.arc, spec.arc_end or spec.arc))
     widest = max(first[1] - first[0], last[1] - last[0])
     steps = spec.sides if whole else max(int(np.ceil(spec.sides * widest / (2.0 * np.pi))), 1)
-    up, around = np.linspace(0.0, 1.0, len(place))[:, None], np.arange(steps + (not whole)) / steps
+    up = np.linspace(0.0, 1.0, len(place))[:, None]
+    around = np.arange(steps + (not whole)) / steps
     low, high = (first[k] * (1.0 - up) + last[k] * up for k in (0, 1))
     angle = low + (high - low) * around
     bow = np.stack([np.cos(angle), np.sin(angle)])
@@ -51,7 +53,8 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
     points = np.stack([ahead, left, axis] if spec.along == "z" else [axis, left, ahead], -1)
     reverse = spec.along == "x"
     if mirror:
-        points, reverse = points * [1.0, -1.0, 1.0], not reverse
+        points = points * [1.0, -1.0, 1.0]
+        reverse = not reverse
     count = len(around)
     vertices = scale * points.reshape(-1, 3)
     i = np.arange(count if whole else count - 1)
@@ -59,7 +62,8 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
     paint = [spec.paint] * (len(place) - 1) if isinstance(spec.paint, str) else list(spec.paint)
     strips: dict[str, list[np.ndarray]] = {name: [] for name in paint}
     for k, name in enumerate(paint):
-        a, b = count * k + i, count * k + j
+        a = count * k + i
+        b = count * k + j
         strips[name] += [np.stack([a, b, b + count], 1), np.stack([a, b + count, a + count], 1)]
     if whole:
         middles = scale * points[[0, -1]].mean(1)

@@ -62,7 +62,9 @@ def _simplify(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...])
         merged = np.stack([np.bincount(member, vertices[:, k]) / count for k in range(3)], 1)
         linked = member[faces]
         whole = (linked[:, 0] != linked[:, 1]) & (linked[:, 1] != linked[:, 2]) & (linked[:, 0] != linked[:, 2])
-        vertices, faces, cells = merged, linked[whole], int(cells * 0.75)
+        vertices = merged
+        faces = linked[whole]
+        cells = int(cells * 0.75)
     return vertices, faces
 
 

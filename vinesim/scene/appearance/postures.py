@@ -64,7 +64,9 @@ def apply_posture(standing: HumanPose, name: str, height: float) -> HumanPose:
     file = _load_postures()
     if name not in file.postures:
         raise AppearanceError(f"posture {name!r} is unknown; give one of: {', '.join(file.postures)}")
-    scale, one, usual = height / file.height, file.postures[name], file.postures["stand"]
+    scale = height / file.height
+    one = file.postures[name]
+    usual = file.postures["stand"]
     points = {}
     for point in ("head", "hips", "left_foot", "right_foot"):
         if at := getattr(one, point) or getattr(usual, point):

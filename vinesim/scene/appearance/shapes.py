@@ -93,7 +93,8 @@ def rod_shape(
     start: ArrayLike, end: ArrayLike, radius: tuple[float, float], scale: float, paint: Paint, kind: str = "cone"
 ) -> Shape:
     """A round cone or a cylinder from one point [3] to another; all lengths [m] are multiplied by ``scale``."""
-    a, b = scale * np.asarray(start, float), scale * np.asarray(end, float)
+    a = scale * np.asarray(start, float)
+    b = scale * np.asarray(end, float)
     half = 0.5 * float(np.linalg.norm(b - a))
     turn = frames.multiply(frames.from_x_axis(b - a), _Z_TO_X)
     ends = tuple(scale * r for r in radius) if kind == "cone" else (scale * radius[0],)

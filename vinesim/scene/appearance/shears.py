@@ -70,6 +70,10 @@ def load_shears(name: str = "shears") -> ShearsModel:
     bolt = np.array(file.bolt)
     turned = [frames.pose(bolt, frames.from_yaw(sign * file.opening)) for sign in (1.0, -1.0)]
     return ShearsModel(
-        parts=parts, open=np.stack(turned), closed=np.stack([frames.pose(bolt)] * 2),
-        mouth=frames.pose(np.array(file.mouth)), mouth_half=np.array(file.mouth_half), force=file.force,
-    )  # fmt: skip
+        parts=parts,
+        open=np.stack(turned),
+        closed=np.stack([frames.pose(bolt)] * 2),
+        mouth=frames.pose(np.array(file.mouth)),
+        mouth_half=np.array(file.mouth_half),
+        force=file.force,
+    )

@@ -30,11 +30,14 @@ class FixedStructure:
 
 
 def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStructure:
-    layout, tendone = scene.layout, scene.training == "tendone"
+    layout = scene.layout
+    tendone = scene.training == "tendone"
     row, place = (a.ravel() for a in np.mgrid[0 : layout.rows, 0 : layout.vines])
     pole = np.stack([place * layout.vine_spacing, row * layout.row_spacing, 0.0 * row], -1)
     there = [one not in layout.missing for one in zip(row.tolist(), place.tolist(), strict=True)]
-    row, place, foot = row[there], place[there], pole[there]
+    row = row[there]
+    place = place[there]
+    foot = pole[there]
     rngs = [
         np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(int(r), int(p))))
         for r, p in zip(row, place, strict=True)
@@ -67,15 +70,20 @@ def build_fixed_structure(scene: Scene, parameters: VineParameters) -> FixedStru
     pieces = [
         _cone_chains(trunk, thick, Organ.TRUNK, np.arange(count)),
         _cone_chains(
-            arms.reshape(-1, ARM_SEGMENTS + 1, 3), thin, Organ.ARM, np.arange(count * arm_count),
+            arms.reshape(-1, ARM_SEGMENTS + 1, 3),
+            thin,
+            Organ.ARM,
+            np.arange(count * arm_count),
             shear_modulus=builder.shear_modulus(parameters.cane.woody_modulus.value),
         ),
         _cone_chains(
             pole[:, None] + np.array([[0, 0, -0.3], [0, 0, layout.height + (0.1 if tendone else 1.15)]]),
-            np.array([radius, radius]), Organ.POLE, np.arange(len(pole)),
+            np.array([radius, radius]),
+            Organ.POLE,
+            np.arange(len(pole)),
         ),
         *_wires(scene, parameters),
-    ]  # fmt: skip
+    ]
     fixed = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
     return FixedStructure(foot, row, rngs, arms, trunk, fixed)
 
@@ -104,9 +112,12 @@ def _cone_chains(
 
 def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarray]]:
     """A net at the roof (tendone), or a fruiting wire and pairs of catch wires in each row (vsp)."""
-    layout, trellis = scene.layout, parameters.trellis
-    wide, deep = (layout.vines - 1) * layout.vine_spacing, (layout.rows - 1) * layout.row_spacing
-    over_x, over_y = 0.5 * layout.vine_spacing, 0.5 * layout.row_spacing
+    layout = scene.layout
+    trellis = parameters.trellis
+    wide = (layout.vines - 1) * layout.vine_spacing
+    deep = (layout.rows - 1) * layout.row_spacing
+    over_x = 0.5 * layout.vine_spacing
+    over_y = 0.5 * layout.row_spacing
     # a wire runs from pole to pole: points half a field before the first and behind the last one
     xs = np.unique([-over_x, *(np.arange(layout.vines) * layout.vine_spacing), wide + over_x])
     ys = np.unique([-over_y, *(np.arange(layout.rows) * layout.row_spacing), deep + over_y])
@@ -125,7 +136,8 @@ def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarra
         across = [(0.0, layout.height), *((side * apart, z) for z in heights for side in (-1.0, 1.0))]
         rows = np.arange(layout.rows) * layout.row_spacing
         lines = [np.stack(np.broadcast_arrays(xs[None], (rows + y)[:, None], z), -1) for y, z in across]
-    first, pieces = 0, []
+    first = 0
+    pieces = []
     for line in lines:
         number = first + np.arange(len(line))
         thickness = np.full(line.shape[1], radius)

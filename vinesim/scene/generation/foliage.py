@@ -25,11 +25,14 @@ def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodie
     slot = np.where(main, piece, AXIS_SEGMENTS + piece)
     rows = np.arange(len(shoots.vine))[:, None]
     nodes = LeafNodes(
-        turn=bodies.turn[rows, slot], along=(share * pieces - piece) * bodies.length[rows, slot],
-        thick=bodies.radius[rows, slot, 0], share=share, up=shoots.up[:, None],
+        turn=bodies.turn[rows, slot],
+        along=(share * pieces - piece) * bodies.length[rows, slot],
+        thick=bodies.radius[rows, slot, 0],
+        share=share,
+        up=shoots.up[:, None],
         hand=np.where((rank + shoots.lateral_at[:, None]) % 2, 1.0, -1.0)[..., None],
         grown=np.where(main, 1.0, LATERAL_AREA),
-    )  # fmt: skip
+    )
     leaf = grow_leaves(scene, parameters.leaf, nodes, shoots.leaf_normal, shoots.leaf_uniform)
     present = (rank < many) & leaf["present"] & (main | shoots.has_lateral[:, None])
 

@@ -33,7 +33,8 @@ def sample_fruit(
     normal: Sampler,
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Two bunches for every shoot, of which :func:`choose_bunches` keeps some: fruit, at, peduncle, axis, roll."""
-    fruit, peduncle = parameters.bunch, parameters.peduncle
+    fruit = parameters.bunch
+    peduncle = parameters.peduncle
     sigma = math.sqrt(math.log(1.0 + fruit.mass_variation.value**2))
     mass = fruit.mass.value * portable_math.exp(sigma * normal(MAX_BUNCHES) - 0.5 * sigma**2)
     mass = np.clip(mass, *fruit.mass_range.value)
@@ -48,10 +49,15 @@ def sample_fruit(
     size = volume_radius * portable_math.cbrt(juice / (count * berry_mass))
     hull = berries.hull_size(count, seed) * size[..., None]
     drawn = {
-        "mass": mass, "count": count, "length": hull[..., 0], "radius": hull[..., 1], "seed": seed, "variety": variety,
+        "mass": mass,
+        "count": count,
+        "length": hull[..., 0],
+        "radius": hull[..., 1],
+        "seed": seed,
+        "variety": variety,
         "pull": peduncle.pull.at(uniform(MAX_BUNCHES)),
         "thick": 0.5 * peduncle.diameter.at(_fraction(mass, fruit.mass_range)),
-    }  # fmt: skip
+    }
 
     # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip
     low, high = parameters.cane.first_bunch_node.value
@@ -114,12 +120,16 @@ def choose_bunches(
         # the first bunch of a shoot is likelier kept than its second
         order = np.argsort(g.random(slots) + 0.45 * (np.arange(slots) % MAX_BUNCHES), kind="stable")
         order = order[(inside & clear)[number, order]]
-        t, r, h = top[number, order], radius[number, order], length[number, order]
+        t = top[number, order]
+        r = radius[number, order]
+        h = length[number, order]
         apart = np.sqrt(((t[:, None, :2] - t[None, :, :2]) ** 2).sum(-1))
         middle = t[:, 2] - 0.5 * h
         rise = np.abs(middle[:, None] - middle[None])
         touch = (apart < r[:, None] + r[None] + MIN_GAP) & (rise < 0.5 * (h[:, None] + h[None]) + 0.03)
-        load, free, shoot = burden[number, order], np.ones(len(order), bool), order // MAX_BUNCHES
+        load = burden[number, order]
+        free = np.ones(len(order), bool)
+        shoot = order // MAX_BUNCHES
         load_kept = np.zeros(per_vine)
         for i in range(len(order)):
             if wanted and free[i] and load_kept[shoot[i]] + load[i] < MAX_BUCKLING_LOAD:

@@ -65,13 +65,16 @@ class Bodies:
 
 def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
     """Bodies of main axes, laterals, peduncles and bunches, with the drag of wood and bunches."""
-    count, cane, peduncle = len(shoots.vine), parameters.cane, parameters.peduncle
+    count = len(shoots.vine)
+    cane = parameters.cane
+    peduncle = parameters.peduncle
     bodies = _allocate(count)
     tip = 0.5 * cane.tip_diameter.value
     share = np.linspace(0.0, 1.0, AXIS_SEGMENTS + 1)
     radius = shoots.base[:, None] + (tip - shoots.base[:, None]) * share
     green = np.clip((share[:-1] - cane.woody_share.value) / 0.2 + 0.5, 0.0, 1.0)
-    woody, soft = math.log(cane.woody_modulus.value), math.log(cane.green_modulus.value)
+    woody = math.log(cane.woody_modulus.value)
+    soft = math.log(cane.green_modulus.value)
     modulus = portable_math.exp(woody * (1.0 - green) + soft * green)
     parent = np.broadcast_to(np.arange(-1, AXIS_SEGMENTS - 1), (count, AXIS_SEGMENTS))
     _fill_rod(bodies, slice(0, AXIS_SEGMENTS), shoots.points, radius, modulus, cane, shoots.up, parent)
@@ -106,14 +109,26 @@ def _allocate(count: int) -> Bodies:
     """The table of ``count`` shoots, all of whose bodies are present, with zeros."""
     shape = (count, SLOT_COUNT)
     return Bodies(
-        present=np.ones(shape, bool), parent=np.zeros(shape, int), organ=np.full(shape, int(Organ.CANE)),
-        origin=np.zeros((*shape, 3)), turn=np.zeros((*shape, 4)), length=np.zeros(shape), radius=np.zeros((*shape, 2)),
-        mass=np.zeros(shape), com=np.zeros((*shape, 3)), inertia=np.zeros((*shape, 3)),
-        stiffness=np.zeros((*shape, 3)), half=np.zeros((*shape, 3)), damping=np.zeros((*shape, 3)),
+        present=np.ones(shape, bool),
+        parent=np.zeros(shape, int),
+        organ=np.full(shape, int(Organ.CANE)),
+        origin=np.zeros((*shape, 3)),
+        turn=np.zeros((*shape, 4)),
+        length=np.zeros(shape),
+        radius=np.zeros((*shape, 2)),
+        mass=np.zeros(shape),
+        com=np.zeros((*shape, 3)),
+        inertia=np.zeros((*shape, 3)),
+        stiffness=np.zeros((*shape, 3)),
+        half=np.zeros((*shape, 3)),
+        damping=np.zeros((*shape, 3)),
         drag=np.zeros(shape),
-        head={"mass": np.zeros((count, MAX_BUNCHES)), "com": np.zeros((count, MAX_BUNCHES, 3)),
-              "inertia": np.zeros((count, MAX_BUNCHES, 3))},
-    )  # fmt: skip
+        head={
+            "mass": np.zeros((count, MAX_BUNCHES)),
+            "com": np.zeros((count, MAX_BUNCHES, 3)),
+            "inertia": np.zeros((count, MAX_BUNCHES, 3)),
+        },
+    )
 
 
 def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
@@ -124,7 +139,8 @@ def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
 
 def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: int) -> None:
     """Fill the slots of the bunch at the end of peduncle ``k`` and of its clusters."""
-    bunch, clusters = peduncle_slots(k).stop - 1, cluster_slots(k)
+    bunch = peduncle_slots(k).stop - 1
+    clusters = cluster_slots(k)
     bodies.present[:, clusters] = False
     has = np.flatnonzero(shoots.has_bunch[:, k])
     if len(has) == 0:
@@ -142,8 +158,10 @@ def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: i
     bodies.parent[:, bunch] = bunch - 1
     bodies.origin[:, bunch] = shoots.peduncle[:, k, -1]
     bodies.turn[:, bunch] = frames.from_x_axis(shoots.bunch_axis[:, k], shoots.bunch_up[:, k])
-    bodies.length[has, bunch], bodies.radius[has, bunch] = long, wide[:, None]
-    bodies.stiffness[:, bunch], bodies.damping[:, bunch] = bodies.stiffness[:, bunch - 1], bodies.damping[:, bunch - 1]
+    bodies.length[has, bunch] = long
+    bodies.radius[has, bunch] = wide[:, None]
+    bodies.stiffness[:, bunch] = bodies.stiffness[:, bunch - 1]
+    bodies.damping[:, bunch] = bodies.damping[:, bunch - 1]
     # the wind takes hold of the bunch as a whole
     bodies.drag[has, bunch] = parameters.bunch.drag.value * 0.5 * np.pi * wide * long
 
@@ -163,9 +181,15 @@ def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: i
 
 
 def _fill_rod(
-    bodies: Bodies, slots: slice, points: np.ndarray, radius: np.ndarray, modulus: np.ndarray,
-    wood: CaneParameters | PeduncleParameters, up: np.ndarray, parent: np.ndarray,
-) -> None:  # fmt: skip
+    bodies: Bodies,
+    slots: slice,
+    points: np.ndarray,
+    radius: np.ndarray,
+    modulus: np.ndarray,
+    wood: CaneParameters | PeduncleParameters,
+    up: np.ndarray,
+    parent: np.ndarray,
+) -> None:
     """Fill the slots of one axis of every shoot. It is a root, or grows on the tip of its parent.
 
     Args:
@@ -180,7 +204,8 @@ def _fill_rod(
     """
     along = np.diff(points, axis=1)
     length = np.linalg.norm(along, axis=-1)
-    start, end = radius[:, :-1], radius[:, 1:]
+    start = radius[:, :-1]
+    end = radius[:, 1:]
     mass, inertia, near, bodies.half[:, slots] = builder.segment_properties(
         length, start, end, modulus, wood.density.value
     )

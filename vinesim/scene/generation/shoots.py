@@ -62,10 +62,12 @@ class Shoots:
 
 
 def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStructure) -> Shoots:
-    tendone, cane = scene.training == "tendone", parameters.cane
+    tendone = scene.training == "tendone"
+    cane = parameters.cane
     each = int((parameters.arm.tendone_shoots if tendone else parameters.arm.vsp_shoots).value)
     arm_count = structure.arms.shape[1]
-    per_vine, vines = each * arm_count, len(structure.foot)
+    per_vine = each * arm_count
+    vines = len(structure.foot)
     count = per_vine * vines
 
     def uniform(*shape: int) -> np.ndarray:
@@ -101,7 +103,8 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
 
     has_lateral = uniform() < cane.lateral_share.value
     lateral_at = 6 + (5 * uniform()).astype(int)
-    lateral_length, sign = cane.lateral_length.at(uniform()), np.where(uniform() < 0.5, 1, -1)
+    lateral_length = cane.lateral_length.at(uniform())
+    sign = np.where(uniform() < 0.5, 1, -1)
     lateral_points = _grow_lateral(points, lateral_at, up, lateral_length, sign, normal(LATERAL_SEGMENTS, 3))
 
     nodes = np.floor(cane.nodes.value[0] + (cane.nodes.value[1] - cane.nodes.value[0] + 1) * uniform()).astype(int)
@@ -116,25 +119,40 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     leaf_normal = np.moveaxis(normal(MAX_NODES + LATERAL_NODES, 8), -1, 0)
     leaf_uniform = np.moveaxis(uniform(MAX_NODES + LATERAL_NODES, 4), -1, 0)
     return Shoots(
-        vine=owner, piece=np.repeat(np.arange(vines * arm_count), each) * ARM_SEGMENTS + piece, up=up,
-        points=points, length=length, base=base, has_lateral=has_lateral, lateral_at=lateral_at,
-        lateral_points=lateral_points, has_bunch=chosen, bunch_at=at, peduncle=peduncle, bunch_axis=bunch_axis,
-        bunch_up=bunch_up, fruit=fruit,
-        nodes=nodes, leaf_normal=leaf_normal, leaf_uniform=leaf_uniform,
-    )  # fmt: skip
+        vine=owner,
+        piece=np.repeat(np.arange(vines * arm_count), each) * ARM_SEGMENTS + piece,
+        up=up,
+        points=points,
+        length=length,
+        base=base,
+        has_lateral=has_lateral,
+        lateral_at=lateral_at,
+        lateral_points=lateral_points,
+        has_bunch=chosen,
+        bunch_at=at,
+        peduncle=peduncle,
+        bunch_axis=bunch_axis,
+        bunch_up=bunch_up,
+        fruit=fruit,
+        nodes=nodes,
+        leaf_normal=leaf_normal,
+        leaf_uniform=leaf_uniform,
+    )
 
 
 def _grow_main_axis(
     scene: Scene, start: np.ndarray, heading: np.ndarray, length: np.ndarray, noise: np.ndarray, foot: np.ndarray
 ) -> np.ndarray:
     """Points of the shoots: over the net they are held between its wires, in a hedge between the catch wires."""
-    layout, tendone = scene.layout, scene.training == "tendone"
+    layout = scene.layout
+    tendone = scene.training == "tendone"
     points = np.empty((len(start), AXIS_SEGMENTS + 1, 3))
     points[:, 0] = start
     heading = frames.normalize(heading)
     step = (length / AXIS_SEGMENTS)[:, None]
     for i in range(AXIS_SEGMENTS):
-        at, share = points[:, i], i / AXIS_SEGMENTS
+        at = points[:, i]
+        share = i / AXIS_SEGMENTS
         heading = heading + noise[:, i] * ([0.10, 0.10, 0.06] if tendone else [0.07, 0.05, 0.03])
         if tendone:
             # the bearing part droops below the net, the rest climbs over it
@@ -154,7 +172,8 @@ def _grow_lateral(
 ) -> np.ndarray:
     """Points of the side shoots: 45 degrees off the main axis, then on with a little wander."""
     rows = np.arange(len(points))
-    start, axis = points[rows, at + 1], frames.normalize(points[rows, at + 1] - points[rows, at])
+    start = points[rows, at + 1]
+    axis = frames.normalize(points[rows, at + 1] - points[rows, at])
     heading = axis + sign[:, None] * frames.normalize(frames.cross(up, axis)) + 0.25 * up
     result = np.empty((len(points), LATERAL_SEGMENTS + 1, 3))
     result[:, 0] = start

@@ -22,10 +22,14 @@ def find_ties(
 
     Each tie is bound to the piece of wire that is nearest; of two catch wires that hold a shoot, to one.
     """
-    layout, trellis, tendone = scene.layout, parameters.trellis, scene.training == "tendone"
-    start, end = shoots.points[:, :-1], shoots.points[:, 1:]
+    layout = scene.layout
+    trellis = parameters.trellis
+    tendone = scene.training == "tendone"
+    start = shoots.points[:, :-1]
+    end = shoots.points[:, 1:]
     spacing = np.array([layout.vine_spacing, layout.row_spacing])
-    low, high = -0.5 * spacing, (np.array([layout.vines, layout.rows]) - 0.5) * spacing
+    low = -0.5 * spacing
+    high = (np.array([layout.vines, layout.rows]) - 0.5) * spacing
     if tendone:
         lines = [
             (axis, low[axis], d / max(round(d / trellis.tendone_wire_spacing.value), 1))
@@ -54,21 +58,26 @@ def find_ties(
     anchor = start[shoot, slot] + share[shoot, slot, which, None] * (end - start)[shoot, slot]
     stiffness = trellis.tie_stiffness.value
     return {
-        "shoot": shoot, "slot": slot, "point": along[:, None] * [1.0, 0.0, 0.0], "anchor": anchor,
+        "shoot": shoot,
+        "slot": slot,
+        "point": along[:, None] * [1.0, 0.0, 0.0],
+        "anchor": anchor,
         "wire": _nearest_wire(structure, anchor, 1 - which if tendone else 0 * which),
         "stiffness": np.full(len(slot), stiffness),
         "damping": np.full(len(slot), trellis.tie_damping.value * stiffness),
-    }  # fmt: skip
+    }
 
 
 def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
     """The piece of wire along x (``axis`` [k] 0) or y (1) that is nearest to each of ``points`` [k, 3] m."""
     fixed = structure.fixed
     wires = np.flatnonzero(fixed["fixed_organ"] == int(Organ.WIRE))
-    start, way = fixed["fixed_start"][wires], (fixed["fixed_end"] - fixed["fixed_start"])[wires]
+    start = fixed["fixed_start"][wires]
+    way = (fixed["fixed_end"] - fixed["fixed_start"])[wires]
     nearest = np.full(len(points), -1)
     for a in np.unique(axis):
-        runs, here = np.abs(way[:, a]) > np.abs(way[:, 1 - a]), np.flatnonzero(axis == a)
+        runs = np.abs(way[:, a]) > np.abs(way[:, 1 - a])
+        here = np.flatnonzero(axis == a)
         posts, post = np.unique(start[runs, a], return_inverse=True)
         lines, line = np.unique(np.delete(start[runs], a, 1), axis=0, return_inverse=True)
         piece = np.full((len(lines), len(posts)), -1)
@@ -81,7 +90,8 @@ def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarra
 
 def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:
     """Where pieces from ``start`` to ``end`` [...] cross one of parallel lines: share of their length, and whether."""
-    low, high = (start - first) / step, (end - first) / step
+    low = (start - first) / step
+    high = (end - first) / step
     line = np.maximum(np.floor(low), np.floor(high))
     found = np.floor(low) != np.floor(high)
     return np.where(found, (line - low) / np.where(found, high - low, 1.0), 0.0), found

@@ -81,18 +81,26 @@ def _generate(scene: Scene, parameters: VineParameters) -> Model:
         # vines have streams of two numbers
         rng = np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(0, 0, number)))
         plant = build_model(
-            load_imported_plant(one.file), pose, len(structure.foot) + number, parameters, variety,
+            load_imported_plant(one.file),
+            pose,
+            len(structure.foot) + number,
+            parameters,
+            variety,
             (scene, rng) if one.leaves else None,
-        )  # fmt: skip
+        )
         model = join_models(model, tie_to_wires(plant, model, one.tie_gap, parameters.trellis))
     return model
 
 
 def _assemble_model(
-    scene: Scene, parameters: VineParameters, structure: FixedStructure, shoots: Shoots, bodies: Bodies,
+    scene: Scene,
+    parameters: VineParameters,
+    structure: FixedStructure,
+    shoots: Shoots,
+    bodies: Bodies,
     leaf: dict[str, np.ndarray],
     ties: dict[str, np.ndarray],
-) -> Model:  # fmt: skip
+) -> Model:
     """Leave out what is masked, number the rest, and make drawn world poses relative."""
     size = bodies.present.sum(1)
     first = np.cumsum(size) - size
@@ -107,10 +115,17 @@ def _assemble_model(
     carrier = number[pick, leaf["slot"]][shown]
 
     model = Model.allocate(
-        tree=len(size), body=int(size.sum()), bunch=int(shoots.has_bunch.sum()), leaf=int(shown.sum()),
-        fixed=len(structure.fixed["fixed_start"]), tie=len(ties["slot"]), box=len(scene.boxes),
-    )  # fmt: skip
-    model.tree_first[:], model.tree_size[:], model.tree_vine[:] = first, size, shoots.vine
+        tree=len(size),
+        body=int(size.sum()),
+        bunch=int(shoots.has_bunch.sum()),
+        leaf=int(shown.sum()),
+        fixed=len(structure.fixed["fixed_start"]),
+        tie=len(ties["slot"]),
+        box=len(scene.boxes),
+    )
+    model.tree_first[:] = first
+    model.tree_size[:] = size
+    model.tree_vine[:] = shoots.vine
     model.tree_piece[:] = np.flatnonzero(structure.fixed["fixed_organ"] == int(Organ.ARM))[shoots.piece]
     model.tree_core[:] = bodies.present[:, :CORE_SLOTS].sum(1)
     model.tree_pose[:] = frames.pose(bodies.origin[:, 0], bodies.turn[:, 0])
@@ -123,10 +138,12 @@ def _assemble_model(
         root[:, None], model.tree_pose[tree], frames.pose(bodies.origin, bodies.turn)[tree, np.maximum(parent, 0)]
     )
     drawn = frames.compose(frames.inverse(base), frames.pose(bodies.origin, bodies.turn)[has])
-    model.body_offset[:], model.body_rest[:] = drawn[:, :3], frames.normalize(drawn[:, 3:])
+    model.body_offset[:] = drawn[:, :3]
+    model.body_rest[:] = frames.normalize(drawn[:, 3:])
     for name in ("organ", "mass", "com", "inertia", "length", "radius", "drag"):
         getattr(model, f"body_{name}")[:] = getattr(bodies, name)[has]
-    model.joint_stiffness[:], model.joint_damping[:] = bodies.stiffness[has], bodies.damping[has]
+    model.joint_stiffness[:] = bodies.stiffness[has]
+    model.joint_damping[:] = bodies.damping[has]
 
     fruit = {name: value[shoots.has_bunch] for name, value in shoots.fruit.items()}
     model.bunch_body[:] = bunch[shoots.has_bunch]
@@ -148,11 +165,9 @@ def _assemble_model(
         getattr(model, f"tie_{name}")[:] = ties[name]
 
     model.leaf_body[:] = carrier
-    model.leaf_base[:], model.leaf_pose[:], model.leaf_age[:] = (
-        leaf["base"][shown],
-        leaf["pose"][shown],
-        leaf["age"][shown],
-    )
+    model.leaf_base[:] = leaf["base"][shown]
+    model.leaf_pose[:] = leaf["pose"][shown]
+    model.leaf_age[:] = leaf["age"][shown]
     blade = np.mean([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
     model.leaf_size[:] = np.sqrt(leaf["area"][shown] / blade)
 
@@ -160,5 +175,6 @@ def _assemble_model(
         getattr(model, name)[:] = value
     for i, box in enumerate(scene.boxes):
         model.box_pose[i] = frames.pose(np.array([box.x, box.y, 0.0]), frames.from_yaw(box.yaw))
-        model.box_size[i], model.box_mass[i] = box.size, box.mass
+        model.box_size[i] = box.size
+        model.box_mass[i] = box.mass
     return model

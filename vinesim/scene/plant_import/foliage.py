@@ -44,7 +44,8 @@ def find_nodes(parent: np.ndarray, radius: np.ndarray, way: np.ndarray, members:
     """
     apart = sum(cane.length.value) / sum(cane.nodes.value)
     thin = members & (2.0 * radius <= cane.base_diameter.value[1])
-    reach, heir = way.copy(), np.full(len(parent), -1)
+    reach = way.copy()
+    heir = np.full(len(parent), -1)
     for point in np.flatnonzero(members)[::-1]:
         below = parent[point]
         if heir[below] < 0 or reach[point] >= reach[heir[below]]:
@@ -71,9 +72,14 @@ def find_nodes(parent: np.ndarray, radius: np.ndarray, way: np.ndarray, members:
 
 
 def add_leaves(
-    tree: TreeBuilder, nodes: Nodes, body: np.ndarray, turn: np.ndarray, scene: Scene, leaf: Leaf,
+    tree: TreeBuilder,
+    nodes: Nodes,
+    body: np.ndarray,
+    turn: np.ndarray,
+    scene: Scene,
+    leaf: Leaf,
     rng: np.random.Generator,
-) -> None:  # fmt: skip
+) -> None:
     """Grow leaves of a scene's season at the nodes of a tree, with their mass and drag on its bodies.
 
     Args:
@@ -86,26 +92,35 @@ def add_leaves(
         rng: of the leaves of this tree.
     """
     count = len(nodes.piece)
-    normal, uniform = rng.standard_normal((8, count)), rng.random((4, count))
+    normal = rng.standard_normal((8, count))
+    uniform = rng.random((4, count))
     if count == 0:
         return
     parts = tree.bodies
     length, thick = (np.array([parts[b][name] for b in body], float) for name in ("length", "radius"))
     # across the axis and the row in a hedge, level over a net; where that is along the axis, the other way round
-    level, row = np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0])
+    level = np.array([0.0, 0.0, 1.0])
+    row = np.array([1.0, 0.0, 0.0])
     up, other = (level, row) if scene.training == "tendone" else (row, level)
     is_along = np.abs(frames.rotate(turn, np.array([1.0, 0.0, 0.0])) @ up) > 0.9
     grown = grow_leaves(
-        scene, leaf,
+        scene,
+        leaf,
         LeafNodes(
-            turn=turn, along=nodes.share * length, thick=thick[:, 0] + nodes.share * (thick[:, 1] - thick[:, 0]),
-            share=nodes.axis_share, up=np.where(is_along[:, None], other, up),
-            hand=np.where(nodes.rank % 2, 1.0, -1.0)[:, None], grown=np.where(nodes.lateral, LATERAL_AREA, 1.0),
+            turn=turn,
+            along=nodes.share * length,
+            thick=thick[:, 0] + nodes.share * (thick[:, 1] - thick[:, 0]),
+            share=nodes.axis_share,
+            up=np.where(is_along[:, None], other, up),
+            hand=np.where(nodes.rank % 2, 1.0, -1.0)[:, None],
+            grown=np.where(nodes.lateral, LATERAL_AREA, 1.0),
         ),
-        normal, uniform,
-    )  # fmt: skip
+        normal,
+        uniform,
+    )
     stays = grown["present"]
-    body, grown = body[stays], {name: value[stays] for name, value in grown.items()}
+    body = body[stays]
+    grown = {name: value[stays] for name, value in grown.items()}
     mass, com, inertia = (np.array([part[name] for part in parts], float) for name in ("mass", "com", "inertia"))
     heavy = add_point_masses(mass, com, inertia, (body,), grown["mass"], grown["pose"][:, :3])
     for b in np.unique(body).tolist():
@@ -113,6 +128,12 @@ def add_leaves(
         parts[b]["drag"] += float(grown["drag"][body == b].sum())
     size = np.sqrt(grown["area"] / np.mean([blade_area(shape) for shape in range(SHAPE_COUNT)]))
     for i, b in enumerate(body.tolist()):
-        tree.leaves.append({
-            "body": b, "base": grown["base"][i], "pose": grown["pose"][i], "age": grown["age"][i], "size": size[i],
-        })  # fmt: skip
+        tree.leaves.append(
+            {
+                "body": b,
+                "base": grown["base"][i],
+                "pose": grown["pose"][i],
+                "age": grown["age"][i],
+                "size": size[i],
+            }
+        )

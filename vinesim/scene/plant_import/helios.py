@@ -42,8 +42,10 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
     table = np.array(rows)
     if not len(table):
         raise PlantFileError(f"{path}: has no cylinders; give a row for each below its head")
-    start, way = table[:, 2:5], table[:, 1:2] * table[:, 5:8]
-    end, parent = start + way, table[:, 8].astype(int)
+    start = table[:, 2:5]
+    way = table[:, 1:2] * table[:, 5:8]
+    end = start + way
+    parent = table[:, 8].astype(int)
     moved = 0
     joined = np.zeros(len(table), int)  # node 0 is the base, node i + 1 the end of cylinder i
     for i in range(1, len(table)):
@@ -56,10 +58,14 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
         joined[i] = one + 1 if on_end else joined[one]
     notes = (f"{moved} branches were joined to the cylinder that they start on, not to their named parent",)
     return sort_nodes(
-        path, np.concatenate([start[:1], end]), np.concatenate([[-1], joined]),
-        2.0 * np.concatenate([table[:1, 0], table[:, 0]]), np.zeros(len(table) + 1), "cylinders (TreeQSM, Helios)",
+        path,
+        np.concatenate([start[:1], end]),
+        np.concatenate([[-1], joined]),
+        2.0 * np.concatenate([table[:1, 0], table[:, 0]]),
+        np.zeros(len(table) + 1),
+        "cylinders (TreeQSM, Helios)",
         notes if moved else (),
-    )  # fmt: skip
+    )
 
 
 def _bearer(path: pathlib.Path, table: np.ndarray, start: np.ndarray, way: np.ndarray, i: int) -> int:
@@ -84,7 +90,9 @@ def read_helios_xml(path: pathlib.Path) -> Skeleton:
     if root.tag != "helios" or len(plants) != 1:
         raise PlantFileError(f"{path}: <{root.tag}> with {len(plants)} plants; give <helios> with one <plant_instance>")
     base = _numbers(path, plants[0], "base_position", 3)
-    position, parent, diameter = [], [], []
+    position = []
+    parent = []
+    diameter = []
     ends: dict[tuple[int, int], int] = {}
     for shoot in plants[0].findall("shoot"):
         name = f"{path}: shoot {shoot.get('ID')}"
@@ -112,9 +120,14 @@ def read_helios_xml(path: pathlib.Path) -> Skeleton:
             if i:
                 ends[int(shoot.get("ID", "-1")), i - 1] = at
     return sort_nodes(
-        path, np.array(position), np.array(parent), np.array(diameter), np.zeros(len(parent)), "Helios XML",
+        path,
+        np.array(position),
+        np.array(parent),
+        np.array(diameter),
+        np.zeros(len(parent)),
+        "Helios XML",
         ("leaves, flowers and fruits are left out",) * (plants[0].find(".//leaf") is not None),
-    )  # fmt: skip
+    )
 
 
 def _numbers(path: pathlib.Path, where: ElementTree.Element, tag: str, count: int | None = None) -> np.ndarray:

@@ -73,14 +73,18 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     def write(self, path: str | pathlib.Path) -> None:
         """Write the plant as a TOML file; :class:`~vinesim.core.errors.WriteError` if that fails."""
         lines = [
-            f"source = {json.dumps(self.source, ensure_ascii=False)}", f'shape = "{self.shape}"',
+            f"source = {json.dumps(self.source, ensure_ascii=False)}",
+            f'shape = "{self.shape}"',
             f"piece = {self.piece!r} # m, length of a rigid body",
             f"notes = {json.dumps(self.notes, ensure_ascii=False)}",
             f"filled = {list(self.filled)} # nodes whose diameter the file does not tell",
             f"bunches = {[list(one) for one in self.bunches]} # node, mass [kg]",
-            "nodes = [ # parent, x, y, z [m], diameter [m]", *(f"  {list(node)}," for node in self.nodes), "]",
-            "", "[wood]",
-        ]  # fmt: skip
+            "nodes = [ # parent, x, y, z [m], diameter [m]",
+            *(f"  {list(node)}," for node in self.nodes),
+            "]",
+            "",
+            "[wood]",
+        ]
         for name in Wood.__struct_fields__:
             number: Number = getattr(self.wood, name)
             source = json.dumps(number.source, ensure_ascii=False)
@@ -93,9 +97,15 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
 
 
 def import_plant(
-    path: str | pathlib.Path, *, unit: str = "m", diameter_unit: str | None = None, plants: str = "vine",
-    shape: Literal["drawn", "slack"] = "drawn", piece: float = 0.06, old_wood: float | None = None,
-) -> ImportedPlant:  # fmt: skip
+    path: str | pathlib.Path,
+    *,
+    unit: str = "m",
+    diameter_unit: str | None = None,
+    plants: str = "vine",
+    shape: Literal["drawn", "slack"] = "drawn",
+    piece: float = 0.06,
+    old_wood: float | None = None,
+) -> ImportedPlant:
     """Read a plant that another program has grown; what the file does not tell is filled from plant parameters.
 
     Args:
@@ -139,10 +149,15 @@ def import_plant(
         for parent, (x, y, z), thick in zip(skeleton.parent, points, diameter, strict=True)
     ]
     return ImportedPlant(
-        source=f"{path.name}, {skeleton.format}", shape=shape, piece=piece, notes=skeleton.notes,
-        filled=tuple(np.flatnonzero(filled).tolist()), nodes=tuple(rows),
-        bunches=tuple((int(i), round(float(skeleton.bunch[i]), 4)) for i in np.flatnonzero(skeleton.bunch)), wood=wood,
-    )  # fmt: skip
+        source=f"{path.name}, {skeleton.format}",
+        shape=shape,
+        piece=piece,
+        notes=skeleton.notes,
+        filled=tuple(np.flatnonzero(filled).tolist()),
+        nodes=tuple(rows),
+        bunches=tuple((int(i), round(float(skeleton.bunch[i]), 4)) for i in np.flatnonzero(skeleton.bunch)),
+        wood=wood,
+    )
 
 
 def _fill_wood(plants: str, old_wood: float | None) -> Wood:
@@ -165,7 +180,8 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
 
     Between two that are known by the way between them, elsewhere by the taper of a cane over the whole plant.
     """
-    parent, diameter = skeleton.parent, skeleton.diameter.copy()
+    parent = skeleton.parent
+    diameter = skeleton.diameter.copy()
     filled = ~np.isfinite(diameter)
     if not filled.any():
         return diameter, filled
@@ -173,7 +189,8 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
     for node in range(1, len(parent)):
         way[node] = way[parent[node]] + np.linalg.norm(skeleton.position[node] - skeleton.position[parent[node]])
     cane = plant_parameters.load_plant(plants).cane
-    base, tip = cane.base_diameter.at(0.5), cane.tip_diameter.value
+    base = cane.base_diameter.at(0.5)
+    tip = cane.tip_diameter.value
     above = np.full(len(parent), -1)  # the nearest known node towards a tip, of the first child that has one
     for node in range(len(parent) - 1, 0, -1):
         known = above[node] if filled[node] else node
@@ -181,7 +198,8 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
             above[parent[node]] = known
     taper = base + (tip - base) * way / way.max()
     for node in np.flatnonzero(filled):
-        below, over = parent[node], above[node]
+        below = parent[node]
+        over = above[node]
         if below >= 0 and over >= 0:
             share = (way[node] - way[below]) / (way[over] - way[below])
             diameter[node] = diameter[below] + share * (diameter[over] - diameter[below])

@@ -72,7 +72,9 @@ def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
 def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
     """Names of the features, and the numbered lines of the section MTG."""
-    section, features, lines = "", [], []
+    section = ""
+    features = []
+    lines = []
     for number, raw in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
         line = raw.split("#", 1)[0].rstrip()
         head = re.match(r"\s*([A-Z]+)\s*:\s*(.*)", line)
@@ -139,7 +141,8 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
 
 def _steps(place: str, code: str) -> list[tuple[str, int]]:
     """Operators and indices of one code: ``^<E2+U1`` gives ^, <2, +1."""
-    found, at = [], 0
+    found = []
+    at = 0
     while at < len(code):
         match = _STEP.match(code, at)
         is_continued = match is not None and match[1] == "^"

@@ -14,10 +14,23 @@ import numpy as np
 from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_nodes
 
 _TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
-    "double": "<f8", "float64": "<f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "<i2",
+    "int16": "<i2",
+    "ushort": "<u2",
+    "uint16": "<u2",
+    "int": "<i4",
+    "int32": "<i4",
+    "uint": "<u4",
+    "uint32": "<u4",
+    "float": "<f4",
+    "float32": "<f4",
+    "double": "<f8",
+    "float64": "<f8",
+}
 
 
 def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
@@ -111,7 +124,10 @@ def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
             elements.append((line[1], int(line[2]), []))
         elif line[:1] == ["property"] and elements and len(line) >= 3:
             elements[-1][2].append((line[-1], _TYPES.get(line[1], "")))
-    tables, words, at, row = {}, body.split() if format == "ascii" else [], 0, 0
+    tables = {}
+    words = body.split() if format == "ascii" else []
+    at = 0
+    row = 0
     for name, count, properties in elements:
         if not properties or any(not kind for _, kind in properties):
             break  # lists have no fixed size; what is read stands before them

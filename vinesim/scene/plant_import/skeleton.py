@@ -74,9 +74,14 @@ def _first(mask: np.ndarray) -> int:
 
 
 def sort_nodes(
-    path: pathlib.Path, position: np.ndarray, parent: np.ndarray, diameter: np.ndarray, bunch: np.ndarray,
-    format: str, notes: tuple[str, ...] = (),
-) -> Skeleton:  # fmt: skip
+    path: pathlib.Path,
+    position: np.ndarray,
+    parent: np.ndarray,
+    diameter: np.ndarray,
+    bunch: np.ndarray,
+    format: str,
+    notes: tuple[str, ...] = (),
+) -> Skeleton:
     """A checked skeleton of nodes in any order: those of each parent after it, the base first."""
     count = len(parent)
     if ((parent < -1) | (parent >= count)).any():

@@ -30,7 +30,8 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
     if not len(canes) or gap <= 0.0:
         return plant
     pose = plant.forward_kinematics(plant.joint_settled)[canes]
-    start, length = pose[:, :3], plant.body_length[canes].astype(float)
+    start = pose[:, :3]
+    length = plant.body_length[canes].astype(float)
     way = frames.rotate(pose[:, 3:], length[:, None] * [1.0, 0.0, 0.0])
     radius = plant.body_radius[canes].astype(float)
     wires = _wires_near(vineyard, np.concatenate([start, start + way]), gap + float(radius.max()))
@@ -43,7 +44,8 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
     rows = []
     # the closest first; to 0.1 mm, so that no rounding error chooses among pieces that run along a wire
     for i in np.argsort(apart[near, wire].round(4), kind="stable").tolist():
-        cane, line = near[i], wires[wire[i]]
+        cane = near[i]
+        line = wires[wire[i]]
         anchor = start[cane] + share[cane, wire[i]] * way[cane]
         others = tied.setdefault((int(plant.body_tree[canes[cane]]), int(vineyard.fixed_index[line])), [])
         if all(np.linalg.norm(anchor - other) >= TIE_SPACING for other in others):
@@ -51,8 +53,10 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
             rows.append((int(canes[cane]), int(line), float(share[cane, wire[i]] * length[cane]), *anchor.tolist()))
     body, line, along, *anchor = np.array(sorted(rows), float).reshape(-1, 6).T
     ties = Model.allocate(tree=0, body=0, bunch=0, leaf=0, fixed=0, box=0, tie=len(rows))
-    ties.tie_body[:], ties.tie_wire[:] = body, line
-    ties.tie_point[:, 0], ties.tie_anchor[:] = along, np.stack(anchor, 1)
+    ties.tie_body[:] = body
+    ties.tie_wire[:] = line
+    ties.tie_point[:, 0] = along
+    ties.tie_anchor[:] = np.stack(anchor, 1)
     ties.tie_stiffness[:] = trellis.tie_stiffness.value
     ties.tie_damping[:] = trellis.tie_damping.value * trellis.tie_stiffness.value
     fields = {name: getattr(ties, name) for name in Model.array_fields() if name.startswith("tie_")}
@@ -75,9 +79,12 @@ def _nearest(
     Segments from ``start`` [k, 3] along ``way`` [k, 3], and from ``wire_start`` [w, 3] along ``wire_way`` [w, 3]
     (Ericson 2005, Real-Time Collision Detection, 5.1.9).
     """
-    a, e = (way * way).sum(1)[:, None], (wire_way * wire_way).sum(1)
+    a = (way * way).sum(1)[:, None]
+    e = (wire_way * wire_way).sum(1)
     off = start[:, None] - wire_start
-    b, c, f = way @ wire_way.T, (way[:, None] * off).sum(-1), (wire_way * off).sum(-1)
+    b = way @ wire_way.T
+    c = (way[:, None] * off).sum(-1)
+    f = (wire_way * off).sum(-1)
     cross = a * e - b * b
     parallel = cross <= 1e-9 * a * e
     share = np.where(parallel, 0.5, np.clip((b * f - c * e) / np.where(parallel, 1.0, cross), 0.0, 1.0))

@@ -21,9 +21,15 @@ _SHORT = 0.3
 """[piece] Wood between two forks that is shorter than this becomes part of the fork."""
 _PEDUNCLE_SEGMENTS = 2
 _OFFSETS = {
-    "tree_first": "body", "tree_piece": "fixed", "body_tree": "tree", "body_parent": "body", "bunch_body": "body",
-    "bunch_cluster": "body", "tie_body": "body", "leaf_body": "body",
-}  # fmt: skip
+    "tree_first": "body",
+    "tree_piece": "fixed",
+    "body_tree": "tree",
+    "body_parent": "body",
+    "bunch_body": "body",
+    "bunch_cluster": "body",
+    "tie_body": "body",
+    "leaf_body": "body",
+}
 """Fields of a model that count something, and what; negative ones mean none."""
 
 
@@ -40,9 +46,13 @@ class _Points:
 
 
 def build_model(
-    plant: ImportedPlant, pose: np.ndarray, vine: int, parameters: VineParameters, variety: int,
+    plant: ImportedPlant,
+    pose: np.ndarray,
+    vine: int,
+    parameters: VineParameters,
+    variety: int,
     leaves: tuple[Scene, np.random.Generator] | None = None,
-) -> Model:  # fmt: skip
+) -> Model:
     """The plant at a pose [7]: its trees, and the old wood that they stand on.
 
     ``parameters`` give peduncles and bunches, which are of ``variety``; bare unless ``leaves`` gives the scene whose
@@ -57,20 +67,24 @@ def build_model(
     wood = np.flatnonzero(old & (points.parent >= 0))
     trunk = _main_axis(points, old)
     model = builder.assemble(
-        trees, fixed_start=place[points.parent[wood]], fixed_end=place[wood],
+        trees,
+        fixed_start=place[points.parent[wood]],
+        fixed_end=place[wood],
         fixed_radius=np.stack([points.radius[points.parent[wood]], points.radius[wood]], -1),
         fixed_organ=np.where(trunk[wood], int(Organ.TRUNK), int(Organ.ARM)),
         fixed_index=np.where(trunk[wood], 0, np.cumsum(~trunk[wood])),
-    )  # fmt: skip
+    )
     return builder.solve_rest_pose(model).check() if plant.shape == "drawn" and trees else model
 
 
 def join_models(first: Model, second: Model) -> Model:
     """Both as one; trees, bodies and bunches of the second are numbered behind those of the first, to whose wires its
     ties are bound."""
-    counts, joined = first.counts(), {}
+    counts = first.counts()
+    joined = {}
     for name in Model.array_fields():
-        a, b = getattr(first, name), getattr(second, name)
+        a = getattr(first, name)
+        b = getattr(second, name)
         if name in _OFFSETS:
             b = np.where(b >= 0, b + counts[_OFFSETS[name]], b).astype(b.dtype)
         elif name == "fixed_index":
@@ -108,7 +122,8 @@ def _main_axis(points: _Points, members: np.ndarray) -> np.ndarray:
 def _cut(plant: ImportedPlant) -> _Points:
     """The skeleton with nodes about one piece apart: wood between forks is cut evenly, too short wood left out."""
     skeleton = plant.skeleton()
-    parent, position = skeleton.parent, skeleton.position
+    parent = skeleton.parent
+    position = skeleton.position
     children = np.bincount(parent[1:], minlength=len(parent))
     fork = (children != 1) | (skeleton.bunch > 0.0)
     fork[0] = True
@@ -144,9 +159,15 @@ def _cut(plant: ImportedPlant) -> _Points:
 
 
 def _tree(
-    wood: Wood, points: _Points, place: np.ndarray, root: int, vine: int, parameters: VineParameters, variety: int,
+    wood: Wood,
+    points: _Points,
+    place: np.ndarray,
+    root: int,
+    vine: int,
+    parameters: VineParameters,
+    variety: int,
     leaves: tuple[Scene, np.random.Generator] | None,
-) -> TreeBuilder:  # fmt: skip
+) -> TreeBuilder:
     """The tree whose first piece ends at ``root``."""
     below = int(points.parent[root])
     turns = {below: frames.from_x_axis(place[root] - place[below])}
@@ -155,7 +176,8 @@ def _tree(
     inside[root] = True
     for node in range(root + 1, len(inside)):
         inside[node] = points.parent[node] >= root and inside[points.parent[node]]
-    main, way = _main_axis(points, inside), points.way
+    main = _main_axis(points, inside)
+    way = points.way
     longest = way[inside].max() - way[below]
     bodies = {below: -1}
     for node in np.flatnonzero(inside).tolist():
@@ -170,10 +192,13 @@ def _tree(
         radius = (float(points.radius[before] if grown else points.radius[node]), float(points.radius[node]))
         turns[node] = turn
         bodies[node] = body = tree.add_rod(
-            bodies[before], float(np.linalg.norm(along)), radius,
-            RodMaterial(modulus, wood.density.value, wood.damping.value), 1,
+            bodies[before],
+            float(np.linalg.norm(along)),
+            radius,
+            RodMaterial(modulus, wood.density.value, wood.damping.value),
+            1,
             rest=frames.multiply(frames.conjugate(turns[before]), turn),
-        )[0]  # fmt: skip
+        )[0]
         tree.bodies[body]["drag"] = wood.drag.value * sum(radius) * float(np.linalg.norm(along))
         if points.bunch[node] > 0.0:
             _hang(tree, body, turn, float(points.bunch[node]), parameters, variety)
@@ -210,6 +235,11 @@ def _hang(
     fruit = mass * (1.0 - parameters.bunch.stem_share.value) / berries.VARIETIES[variety].mass
     count = int(np.clip(round(fruit), 1, berries.PROTOTYPE_BERRIES[-1]))
     tree.add_bunch(
-        last, mass, count=count, variety=variety, parameters=parameters, pull=float(stalk.pull.at(0.5)),
+        last,
+        mass,
+        count=count,
+        variety=variety,
+        parameters=parameters,
+        pull=float(stalk.pull.at(0.5)),
         bend=float(stalk.bend_strength.value * np.pi / 4.0 * thick**3),
-    )  # fmt: skip
+    )

@@ -160,9 +160,11 @@ class CameraFrame:
         """The parts that were made."""
         made = CameraOutput.NONE if self.bunches is None else CameraOutput.BUNCHES
         for output, array in (
-            (CameraOutput.RGB, self.rgb), (CameraOutput.DEPTH, self.depth), (CameraOutput.LABELS, self.labels),
+            (CameraOutput.RGB, self.rgb),
+            (CameraOutput.DEPTH, self.depth),
+            (CameraOutput.LABELS, self.labels),
             (CameraOutput.EXACT_DEPTH, self.exact_depth),
-        ):  # fmt: skip
+        ):
             if array is not None and array.size:
                 made |= output
         return made

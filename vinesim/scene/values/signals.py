@@ -34,9 +34,11 @@ TONE_LEVEL = 0.5
 """Amplitude of that tone within 1 m. GUESSED."""
 
 USUAL_COLOR: dict[LightPattern, Color] = {
-    LightPattern.OFF: UNLIT, LightPattern.NOTIFICATION: (255, 255, 255), LightPattern.WARNING: (255, 150, 0),
+    LightPattern.OFF: UNLIT,
+    LightPattern.NOTIFICATION: (255, 255, 255),
+    LightPattern.WARNING: (255, 150, 0),
     LightPattern.ALARM: (255, 0, 0),
-}  # fmt: skip
+}
 """Colours unless others are asked for (IEC 60073)."""
 
 

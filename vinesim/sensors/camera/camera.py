@@ -72,7 +72,8 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def ideal(self) -> CameraSpec:
         """The same camera if it measured exactly and from anywhere."""
         number = msgspec.structs.replace
-        near, far = number(self.nearest, value=0.0), number(self.farthest, value=1000.0)
+        near = number(self.nearest, value=0.0)
+        far = number(self.farthest, value=1000.0)
         return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
 
     def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
@@ -80,7 +81,8 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
         ``scale`` enlarges the picture; ``size`` gives it this width and height [px], with the same horizontal angle.
         """
-        width, height = round(self.width.value * scale), round(self.height.value * scale)
+        width = round(self.width.value * scale)
+        height = round(self.height.value * scale)
         if size is not None:
             width, height = size
             scale = width / self.width.value
@@ -166,7 +168,9 @@ class Camera:
         self._quality = quality = QUALITIES[self.quality]
         self._lens: LensMap = lens_map(self.info)
         drawn = self._drawn = self._lens.pinhole
-        width, height, samples = drawn.width, drawn.height, quality.samples
+        width = drawn.width
+        height = drawn.height
+        samples = quality.samples
         period = self.shadow_period
         if period is None:
             period = 0.0 if self.quality == "still" else 0.2
@@ -215,7 +219,8 @@ class Camera:
         is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
         measures = self._stereo is not None and CameraOutput.DEPTH in outputs
         picture = self.render_on_device(primitives, pose, time, is_lit=is_lit, measures=measures)
-        lens, measured = pinhole(self._drawn, pose), None
+        lens = pinhole(self._drawn, pose)
+        measured = None
         if measures and self._stereo and self.device != "cpu":
             assert picture is not None
             measured = self._stereo.measure_on_device(primitives, lens, self.rasterizer.depth, picture)
@@ -226,7 +231,8 @@ class Camera:
             self.rasterizer.labels if CameraOutput.LABELS in outputs else None,
             measured,
         )
-        rgb, exact = rgb.reshape(-1, shape[1], 3), exact.reshape(-1, shape[1])
+        rgb = rgb.reshape(-1, shape[1], 3)
+        exact = exact.reshape(-1, shape[1])
         if CameraOutput.DEPTH not in outputs:
             depth = np.zeros((0, 0), np.float32)
         elif measured is not None:
@@ -234,7 +240,8 @@ class Camera:
         elif self._stereo:
             depth = self._stereo.measure(primitives, lens, exact, rgb, None)
         else:
-            too_near, too_far = exact < self.spec.nearest.value, exact > self.spec.farthest.value
+            too_near = exact < self.spec.nearest.value
+            too_far = exact > self.spec.farthest.value
             depth = np.where(too_near, np.float32(-np.inf), np.where(too_far, np.float32(np.inf), exact))
         self.image_index += 1
         return CameraFrame(
@@ -258,7 +265,8 @@ class Camera:
         for i, array in enumerate(arrays):
             if array is not None:
                 if i not in self._host_buffers:
-                    shape, kind = array.shape, array.dtype
+                    shape = array.shape
+                    kind = array.dtype
                     self._host_buffers[i] = wp.empty(shape, dtype=kind, device="cpu", pinned=True)
                 wp.copy(self._host_buffers[i], array)
         wp.synchronize_stream(self.device)
@@ -292,7 +300,8 @@ class Camera:
         seen.draw(primitives, lens, beside=beside)
         if not is_lit:
             return None
-        seen, quality = self._supersampled, self._quality
+        seen = self._supersampled
+        quality = self._quality
         if quality.samples > 1:
             lens = pinhole(supersampled(self._drawn, quality.samples), pose)
             seen.draw(primitives, lens)
@@ -315,7 +324,8 @@ class Camera:
 
     def _shade(self, primitives: Primitives, near: ShadowMap, far: ShadowMap, lens: Pinhole) -> None:
         """Light the rows that ``lens`` draws."""
-        seen, block = self._supersampled, self._quality.block
+        seen = self._supersampled
+        block = self._quality.block
         across, down = (-(-n // block) for n in (seen.width, lens.end_row - lens.first_row))
         run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
         wp.launch(

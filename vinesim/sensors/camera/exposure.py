@@ -21,7 +21,8 @@ ADAPTED_SHARE = 0.5
 """Share of the stops that would bring any picture to the key value: dark scenes stay darker than bright ones."""
 LOW_SUN_SHARE = 0.7
 """Share of the stops by which a low sun gives less light that exposure makes up beforehand."""
-MIN_EXPOSURE, MAX_EXPOSURE = 0.25, 8.0
+MIN_EXPOSURE = 0.25
+MAX_EXPOSURE = 8.0
 """Exposure stays within these."""
 ADAPTATION_TIME = 0.25
 """Time constant with which exposure, in stops, follows its target [s]."""
@@ -51,7 +52,11 @@ class Exposure:
         workers: ThreadPool | None = None,
     ) -> None:
         """``width`` and ``height`` of the picture [px], each pixel of ``samples`` squared samples."""
-        self.width, self.height, self.samples, self.fixed, self.device = width, height, samples, fixed, device
+        self.width = width
+        self.height = height
+        self.samples = samples
+        self.fixed = fixed
+        self.device = device
         self._workers = workers or ThreadPool(1)
         self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
         self._numbers = self.radiance.view(float) if device == "cpu" else None
@@ -72,7 +77,8 @@ class Exposure:
             keep = float(np.exp(-since / ADAPTATION_TIME)) if since >= 0.0 else 0.0
             self._time = time
             step = _METERING_STRIDE * self.samples
-            across, down = self.width * self.samples, self.height * self.samples
+            across = self.width * self.samples
+            down = self.height * self.samples
             if min(across, down) < step:
                 step = 1
             wp.launch(
@@ -145,7 +151,8 @@ def glare(picture: np.ndarray, lit: np.ndarray) -> None:
     Lamps are few pixels: the products of matrices here have their rows and columns only, and cost 2 ms where a blur
     of the whole picture takes 150.
     """
-    rows, columns = np.flatnonzero(lit.any(1)), np.flatnonzero(lit.any(0))
+    rows = np.flatnonzero(lit.any(1))
+    columns = np.flatnonzero(lit.any(0))
     lamp = picture[np.ix_(rows, columns)] * lit[np.ix_(rows, columns)][..., None]
     lamp = np.ascontiguousarray(lamp.transpose(2, 0, 1))
     for width, strength in _GLARE:

@@ -65,7 +65,9 @@ class LiveLight:
         end: int,
     ) -> None:
         """Sort and light the points of some lists."""
-        points, tables, materials = self._points, self._tables, primitives.materials
+        points = self._points
+        tables = self._tables
+        materials = primitives.materials
         arrays = [points.u, points.v, points.z, points.primitive, points.pixels, points.count]
 
         def launch(kernel: wp.Kernel, inputs: list[Any], outputs: list[wp.array]) -> None:
@@ -82,7 +84,8 @@ class LiveLight:
 
     def _update_tables(self, primitives: Primitives, light: Light) -> None:
         """Views of the primitives' arrays as they are now: they are made anew with the list of bodies."""
-        shapes, materials = primitives.shapes, primitives.materials
+        shapes = primitives.shapes
+        materials = primitives.materials
         sources = [shapes.a, shapes.b, shapes.c, shapes.d, materials.tint]
         sources += [materials.leaf_texture, materials.noise_texture, materials.soil_texture, light.sky_table]
         if len(sources) == len(self._sources) and all(a is b for a, b in zip(sources, self._sources, strict=True)):
@@ -98,7 +101,9 @@ class LiveLight:
 def shadow_maps(near: ShadowMap, far: ShadowMap, depth: wp.array) -> light_points.ShadowMaps:
     """Both maps and the array that holds the depths of the near one, then those of the far one."""
     maps = light_points.ShadowMaps()
-    maps.near, maps.far, maps.depth = near, far, depth
+    maps.near = near
+    maps.far = far
+    maps.depth = depth
     return maps
 
 

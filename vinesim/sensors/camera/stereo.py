@@ -75,21 +75,29 @@ class Stereo:
         ``second_from_first``: what the second imager sees is not drawn but taken from the depth of the first one (on a
         CPU). ``workers`` share the rows; every number of them gives the same bits.
         """
-        self.info, self.device, self._workers = info, device, workers or ThreadPool(1)
+        self.info = info
+        self.device = device
+        self._workers = workers or ThreadPool(1)
         self._second_from_first = second_from_first and device == "cpu"
         s = self._parameters = stereo_depth.Stereo()
-        s.baseline, s.focal_baseline = spec.baseline.value, spec.focal.value * spec.baseline.value
+        s.baseline = spec.baseline.value
+        s.focal_baseline = spec.focal.value * spec.baseline.value
         s.scale = min(spec.focal.value / info.fx, 1.0)
         s.stride = max(1, round(spec.window.value / 5.0 / s.scale))
-        s.sigma, s.step = spec.noise.value, spec.step.value
+        s.sigma = spec.noise.value
+        s.step = spec.step.value
         s.nearest, s.farthest = reach
-        s.fattening, s.support = spec.fattening.value, spec.support.value
+        s.fattening = spec.fattening.value
+        s.support = spec.support.value
         s.slant_kept, s.slant_lost = (float(np.cos(np.radians(a.value))) for a in (spec.slant_kept, spec.slant_lost))
         reach_of_window = np.sqrt(8.0) * s.stride * s.scale / spec.focal.value
         s.slope = float(reach_of_window * np.tan(np.radians(min(spec.slant_kept.value, 85.0))))
-        s.contrast, s.projector, s.saturation = spec.contrast.value, spec.projector.value, spec.saturation.value
+        s.contrast = spec.contrast.value
+        s.projector = spec.projector.value
+        s.saturation = spec.saturation.value
         # the second imager must look as far left as the first sees the nearest things, or to the end of its field
-        left, right = -info.cx / info.fx, (info.width - 1 - info.cx) / info.fx
+        left = -info.cx / info.fx
+        right = (info.width - 1 - info.cx) / info.fx
         edge = max(-float(np.tan(np.radians(0.5 * spec.field.value))), left - s.baseline / max(reach[0], 1e-3))
         focal = spec.focal.value
         self._columns = int(np.ceil((right - edge) * focal)) + 1
@@ -153,11 +161,18 @@ class Stereo:
             stereo_depth.measure_depth,
             rows * columns,
             inputs=[
-                self._parameters, lens, second, self._disparity, self._grey, self._second_depth, self._noise, 1,
+                self._parameters,
+                lens,
+                second,
+                self._disparity,
+                self._grey,
+                self._second_depth,
+                self._noise,
+                1,
             ],
             outputs=[self._depth],
             device=self.device,
-        )  # fmt: skip
+        )
         return self._depth
 
     def _set_picture(self, depth: np.ndarray, rgb: np.ndarray) -> None:
@@ -217,8 +232,11 @@ class Stereo:
         other.rotation = lens.rotation
         other.fx = other.fy = float(self._focal)
         other.cx, other.cy = map(float, self._centre)
-        other.width, other.height, other.max_depth = self._columns, self._rows, lens.max_depth
-        other.first_row, other.end_row = 0, self._rows
+        other.width = self._columns
+        other.height = self._rows
+        other.max_depth = lens.max_depth
+        other.first_row = 0
+        other.end_row = self._rows
         wide = max(other.cx, other.width - other.cx) / other.fx
         high = max(other.cy, other.height - other.cy) / other.fy
         other.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))

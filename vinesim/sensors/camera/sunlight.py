@@ -55,11 +55,17 @@ class ShadowSquare:
         workers: ThreadPool,
     ) -> None:
         """``depth`` [side * side] holds the map."""
-        self.ahead, self.slack, self.rigid, self.device, self._workers = ahead, slack, rigid, device, workers
-        self._every, self._known = wp.empty(0, dtype=wp.int32, device=device), -1
+        self.ahead = ahead
+        self.slack = slack
+        self.rigid = rigid
+        self.device = device
+        self._workers = workers
+        self._every = wp.empty(0, dtype=wp.int32, device=device)
+        self._known = -1
         self.struct = shadow_maps.ShadowMap()
         self.struct.depth = depth
-        self.struct.texel, self.struct.side = float(texel), side
+        self.struct.texel = float(texel)
+        self.struct.side = side
         self.half = 0.5 * texel * side
         self._drawn_balls = np.zeros((0, 4), np.float32)
         """Bounding spheres of all clusters when the map was drawn last; a GPU draws the whole map and keeps none."""
@@ -70,7 +76,9 @@ class ShadowSquare:
         self.right /= np.linalg.norm(self.right)
         self.up = np.cross(self.right, sun)
         self.focus = np.full(3, np.inf)
-        self.time, self.version, self.built = -np.inf, -1, -1
+        self.time = -np.inf
+        self.version = -1
+        self.built = -1
         self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
 
     def follow(self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float, period: float) -> None:
@@ -89,12 +97,15 @@ class ShadowSquare:
                 return
             if self.device != "cpu":
                 windows = self._whole()
-        self.time, self.version, self.built = time, primitives.pose_version, primitives.layout_version
+        self.time = time
+        self.version = primitives.pose_version
+        self.built = primitives.layout_version
         self._draw(primitives, windows)
 
     def _whole(self) -> list[Window]:
         """Windows that cover the map, one for each thread."""
-        side, count = self.struct.side, self._workers.size
+        side = self.struct.side
+        count = self._workers.size
         return [(0, side, side * i // count, side * (i + 1) // count) for i in range(count)]
 
     def _texels(self, ball: np.ndarray) -> np.ndarray:
@@ -140,7 +151,8 @@ class ShadowSquare:
         if self._known != primitives.layout_version:
             every = np.arange(len(primitives.cluster_first), dtype=np.int32)
             mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
-            self._every, self._known = wp.array(mine, device=self.device), primitives.layout_version
+            self._every = wp.array(mine, device=self.device)
+            self._known = primitives.layout_version
         return self._every
 
     def _draw(self, primitives: Primitives, windows: list[Window]) -> None:
@@ -153,11 +165,13 @@ class ShadowSquare:
         """Clear and draw some columns and rows of the map."""
         if self.device == "cpu":
             which = wp.array(self._casters_inside(primitives, window).astype(np.int32), device="cpu")
-            lanes, slices = 1, 1
+            lanes = 1
+            slices = 1
             square = self.struct.depth.numpy().reshape(self.struct.side, self.struct.side)
             square[window[2] : window[3], window[0] : window[1]] = _NOTHING
         else:  # a GPU culls faster than it can be told what to draw, and wants a thread for every row
-            which, (lanes, slices) = self._casters(primitives), _GPU_THREADS
+            which = self._casters(primitives)
+            (lanes, slices) = _GPU_THREADS
             self.struct.depth.fill_(_NOTHING)
         if len(which):
             scene = [primitives.shapes, primitives.clusters, primitives.ball, which, self.struct]
@@ -179,8 +193,10 @@ _NOON_SUN = np.array([3.3, 2.95, 2.35])
 _NOON_SINE = 0.75
 _OPTICAL_DEPTH = np.array([0.10, 0.15, 0.27])
 """Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh's and some haze."""
-_SKY_COLOUR, _HAZE_COLOUR = np.array([0.52, 0.70, 1.0]), np.array([0.50, 0.60, 0.72])
-_GROUND_COLOUR, _CANOPY_COLOUR = np.array([0.26, 0.21, 0.13]), np.array([0.14, 0.19, 0.075])
+_SKY_COLOUR = np.array([0.52, 0.70, 1.0])
+_HAZE_COLOUR = np.array([0.50, 0.60, 0.72])
+_GROUND_COLOUR = np.array([0.26, 0.21, 0.13])
+_CANOPY_COLOUR = np.array([0.14, 0.19, 0.075])
 _WHITE_BALANCE_SHARE = 0.6
 """Share of the colour of the light that a camera's white balance takes out."""
 
@@ -257,7 +273,8 @@ class Sunlight:
         ``fine`` divides the texels of the shadow map nearby.
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
-        self.period, self._device = period, device
+        self.period = period
+        self._device = device
         self._direction = np.zeros(3)
         self.balance = np.ones(3)
         """White balance: factors [3] on linear light."""
@@ -266,7 +283,8 @@ class Sunlight:
         light = deferred.Light()
         light.shadow_taps = taps
         k = np.arange(max(taps, 1))
-        angle, radius = 2.399963 * k, np.sqrt((k + 0.5) / len(k))
+        angle = 2.399963 * k
+        radius = np.sqrt((k + 0.5) / len(k))
         light.sample_spiral = _pairs(radius * np.cos(angle), radius * np.sin(angle), device)
         turn = np.arange(64) * (2.0 * np.pi / 64)
         light.sample_rotations = _pairs(np.cos(turn), np.sin(turn), device)
@@ -275,7 +293,8 @@ class Sunlight:
         side = 1024 * fine
         self.depth = wp.empty(side * side + 1024 * 1024, dtype=float, device=device)
         """Depths of both shadow maps [texel]: the near one, then the far one."""
-        near, far = self.depth[: side * side], self.depth[side * side :]
+        near = self.depth[: side * side]
+        far = self.depth[side * side :]
         self._near = ShadowSquare(0.007 / fine, side, 2.5, 0.8, True, near, device, workers)
         self._far = ShadowSquare(0.035, 1024, 12.0, 4.0, False, far, device, workers)
 
@@ -285,15 +304,19 @@ class Sunlight:
         direction = direction / np.linalg.norm(direction)
         if direction @ self._direction > _MIN_COS_CHANGE:
             return
-        self._direction, light = direction, self.light
+        self._direction = direction
+        light = self.light
         now = OutdoorLight.of(direction[2])
         light.sun = _vector(direction)
         light.sun_colour = _vector(now.sun)
-        light.sky_colour, light.haze_colour = _vector(now.sky), _vector(now.haze)
-        light.ground_colour, light.canopy_colour = _vector(now.ground), _vector(now.canopy)
+        light.sky_colour = _vector(now.sky)
+        light.haze_colour = _vector(now.haze)
+        light.ground_colour = _vector(now.ground)
+        light.canopy_colour = _vector(now.canopy)
         table = textures.sky_texture(tuple(direction), tuple(now.sun)) * np.float32(now.dim)
         light.sky_table = wp.array(table, dtype=wp.vec3, device=self._device)
-        self.brightness, self.balance = now.brightness, now.balance
+        self.brightness = now.brightness
+        self.balance = now.balance
         raised = np.array([direction[0], direction[1], max(direction[2], 0.1)])
         raised /= np.linalg.norm(raised)
         self._near.set_sun(raised)

@@ -39,7 +39,8 @@ from vinesim.sensors.spec_file import SensorError
 
 IMAGES_PER_VINEYARD = 5
 """Images of one vineyard before the next one is generated."""
-MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 16, 4096
+MIN_IMAGE_SIZE = 16
+MAX_IMAGE_SIZE = 4096
 """Width and height of pictures [px]."""
 CAMERA_HEIGHT = (0.7, 1.7)
 """Height of the camera above the ground [m]: robots' arms and heads."""
@@ -53,12 +54,15 @@ LATITUDE = np.radians(41.6)
 """Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
 MIN_ACTOR_SHARE = 0.01
 """Least share of the pixels that show actors or boxes, where there are any."""
-_MAX_TRIES, _TRIES_WITH_ACTORS = 60, 30
+_MAX_TRIES = 60
+_TRIES_WITH_ACTORS = 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 _SUFFIXES = {"labels": ".txt", "records": ".json"}
 """Of files in folders that hold no PNGs."""
 SPLITS = ("train", "val", "test")
-_VAL_VINEYARD, _TEST_VINEYARD, _SPLIT_PERIOD = 1, 2, 10
+_VAL_VINEYARD = 1
+_TEST_VINEYARD = 2
+_SPLIT_PERIOD = 10
 """Of every ten vineyards in the order of their numbers, the second is for validation and the third for tests."""
 
 
@@ -140,7 +144,8 @@ class VineyardRenderer:
     """One vineyard of a plan, ready to be looked at."""
 
     def __init__(self, plan: DatasetPlan, number: int) -> None:
-        self.plan, self.scene = plan, plan.vineyard(number)
+        self.plan = plan
+        self.scene = plan.vineyard(number)
         self.model = generate_uncached(self.scene)
         if not len(self.model.bunch_body):
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
@@ -160,9 +165,16 @@ class VineyardRenderer:
         seen = self._choose_view(rng, snapshot, near, [(one["x"], one["y"]) for one in activity.get("actors", [])])
         truths = ground_truth.bunch_truths(self.primitives, snapshot, seen, self.caster)
         camera = Camera(
-            self.spec, self.info, "camera", sun, quality="still", threads=1, seed=self.plan.seed, image_index=image,
+            self.spec,
+            self.info,
+            "camera",
+            sun,
+            quality="still",
+            threads=1,
+            seed=self.plan.seed,
+            image_index=image,
             device=self.plan.device,
-        )  # fmt: skip
+        )
         frame = camera.render(self.primitives, seen.pose)
         assert frame.exact_depth is not None
         bunches = formats.bunch_records(truths, self.info, self.ripeness.bunch)
@@ -226,11 +238,9 @@ class VineyardRenderer:
             bunch = int(hanging[rng.integers(len(hanging))])
             pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
             middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
-            height, away, around = (
-                rng.uniform(*CAMERA_HEIGHT),
-                rng.uniform(*BUNCH_DISTANCE),
-                rng.uniform(0.0, 2.0 * np.pi),
-            )
+            height = rng.uniform(*CAMERA_HEIGHT)
+            away = rng.uniform(*BUNCH_DISTANCE)
+            around = rng.uniform(0.0, 2.0 * np.pi)
             if actors and attempt < _TRIES_WITH_ACTORS:  # a person is behind the bunch
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
@@ -285,7 +295,8 @@ def prepare_folder(plan: DatasetPlan, folder: pathlib.Path, images: int) -> None
 
     :class:`DatasetError` otherwise.
     """
-    file, settings = folder / "dataset.json", plan.settings()
+    file = folder / "dataset.json"
+    settings = plan.settings()
     try:
         if file.exists():
             _check_same_settings(file, settings)
@@ -348,7 +359,8 @@ def _is_whole(folder: pathlib.Path, image: int) -> bool:
 
 def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
     """Draw images, in order; yields the number of each when it is done. :class:`WriteError` if one is not written."""
-    number, vineyard = -1, None
+    number = -1
+    vineyard = None
     for image in images:
         if vineyard is None or image // IMAGES_PER_VINEYARD != number:
             number = image // IMAGES_PER_VINEYARD

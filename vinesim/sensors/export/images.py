@@ -20,7 +20,8 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 def look_at(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
     """Pose [7] of an optical frame at ``eye`` that looks ``at`` a point, level."""
-    eye, at = np.asarray(eye, float), np.asarray(at, float)
+    eye = np.asarray(eye, float)
+    at = np.asarray(at, float)
     forward = frames.normalize(at - eye)
     right = np.cross(forward, [0.0, 0.0, 1.0])
     right = frames.normalize(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0.0, 0.0])
@@ -58,7 +59,8 @@ _ORGAN_COLOUR = {
 
 def label_colours(labels: np.ndarray) -> np.ndarray:
     """Labels [height, width] as RGB: one colour for each organ, its brightness (hue for bunches) by instance."""
-    organ, index = labels // LABEL_STRIDE, labels % LABEL_STRIDE
+    organ = labels // LABEL_STRIDE
+    index = labels % LABEL_STRIDE
     table = np.array([_ORGAN_COLOUR[o] for o in Organ], np.float32)
     bright = 0.7 + 0.3 * ((index * 0.618034) % 1.0)
     colours = table[organ] * bright[..., None]
@@ -108,7 +110,8 @@ def save_frame(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "fram
 def overview_pose(model: Model) -> np.ndarray:
     """Pose [7] of an optical frame from which a scene shows itself: in the alley, at eye height, along the rows."""
     spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2], np.zeros((1, 2))])
-    low, high = spots.min(0), spots.max(0)
+    low = spots.min(0)
+    high = spots.max(0)
     middle = 0.5 * (low + high)
     eye = np.array([low[0] - 0.6, middle[1] - 0.25, 1.45])
     return look_at(eye, np.array([high[0], middle[1] + 0.1, 1.40]))

@@ -33,7 +33,8 @@ MAX_RAYS = 8
 """Of one shot."""
 FOOTPRINT_RANGE = 3.0
 """All rays leave from one point; beams have their real width at this range [m], less nearer, more beyond."""
-MAX_SHARED_TRANSLATION, MAX_SHARED_ROTATION = 4e-3, 3.5e-3
+MAX_SHARED_TRANSLATION = 4e-3
+MAX_SHARED_ROTATION = 3.5e-3
 """Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place, their middle one.
 
 That is at most half a step of the head aside, and saves the finding of what is near for every few firings.
@@ -167,7 +168,11 @@ class Lidar:
         number of them gives the same bits. ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits:
         see :class:`LidarRasterizer`.
         """
-        self.spec, self.name, self.frame_id, self.device, self.seed = spec, name, frame_id, device, seed
+        self.spec = spec
+        self.name = name
+        self.frame_id = frame_id
+        self.device = device
+        self.seed = seed
         self.is_exact = False
         """Whether revolutions that begin from now on measure what the middle of each beam meets, exactly."""
         self.revolution = 0
@@ -188,9 +193,14 @@ class Lidar:
         azimuth = beside - 2.0 * np.pi * spec.rate.value * within
         flat = int(np.argmin(np.abs(elevation)))
         self.level = LevelLaser(
-            int(order[flat]), self.firings, float(within[flat]), spec.firing_period.value, float(azimuth[flat]),
-            spec.nearest.value, spec.farthest.value,
-        )  # fmt: skip
+            int(order[flat]),
+            self.firings,
+            float(within[flat]),
+            spec.firing_period.value,
+            float(azimuth[flat]),
+            spec.nearest.value,
+            spec.farthest.value,
+        )
         """The laser nearest to the horizontal."""
         across, up = self._footprint()
         self.ray_grid = grid(
@@ -231,7 +241,8 @@ class Lidar:
         for organ, number in spec.reflectance.items():
             reflectance[Organ[organ.upper()]] = number.value
         receiver.reflectance = wp.array(reflectance, dtype=float, device=self.device)
-        receiver.rays, receiver.used = round(self.spec.rays.value), round(spec.rays.value)
+        receiver.rays = round(self.spec.rays.value)
+        receiver.used = round(spec.rays.value)
         receiver.returns = _RETURNS[self.spec.returns]
         for name in ("nearest", "farthest", "merge", "separation", "noise", "weak_noise", "step", "weakest", "flicker"):
             setattr(receiver, name, float(getattr(spec, name).value))

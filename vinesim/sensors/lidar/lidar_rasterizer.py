@@ -34,9 +34,14 @@ class LidarRasterizer:
         x forward, z up, azimuth counter-clockwise seen from above.
         """
         wp.load_module(lidar_raster, device=device)  # threads must not do so at the same time
-        elevation, azimuth = np.asarray(elevation, float), np.asarray(azimuth, float)
-        self.rows, self.columns, self.step, self.device = len(elevation), columns, float(step), device
-        e, a = np.tile(elevation, columns), (azimuth + step * np.arange(columns)[:, None]).ravel()
+        elevation = np.asarray(elevation, float)
+        azimuth = np.asarray(azimuth, float)
+        self.rows = len(elevation)
+        self.columns = columns
+        self.step = float(step)
+        self.device = device
+        e = np.tile(elevation, columns)
+        a = (azimuth + step * np.arange(columns)[:, None]).ravel()
         rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1).astype(np.float32)
         self.direction = wp.array(rays, dtype=wp.vec3, device=device)
         """Unit vectors in the head's frame [column * row]: column by column, as shots are fired."""
@@ -56,7 +61,8 @@ class LidarRasterizer:
         # one slot early: the division above may round otherwise than a kernel's
         slots = np.searchsorted(slot, np.arange(ELEVATION_SLOTS + 3) - 1).astype(np.int32)
         head.row_slots = wp.array(slots, device=device)
-        head.direction, head.step = _as_floats(self.direction), self.step
+        head.direction = _as_floats(self.direction)
+        head.step = self.step
         self._head = head
         self._azimuth_range = azimuth.min(), azimuth.max()
 
@@ -74,10 +80,8 @@ class LidarRasterizer:
         different columns at the same time.
         """
         count = self.columns - first if count is None else count
-        head, part = (
-            self._head_at(pose, reach, first, first + count),
-            slice(first * self.rows, (first + count) * self.rows),
-        )
+        head = self._head_at(pose, reach, first, first + count)
+        part = slice(first * self.rows, (first + count) * self.rows)
         self._keys[part].fill_(int(EMPTY_KEY))
         bound = wp.empty(len(primitives.cluster_first), dtype=float, device=self.device)
         wp.launch(
@@ -125,7 +129,9 @@ class LidarRasterizer:
             setattr(head, name, getattr(self._head, name))
         head.eye = wp.vec3(*map(float, pose[:3]))
         head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
-        head.first_column, head.end_column, head.max_range = first, end, float(reach)
+        head.first_column = first
+        head.end_column = end
+        head.max_range = float(reach)
         low, high = self._azimuth_range
         turn = 0.5 * (low + high) + 0.5 * (first + end - 1) * self.step
         reaches = 0.5 * (high - low + abs(self.step) * (end - first)) + 1e-4

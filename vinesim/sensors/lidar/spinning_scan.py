@@ -44,7 +44,8 @@ class PoseHistory:
         if len(known) == 1:
             return np.repeat(poses, len(times), 0)
         share = np.clip((times - known[after - 1]) / (known[after] - known[after - 1]), 0.0, 1.0)[:, None]
-        first, second = poses[after - 1], poses[after].copy()
+        first = poses[after - 1]
+        second = poses[after].copy()
         second[(first[:, 3:] * second[:, 3:]).sum(1) < 0.0, 3:] *= -1.0
         between = first + share * (second - first)
         between[:, 3:] = frames.normalize(between[:, 3:])
@@ -82,7 +83,9 @@ class SpinningScan:
         if self._start is None or now < self._start - self._period:
             self._begin(now)
         while self._start is not None:
-            lidar, start, step = self.lidar, self._start, self.lidar.spec.firing_period.value
+            lidar = self.lidar
+            start = self._start
+            step = self.lidar.spec.firing_period.value
             due = min(int((now - start) / step + 1e-6) + 1, lidar.firings) if now >= start - 1e-9 else 0
             if due > self._next_column:
                 times = start + step * np.arange(self._next_column, due)
@@ -98,6 +101,7 @@ class SpinningScan:
             self._begin(start + late * self._period)
 
     def _begin(self, start: float) -> None:
-        self._start, self._next_column = start, 0
+        self._start = start
+        self._next_column = 0
         self.pose_history.discard_before(start)
         self.lidar.begin_revolution()

@@ -50,7 +50,8 @@ class Ripeness:
 
 def bunch_bodies(model: Model, bunch: int) -> np.ndarray:
     """Bodies that carry one bunch's berries [piece]: its own, then its clusters."""
-    first, count = int(model.bunch_cluster[bunch]), int(model.bunch_clusters[bunch])
+    first = int(model.bunch_cluster[bunch])
+    count = int(model.bunch_clusters[bunch])
     return np.append(model.bunch_body[bunch], np.arange(first, first + count))
 
 
@@ -129,9 +130,12 @@ class _Bunches:
         """What primitives [n] of any kind get from their segment and bunch."""
         which = self.which[bunch]
         return {
-            "organ": int(Organ.BUNCH), "label": label(Organ.BUNCH, 0) + which, "group": self._group[bunch],
-            "bunch": which, "carrier": self._carrier[segment],
-        }  # fmt: skip
+            "organ": int(Organ.BUNCH),
+            "label": label(Organ.BUNCH, 0) + which,
+            "group": self._group[bunch],
+            "bunch": which,
+            "carrier": self._carrier[segment],
+        }
 
     def rachis(self) -> Batch:
         """The axes on which the pedicels sit."""
@@ -179,7 +183,8 @@ class _Berries:
 
     @classmethod
     def of(cls, model: Model, bunches: _Bunches, ripeness: Ripeness | None) -> _Berries:
-        layouts, which = bunches.layouts, bunches.which
+        layouts = bunches.layouts
+        which = bunches.which
         count = np.array([len(one.radius) for one in layouts])
         bunch = np.repeat(np.arange(len(layouts)), count)
         position, radius, axis, foot = (
@@ -226,7 +231,8 @@ class _Berries:
         """From the rachis to the berries that do not touch it."""
         end = self.position - self.axis * (self.radius * self.elongation * 0.95)[:, None]
         free = np.linalg.norm(end - self.foot, axis=1) > _MIN_PEDICEL
-        segment, bunch = self.segment[free], self.bunch[free]
+        segment = self.segment[free]
+        bunch = self.bunch[free]
         return make_batch(
             CONE,
             stack_columns(bunches.placed(self.foot[free], segment, bunch), 0.0010),

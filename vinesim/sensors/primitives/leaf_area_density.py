@@ -27,7 +27,8 @@ class LeafDensity:
         inside = ((index >= 0) & (index < density.shape)).all(1)
         np.add.at(density, tuple(index[inside].T), _BLADE_AREA * blades[inside, 3] ** 2 / cell**3)
         self._grid = wp.array(density, dtype=float, device=device)
-        self._corner, self._cell = wp.vec3(*map(float, corner)), float(cell)
+        self._corner = wp.vec3(*map(float, corner))
+        self._cell = float(cell)
 
     def visible_sky(self, points: np.ndarray) -> np.ndarray:
         """Share of the sky light [k] that reaches ``points`` [k, 3] m."""

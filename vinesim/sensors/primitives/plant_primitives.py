@@ -23,7 +23,8 @@ def cane_batch(model: Model) -> Batch:
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
     rng = np.random.default_rng(5)
     seed = rng.uniform(size=len(model.tree_first))
-    organ, tree = model.body_organ[bodies], model.body_tree[bodies]
+    organ = model.body_organ[bodies]
+    tree = model.body_tree[bodies]
     index = tree.copy()
     bunch_of = model.bunch_of_body()[bodies]
     index = np.where(bunch_of >= 0, bunch_of, index)
@@ -57,12 +58,15 @@ def leaf_batches(model: Model) -> list[Batch]:
     shape = leaves.blade_shape(np.arange(count))
     q = model.leaf_pose[:, 3:]
     rib, up = (frames.rotate(q, np.broadcast_to(np.eye(3)[k], (count, 3))) for k in (0, 2))
-    base, petiole_end, size = model.leaf_base, model.leaf_pose[:, :3], model.leaf_size * textures.leaf_scale(shape)
+    base = model.leaf_base
+    petiole_end = model.leaf_pose[:, :3]
+    size = model.leaf_size * textures.leaf_scale(shape)
     young = rng.uniform(size=(count, 1))
     tint = np.array([0.042, 0.115, 0.016]) * (0.75 + 0.6 * young) * (1.0 + 0.10 * rng.normal(size=(count, 1)))
     tint = tint + np.array([0.030, 0.035, 0.0]) * np.clip(0.7 * rng.normal(size=(count, 1)), 0.0, 2.0)
     bend = np.stack([rng.normal(-0.10, 0.16, count), rng.normal(-0.16, 0.14, count), rng.uniform(0.0, 0.45, count)], 1)
-    body, tree = model.leaf_body, model.body_tree[model.leaf_body]
+    body = model.leaf_body
+    tree = model.body_tree[model.leaf_body]
     names = label(Organ.LEAF, 0) + tree
     blade = make_batch(
         LEAF,

@@ -61,7 +61,8 @@ def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int
     for number, batch in enumerate([*fixed, *moving]):
         rigid = number >= len(fixed)
         order = np.lexsort((batch.bunch, batch.group))
-        group, bunch = batch.group[order], batch.bunch[order]
+        group = batch.group[order]
+        bunch = batch.bunch[order]
         first, size = _runs(group, bunch)
         static = not rigid and bool((batch.carrier == static_carrier).all())
         clusters["first"].append(total + first)

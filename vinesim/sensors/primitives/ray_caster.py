@@ -20,7 +20,8 @@ def enclosing_primitive(primitives: Primitives, point: np.ndarray) -> int:
     near = np.flatnonzero(np.linalg.norm(reach[:, :3] - point, axis=1) <= reach[:, 3])
     if not len(near):
         return -1
-    first, size = primitives.cluster_first[near], primitives.cluster_size[near]
+    first = primitives.cluster_first[near]
+    size = primitives.cluster_size[near]
     which = np.concatenate([np.arange(f, f + n) for f, n in zip(first, size, strict=True)])
     kind = np.repeat(primitives.cluster_kind[near], size)
     a, b, c = (getattr(primitives.shapes, name).numpy()[which].astype(float) for name in "abc")
@@ -80,7 +81,8 @@ class RayCaster:
             self._plants.refit()
             if self._rigid:
                 self._rigid.refit()
-        self._layout_version, self._pose_version = p.layout_version, p.pose_version
+        self._layout_version = p.layout_version
+        self._pose_version = p.pose_version
 
     def cast(
         self, origin: np.ndarray, direction: np.ndarray, reach: float = MAX_DEPTH
@@ -104,7 +106,8 @@ class RayCaster:
 
     def cast_camera(self, lens: Pinhole) -> tuple[np.ndarray, np.ndarray]:
         """Depth [height, width] m (inf: nothing) and primitives [height, width] of a camera; as :meth:`cast`."""
-        p, count = self.primitives, lens.width * lens.height
+        p = self.primitives
+        count = lens.width * lens.height
         depth = wp.empty(count, dtype=float, device=p.device)
         primitive = wp.empty(count, dtype=wp.int32, device=p.device)
         wp.launch(
@@ -114,5 +117,6 @@ class RayCaster:
             outputs=[depth, primitive],
             device=p.device,
         )
-        shape, found = (lens.height, lens.width), primitive.numpy()
+        shape = (lens.height, lens.width)
+        found = primitive.numpy()
         return np.where(found == -1, np.inf, depth.numpy()).reshape(shape), found.reshape(shape)

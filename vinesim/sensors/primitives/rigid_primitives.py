@@ -51,7 +51,8 @@ def rigid_batches(
     for k, visual in enumerate(visuals):
         if visual.organ == Organ.BUNCH:  # a picked bunch that has become a rigid body
             place = shape[visual.index]
-            which, on = np.array([visual.index]), np.full(len(place), first + k)
+            which = np.array([visual.index])
+            on = np.full(len(place), first + k)
             mine = bunch_batches(model, which, [place], [on], np.array([groups + k]), ripeness)
             batches += [dataclasses.replace(b, bunch=np.full(len(b), -1)) for b in mine]
             continue
@@ -72,8 +73,10 @@ def rigid_batches(
 
 def _rigid_shape(shape: Shape, common: dict) -> Batch:
     """One primitive, or the triangles of a mesh, in the frame of its body."""
-    size, pose = shape.size, np.asarray(shape.pose, float)
-    centre, turn = pose[:3], pose[3:]
+    size = shape.size
+    pose = np.asarray(shape.pose, float)
+    centre = pose[:3]
+    turn = pose[3:]
     if shape.kind in ("capsule", "cylinder", "cone"):
         low, high = (size[0], size[1]) if shape.kind == "cone" else (size[0], size[0])
         half = frames.rotate(turn, np.array([0.0, 0.0, size[-1]]))

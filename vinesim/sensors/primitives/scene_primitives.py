@@ -45,18 +45,29 @@ _SKY_OF_RIGID = 0.7
 _RIGID_ROOM = 2048
 """Rigid primitives for which there is room from the start."""
 _PRIMITIVE_COLUMNS = {
-    **{f"local_{name}": wp.vec4 for name in "abcd"}, **dict.fromkeys("abcd", wp.vec4), "tint": wp.vec3,
-    "lower": wp.vec3, "upper": wp.vec3, "sky": wp.float32,
+    **{f"local_{name}": wp.vec4 for name in "abcd"},
+    **dict.fromkeys("abcd", wp.vec4),
+    "tint": wp.vec3,
+    "lower": wp.vec3,
+    "upper": wp.vec3,
+    "sky": wp.float32,
     **dict.fromkeys(("kind", "carrier", "label", "organ", "material"), wp.int32),
-}  # fmt: skip
+}
 """Values of each primitive: ``local_`` in the frame of its carrier, the others in the world."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
 """Fields of :class:`ClusterLayout` with a value for each primitive."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
 """Values of each cluster."""
 _TEXTURES = (
-    "leaf_texture", "noise_texture", "soil_texture", "rows", "ground_sky", "ground_x", "ground_y", "ground_cell",
-)  # fmt: skip
+    "leaf_texture",
+    "noise_texture",
+    "soil_texture",
+    "rows",
+    "ground_sky",
+    "ground_x",
+    "ground_y",
+    "ground_cell",
+)
 """Fields of ``Materials`` that are the same for all primitives."""
 
 
@@ -76,11 +87,14 @@ class Primitives:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
         the fruit: all of it is ripe unless given; ``renderer``: see :mod:`~vinesim.sensors.raster.renderer_selection`.
         """
-        self.model, self.device, self._ripeness = model, device, ripeness
+        self.model = model
+        self.device = device
+        self._ripeness = ripeness
         self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
         """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
         does so itself."""
-        self._bodies, self._wires = len(model.body_mass), wire_segments(model)
+        self._bodies = len(model.body_mass)
+        self._wires = wire_segments(model)
         self._static_carrier = self._bodies + len(self._wires)
         """Carrier of the static scene; before it are those of plants' bodies and of segments of wires, behind it those
         of rigid bodies."""
@@ -93,7 +107,8 @@ class Primitives:
         """Shapes and clusters of the rigid bodies by organ, index and identity of the shapes."""
         self._moved = np.zeros(0, np.int64)
         outline, hull = textures.leaf_outlines()
-        self._outline, self._hull = wp.array(outline, device=device), wp.array(hull, dtype=wp.vec2, device=device)
+        self._outline = wp.array(outline, device=device)
+        self._hull = wp.array(hull, dtype=wp.vec2, device=device)
         self._body_q = State.at_rest(model).body_q
         self.pose_version = 0
         """Counts changes of any pose."""
@@ -157,8 +172,10 @@ class Primitives:
         self._open(baked)
         self._pose(np.arange(len(self.cluster_first)))
 
-        low, high = low - 3.0, high + 3.0
-        posed, kind = self.shapes.a.numpy(), self.shapes.kind.numpy()
+        low = low - 3.0
+        high = high + 3.0
+        posed = self.shapes.a.numpy()
+        kind = self.shapes.kind.numpy()
         blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
         canopy = LeafDensity(blades, low, high, self.device)
         # light runs on from one piece of wood to the next: cones know the sky at their far end too
@@ -174,7 +191,8 @@ class Primitives:
 
     def _plant_batches(self, grass: float, low: np.ndarray, high: np.ndarray) -> list[Batch]:
         """Plants, trellis, grass and fallen leaves on the ground from ``low`` to ``high`` [2] m."""
-        model, static = self.model, self._static_carrier
+        model = self.model
+        static = self._static_carrier
         batches = [cane_batch(model), *leaf_batches(model)]
         every = np.arange(len(model.bunch_body))
         pieces = [bunch_bodies(model, int(bunch)) for bunch in every]
@@ -189,9 +207,11 @@ class Primitives:
     def _open(self, baked: disk_cache.Arrays) -> None:
         """Take over what :meth:`_bake` made; poses are not yet applied."""
         low, high = _ground_extent(self.model)
-        low, high = low - 3.0, high + 3.0
+        low = low - 3.0
+        high = high + 3.0
         self._textures.ground_sky = wp.array(baked["ground_sky"], dtype=float, device=self.device)
-        self._textures.ground_x, self._textures.ground_y = float(low[0]), float(low[1])
+        self._textures.ground_x = float(low[0])
+        self._textures.ground_y = float(low[1])
         self._textures.ground_cell = float(_ground_step(low, high))
         self.plant_count = len(baked["label"])
         """How many primitives are plants or the static scene; those of rigid bodies follow them."""
@@ -212,7 +232,8 @@ class Primitives:
     def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
         """Lay out the primitives of rigid bodies behind those of the plants, which stay as they are."""
         plants = self._plants
-        rows, clusters = self.plant_count, len(plants.first)
+        rows = self.plant_count
+        clusters = len(plants.first)
         bodies = self._lay_out_rigid(visuals)
         empty = not bodies
         rigid = plants if empty else join_rigid([one for _, one in bodies], [carrier for carrier, _ in bodies], rows)
@@ -229,8 +250,11 @@ class Primitives:
         }
         end = rows if empty else rows + len(rigid.label)
         self.label, self.organ = (self._columns[name][:end].numpy() for name in ("label", "organ"))
-        self.cluster_first, self.cluster_size, self.cluster_kind = joined["first"], joined["size"], joined["kind"]
-        self._owner, self.cluster_bunch = joined["owner"], joined["bunch"]
+        self.cluster_first = joined["first"]
+        self.cluster_size = joined["size"]
+        self.cluster_kind = joined["kind"]
+        self._owner = joined["owner"]
+        self.cluster_bunch = joined["bunch"]
         self.rigid_clusters = np.arange(clusters, len(self.cluster_first))
         version = np.zeros(len(self.cluster_first), np.int64)
         if self.layout_version:
@@ -257,7 +281,9 @@ class Primitives:
 
     def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
         """Carrier and clusters of each rigid body that has a shape; one that was there before is not laid out anew."""
-        picked, known, found = self._picked_bunch_shapes(visuals), {}, []
+        picked = self._picked_bunch_shapes(visuals)
+        known = {}
+        found = []
         for number, visual in enumerate(visuals):
             key = visual.organ, visual.index, id(visual.shapes)
             if key not in self._rigid:
@@ -272,7 +298,8 @@ class Primitives:
 
     def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
         """Device memory for the plants and twice as many rigid primitives as given; that of the plants is kept."""
-        kept, room = self._columns, max(2 * rigid, _RIGID_ROOM)
+        kept = self._columns
+        room = max(2 * rigid, _RIGID_ROOM)
         for names, count in ((_PRIMITIVE_COLUMNS, self.plant_count), (_CLUSTER_COLUMNS, len(plants.first))):
             for name, kind in names.items():
                 column = wp.zeros(count + room, dtype=kind, device=self.device)
@@ -297,18 +324,29 @@ class Primitives:
         """Structs of the primitives and clusters that there are now, in the memory of the columns."""
         column = {name: self._columns[name][: len(self.label)] for name in _PRIMITIVE_COLUMNS}
         column |= {name: self._columns[name][: len(self.cluster_first)] for name in _CLUSTER_COLUMNS}
-        self._local, self.shapes, self.clusters = primitives.Shapes(), primitives.Shapes(), primitives.Clusters()
+        self._local = primitives.Shapes()
+        self.shapes = primitives.Shapes()
+        self.clusters = primitives.Clusters()
         for name in "abcd":
             setattr(self._local, name, column[f"local_{name}"])
             setattr(self.shapes, name, column[name])
         for table in (self._local, self.shapes):
-            table.kind, table.outline, table.hull = column["kind"], self._outline, self._hull
-        self.clusters.first, self.clusters.size = column["first"], column["size"]
-        self.clusters.kind, self.clusters.shown = column["cluster_kind"], column["shown"]
-        self._carrier, self.labels, self.organs = column["carrier"], column["label"], column["organ"]
-        self.lower, self.upper, self.ball = column["lower"], column["upper"], column["ball"]
+            table.kind = column["kind"]
+            table.outline = self._outline
+            table.hull = self._hull
+        self.clusters.first = column["first"]
+        self.clusters.size = column["size"]
+        self.clusters.kind = column["cluster_kind"]
+        self.clusters.shown = column["shown"]
+        self._carrier = column["carrier"]
+        self.labels = column["label"]
+        self.organs = column["organ"]
+        self.lower = column["lower"]
+        self.upper = column["upper"]
+        self.ball = column["ball"]
         self.materials = materials.Materials()
-        self.materials.material, self.materials.tint = column["material"], column["tint"]
+        self.materials.material = column["material"]
+        self.materials.tint = column["tint"]
         self.materials.sky = column["sky"]
         for name in _TEXTURES:
             setattr(self.materials, name, getattr(self._textures, name))
@@ -330,7 +368,8 @@ class Primitives:
         ``moved`` are the trees that may have moved since the last call (default: those of this snapshot and
         the one before). A caller that skips snapshots must gather them from all of these.
         """
-        body_q, visual_q = snapshot.body_q, np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
+        body_q = snapshot.body_q
+        visual_q = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
         trees = np.union1d(snapshot.moved_trees if moved is None else moved, self._moved).astype(np.int64)
         self._moved = np.asarray(snapshot.moved_trees, np.int64)
         new_visuals = snapshot.visuals is not self._visuals
@@ -363,7 +402,8 @@ class Primitives:
 
     def _clusters_of(self, owners: np.ndarray) -> np.ndarray:
         """Clusters that the given trees, and pieces of wire, which are numbered behind all trees, [k] move."""
-        start, size = self._owner_start[owners], self._owner_start[owners + 1] - self._owner_start[owners]
+        start = self._owner_start[owners]
+        size = self._owner_start[owners + 1] - self._owner_start[owners]
         inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
         return self._by_owner[np.repeat(start, size) + inner]
 

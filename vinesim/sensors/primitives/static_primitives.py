@@ -63,7 +63,8 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     start, end = (model.fixed_start[piece] + share[:, None] * way[piece] for share in (begin, stop))
     radius = model.fixed_radius[piece]
     thick, thin = (radius[:, 0] * (1.0 - share) + radius[:, 1] * share for share in (begin, stop))
-    organ, index = model.fixed_organ[piece], model.fixed_index[piece]
+    organ = model.fixed_organ[piece]
+    index = model.fixed_index[piece]
     table = {o: _TRELLIS[Organ(int(o))] for o in np.unique(organ)}
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
     rng = np.random.default_rng(3)
@@ -71,10 +72,14 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     # bark runs through from piece to piece: distances count from the foot of a post, along a wire
     upright = np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1)
     return {
-        "a": stack_columns(start, thick), "b": stack_columns(end, thin),
+        "a": stack_columns(start, thick),
+        "b": stack_columns(end, thin),
         "c": stack_columns(np.where(upright, start[:, 2], length * begin), seed, 0.0, 0.0),
-        "material": material, "tint": tint, "organ": organ, "label": organ * label(Organ(1), 0) + index,
-    }  # fmt: skip
+        "material": material,
+        "tint": tint,
+        "organ": organ,
+        "label": organ * label(Organ(1), 0) + index,
+    }
 
 
 def row_layout(model: Model) -> tuple[float, float]:
@@ -95,13 +100,15 @@ def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
 
 def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: int) -> Batch | None:
     """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
-    low, high = low - 1.0, high + 1.0
+    low = low - 1.0
+    high = high + 1.0
     n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
     if n == 0:
         return None
     rng = np.random.default_rng(29)
     position = low + (high - low) * rng.uniform(size=(n, 2))
-    turn, tilt = rng.uniform(0.0, 2.0 * np.pi, n), rng.normal(0.0, 0.15, n)
+    turn = rng.uniform(0.0, 2.0 * np.pi, n)
+    tilt = rng.normal(0.0, 0.15, n)
     rib = np.stack([np.cos(turn), np.sin(turn), tilt], 1) / np.hypot(1.0, tilt)[:, None]
     up = np.cross(rib, np.stack([np.sin(turn), -np.cos(turn), rng.normal(0.0, 0.15, n)], 1))
     up /= np.linalg.norm(up, axis=1, keepdims=True)
@@ -129,7 +136,8 @@ def grass_batch(
     rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, static_carrier: int
 ) -> Batch | None:
     """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
-    low, high = low - 3.0, high + 3.0
+    low = low - 3.0
+    high = high + 3.0
     count = int(min(density * np.prod(high - low), 60_000))
     if count == 0:
         return None

@@ -16,13 +16,15 @@ import numpy as np
 from vinesim.core import disk_cache
 from vinesim.scene import leaves
 
-GRASS_OUTLINE, HERB_OUTLINE = leaves.SHAPE_COUNT, leaves.SHAPE_COUNT + 1
+GRASS_OUTLINE = leaves.SHAPE_COUNT
+HERB_OUTLINE = leaves.SHAPE_COUNT + 1
 """Numbers of the outlines that are not vine leaves: a tuft of grass, a broad weed."""
 OUTLINE_COUNT = leaves.SHAPE_COUNT + 2
 TEXTURE_SIZE = 256
 """Texels along each side of the tables."""
 _DISTANCE_STEPS = 400.0
-SKY_ROWS, SKY_COLUMNS = 512, 1024
+SKY_ROWS = 512
+SKY_COLUMNS = 1024
 _SUPERSAMPLING = 4
 
 
@@ -92,7 +94,8 @@ def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
 @_cached
 def _leaf_outlines() -> disk_cache.Arrays:
     u, v = _grid(TEXTURE_SIZE * _SUPERSAMPLING)
-    theta, radius = np.arctan2(u, v), np.hypot(u, v)
+    theta = np.arctan2(u, v)
+    radius = np.hypot(u, v)
     table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE))
     knots = np.linspace(-np.pi, np.pi, 8193)
     for shape in range(leaves.SHAPE_COUNT):
@@ -131,7 +134,8 @@ def _leaf_texture() -> disk_cache.Arrays:
     table = np.zeros((OUTLINE_COUNT, TEXTURE_SIZE, TEXTURE_SIZE, 4), np.float32)
     for shape in range(leaves.SHAPE_COUNT):
         rng = np.random.default_rng(71 + shape)
-        vein, crease = np.zeros_like(u), np.zeros_like(u)
+        vein = np.zeros_like(u)
+        crease = np.zeros_like(u)
         for angle, length in ((0.0, 1.0), (54.0, 0.86), (-54.0, 0.86), (112.0, 0.62), (-112.0, 0.62)):
             turn = np.radians(angle)
             tip = length * np.array([np.sin(turn), np.cos(turn)])
@@ -146,7 +150,8 @@ def _leaf_texture() -> disk_cache.Arrays:
                     away, along = _segment(u, v, root, root + reach * np.array([np.sin(out), np.cos(out)]))
                     vein = np.maximum(vein, 0.75 * np.exp(-((away / (0.012 * (1.0 - 0.6 * along))) ** 2)))
                     crease += 0.009 * np.exp(-((away / 0.03) ** 2))
-        fine, wide = _smooth_noise(rng, 3.0), _smooth_noise(rng, 8.0)
+        fine = _smooth_noise(rng, 3.0)
+        wide = _smooth_noise(rng, 8.0)
         net = np.exp(-((fine / 0.25) ** 2))  # areoles: where a band-limited noise crosses zero
         slope_v, slope_u = np.gradient(0.010 * wide + 0.004 * fine - crease, 2.0 / TEXTURE_SIZE)
         table[shape] = np.stack([np.maximum(vein, 0.25 * net), slope_u, slope_v, 0.5 + 0.2 * wide + 0.12 * fine], -1)
@@ -221,7 +226,8 @@ def _sky_layers() -> disk_cache.Arrays:
     far = 0.22 / (height + 0.12)
     cover = sample_noise(flat * np.cos(azimuth) * far * 0.5, flat * np.sin(azimuth) * far * 0.5, slice(0, 2))
     cloud = smoothstep(0.56, 0.86, cover[..., 0] + 0.25 * (cover[..., 1] - 0.5)) * smoothstep(0.02, 0.2, height) * 0.55
-    height, azimuth = height[:_RIDGE_ROWS], azimuth[:_RIDGE_ROWS]
+    height = height[:_RIDGE_ROWS]
+    azimuth = azimuth[:_RIDGE_ROWS]
     turns = azimuth / (2.0 * np.pi)
     shares = []
     for base, rise, count in ((0.045, 0.085, 2.0), (0.020, 0.050, 3.0)):
@@ -267,7 +273,8 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
     Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
     hills in the haze.
     """
-    table, layers = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32), _sky_layers()
+    table = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32)
+    layers = _sky_layers()
     for first in range(0, SKY_ROWS, _SKY_BAND):
         rows = slice(first, first + _SKY_BAND)
         table[rows] = _sky_rows(rows, layers, np.array(sun), np.array(colour_of_sun))
@@ -277,9 +284,11 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
 def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
     """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
     height, azimuth = _sky_directions()
-    height, colour = height[rows], _clear_sky()[rows]
+    height = height[rows]
+    colour = _clear_sky()[rows]
     flat = np.sqrt(1.0 - height**2)
-    x, y = flat * np.cos(azimuth), flat * np.sin(azimuth)
+    x = flat * np.cos(azimuth)
+    y = flat * np.sin(azimuth)
     away = 1.0 - np.clip(x * sun[0] + y * sun[1] + height * sun[2], 0.0, 1.0)
     halo = 0.07 * np.exp(-6.0 * away) + 0.35 * np.exp(-60.0 * away) + 6.0 * np.exp(-4000.0 * away)
     colour = colour + halo[..., None] * colour_of_sun
@@ -294,10 +303,15 @@ def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of
 def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
     """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
     table = np.ascontiguousarray(noise_texture()[..., octaves]).reshape(TEXTURE_SIZE**2, -1)
-    fx, fy = (x % 1.0) * TEXTURE_SIZE, (y % 1.0) * TEXTURE_SIZE
-    i, j = fx.astype(int) % TEXTURE_SIZE, fy.astype(int) % TEXTURE_SIZE
-    ax, ay = (fx % 1.0)[..., None], (fy % 1.0)[..., None]
-    right, here, above = (i + 1) % TEXTURE_SIZE, j * TEXTURE_SIZE, (j + 1) % TEXTURE_SIZE * TEXTURE_SIZE
+    fx = (x % 1.0) * TEXTURE_SIZE
+    fy = (y % 1.0) * TEXTURE_SIZE
+    i = fx.astype(int) % TEXTURE_SIZE
+    j = fy.astype(int) % TEXTURE_SIZE
+    ax = (fx % 1.0)[..., None]
+    ay = (fy % 1.0)[..., None]
+    right = (i + 1) % TEXTURE_SIZE
+    here = j * TEXTURE_SIZE
+    above = (j + 1) % TEXTURE_SIZE * TEXTURE_SIZE
     upper = table.take(here + i, 0) * (1.0 - ax) + table.take(here + right, 0) * ax
     lower = table.take(above + i, 0) * (1.0 - ax) + table.take(above + right, 0) * ax
     return upper * (1.0 - ay) + lower * ay

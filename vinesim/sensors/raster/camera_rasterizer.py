@@ -60,9 +60,15 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
     lens = Pinhole()
     lens.eye = wp.vec3(*map(float, pose[:3]))
     lens.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))
-    lens.fx, lens.fy, lens.cx, lens.cy = float(info.fx), float(info.fy), float(info.cx), float(info.cy)
-    lens.width, lens.height, lens.max_depth = int(info.width), int(info.height), MAX_DEPTH
-    lens.first_row, lens.end_row = 0, lens.height
+    lens.fx = float(info.fx)
+    lens.fy = float(info.fy)
+    lens.cx = float(info.cx)
+    lens.cy = float(info.cy)
+    lens.width = int(info.width)
+    lens.height = int(info.height)
+    lens.max_depth = MAX_DEPTH
+    lens.first_row = 0
+    lens.end_row = lens.height
     wide = max(info.cx, info.width - info.cx) / info.fx
     high = max(info.cy, info.height - info.cy) / info.fy
     lens.near_radius = float(NEAR_DEPTH) * float(np.sqrt(1.0 + wide * wide + high * high))
@@ -78,7 +84,8 @@ def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
             band = Pinhole()
             for name in Pinhole.vars:
                 setattr(band, name, getattr(lens, name))
-            band.first_row, band.end_row = first, end
+            band.first_row = first
+            band.end_row = end
             bands.append(band)
     return bands
 
@@ -103,7 +110,9 @@ class CameraRasterizer:
         """``workers`` draw bands of rows at once; every number of them gives the same bits."""
         count = width * height
         self.workers = workers or ThreadPool(1)
-        self.width, self.height, self.device = width, height, device
+        self.width = width
+        self.height = height
+        self.device = device
         self.keys = wp.empty(count, dtype=wp.int64, device=device)
         self._keys = self.keys.numpy() if device == "cpu" else None
         self.primitive = wp.empty(count, dtype=wp.int32, device=device)

@@ -33,7 +33,10 @@ class CudaRasterizer:
         block: int = 64,
         room: int = 16384,
     ) -> None:
-        self.device, self._groups, self._lanes, self._listers = device, groups, lanes, listers
+        self.device = device
+        self._groups = groups
+        self._lanes = lanes
+        self._listers = listers
         self._block = block
         self._count = wp.zeros(_LISTS, dtype=wp.int32, device=device)
         self._pieces = wp.empty((_LISTS, room), dtype=wp.vec4i, device=device)

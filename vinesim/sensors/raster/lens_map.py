@@ -39,9 +39,12 @@ class LensMap:
                 f"distortion {list(info.distortion)} folds the picture of {info.width}x{info.height} px over itself; "
                 "give coefficients that are valid up to its corners"
             )
-        columns, rows = across * np.float32(info.fx), down * np.float32(info.fy)
-        left, top = int(np.floor(columns.min())), int(np.floor(rows.min()))
-        width, height = int(np.ceil(columns.max())) - left + 1, int(np.ceil(rows.max())) - top + 1
+        columns = across * np.float32(info.fx)
+        rows = down * np.float32(info.fy)
+        left = int(np.floor(columns.min()))
+        top = int(np.floor(rows.min()))
+        width = int(np.ceil(columns.max())) - left + 1
+        height = int(np.ceil(rows.max())) - top + 1
         if width * height > MAX_GROWTH * info.width * info.height:
             raise LensError(
                 f"distortion {list(info.distortion)} needs {width}x{height} px to be drawn for a picture of "
@@ -50,7 +53,8 @@ class LensMap:
         self.pinhole = dataclasses.replace(
             info, width=width, height=height, cx=float(-left), cy=float(-top), distortion=()
         )
-        self._columns, self._rows = columns - np.float32(left), rows - np.float32(top)
+        self._columns = columns - np.float32(left)
+        self._rows = rows - np.float32(top)
         self._nearest = np.rint(self._rows).astype(np.intp) * width + np.rint(self._columns).astype(np.intp)
 
     def nearest(self, drawn: np.ndarray) -> np.ndarray:

@@ -15,7 +15,9 @@ from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
 from vinesim.kernels.raster import leaf_surface, pinhole, primitives
 from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
 
-FAR, UNBOUND, NEAR_DEPTH = float(primitives.FAR), float(pinhole.UNBOUND), float(pinhole.NEAR_DEPTH)
+FAR = float(primitives.FAR)
+UNBOUND = float(pinhole.UNBOUND)
+NEAR_DEPTH = float(pinhole.NEAR_DEPTH)
 TEXELS = float(leaf_surface.OUTLINE_TEXELS)
 
 mat3 = ti.types.matrix(3, 3, ti.f32)
@@ -26,7 +28,8 @@ Lens = ti.types.struct(
 )
 Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
 """Box: lowest and highest x, lowest and highest y [pixel]; strips: slope, low, high; no point of it is nearer [m]."""
-EMPTY_BOUNDS, UNBOUNDED_STRIP = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND), vec3(0.0, -UNBOUND, UNBOUND)
+EMPTY_BOUNDS = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
+UNBOUNDED_STRIP = vec3(0.0, -UNBOUND, UNBOUND)
 
 
 # ------------------------------------------------------------------------------------------------- bounds
@@ -40,7 +43,8 @@ def tangents(x, z, r):
     if free > 0.0:
         t = ti.sqrt(free)
         tiny = 1.0e-6 * t
-        low, high = vec2(x * t - z * r, z * t + x * r), vec2(x * t + z * r, z * t - x * r)
+        low = vec2(x * t - z * r, z * t + x * r)
+        high = vec2(x * t + z * r, z * t - x * r)
         out[0] = ti.select(low[1] > tiny, low[0] / ti.max(low[1], tiny), ti.select(low[0] < 0.0, -UNBOUND, UNBOUND))
         out[1] = ti.select(high[1] > tiny, high[0] / ti.max(high[1], tiny), ti.select(high[0] < 0.0, -UNBOUND, UNBOUND))
     return out
@@ -49,7 +53,8 @@ def tangents(x, z, r):
 @ti.func
 def ball(lens, p, r):
     """Box around the picture of a sphere."""
-    h, v = tangents(p[0], p[2], r) * lens.focal[0] + lens.centre[0], tangents(p[1], p[2], r) * lens.focal[1]
+    h = tangents(p[0], p[2], r) * lens.focal[0] + lens.centre[0]
+    v = tangents(p[1], p[2], r) * lens.focal[1]
     return vec4(h[0], h[1], v[0] + lens.centre[1], v[1] + lens.centre[1])
 
 
@@ -65,18 +70,25 @@ def widened(box, q):
 
 @ti.func
 def leaf_outline(s, hull: ti.template(), lens):
-    size, p, rib, up = s.a[3], s.a.xyz, s.b.xyz, s.c.xyz
+    size = s.a[3]
+    p = s.a.xyz
+    rib = s.b.xyz
+    up = s.c.xyz
     side = cross(rib, up)
     reach = s.d.xyz * vec3(0.9, 1.1, 0.95)
     levels = vec2(ti.min(reach, 0.0).sum(), ti.max(reach, 0.0).sum())
-    depth, box, turned = FAR, EMPTY_BOUNDS, EMPTY_BOUNDS
+    depth = FAR
+    box = EMPTY_BOUNDS
+    turned = EMPTY_BOUNDS
     for n in ti.static(range(16)):
-        u, v = hull[int(s.b[3]), n // 2, 0], hull[int(s.b[3]), n // 2, 1]
+        u = hull[int(s.b[3]), n // 2, 0]
+        v = hull[int(s.b[3]), n // 2, 1]
         q = p + (side * u + rib * v + up * levels[n % 2]) * size
         depth = ti.min(depth, q[2])
         q[2] = ti.max(q[2], 0.01)
         at = pixel_of(lens, q)
-        box, turned = widened(box, at), widened(turned, vec2(at[0] - at[1], at[0] + at[1]))
+        box = widened(box, at)
+        turned = widened(turned, vec2(at[0] - at[1], at[0] + at[1]))
     if depth < NEAR_DEPTH:
         turned = vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
         box = ball(lens, p + rib * (0.25 * size), 1.45 * size)
@@ -87,11 +99,18 @@ def leaf_outline(s, hull: ti.template(), lens):
 
 @ti.func
 def cone_outline(s, hull: ti.template(), lens):
-    a, b, r = s.a.xyz, s.b.xyz, ti.max(s.a[3], s.b[3])
-    box, strip = EMPTY_BOUNDS, UNBOUNDED_STRIP
+    a = s.a.xyz
+    b = s.b.xyz
+    r = ti.max(s.a[3], s.b[3])
+    box = EMPTY_BOUNDS
+    strip = UNBOUNDED_STRIP
     if ti.max(a[2], b[2]) > -r:
         # what comes closer than NEAR_DEPTH may be cut there if its axis stays clear of all that is so close and in view
-        axis, cut, start, end, clear = b - a, NEAR_DEPTH - r, a, b, True
+        axis = b - a
+        cut = NEAR_DEPTH - r
+        start = a
+        end = b
+        clear = True
         if ti.min(a[2], b[2]) < cut:
             clear = length(a + axis * clamp(-dot(a, axis) / dot(axis, axis), 0.0, 1.0)) - r > lens.near_radius
             if a[2] < cut and b[2] > cut:
@@ -100,7 +119,8 @@ def cone_outline(s, hull: ti.template(), lens):
                 end = a + axis * ((cut - a[2]) / axis[2])
         box = vec4(-UNBOUND, UNBOUND, -UNBOUND, UNBOUND)
         if clear:
-            f, g = ball(lens, start, r), ball(lens, end, r)
+            f = ball(lens, start, r)
+            g = ball(lens, end, r)
             box = vec4(ti.min(f[0], g[0]), ti.max(f[1], g[1]), ti.min(f[2], g[2]), ti.max(f[3], g[3]))
             rise = 0.5 * (g[2] + g[3] - f[2] - f[3])
             if ti.min(start[2], end[2]) - r > 0.01 and ti.abs(rise) > 2.0:
@@ -139,7 +159,9 @@ def box_outline(s, hull: ti.template(), lens):
     o = ball_outline(lens, s.a.xyz, length(vec3(s.a[3], s.b[3], s.c[3])))
     if o.depth > NEAR_DEPTH:
         o.box = EMPTY_BOUNDS
-        x, y, z = s.b.xyz * s.a[3], s.c.xyz * s.b[3], cross(s.b.xyz, s.c.xyz) * s.c[3]
+        x = s.b.xyz * s.a[3]
+        y = s.c.xyz * s.b[3]
+        z = cross(s.b.xyz, s.c.xyz) * s.c[3]
         for n in ti.static(range(8)):
             corner = x * (n % 2 * 2 - 1) + y * (n // 2 % 2 * 2 - 1) + z * (n // 4 * 2 - 1)
             o.box = widened(o.box, pixel_of(lens, s.a.xyz + corner))
@@ -148,8 +170,11 @@ def box_outline(s, hull: ti.template(), lens):
 
 @ti.func
 def triangle_outline(s, hull: ti.template(), lens):
-    a, b, c = s.a.xyz, s.b.xyz, s.c.xyz
-    depth, box = ti.min(a[2], b[2], c[2]), EMPTY_BOUNDS
+    a = s.a.xyz
+    b = s.b.xyz
+    c = s.c.xyz
+    depth = ti.min(a[2], b[2], c[2])
+    box = EMPTY_BOUNDS
     if dot(a, cross(b - a, c - a)) < 0.0 and ti.max(a[2], b[2], c[2]) > 0.0:
         if depth > NEAR_DEPTH:
             box = widened(widened(widened(box, pixel_of(lens, a)), pixel_of(lens, b)), pixel_of(lens, c))
@@ -201,32 +226,46 @@ def hit_ellipsoid(s, outlines: ti.template(), d, smooth):
 def hit_box(s, outlines: ti.template(), d, smooth):
     ray = in_box_frame(s, d)
     m = 1.0 / ti.select(ti.abs(ray) > 1.0e-12, ray, 1.0e-12)
-    n, k = m * in_box_frame(s, s.a.xyz), ti.abs(m) * vec3(s.a[3], s.b[3], s.c[3])
-    near, far = (n - k).max(), (n + k).min()
+    n = m * in_box_frame(s, s.a.xyz)
+    k = ti.abs(m) * vec3(s.a[3], s.b[3], s.c[3])
+    near = (n - k).max()
+    far = (n + k).min()
     return ti.select(near <= far and near > 0.0, near, FAR)
 
 
 @ti.func
 def hit_cone(s, outlines: ti.template(), d, smooth):
     """The hull of two spheres, measured from the foot of the perpendicular onto the axis' middle."""
-    a, b, ra, rb = s.a.xyz, s.b.xyz, s.a[3], s.b[3]
-    ba, slope, dd = b - a, ra - rb, dot(d, d)
+    a = s.a.xyz
+    b = s.b.xyz
+    ra = s.a[3]
+    rb = s.b[3]
+    ba = b - a
+    slope = ra - rb
+    dd = dot(d, d)
     shift = dot((a + b) * 0.5, d) / dd
-    oa, ob = d * shift - a, d * shift - b
-    m0, m1, m2, m3, m5 = dot(ba, ba), dot(ba, oa), dot(ba, d), dot(d, oa), dot(oa, oa)
+    oa = d * shift - a
+    ob = d * shift - b
+    m0 = dot(ba, ba)
+    m1 = dot(ba, oa)
+    m2 = dot(ba, d)
+    m3 = dot(d, oa)
+    m5 = dot(oa, oa)
     d2 = m0 - slope * slope
     k2 = d2 * dd - m2 * m2
     k1 = d2 * m3 - m1 * m2 + m2 * slope * ra
     k0 = d2 * m5 - m1 * m1 + m1 * slope * ra * 2.0 - m0 * ra * ra
     h = k1 * k1 - k0 * k2
-    best, side = FAR, False
+    best = FAR
+    side = False
     if d2 > 0.0 and h >= 0.0:
         root = ti.sqrt(h)
         if k2 > 0.0:
             t = (-root - k1) / k2
             y = m1 - ra * slope + t * m2
             if y > 0.0 and y < d2:
-                best, side = t + shift, True
+                best = t + shift
+                side = True
         elif k2 < 0.0:  # steeper than the slope: either root may be the first hit
             for sign in ti.static((1.0, -1.0)):
                 t = (sign * root - k1) / k2
@@ -246,9 +285,12 @@ def hit_cone(s, outlines: ti.template(), d, smooth):
 
 @ti.func
 def hit_cylinder(s, outlines: ti.template(), d, smooth):
-    a, b, r = s.a.xyz, s.b.xyz, s.a[3]
+    a = s.a.xyz
+    b = s.b.xyz
+    r = s.a[3]
     ba = b - a
-    length2, m = dot(ba, ba), dot(ba, d)
+    length2 = dot(ba, ba)
+    m = dot(ba, d)
     shift = dot((a + b) * 0.5, d) / dot(d, d)
     oa = d * shift - a
     n = dot(ba, oa)
@@ -272,8 +314,12 @@ def hit_cylinder(s, outlines: ti.template(), d, smooth):
 
 @ti.func
 def hit_triangle(s, outlines: ti.template(), d, smooth):
-    p, q, r = s.a.xyz, s.b.xyz, s.c.xyz
-    u, v, w = dot(d, cross(r, q)), dot(d, cross(p, r)), dot(d, cross(q, p))
+    p = s.a.xyz
+    q = s.b.xyz
+    r = s.c.xyz
+    u = dot(d, cross(r, q))
+    v = dot(d, cross(p, r))
+    w = dot(d, cross(q, p))
     slack = -1.0e-6 * (ti.abs(u) + ti.abs(v) + ti.abs(w))
     t = FAR
     if u >= slack and v >= slack and w >= slack and u + v + w > 0.0:
@@ -284,11 +330,14 @@ def hit_triangle(s, outlines: ti.template(), d, smooth):
 
 @ti.func
 def on_blade(outlines: ti.template(), number, u, v, smooth):
-    x, y = (u + 1.0) * TEXELS - 0.5, (v + 0.75) * TEXELS - 0.5
-    i, j = clamp(int(x), 0, 254), clamp(int(y), 0, 254)
+    x = (u + 1.0) * TEXELS - 0.5
+    y = (v + 0.75) * TEXELS - 0.5
+    i = clamp(int(x), 0, 254)
+    j = clamp(int(y), 0, 254)
     inside = int(outlines[number, j, i]) > 0
     if smooth:
-        fx, fy = x - i, y - j
+        fx = x - i
+        fy = y - j
         low = outlines[number, j, i] * (1.0 - fx) + outlines[number, j, i + 1] * fx
         high = outlines[number, j + 1, i] * (1.0 - fx) + outlines[number, j + 1, i + 1] * fx
         inside = low * (1.0 - fy) + high * fy > 0.0
@@ -298,8 +347,11 @@ def on_blade(outlines: ti.template(), number, u, v, smooth):
 @ti.func
 def hit_leaf(s, outlines: ti.template(), ray, smooth):
     """Two half surfaces w = a u^2 + b v^2 + c |u| in the leaf's own frame and unit, hinged at u = 0."""
-    rib, up, bend = s.b.xyz, s.c.xyz, s.d
-    side, per = cross(rib, up), 1.0 / s.a[3]
+    rib = s.b.xyz
+    up = s.c.xyz
+    bend = s.d
+    side = cross(rib, up)
+    per = 1.0 / s.a[3]
     o = vec3(dot(s.a.xyz, side), dot(s.a.xyz, rib), dot(s.a.xyz, up)) * -per
     d = vec3(dot(ray, side), dot(ray, rib), dot(ray, up)) * per
     q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
@@ -317,7 +369,8 @@ def hit_leaf(s, outlines: ti.template(), ray, smooth):
                 top, bottom = (q0, q) if ti.static(k == 0) else (q, q2)
                 if bottom != 0.0:
                     t = top / bottom
-                    u, v = o[0] + t * d[0], o[1] + t * d[1]
+                    u = o[0] + t * d[0]
+                    v = o[1] + t * d[1]
                     nearer = t > 0.0 and t < best and sign * u >= -1.0e-5
                     if nearer and u < 0.99 and u > -0.99 and v > -0.74 and v < 1.24:
                         best = ti.select(on_blade(outlines, int(s.b[3]), u, v, smooth), t, best)
@@ -350,7 +403,10 @@ def place_points(lens, a, b, c, d):
 
 @ti.func
 def place_box(lens, a, b, c, d):
-    x, y, z, w = b[0], b[1], b[2], b[3]
+    x = b[0]
+    y = b[1]
+    z = b[2]
+    w = b[3]
     first = vec3(1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y + z * w), 2.0 * (x * z - y * w))
     second = vec3(2.0 * (x * y - z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z + x * w))
     return Placed(a=point(lens, a), b=arrow(lens, vec4(first, c[0])), c=arrow(lens, vec4(second, c[1])), d=d)

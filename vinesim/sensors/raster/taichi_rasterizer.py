@@ -22,11 +22,13 @@ from vinesim.kernels.raster import pinhole
 from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
 from vinesim.sensors.raster.taichi_primitives import KERNEL_FUNCTIONS, Lens, mat3
 
-EMPTY_KEY, SMOOTH_SIZE = int(pinhole.EMPTY_KEY), float(pinhole.SMOOTH_SIZE)
+EMPTY_KEY = int(pinhole.EMPTY_KEY)
+SMOOTH_SIZE = float(pinhole.SMOOTH_SIZE)
 _NO_PRIMITIVE = 2**31 - 1
 _INEXACT = 2**30
 """Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
-_CORES, _GPU = (64, 1), (24, 32)
+_CORES = (64, 1)
+_GPU = (24, 32)
 """How many share the primitives of a cluster, and the rows of each of them. Taichi hands 512 iterations at once to a
 core of a CPU, idle ones counted: so 8 clusters, few enough that no core is left with all that is near."""
 KEY, DEPTH, NUMBER = range(3)
@@ -59,26 +61,34 @@ def _draw_kernel(kind: int, phase: int):
 
     @ti.kernel
     def draw(
-        a: Table, b: Table, c: Table, d: Table,
-        outlines: ti.types.ndarray(ndim=3), hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
-        first: ti.types.ndarray(dtype=ti.i32, ndim=1), size: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        a: Table,
+        b: Table,
+        c: Table,
+        d: Table,
+        outlines: ti.types.ndarray(ndim=3),
+        hull: ti.types.ndarray(dtype=ti.f32, ndim=3),
+        first: ti.types.ndarray(dtype=ti.i32, ndim=1),
+        size: ti.types.ndarray(dtype=ti.i32, ndim=1),
         which: ti.types.ndarray(dtype=ti.i32, ndim=1),
-        view: ti.types.ndarray(dtype=ti.f32, ndim=1), lanes: ti.i32, slices: ti.i32,
-        keys: ti.types.ndarray(ndim=1), number: ti.types.ndarray(dtype=ti.i32, ndim=1),
-    ):  # fmt: skip
+        view: ti.types.ndarray(dtype=ti.f32, ndim=1),
+        lanes: ti.i32,
+        slices: ti.i32,
+        keys: ti.types.ndarray(ndim=1),
+        number: ti.types.ndarray(dtype=ti.i32, ndim=1),
+    ):
         for k, lane, part in ti.ndrange(which.shape[0], lanes, slices):
-            i, end = first[which[k]] + lane, first[which[k]] + size[which[k]]
+            i = first[which[k]] + lane
+            end = first[which[k]] + size[which[k]]
             while i < end:
                 lens = lens_of(view)
                 s = place(lens, a[i], b[i], c[i], d[i])
                 o = outline(s, hull, lens)
                 smooth = s.a[3] * lens.focal[0] > s.a[2] * SMOOTH_SIZE
                 nearest = int(clamp(o.depth, 0.0, lens.max_depth) * 1.0e6)
-                left, right = clamp(o.box[0] - 0.01, 0.0, lens.size[0]), clamp(o.box[1] + 1.01, 0.0, lens.size[0])
-                top, bottom = (
-                    int(clamp(o.box[2] - 0.01, 0.0, lens.size[1])),
-                    int(clamp(o.box[3] + 1.01, 0.0, lens.size[1])),
-                )
+                left = clamp(o.box[0] - 0.01, 0.0, lens.size[0])
+                right = clamp(o.box[1] + 1.01, 0.0, lens.size[0])
+                top = int(clamp(o.box[2] - 0.01, 0.0, lens.size[1]))
+                bottom = int(clamp(o.box[3] + 1.01, 0.0, lens.size[1]))
                 if left < right:
                     y = top + part
                     while y < bottom:
@@ -133,7 +143,9 @@ class TaichiRasterizer:
         if self._gpu:
             self._rasterize_on_gpu(primitives, lens, mine, keys.numpy())
             return
-        s, eye, pixels = primitives.shapes, _pinhole_values(lens), keys.numpy()
+        s = primitives.shapes
+        eye = _pinhole_values(lens)
+        pixels = keys.numpy()
         tables = [t.numpy() for t in (s.a, s.b, s.c, s.d, s.outline, s.hull)]
         pixels.fill(EMPTY_KEY)
         for number, these in mine.items():
@@ -145,7 +157,8 @@ class TaichiRasterizer:
     ) -> None:
         """On a GPU: depths, then numbers; what has not moved stays there."""
         if self._of != (primitives, primitives.pose_version):
-            s, self._of = primitives.shapes, (primitives, primitives.pose_version)
+            s = primitives.shapes
+            self._of = (primitives, primitives.pose_version)
             vectors = [(ti.Vector.ndarray(4, ti.f32, len(t)), t.numpy()) for t in (s.a, s.b, s.c, s.d)]
             flat = [(ti.ndarray(ti.i32, s.outline.shape), s.outline.numpy().astype(np.int32))]
             hull = s.hull.numpy()
@@ -184,7 +197,9 @@ def _floating_point_kept() -> Iterator[None]:
     Taichi switches denormal numbers off for whatever this thread computes from then on: physics in the same process
     would have other bits than without a camera.
     """
-    libm, environment = ctypes.CDLL(None), ctypes.create_string_buffer(64)  # fenv_t: 32 bytes on x86-64, 8 on AArch64
+    # fenv_t: 32 bytes on x86-64, 8 on AArch64
+    libm = ctypes.CDLL(None)
+    environment = ctypes.create_string_buffer(64)
     libm.fegetenv(environment)
     try:
         yield
