@@ -17,15 +17,6 @@ from vinesim.kernels.plants.body_dynamics import (
     terms_left,
     tie_terms,
 )
-from vinesim.kernels.plants.contiguous import (
-    contiguous_bodies,
-    contiguous_factors,
-    contiguous_forces,
-    contiguous_joints,
-    contiguous_model,
-    contiguous_prediction,
-    contiguous_scratch,
-)
 from vinesim.kernels.plants.kinematics import body_kinematics
 from vinesim.kernels.plants.lane_records import (
     AXES,
@@ -381,12 +372,6 @@ def predict_groups(
     groups: [thread] first place in ``trees``, and how many; in a group of two or more no root floats. records_out:
     scratch, no two threads at once; the others are those of :func:`predict`.
     """
-    bodies = contiguous_bodies(bodies_out)
-    factors = contiguous_factors(factors_out)
-    prediction = contiguous_prediction(prediction_out)
-    trees_model = contiguous_model(model)
-    state = contiguous_joints(joints)
-    given = contiguous_forces(forces)
     span = groups[wp.tid()]
     count = span[1]
     phis = Lanes()
@@ -395,25 +380,25 @@ def predict_groups(
     for lane in range(LANES):
         tree = trees[span[0] + wp.min(lane, count - 1)]
         listed[lane] = tree
-        phi = chosen_phi(p, trees_model, state, tree, tree_phi[tree], tree_euler_steps[tree])
+        phi = chosen_phi(p, model, joints, tree, tree_phi[tree], tree_euler_steps[tree])
         phis[lane] = phi
         tree_phi_out[tree] = phi
         together = together and tree_steps[tree] == 1 and not is_conservative(p, phi)
     if together:
-        walk_eight(p, trees_model, given, state, listed, count, phis, records_out, bodies, factors, prediction)
+        walk_eight(p, model, forces, joints, listed, count, phis, records_out, bodies_out, factors_out, prediction_out)
     else:
         for lane in range(count):
             tree = listed[lane]
             step = substep_parameters(p, tree_steps[tree])
             predict_tree(
                 step,
-                trees_model,
-                given,
-                state,
+                model,
+                forces,
+                joints,
                 tree,
                 phis[lane],
-                bodies,
-                factors,
-                contiguous_scratch(scratch_out),
-                prediction,
+                bodies_out,
+                factors_out,
+                scratch_out,
+                prediction_out,
             )

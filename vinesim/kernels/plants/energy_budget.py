@@ -22,15 +22,6 @@ import warp as wp
 
 from vinesim.kernels.compiler_flags import INLINE_ALL
 from vinesim.kernels.plants.body_dynamics import terms_left
-from vinesim.kernels.plants.contiguous import (
-    contiguous_bodies,
-    contiguous_factors,
-    contiguous_forces,
-    contiguous_joints,
-    contiguous_model,
-    contiguous_prediction,
-    contiguous_scratch,
-)
 from vinesim.kernels.plants.first_mode import place_relaxed
 from vinesim.kernels.plants.kinematics import body_kinematics, parent_kinematics
 from vinesim.kernels.plants.prediction import accelerate_bodies, add_terms
@@ -211,11 +202,11 @@ def begin_budget(
         return
     energy = tree_energy(
         p,
-        contiguous_model(model),
-        contiguous_forces(forces),
-        contiguous_joints(joints),
+        model,
+        forces,
+        joints,
         tree,
-        contiguous_bodies(bodies_out),
+        bodies_out,
     )
     budget_out.limit[tree] = energy[0] + energy[1] + ROUNDING * energy[2]
     budget_out.last[tree] = energy[0] + energy[1]
@@ -402,11 +393,7 @@ def keep_budget(
     close = is_close(kind, tree_phi[tree])
     watched = is_watched(kind, tree_phi[tree], tree, budget_out)
     if is_due(rate, close, tree, budget_out):
-        dense = contiguous_model(model)
-        state = contiguous_joints(joints_out)
-        loads = contiguous_forces(forces)
-        bodies = contiguous_bodies(bodies_out)
-        energy = tree_energy(p, dense, loads, state, tree, bodies)
+        energy = tree_energy(p, model, forces, joints_out, tree, bodies_out)
         if energy[3] != budget_out.held[tree]:
             budget_out.limit[tree] = NO_LIMIT
             return
@@ -425,16 +412,16 @@ def keep_budget(
                 p.dt / float(tree_steps[tree]),
                 goal,
                 limit + BAND * budget_out.scale[tree] + rounding,
-                dense,
-                loads,
+                model,
+                forces,
                 tree,
                 budget_out,
                 tree_euler_steps_out,
-                state,
-                bodies,
-                contiguous_factors(factors_out),
-                contiguous_scratch(scratch_out),
-                contiguous_prediction(prediction_out),
+                joints_out,
+                bodies_out,
+                factors_out,
+                scratch_out,
+                prediction_out,
             )
         else:
             budget_out.scale[tree] = wp.max(FADE * budget_out.scale[tree], energy[0])

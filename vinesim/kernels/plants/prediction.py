@@ -16,15 +16,6 @@ from vinesim.kernels.plants.body_dynamics import (
     tie_terms,
     turned_rest_moment,
 )
-from vinesim.kernels.plants.contiguous import (
-    contiguous_bodies,
-    contiguous_factors,
-    contiguous_forces,
-    contiguous_joints,
-    contiguous_model,
-    contiguous_prediction,
-    contiguous_scratch,
-)
 from vinesim.kernels.plants.forces import shear_stiffness
 from vinesim.kernels.plants.kinematics import body_kinematics, max_joint_rate, parent_kinematics
 from vinesim.kernels.plants.spatial import cross_rows, inverse_symmetric, symmetric, world_inertia
@@ -349,20 +340,18 @@ def predict(
     at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
     that is needed later.
     """
-    trees_model = contiguous_model(model)
-    state = contiguous_joints(joints)
     tree = trees[wp.tid()]
-    phi = chosen_phi(p, trees_model, state, tree, tree_phi[tree], tree_euler_steps[tree])
+    phi = chosen_phi(p, model, joints, tree, tree_phi[tree], tree_euler_steps[tree])
     tree_phi_out[tree] = phi
     predict_tree(
         substep_parameters(p, tree_steps[tree]),
-        trees_model,
-        contiguous_forces(forces),
-        state,
+        model,
+        forces,
+        joints,
         tree,
         phi,
-        contiguous_bodies(bodies_out),
-        contiguous_factors(factors_out),
-        contiguous_scratch(scratch_out),
-        contiguous_prediction(prediction_out),
+        bodies_out,
+        factors_out,
+        scratch_out,
+        prediction_out,
     )
