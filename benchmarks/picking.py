@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from vinesim.api.picking import Grasp, PickAttempt, attempt_pick
-from vinesim.client.tasks import pick_planning
+from vinesim.client.tasks import planning
 from vinesim.client.tasks.start_poses import bunch_centres, spawn_pose
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
@@ -22,7 +22,7 @@ from vinesim.scene.values import Measurement
 SCENE = "demo"
 REACH = 3.0
 """[m] Bunches this near to the start place are tried; the base may move."""
-CLASSES = (-np.inf, 0.0, 0.005, 0.015, pick_planning.FULL_CLEARANCE, np.inf)
+CLASSES = (-np.inf, 0.0, 0.005, 0.015, planning.FULL_CLEARANCE, np.inf)
 """[m] Bounds of the classes of clearance: planned picks have 5 mm at least."""
 
 
@@ -42,7 +42,7 @@ def picking() -> Iterator[Measurement]:
     model = generate(scene)
     near = spawn_pose(scene, 0)[:2]
     around = int((np.linalg.norm(bunch_centres(model)[:, :2] - near, axis=1) < REACH).sum())
-    tries = [attempt_pick(model, Grasp(*one)) for one in pick_planning.freest_bases(model, near, REACH)]
+    tries = [attempt_pick(model, Grasp(*one)) for one in planning.freest_bases(model, near, REACH)]
     case = f"{SCENE}, bunches within {REACH:g} m of start place 0"
     yield Measurement("picking", case, float(around), "bunches")
     yield Measurement("picking", f"{case}, that a base can stand before and a hand fits", float(len(tries)), "bunches")
@@ -58,7 +58,7 @@ def success_measurements(tries: list[PickAttempt]) -> Iterator[Measurement]:
     for name, group in groups.items():
         share = 100.0 * sum(one.picked for one in group) / max(len(group), 1)
         yield Measurement("picking", f"{name} ({len(group)} tried)", share, "%")
-    freest = [one for one in tries if one.clearance >= pick_planning.MIN_HAND_CLEARANCE][:1]
+    freest = [one for one in tries if one.clearance >= planning.MIN_HAND_CLEARANCE][:1]
     yield Measurement("picking", "the one a job would take", 100.0 * sum(one.picked for one in freest), "%")
     for phase, count in collections.Counter(one.reason.split(":")[0] for one in tries if one.reason).most_common():
         yield Measurement("picking", f"failed in phase {phase}", float(count), "bunches")

@@ -24,8 +24,7 @@ from benchmarks.support.network_emulator import NetworkEmulator
 from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop
 from vinesim.core import frames
-from vinesim.rigid.human_posture import standing_pose
-from vinesim.rigid.human_shapes import HAND_HALF_THICKNESS
+from vinesim.rigid.human_posture import HAND_HALF_THICKNESS, standing_pose
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene

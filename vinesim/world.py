@@ -39,7 +39,7 @@ from vinesim.scene.wind import Wind
 from vinesim.wind.plant_wind import WindOnPlants
 from vinesim.wires.deflected_wires import DeflectedWires
 from vinesim.wires.elastic_supports import ElasticSupports
-from vinesim.wires.wire_shapes import WireShapes
+from vinesim.wires.wire_segments import WireShapes
 
 LEAST_SHARED_TREES = 16
 """Threads are woken for a step of so many trees: two groups of eight, 30 us of work. TUNED."""

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.audio import loudness, opus
+from vinesim.audio import hearing, opus
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, find_fault, from_pcm, to_pcm
+from vinesim.audio.hearing import SpectatorsSpeakTo, may_hear
 from vinesim.audio.loudspeaker import MAX_QUEUED, Loudspeaker
 from vinesim.audio.microphone import DELAY, MAX_DELAY, HeardFrame, Microphone
-from vinesim.audio.permission import SpectatorsSpeakTo, may_hear
 
 START = 100.0
 
@@ -51,12 +51,12 @@ def amplitude(samples, frequency):
 
 def test_loudness_falls_by_the_distance_and_ends():
     distances = np.linspace(0.0, 40.0, 4001)
-    gains = np.array([loudness.gain(d) for d in distances])
+    gains = np.array([hearing.gain(d) for d in distances])
     assert (np.diff(gains) <= 0.0).all()
-    assert gains[0] == loudness.gain(1.0) == 1.0
-    assert loudness.gain(2.0) / loudness.gain(10.0) == pytest.approx(5.0)
-    assert (gains[distances >= loudness.REACH] == 0.0).all()
-    assert loudness.gain(np.nan) == 0.0
+    assert gains[0] == hearing.gain(1.0) == 1.0
+    assert hearing.gain(2.0) / hearing.gain(10.0) == pytest.approx(5.0)
+    assert (gains[distances >= hearing.REACH] == 0.0).all()
+    assert hearing.gain(np.nan) == 0.0
     assert np.abs(np.diff(gains)).max() < 0.011, "no step anywhere"
 
 
@@ -69,9 +69,7 @@ def test_a_voice_is_recorded_as_it_was_said():
 def test_voices_add_up_each_by_its_loudness():
     near = tone(440.0)
     far = tone(700.0)
-    heard = record(
-        Microphone(), frames_of(near, "anna", loudness.gain(2.0)), frames_of(far, "ben", loudness.gain(10.0))
-    )
+    heard = record(Microphone(), frames_of(near, "anna", hearing.gain(2.0)), frames_of(far, "ben", hearing.gain(10.0)))
     assert amplitude(heard, 440.0) == pytest.approx(0.25, abs=1e-3)
     assert amplitude(heard, 700.0) == pytest.approx(0.05, abs=1e-3)
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.support.contact_scenes import bunch_scene, cane
-from vinesim.avatar.local_human import LocalHuman
-from vinesim.avatar.shears import CUT_PULSE, MISS_PULSE
+from vinesim.avatar.local_human import CUT_PULSE, MISS_PULSE, LocalHuman
 from vinesim.core import frames
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene import appearance

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks.picking import class_name, success_measurements
 from vinesim.api.picking import Grasp, PickAttempt, attempt_pick
-from vinesim.client.tasks import pick_planning
+from vinesim.client.tasks import planning
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
@@ -45,7 +45,7 @@ def test_narrow_bunches_are_tried_as_well_and_the_freest_is_the_one_that_a_job_t
     scene = with_seed(load_scene("harvest"), 7)
     model = generate(scene)
     near = spawn_pose(scene, 0)[:2]
-    found = list(pick_planning.freest_bases(model, near, 3.0))
+    found = list(planning.freest_bases(model, near, 3.0))
     assert len({bunch for bunch, *_ in found}) == len(found) > 5
     assert min(clearance for *_, clearance in found) < 0.0
     result = attempt_pick(model, Grasp(*found[0]))

@@ -20,8 +20,7 @@ from vinesim.core import frames
 from vinesim.net.codec import human as poses
 from vinesim.net.codec.messages import Hello
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.rigid.human_posture import standing_pose
-from vinesim.rigid.human_shapes import BODY_PARTS
+from vinesim.rigid.human_posture import BODY_PARTS, standing_pose
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene import appearance

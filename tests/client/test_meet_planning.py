@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from vinesim.client.tasks.meet_planning import (
-    BOX_AHEAD,
+from vinesim.client.tasks.planning import (
+    CLAMPED_BOX_DISTANCE,
     KEPT_AWAY,
     MAX_PULL,
     PERSON_CLEARANCE,
     REACH,
+    TURNING_RADIUS,
     plan_meeting,
 )
 from vinesim.client.tasks.start_poses import PlacementError, bunch_centres, ground_clearance, start_pose
-from vinesim.client.tasks.swap_planning import TURNING_RADIUS
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 
@@ -26,7 +26,7 @@ def test_person_and_carrier_have_room_and_reach():
     assert model.bunch_pull[plan.bunch] < MAX_PULL
     assert ground_clearance(model, waits[None])[0] > TURNING_RADIUS
     towards = np.array([np.cos(plan.heading), np.sin(plan.heading)])
-    gives = waits + (BOX_AHEAD + REACH) * towards
+    gives = waits + (CLAMPED_BOX_DISTANCE + REACH) * towards
     way = gives + np.linspace(0.0, 1.0, 20)[:, None] * (plan.stand - gives)
     assert ground_clearance(model, way).min() > 0.5 * PERSON_CLEARANCE
     assert (plan.stand - gives) @ towards == pytest.approx(np.linalg.norm(plan.stand - gives), rel=1e-6), "ahead of it"

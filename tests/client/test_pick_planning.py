@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from vinesim.client.tasks import path_planning, pick_planning, start_poses
+from vinesim.client.tasks import planning, start_poses
 from vinesim.core import frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import Box, Scene, load_scene, with_seed
@@ -23,25 +23,23 @@ def test_planned_tasks_are_geometrically_feasible(seed: int):
     plan = harvest(seed)
     model = generate(plan)
     start = start_poses.spawn_pose(plan, 0)[:2]
-    for task in itertools.islice(pick_planning.plan_picks(model, start), 3):
+    for task in itertools.islice(planning.plan_picks(model, start), 3):
         centre = start_poses.bunch_centres(model)[task.bunch]
         local = frames.compose(frames.inverse(task.base_pose), frames.pose(centre))[:3]
-        assert local[0] == pytest.approx(pick_planning.BUNCH_AHEAD, abs=0.02)
+        assert local[0] == pytest.approx(planning.BUNCH_AHEAD, abs=0.02)
         assert local[1] == pytest.approx(
-            pick_planning.BUNCH_ASIDE if task.side == "left" else -pick_planning.BUNCH_ASIDE, abs=0.02
+            planning.BUNCH_ASIDE if task.side == "left" else -planning.BUNCH_ASIDE, abs=0.02
         )
-        assert model.bunch_radius[task.bunch] <= pick_planning.MAX_BUNCH_RADIUS
+        assert model.bunch_radius[task.bunch] <= planning.MAX_BUNCH_RADIUS
         # the path keeps clear of static objects and ends with the box beside the base, on the arm's side
         points = np.concatenate([task.base_pose[None, :2], task.path])
         for a, b in itertools.pairwise(points[:-1]):
             line = a + np.linspace(0.0, 1.0, 50)[:, None] * (b - a)
-            assert (
-                start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - path_planning.GRID_SIZE
-            )
+            assert start_poses.ground_clearance(model, line).min() > planning.BASE_CLEARANCE - planning.GRID_SIZE
         end = frames.pose(np.append(points[-1], 0.0), frames.from_yaw(task.final_heading))
         box = frames.compose(frames.inverse(end), model.box_pose[task.box].astype(float))[:3]
-        gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - pick_planning.BASE_HALF_WIDTH
-        assert gap == pytest.approx(pick_planning.BOX_GAP, abs=1e-6)
+        gap = abs(box[1]) - 0.5 * float(model.box_size[task.box, 1]) - planning.BASE_HALF_WIDTH
+        assert gap == pytest.approx(planning.BOX_GAP, abs=1e-6)
         assert (box[1] > 0.0) == (task.side == "left")
 
 
@@ -50,25 +48,23 @@ def test_a_path_avoids_static_objects_and_is_short():
     # a vine stands between
     start = np.array([5.0, 1.4])
     goal = np.array([5.0, -1.4])
-    points = path_planning.find_path(model, start, goal, pick_planning.BASE_CLEARANCE)
+    points = planning.find_path(model, start, goal, planning.BASE_CLEARANCE)
     length = np.linalg.norm(np.diff(points, axis=0), axis=1).sum()
     assert 2.8 < length < 5.0
     for a, b in itertools.pairwise(points):
         line = a + np.linspace(0.0, 1.0, 100)[:, None] * (b - a)
-        assert start_poses.ground_clearance(model, line).min() > pick_planning.BASE_CLEARANCE - path_planning.GRID_SIZE
+        assert start_poses.ground_clearance(model, line).min() > planning.BASE_CLEARANCE - planning.GRID_SIZE
 
 
 def test_there_is_no_path_through_a_vine():
     model = generate(harvest(7))
-    assert (
-        path_planning.find_path(model, np.array([5.0, 1.4]), np.array([5.0, 0.1]), pick_planning.BASE_CLEARANCE) is None
-    )
+    assert planning.find_path(model, np.array([5.0, 1.4]), np.array([5.0, 0.1]), planning.BASE_CLEARANCE) is None
 
 
 def test_boxes_without_free_space_are_reported():
     model = generate(harvest(7, boxes=()))
     with pytest.raises(start_poses.PlacementError, match=r"no box of this scene has .* room beside it"):
-        next(pick_planning.plan_picks(model, np.zeros(2)))
+        next(planning.plan_picks(model, np.zeros(2)))
 
 
 def test_a_box_is_an_obstacle_of_its_size():

@@ -10,7 +10,7 @@ from benchmarks.support.ear import Ear
 from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, to_pcm
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.client.client import Client
 from vinesim.client.sound.exchange import MAX_WAITING
 from vinesim.client.spectator import Spectator

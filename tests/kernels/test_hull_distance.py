@@ -12,7 +12,7 @@ import warp as wp
 from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import distance, hull_distance, structs
-from vinesim.rigid.hulls import hull_arrays
+from vinesim.rigid.collision_geoms import hull_arrays
 
 TOLERANCE = 0.002
 

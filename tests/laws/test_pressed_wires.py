@@ -22,7 +22,7 @@ from tests.laws.test_wires import ARM as SHOOT
 from tests.support.contact_scenes import cane, probe
 from tests.support.long_rows import each_once, long
 from vinesim.core import frames
-from vinesim.rigid.wire_contacts import WIRE_MASS
+from vinesim.rigid.mujoco_contacts import WIRE_MASS
 from vinesim.scene.builder import assemble
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model

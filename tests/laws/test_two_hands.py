@@ -13,8 +13,7 @@ from vinesim.client.client import Client
 from vinesim.core import frames
 from vinesim.net.codec import messages
 from vinesim.net.transport.memory_bus import MemoryHub
-from vinesim.rigid.human_posture import standing_pose
-from vinesim.rigid.human_shapes import HAND_HALF_THICKNESS
+from vinesim.rigid.human_posture import HAND_HALF_THICKNESS, standing_pose
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose
 

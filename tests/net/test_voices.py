@@ -5,8 +5,7 @@ import pytest
 
 from benchmarks.support.fake_client import FakeClient, tree_row
 from vinesim.audio.frame import FRAME_SAMPLES, Codec, to_pcm
-from vinesim.audio.loudness import REACH
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import REACH, SpectatorsSpeakTo
 from vinesim.net.codec.header import MAX_DATAGRAM, MessageError
 from vinesim.net.codec.voice import VoiceFrame, decode_voice, encode_voice
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -11,7 +11,7 @@ import pytest
 
 from tests.support.contact_scenes import bar, cane
 from vinesim.core import frames
-from vinesim.rigid.pair_friction import PairFriction
+from vinesim.rigid.mujoco_contacts import PairFriction
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description

@@ -9,10 +9,10 @@ import pytest
 
 from tests.physics.test_human_body import eva, put
 from tests.support.contact_scenes import bunch_scene, cane, gripper, probe
-from vinesim.avatar.haptics import HapticFeedback
+from vinesim.avatar.local_human import HapticFeedback
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.rigid.human_shapes import HAND_HALF_THICKNESS
+from vinesim.rigid.human_posture import HAND_HALF_THICKNESS
 from vinesim.scene.builder import assemble
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State

@@ -14,8 +14,7 @@ from tests.support.contact_scenes import probe
 from vinesim.core import frames
 from vinesim.rigid import static_world
 from vinesim.rigid.human_body import HumanError
-from vinesim.rigid.human_posture import VISUAL_PARTS, body_posture, standing_pose
-from vinesim.rigid.human_shapes import BODY_PARTS, HAND_HALF_THICKNESS
+from vinesim.rigid.human_posture import BODY_PARTS, HAND_HALF_THICKNESS, VISUAL_PARTS, body_posture, standing_pose
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene import appearance
 from vinesim.scene.ids import Organ

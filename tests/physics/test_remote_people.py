@@ -11,8 +11,8 @@ from tests.physics.test_human_body import contact_force, crate_yard, eva
 from tests.physics.test_rigid_world import ARM, arm, step, yard
 from tests.support.long_rows import each_once
 from vinesim.rigid.human_body import MAX_REMOTE_FORCE
-from vinesim.rigid.human_shapes import BODY_PARTS
-from vinesim.rigid.mujoco_sleep import wake_body
+from vinesim.rigid.human_posture import BODY_PARTS
+from vinesim.rigid.recompile import wake_body
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import POINT_NAMES
 

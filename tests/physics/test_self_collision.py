@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from tests.support.robot_yard import Yard
+from vinesim.rigid.mujoco_contacts import disabled_pairs
 from vinesim.rigid.rigid_world import RigidWorld
-from vinesim.rigid.self_collision import disabled_pairs
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from tests.support.contact_forces import pressed_on_ground
-from vinesim.client.tasks import pick_planning, start_poses
+from vinesim.client.tasks import planning, start_poses
 from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
@@ -37,7 +37,7 @@ def vinebot() -> RobotDescription:
 def vineyard(seed: int) -> tuple[Model, PickPlan]:
     plan = with_seed(load_scene("harvest"), seed)
     model = generate(plan)
-    return model, next(pick_planning.plan_picks(model, start_poses.spawn_pose(plan, 0)[:2]))
+    return model, next(planning.plan_picks(model, start_poses.spawn_pose(plan, 0)[:2]))
 
 
 def disable_sleep(physics: Physics) -> None:

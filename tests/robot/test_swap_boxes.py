@@ -7,7 +7,7 @@ import functools
 import numpy as np
 import pytest
 
-from vinesim.client.tasks import start_poses, swap_planning
+from vinesim.client.tasks import planning, start_poses
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
@@ -24,14 +24,14 @@ pytestmark = pytest.mark.slow
 def yard() -> tuple[Model, SwapPlan]:
     plan = load_scene("harvest")
     model = generate(plan)
-    return model, swap_planning.plan_swap(model, start_poses.spawn_pose(plan, 1))
+    return model, planning.plan_swap(model, start_poses.spawn_pose(plan, 1))
 
 
 def start_task(count: int = 6) -> SwapBoxes:
     model, swap = yard()
     physics = Physics(model, detachment=False)
     robot = Robot(physics.rigid, load_description("logistic"), "carrier", pose=swap.start)
-    swap_planning.fill_box(physics, swap.full_box, count)
+    planning.fill_box(physics, swap.full_box, count)
     return SwapBoxes(physics, robot, swap)
 
 
@@ -96,4 +96,4 @@ def test_a_robot_without_clamps_is_refused():
 def test_an_unknown_box_is_refused():
     model, swap = yard()
     with pytest.raises(start_poses.PlacementError, match="no box 7: this scene has 2"):
-        swap_planning.plan_swap(model, swap.start, full=7)
+        planning.plan_swap(model, swap.start, full=7)

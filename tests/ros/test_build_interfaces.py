@@ -16,7 +16,8 @@ import pytest
 from tests.support.waiting import TIMEOUT
 from vinesim.core import frames
 from vinesim.ros import middleware
-from vinesim.ros.messages import message_packages, package_build
+from vinesim.ros.messages import message_packages
+from vinesim.ros.messages import message_packages as package_build
 
 pytestmark = [
     pytest.mark.ros,

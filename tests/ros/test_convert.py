@@ -27,8 +27,9 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from vinesim.ros.commands import convert as commands
-from vinesim.ros.messages import convert, message_packages, serialized
-from vinesim.ros.messages.transforms import SerializedTransforms, split_time
+from vinesim.ros.messages import convert, message_packages
+from vinesim.ros.messages import convert as serialized
+from vinesim.ros.messages.convert import SerializedTransforms, split_time
 from vinesim.scene.values import (
     CameraFrame,
     CameraInfo,

@@ -29,7 +29,7 @@ from vinesim.client.rate_loop import RateLoop
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
-from vinesim.ros.flow_control import FIRST_LOOK, SUBSCRIBER_TIMEOUT, WIDE_WINDOW, WINDOW, FlowControl
+from vinesim.ros.topic import FIRST_LOOK, SUBSCRIBER_TIMEOUT, WIDE_WINDOW, WINDOW, FlowControl
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 

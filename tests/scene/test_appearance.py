@@ -13,8 +13,7 @@ from tests.support import sensor_scenes
 from vinesim.core import frames
 from vinesim.core.data_files import find_data_file
 from vinesim.kernels.shading import materials
-from vinesim.rigid.human_posture import standing_pose
-from vinesim.rigid.human_shapes import BODY_PARTS, body_shapes, hand_shapes
+from vinesim.rigid.human_posture import BODY_PARTS, body_shapes, hand_shapes, standing_pose
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.rigid.static_world import CRATE_WALL
 from vinesim.robot.description.loader import load_description

@@ -13,7 +13,7 @@ import pytest
 from tests.support import sensor_scenes
 from vinesim.core import frames
 from vinesim.core.data_files import find_data_file
-from vinesim.scene import lens_distortion
+from vinesim.scene import camera_geometry
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import CameraInfo
@@ -64,7 +64,7 @@ def test_small_balls_lie_on_their_pixels(lens: str) -> None:
         rows, columns = np.nonzero(frame.labels == label(Organ.BOX, i))
         assert np.hypot(columns.mean() - pixel[0], rows.mean() - pixel[1]) < 1.0, f"ball {i} of {pixel}"
     # without its distortion, the same camera shows the outer ones elsewhere
-    assert np.abs(_projected(local, dataclasses.replace(info, distortion=lens_distortion.NONE)) - wanted).max() > 4.0
+    assert np.abs(_projected(local, dataclasses.replace(info, distortion=camera_geometry.NONE)) - wanted).max() > 4.0
 
 
 @pytest.mark.parametrize("lens", LENSES)

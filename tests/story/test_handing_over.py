@@ -8,7 +8,7 @@ import pytest
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.cli.human_client import pick_and_give
-from vinesim.client.tasks.meet_planning import plan_meeting
+from vinesim.client.tasks.planning import plan_meeting
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core import frames
 from vinesim.rigid.human_posture import standing_pose

@@ -8,7 +8,7 @@ import pytest
 
 from tests.support.contact_forces import pressed_on_ground
 from vinesim.client.client import Client
-from vinesim.client.tasks import pick_planning, start_poses
+from vinesim.client.tasks import planning, start_poses
 from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -31,7 +31,7 @@ def test_a_picked_bunch_is_in_the_box_with_its_weight_on_the_other_client():
     model = generate(scene)
     vinebot = load_description("vinebot")
     hub = MemoryHub(delay=0.02, jitter=0.005, seed=2)
-    task = next(pick_planning.plan_picks(model, start_poses.spawn_pose(scene, 0)[:2]))
+    task = next(planning.plan_picks(model, start_poses.spawn_pose(scene, 0)[:2]))
     box = object_id(ObjectKind.BOX, task.box)
     visitor_xy = model.box_pose[task.box, :2] + [0.0, 1.6]
     worker, visitor = (

@@ -13,7 +13,7 @@ import pathlib
 
 import numpy as np
 
-from vinesim.client.tasks import pick_planning
+from vinesim.client.tasks import planning
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
@@ -63,7 +63,7 @@ def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: f
     The base may move. Also those are listed about which the hand has no room.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
-    found = pick_planning.freest_bases(generate(scene), start_pose(scene, spawn)[:2], reach)
+    found = planning.freest_bases(generate(scene), start_pose(scene, spawn)[:2], reach)
     return [Grasp(*one) for one in found]
 
 

@@ -12,7 +12,7 @@ from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession, save_report
 from vinesim.client.client import Client
-from vinesim.client.tasks.meet_planning import REACH
+from vinesim.client.tasks.planning import REACH
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose, validate_bunch
 from vinesim.core import frames
 from vinesim.core.errors import writing

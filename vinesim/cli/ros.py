@@ -25,7 +25,8 @@ def build(quiet: bool, wheel: pathlib.Path | None) -> int:
         if not quiet:
             print(f"ROS 2 is not usable here: {reason}")
         return 0 if quiet else 3
-    from vinesim.ros.messages import message_packages, package_wheel
+    from vinesim.ros.messages import message_packages
+    from vinesim.ros.messages import message_packages as package_wheel
 
     places = {package: message_packages.place_of_official(package) for package in message_packages.available_packages()}
     missing = [package for package, place in places.items() if place is None]

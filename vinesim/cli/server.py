@@ -7,7 +7,7 @@ import pathlib
 import threading
 from typing import Any
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.cli.signals import stop_at_signals
 from vinesim.core.errors import UsageError
 from vinesim.net.pace import describe

@@ -19,7 +19,7 @@ from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
 from vinesim.kernels.launch import bind_launch
-from vinesim.kernels.plants.overloads import count_overloaded_steps
+from vinesim.kernels.plants.tree_checks import count_overloaded_steps
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
 from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.rigid.rigid_world import RigidWorld

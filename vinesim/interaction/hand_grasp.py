@@ -16,9 +16,8 @@ from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.ties import TieLimitError
-from vinesim.rigid.hand_body import HandBody
-from vinesim.rigid.human_body import HumanBody
-from vinesim.rigid.human_shapes import GRASP_POINTS, HAND_HALF_THICKNESS
+from vinesim.rigid.human_body import HandBody, HumanBody
+from vinesim.rigid.human_posture import GRASP_POINTS, HAND_HALF_THICKNESS
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import Contact, Detachment
 

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.rigid.mujoco_sleep import wake_body
+from vinesim.rigid.recompile import wake_body
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import ObjectKind, object_id, parse_object_name
 

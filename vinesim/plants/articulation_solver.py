@@ -28,7 +28,7 @@ from vinesim.core.errors import checked_index
 from vinesim.kernels.launch import BoundLaunch as Launch
 from vinesim.kernels.launch import bind_launch, bound, join_partitions
 from vinesim.kernels.plants import first_mode, structs
-from vinesim.kernels.plants.eight_trees import predict_groups
+from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
 from vinesim.kernels.plants.energy_budget import (
     CLOSELY,
     MIN_PHI,
@@ -44,7 +44,6 @@ from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_resp
 from vinesim.kernels.plants.integration import integrate
 from vinesim.kernels.plants.joint_wrench import joint_wrench
 from vinesim.kernels.plants.kinematics import forward_kinematics
-from vinesim.kernels.plants.lane_records import LANES, RECORD
 from vinesim.kernels.plants.lean_prediction import predict_lean
 from vinesim.kernels.plants.prediction import predict
 from vinesim.kernels.shared_launch import LaunchPool

@@ -15,7 +15,7 @@ import warp as wp
 
 from vinesim.core.warp_arrays import share
 from vinesim.kernels.launch import bind_launch
-from vinesim.kernels.plants.fastest_tree import find_fastest
+from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.plants.articulation_solver import ArticulationSolver
 
 log = logging.getLogger(__name__)

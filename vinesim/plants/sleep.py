@@ -15,7 +15,7 @@ import warp as wp
 
 from vinesim.core.warp_arrays import share
 from vinesim.kernels.launch import bind_launch
-from vinesim.kernels.plants.quiet_steps import count_quiet_steps
+from vinesim.kernels.plants.tree_checks import count_quiet_steps
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.equilibrium import EquilibriumFinder
 from vinesim.scene.physics_parameters import PhysicsParameters

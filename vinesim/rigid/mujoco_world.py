@@ -9,28 +9,26 @@ import dataclasses
 import logging
 import threading
 import weakref
+from collections.abc import Collection, Mapping
 
 import mujoco
 import numpy as np
 
 from vinesim.core.warp_arrays import SharedArrays
 from vinesim.rigid import collision_geoms, free_bunch, recompile, static_world
-from vinesim.rigid.body_tables import list_owners, list_visuals
+from vinesim.rigid.collision_geoms import hull_arrays
 from vinesim.rigid.effective_mass import EffectiveMass
 from vinesim.rigid.free_bunch import FreeBunch
-from vinesim.rigid.hand_body import HandBody
-from vinesim.rigid.hulls import hull_arrays
-from vinesim.rigid.human_body import HumanBody, HumanError
-from vinesim.rigid.link_sensors import LinkSensors
-from vinesim.rigid.pair_friction import PairFriction
+from vinesim.rigid.human_body import HandBody, HumanBody, HumanError
+from vinesim.rigid.human_posture import BODY_PARTS, SIDES, VISUAL_PARTS
+from vinesim.rigid.mujoco_contacts import PairFriction, SoftWires, SpeculativeContacts
 from vinesim.rigid.recompile import WorldNames
 from vinesim.rigid.robot_body import RobotBody
-from vinesim.rigid.speculative_contacts import SpeculativeContacts
-from vinesim.rigid.wire_contacts import SoftWires
+from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.values import RigidVisual
+from vinesim.scene.values import RigidBox, RigidVisual
 
 _log = logging.getLogger(__name__)
 
@@ -50,7 +48,7 @@ class CompiledWorld:
     bunches: dict[int, tuple[int, FreeBunch]]
     """Free bunches that have bodies in it already, each with its slot."""
     hulls: SharedArrays
-    """See :func:`vinesim.rigid.hulls.hull_arrays`."""
+    """See :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
     removed: tuple[RobotBody | HumanBody, ...] = ()
     """Actors of the present world that it is made without."""
 
@@ -62,7 +60,7 @@ def _log_mujoco_warnings() -> None:
         mujoco.set_mju_user_warning(_log.warning)
 
 
-class WorldCore:
+class MujocoWorld:
     """MuJoCo's model and data, and what they contain; compiled anew when an actor joins or leaves."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
@@ -336,3 +334,126 @@ class WorldCore:
         """List the geoms that collide anew after a hand closed or opened, and count :attr:`generation`."""
         self.generation += 1
         self.geoms = collision_geoms.colliding(self.mj_model, self._owned_geoms)
+
+
+# Tables of a compiled MuJoCo world: what sensors draw, and which actor owns which body.
+
+
+def list_visuals(
+    boxes: Mapping[int, RigidBox],
+    names: WorldNames,
+    robots: Mapping[str, RobotBody],
+    humans: Mapping[str, HumanBody],
+    bunches: Mapping[int, tuple[FreeBunch, int]],
+) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
+    """All rigid bodies that have a shape and their MuJoCo bodies [visual]; 0 for parts that are placed by posture.
+
+    ``bunches`` gives the shapes and the MuJoCo body of every free bunch.
+    """
+    visuals = []
+    bodies = []
+    for number, box in boxes.items():
+        length, width, height = map(float, box.size)
+        shapes = appearance.crate_shapes((length, width, height), number)
+        visuals.append(RigidVisual(f"box/{number}", Organ.BOX, number, shapes))
+        bodies.append(names.body[f"box/{number}"])
+    for name, robot in robots.items():
+        for link, shapes in robot.shown_shapes.items():
+            if shapes:
+                visuals.append(RigidVisual(f"{name}/{link}", Organ.ROBOT, robot.spec.index, shapes))
+                bodies.append(robot.bodies[link])
+    shears = {f"{side}_{part}": shapes for side in SIDES for part, shapes in appearance.load_shears().parts.items()}
+    for name, human in humans.items():
+        shapes_of_part = human.looks.parts | shears
+        simulated = [(part, human.bodies[part]) for part in (*BODY_PARTS, *(hand.link for hand in human.hands))]
+        for part, body in (*simulated, *((part, 0) for part in (*VISUAL_PARTS, *human.shears_parts))):
+            visuals.append(RigidVisual(f"{name}/{part}", Organ.HUMAN, human.spec.index, shapes_of_part[part]))
+            bodies.append(body)
+    for bunch, (free, body) in bunches.items():
+        visuals.append(RigidVisual(f"bunch/{bunch}", Organ.BUNCH, bunch, free.shapes))
+        bodies.append(body)
+    return tuple(visuals), np.array(bodies, int)
+
+
+def list_owners(
+    boxes: Collection[int],
+    names: WorldNames,
+    robots: Mapping[str, RobotBody],
+    humans: Mapping[str, HumanBody],
+    bunch_body: Mapping[int, int],
+) -> dict[int, tuple[str, str]]:
+    """By MuJoCo body: actor and link of everything that can be added, removed or moved."""
+    owners = {names.body[f"box/{i}"]: (f"box/{i}", "box") for i in boxes}
+    actors: dict[str, RobotBody | HumanBody] = {**robots, **humans}
+    for name, actor in actors.items():
+        owners.update({body: (name, link) for link, body in actor.bodies.items()})
+    owners.update({body: (f"bunch/{i}", "bunch") for i, body in bunch_body.items()})
+    return owners
+
+
+# Sensors in links of robots: the wrench on the parent and the acceleration, measured in every step for all at once.
+
+
+class LinkSensors:
+    """What the sensors measured in the last step, in frames of the step's start; a row for each sensor."""
+
+    def __init__(self) -> None:
+        self._row: dict[tuple[str, str], int] = {}
+        """Row of a sensor, by robot and link."""
+        self._body = self._root = np.zeros(0, int)
+        """[sensor] MuJoCo body of the link, and of the root of its robot."""
+        self._wrench = np.zeros((0, 6))
+        self._com = np.zeros((0, 3))
+        """[sensor, 6] moment about the robot's centre of mass and force of the parent on the link [N m, N]; [sensor, 3]
+        that centre [m]; world axes."""
+        self._position = np.zeros((0, 3))
+        self._rotation = np.zeros((0, 9))
+        """[sensor, 3] m and [sensor, 9] row by row: pose of the link."""
+        self._acceleration = np.zeros((0, 6))
+        """[sensor, 6] rad/s^2, m/s^2: see :meth:`acceleration`."""
+
+    def find_indices(self, m: mujoco.MjModel, robots: Mapping[str, RobotBody]) -> None:
+        """Take over which links have sensors, in a world that was compiled anew; measurements are kept."""
+        keys = [(name, link) for name, robot in robots.items() for link in robot.sensor_links]
+        kept = np.array([self._row.get(key, -1) for key in keys], int)
+        for name in ("_wrench", "_com", "_position", "_rotation", "_acceleration"):
+            before: np.ndarray = getattr(self, name)
+            after = np.zeros((len(keys), before.shape[1]))
+            after[kept >= 0] = before[kept[kept >= 0]]
+            setattr(self, name, after)
+        self._rotation[kept < 0] = np.eye(3).ravel()
+        self._row = {key: row for row, key in enumerate(keys)}
+        self._body = np.array([robots[name].bodies[link] for name, link in keys], int)
+        self._root = m.body_rootid[self._body]
+
+    def measure(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        """Measure the step that ends, while MuJoCo's poses are still those of its start."""
+        body = self._body
+        if not len(body):
+            return
+        mujoco.mj_rnePostConstraint(m, d)
+        self._wrench = d.cfrc_int[body]
+        self._com = d.subtree_com[self._root]
+        self._position = d.xpos[body]
+        self._rotation = d.xmat[body]
+        for row, link in enumerate(body.tolist()):
+            mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, link, self._acceleration[row], 1)
+
+    def wrench(self, robot: str, link: str) -> np.ndarray:
+        """Force [N] and moment about the link's origin [N m] of the link on its parent [6], in the link's axes."""
+        row = self._find(robot, link)
+        (x, y, z) = (self._com[row] - self._position[row]).tolist()
+        (u, v, w) = self._wrench[row, 3:].tolist()
+        moment = self._wrench[row, :3] + np.array([y * w - z * v, z * u - x * w, x * v - y * u])
+        rotation = self._rotation[row].reshape(3, 3)
+        return -np.concatenate([self._wrench[row, 3:] @ rotation, moment @ rotation])
+
+    def acceleration(self, robot: str, link: str) -> np.ndarray:
+        """[6] rad/s^2, m/s^2: angular and proper linear acceleration of the link's origin, link axes."""
+        return self._acceleration[self._find(robot, link)].copy()
+
+    def _find(self, robot: str, link: str) -> int:
+        try:
+            return self._row[robot, link]
+        except KeyError:
+            raise ValueError(f"link {link!r} of robot {robot!r} has no sensor; call add_link_sensor() first") from None

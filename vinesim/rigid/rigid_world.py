@@ -12,25 +12,29 @@ M^ = M + dt D + dt^2 K, not M. With plain M a gripper closes with 6.6 N where it
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Collection, Sequence
+from typing import Any
 
 import mujoco
 import numpy as np
 
-from vinesim.rigid import free_bunch, mujoco_sleep, recompile, static_world
-from vinesim.rigid.human_body import HumanBody, HumanError
-from vinesim.rigid.human_shapes import BODY_PARTS
-from vinesim.rigid.mujoco_world import CompiledWorld
-from vinesim.rigid.rigid_world_boxes import BoxAccess
-from vinesim.rigid.rigid_world_bunches import BunchAccess
-from vinesim.rigid.rigid_world_humans import HumanAccess
-from vinesim.rigid.rigid_world_robots import RobotAccess
+from vinesim.core import frames
+from vinesim.rigid import free_bunch, recompile, static_world
+from vinesim.rigid.free_bunch import FreeBunch
+from vinesim.rigid.human_body import HumanBody, HumanError, hand_wrenches
+from vinesim.rigid.human_posture import BODY_PARTS, PALM_TO_FINGERTIP
+from vinesim.rigid.mujoco_contacts import SoftWires
+from vinesim.rigid.mujoco_world import CompiledWorld, MujocoWorld
+from vinesim.rigid.recompile import wake_body
 from vinesim.rigid.robot_body import RobotBody, build_error
+from vinesim.rigid.static_world import FIRST_FIXED_GEOM, FIXED
 from vinesim.rigid.urdf import RobotError
-from vinesim.rigid.wire_contacts import SoftWires
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
-from vinesim.scene.values import HumanSpec, RobotSpec
+from vinesim.scene.values import HandSample, HumanPose, HumanSpec, RigidBox, RobotSpec
+from vinesim.scene.values.signals import Color
 from vinesim.wires.deflected_wires import DeflectedWires
 
 _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
@@ -40,7 +44,7 @@ MAX_RATE = 1e4
 """[m/s, rad/s] No body moves as fast, unless the simulation has become unstable."""
 
 
-class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
+class RigidWorld(MujocoWorld):
     """Robots, people, crates, free bunches and static geoms in one MuJoCo world, and their step."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
@@ -144,7 +148,7 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
             return False
         for new, old in replaced.items():
             new.take_over(old)
-            mujoco_sleep.keep_touching_awake(self.mj_model, self.mj_data, self.mj_model.body(new.spec.name).id)
+            recompile.keep_touching_awake(self.mj_model, self.mj_data, self.mj_model.body(new.spec.name).id)
         self._robots = {robot.spec.name: robot for robot in compiled.robots}
         self._humans = {human.spec.name: human for human in compiled.humans}
         self._replace_world(compiled)
@@ -319,6 +323,386 @@ class RigidWorld(RobotAccess, HumanAccess, BunchAccess, BoxAccess):
         self.faults += len(stopped)
         names = ", ".join(stopped)
         self.last_fault = f"t = {d.time:.2f} s: {names} moved by a number that is not finite or too fast; stopped"
+
+    # ------------------------------------------------------------------ robots, by name
+    # Robots of a rigid world. Every method raises ``ValueError`` if no robot or link has the name given, and
+    # :class:`RobotError` for commands that are not finite or of another shape.
+
+    def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
+        """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest, with its targets there."""
+        self._check_joints(name, position=position)
+        _check_finite(name, "pose", pose, 7)
+        self.robot(name).place(self.mj_model, self.mj_data, np.asarray(pose, float), position)
+        self._kinematics_current = False
+
+    def _check_joints(self, name: str, **commands: object) -> None:
+        """:class:`RobotError` unless each command that is given has one finite number for each drive."""
+        count = len(self.robot(name).spec.drives)
+        for what, given in commands.items():
+            if given is not None:
+                _check_finite(name, f"joint {what}", given, count)
+
+    # commands
+
+    def command(self, name: str, position: np.ndarray, velocity: np.ndarray | None = None) -> None:
+        """Set the targets of the servos: ``position`` [joint] and ``velocity`` [joint] (zero unless given)."""
+        self._check_joints(name, position=position, velocity=velocity)
+        self.robot(name).command(position, velocity)
+
+    def set_gains(
+        self,
+        name: str,
+        stiffness: np.ndarray,
+        damping: np.ndarray,
+        effort: np.ndarray,
+        *,
+        limit: np.ndarray | None = None,
+        exact: np.ndarray | None = None,
+    ) -> None:
+        """Set the gains of the servos and a feedforward ``effort`` (all [joint]); they last until the next call.
+
+        Args:
+            name: of the robot.
+            stiffness: N m/rad or N/m; with zero gains a joint is driven by ``effort`` alone.
+            damping: N m s/rad or N s/m.
+            effort: N m or N, added within ``limit``.
+            limit: N m or N, of the servos; that of the drive unless a lower one is given.
+            exact: bool, joints that swing with just this damping; the others are damped as if it were larger by dt
+            times
+                stiffness, as stiff servos should be.
+        """
+        self._check_joints(name, stiffness=stiffness, damping=damping, effort=effort)
+        self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
+
+    def command_base(self, name: str, velocity: tuple[float, float, float]) -> None:
+        """Drive the base with (vx, vy, wz) [m/s, m/s, rad/s] in its own axes; zero holds it in place."""
+        robot = self.robot(name)
+        _check_finite(name, "base velocity", velocity, 3)
+        robot.base_velocity[:] = velocity
+        robot.base_slip = self.parameters.base_slip
+
+    def follow_remote(
+        self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> None:
+        """Pull the copy of a remote robot to its received state; it stays dynamic, so that a vine still holds it back.
+
+        ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
+        """
+        self._check_joints(name, position=position, velocity=velocity)
+        _check_finite(name, "base pose", base_q, 7)
+        _check_finite(name, "base velocity", base_qd, 6)
+        self.robot(name).follow_remote(
+            self.mj_data, np.asarray(base_q, float), np.asarray(base_qd, float), position, velocity
+        )
+
+    def apply_wrench(self, name: str, link: str, force: np.ndarray, moment: np.ndarray = np.zeros(3)) -> None:
+        """Apply a force [3] N and a moment [3] N m at a link's centre of mass, world axes, until the next call."""
+        wrench = self.mj_data.xfrc_applied[self._link_body(name, link)]
+        _check_finite(name, "force", force, 3)
+        _check_finite(name, "moment", moment, 3)
+        wrench[:3], wrench[3:] = force, moment
+
+    def set_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
+        """Apply the wrenches [6] by link with which remote people push a robot, until the next call.
+
+        Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them
+        as contacts. Raises :class:`RobotError` if a link does not exist or a wrench is not finite.
+        """
+        robot = self.robot(name)
+        for link, wrench in wrenches.items():
+            _check_finite(name, f"wrench on {link!r}", wrench, 6)
+        if wrenches or robot.remote_wrenches:
+            robot.set_remote_wrenches(self.mj_data, wrenches)
+
+    def set_indicator_color(self, name: str, color: Color | None) -> None:
+        """Set the colour of a robot's indicator lights, black for unlit; None: as its URDF has them."""
+        robot = self.robot(name)
+        robot.indicator_color = color
+        self._show_lamps(robot)
+
+    # joints and base
+
+    def joint_measurements(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Position, velocity, effort and contact effort of the drives, each [joint] in the order of ``spec.drives``.
+
+        The effort is that of the drive in the last step: servo and its share of gravity compensation. The contact
+        effort is J^T f of the contacts with plants and with rigid bodies; at rest the two cancel.
+        """
+        robot = self.robot(name)
+        d = self.mj_data
+        return d.qpos[robot.q], d.qvel[robot.v], robot.transmitted_effort(d), self.contact_force[robot.v]
+
+    def joint_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity [joint] of the drives alone, as in :meth:`joint_measurements`."""
+        robot = self.robot(name)
+        return self.mj_data.qpos[robot.q], self.mj_data.qvel[robot.v]
+
+    def gravity_effort(self, name: str) -> np.ndarray:
+        """[joint] N m or N: the part of the drives' effort that carries the robot's own weight."""
+        return self.mj_data.qfrc_gravcomp[self.robot(name).v]
+
+    def joint_inertia(self, name: str) -> np.ndarray:
+        """[joint] kg m^2 or kg: inertia that each drive sees while the others stand, armature included, in this
+        pose."""
+        return self.mj_data.M[self.robot(name).inertia_index]
+
+    def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Pose [7] and velocity [6] (world axes) of the base link."""
+        robot = self.robot(name)
+        d = self.mj_data
+        x, y, yaw = d.qpos[robot.base_q].tolist()
+        vx, vy, wz = d.qvel[robot.base_v].tolist()
+        half = 0.5 * yaw
+        pose = np.array([x, y, robot.base_height, 0.0, 0.0, math.sin(half), math.cos(half)])
+        return pose, np.array([vx, vy, 0.0, 0.0, 0.0, wz])
+
+    # links
+
+    def link_centre(self, name: str, link: str) -> np.ndarray:
+        """Centre of mass [3] m of a link at the last step's start; ``ValueError`` if there is none of this name."""
+        return self.mj_data.xipos[self._link_body(name, link)].copy()
+
+    def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
+        """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per joint velocity."""
+        robot = self.robot(name)
+        body = self._link_body(name, link)
+        self.update_kinematics()
+        jacobian = np.zeros((6, self.mj_model.nv))
+        mujoco.mj_jac(self.mj_model, self.mj_data, jacobian[:3], jacobian[3:], np.asarray(point, float), body)
+        return jacobian[:, robot.v]
+
+    def add_link_sensor(self, name: str, link: str) -> None:
+        """From the next step on, measure :meth:`link_wrench` and :meth:`link_acceleration` at a link."""
+        self._link_body(name, link)
+        if link not in self.robot(name).sensor_links:
+            self.robot(name).sensor_links.append(link)
+            self._link_sensors.find_indices(self.mj_model, self._robots)
+
+    def link_wrench(self, name: str, link: str) -> np.ndarray:
+        """[6] N, N m about the link's origin: wrench of the link, and all beyond it, on its parent.
+
+        In the link's axes, mean of the last step. Weight, inertia, pushes and contacts with rigid bodies are included;
+        contacts with plants are not: they are in ``Physics.contacts``.
+        """
+        return self._link_sensors.wrench(name, link)
+
+    def link_acceleration(self, name: str, link: str) -> np.ndarray:
+        """[6] rad/s^2, m/s^2: angular and proper acceleration of a link's origin in its axes; at rest 9.81 upwards."""
+        return self._link_sensors.acceleration(name, link)
+
+    def link_angular_velocity(self, name: str, link: str) -> np.ndarray:
+        """[3] rad/s of a link, in its axes."""
+        body = self._link_body(name, link)
+        self.update_kinematics()
+        jacobian = np.zeros((3, self.mj_model.nv))
+        mujoco.mj_jacBody(self.mj_model, self.mj_data, None, jacobian, body)
+        return jacobian @ self.mj_data.qvel @ self.mj_data.xmat[body].reshape(3, 3)
+
+    # ------------------------------------------------------------------ people, by name
+    # People of a rigid world. Every method raises :class:`HumanError` if no person or hand has the name given.
+
+    def move_human(self, name: str, pose: HumanPose) -> None:
+        """Set where a person's tracked points are at the end of the coming step, which hands are closed or have
+        shears."""
+        human = self.human(name)
+        busy = [hand.busy for hand in human.hands]
+        shears = human.shears_parts
+        human.set_pose(pose)
+        if shears != human.shears_parts:
+            self._list_visuals()
+        if busy != [hand.busy for hand in human.hands]:
+            human.update_hand_collisions(self.mj_model)
+            self._update_geoms()
+
+    def hand_sample(self, name: str, side: str) -> HandSample:
+        """A person's ``"left"`` or ``"right"`` hand after the last step."""
+        human = self.human(name)
+        return human.hand_sample(human.hand(side), self.mj_data)
+
+    def hand_wrenches(self, name: str) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
+        """Wrenches of a person's hands on robots in the last step; see :mod:`vinesim.rigid.human_body`."""
+        robots = self._robots.items()
+        links = {body: (robot, link) for robot, found in robots for link, body in found.bodies.items()}
+        return hand_wrenches(self.mj_model, self.mj_data, self.human(name), links)
+
+    # grasps
+
+    def grasp(self, name: str, side: str, actor: str, link: str) -> None:
+        """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are those of
+        ``RigidGeoms``."""
+        hand = self.human(name).hand(side)
+        body = self._body_of_object(actor, link)
+        self.update_kinematics()
+        pose = np.concatenate([self.mj_data.xpos[[body, hand.body]], self.mj_data.xquat[[body, hand.body]]], -1)
+        pose[:, 3:] = frames.from_wxyz(pose[:, 3:])
+        hand.grasp_pose = frames.compose(frames.inverse(pose[0]), pose[1])
+        hand.held = (actor, link)
+        hand.weld_to(self.mj_model, self.mj_data, body)
+        self._update_geoms()
+
+    def grasp_plant(self, name: str, side: str, body: int) -> None:
+        """Let a hand hold a plant's ``body``: it touches nothing, and :meth:`place_hand` puts it on the plant."""
+        hand = self.human(name).hand(side)
+        hand.held = ("plants", f"body/{body}")
+        hand.weld_to(self.mj_model, self.mj_data, None)
+        self._update_geoms()
+
+    def place_hand(self, name: str, side: str, pose: np.ndarray) -> None:
+        """Put a hand at ``pose`` [7], at rest."""
+        self.human(name).hand(side).place(self.mj_data, pose)
+        self._kinematics_current = False
+
+    def release(self, name: str, side: str) -> None:
+        """Open a hand."""
+        self.human(name).hand(side).release(self.mj_model, self.mj_data)
+        self._update_geoms()
+
+    def nearest_to_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
+        """What a hand can grasp: gap [m], actor and link of the nearest rigid body; None if none is nearer than
+        ``reach``.
+
+        The ground and the person's own body are left out.
+        """
+        hand = self.human(name).hand(side)
+        self.update_kinematics()
+        m = self.mj_model
+        d = self.mj_data
+        of_hand = range(m.body_geomadr[hand.body], m.body_geomadr[hand.body] + m.body_geomnum[hand.body])
+        best: tuple[float, str, str] | None = None
+        for geoms in (self.geoms, self.static_geoms):
+            distance = np.linalg.norm(d.geom_xpos[geoms.id] - d.xpos[hand.body], axis=1)
+            for i in np.flatnonzero(distance - geoms.radius < reach + PALM_TO_FINGERTIP):
+                if geoms.kind[i] != mujoco.mjtGeom.mjGEOM_PLANE and geoms.actor[i] != name:
+                    gap = min(mujoco.mj_geomDistance(m, d, geom, int(geoms.id[i]), reach, None) for geom in of_hand)
+                    if gap < reach and (best is None or gap < best[0]):
+                        best = (gap, geoms.actor[i], geoms.link[i])
+        return best
+
+    # ------------------------------------------------------------------ free bunches, by number
+    # Picked bunches as free bodies.
+
+    @property
+    def bunch_room(self) -> int:
+        """Number of free bunches that still get bodies without the world being compiled anew."""
+        return self._pool_size - 1 - max(self._bunch_slot.values(), default=-1)
+
+    def add_bunch(self, bunch: int, body: FreeBunch, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Add a bunch at ``pose`` [7] with ``velocity`` [6] (of its origin, angular; world axes)."""
+        self.add_bunches({bunch: (body, pose, velocity)})
+
+    def add_bunches(self, bunches: dict[int, tuple[FreeBunch, np.ndarray, np.ndarray]]) -> None:
+        """Add several bunches, each with its pose [7] and velocity [6]; ``ValueError`` if one exists already."""
+        if known := sorted(bunches.keys() & self._free_bunches.keys()):
+            raise ValueError(f"bunch {known[0]} is free already")
+        derived = {bunch: self._derive(body) for bunch, (body, _, _) in bunches.items()}
+        unused = iter(sorted(set(range(self._pool_size + len(bunches))) - set(self._bunch_slot.values())))
+        for bunch, (body, _, _) in bunches.items():
+            self._free_bunches[bunch] = body
+            self._bunch_slot[bunch] = next(unused)
+        if max(self._bunch_slot[bunch] for bunch in bunches) >= self._pool_size:
+            self._recompile()
+        else:
+            for bunch, (body, _, _) in bunches.items():
+                free_bunch.activate(self.mj_model, self._bunch_slot[bunch], body, derived[bunch])
+            self._update_tables()
+        for bunch, (_, pose, velocity) in bunches.items():
+            self.place_bunch(bunch, pose, velocity)
+
+    def place_bunch(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
+        """Put a free bunch at ``pose`` [7] with ``velocity`` [6] in world axes, and wake it."""
+        joint = self._bunch_joint(bunch)
+        pose = np.asarray(pose, float)
+        rotation = frames.normalize(pose[3:])
+        joint.qpos[:] = np.concatenate([pose[:3], frames.to_wxyz(rotation)])
+        joint.qvel[:3] = velocity[:3]
+        joint.qvel[3:] = frames.rotate(frames.conjugate(rotation), np.asarray(velocity[3:], float))
+        wake_body(self.mj_model, self.mj_data, self._body_of_object(f"bunch/{bunch}", "bunch"))
+        self._kinematics_current = False
+
+    def remove_bunch(self, bunch: int) -> None:
+        """Remove a free bunch; the world is compiled anew."""
+        del self._free_bunches[bunch], self._bunch_slot[bunch]
+        self._passing_bunches.discard(bunch)
+        self._recompile()
+
+    def let_pass(self, bunch: int) -> None:
+        """Let a bunch that has just been picked pass through the fixed pieces (wood, wires, poles) if it overlaps one,
+        until it is clear of them: as it hung there, that overlap was no contact."""
+        self.update_kinematics()
+        self._passing_bunches.add(bunch)
+        self._end_passing()
+
+    def _end_passing(self) -> None:
+        """Let passing bunches that are clear of all fixed pieces touch these again; MuJoCo's poses must be current."""
+        clear = {bunch for bunch in self._passing_bunches if not self._overlaps_fixed_piece(bunch)}
+        self._passing_bunches -= clear
+        self._set_passing(clear, False)
+
+    def _set_passing(self, bunches: set[int], passing: bool) -> None:
+        """Let free bunches touch fixed pieces or not."""
+        m = self.mj_model
+        bits = free_bunch.CONAFFINITY & ~FIXED if passing else free_bunch.CONAFFINITY
+        for bunch in bunches:
+            m.body_conaffinity[self._body_of_object(f"bunch/{bunch}", "bunch")] = bits
+            m.geom_conaffinity[self._geoms_of_bunch(bunch)] = bits
+
+    def _overlaps_fixed_piece(self, bunch: int) -> bool:
+        m = self.mj_model
+        d = self.mj_data
+        geoms = self._geoms_of_bunch(bunch)
+        low = (d.geom_xpos[geoms] - m.geom_rbound[geoms, None]).min(0)
+        high = (d.geom_xpos[geoms] + m.geom_rbound[geoms, None]).max(0)
+        start = self.model.fixed_start
+        end = self.model.fixed_end
+        radius = self.model.fixed_radius.mean(1)[:, None]
+        near = (np.minimum(start, end) - radius < high) & (low < np.maximum(start, end) + radius)
+        pieces = np.flatnonzero(near.all(1)) + FIRST_FIXED_GEOM
+        pairs = itertools.product(geoms, pieces.tolist())
+        return any(mujoco.mj_geomDistance(m, d, geom, piece, 0.0, None) < 0.0 for geom, piece in pairs)
+
+    def _geoms_of_bunch(self, bunch: int) -> range:
+        """MuJoCo's numbers of the shapes of a free bunch."""
+        first = int(self.mj_model.body_geomadr[self._body_of_object(f"bunch/{bunch}", "bunch")])
+        return range(first, first + len(self._free_bunches[bunch].radius))
+
+    def bunch_pose(self, bunch: int) -> np.ndarray:
+        """World pose [7] of a free bunch."""
+        qpos = self._bunch_joint(bunch).qpos
+        return np.concatenate([qpos[:3], frames.from_wxyz(qpos[3:])])
+
+    def _bunch_joint(self, bunch: int) -> Any:  # MuJoCo's view of a joint has no public type
+        return self.mj_data.joint(free_bunch.slot_name(self._bunch_slot[bunch]))
+
+    # ------------------------------------------------------------------ boxes, by number
+    # Boxes that come and go; those of the scene have the numbers that they have in its model.
+
+    def add_box(self, number: int, box: RigidBox) -> None:
+        """Add a box at rest; the state of all others is unchanged. ``ValueError`` if one has its number."""
+        if number in self._boxes:
+            raise ValueError(f"box {number} is here already")
+        self._use_boxes(self._boxes | {number: box})
+
+    def remove_box(self, number: int) -> None:
+        """Remove a box; what lay in it or on it falls. ``ValueError`` if there is none of this number."""
+        if number not in self._boxes:
+            raise ValueError(f"no box {number} here")
+        self._use_boxes({other: box for other, box in self._boxes.items() if other != number})
+
+    def _use_boxes(self, boxes: dict[int, RigidBox]) -> None:
+        static = static_world.build_static_world(self.model, self.parameters, boxes)
+        with self._compile_lock:
+            self._boxes = boxes
+            self._static_spec = static
+        self._recompile()
+
+
+def _check_finite(name: str, what: str, given: object, size: int) -> None:
+    """:class:`RobotError` unless a command consists of ``size`` finite numbers."""
+    values = np.asarray(given, float)
+    if values.shape != (size,):
+        raise RobotError(f"robot {name!r}: {what} has the shape {values.shape}; give {size} numbers")
+    if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():  # the first is the cheapest
+        raise RobotError(f"robot {name!r}: {what} is {values.tolist()}; give finite numbers")
 
 
 def _free_code(

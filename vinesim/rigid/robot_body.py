@@ -16,7 +16,7 @@ from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.launch import bind_launch
 from vinesim.kernels.rigid import joint_servos
-from vinesim.rigid import recompile, self_collision
+from vinesim.rigid import mujoco_contacts, recompile
 from vinesim.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
 from vinesim.rigid.urdf import RobotError, check, collision_materials, collision_urdf, link_friction, shapes_of_robot
 from vinesim.scene.materials import Material
@@ -359,7 +359,7 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_TRUE
             joint.actfrcrange = [-driven[joint.name].effort, driven[joint.name].effort]
     if not given.is_copy:
-        self_collision.let_links_collide(child, given, code)
+        mujoco_contacts.let_links_collide(child, given, code)
     return child
 
 

@@ -20,18 +20,21 @@ from vinesim.ros import middleware
 from vinesim.ros.commands.actions import ControllerActions
 from vinesim.ros.commands.subscriptions import BASE_COMMAND, CommandQueue, CommandSubscriptions
 from vinesim.ros.commands.types import Command, GoalResult
-from vinesim.ros.flow_control import FlowControl
 from vinesim.ros.messages import convert, message_packages
 from vinesim.ros.node import Node
 from vinesim.ros.publishers.clock import CLOCK, ClockPublisher
 from vinesim.ros.publishers.contacts import ContactPublisher
-from vinesim.ros.publishers.control import ControlPublisher
-from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
 from vinesim.ros.publishers.lights import LightsPublisher
-from vinesim.ros.publishers.proprioception import ProprioceptionPublisher
-from vinesim.ros.publishers.robot import ODOM_FRAME, ODOMETRY, RobotPublisher
+from vinesim.ros.publishers.robot import (
+    ODOM_FRAME,
+    ODOMETRY,
+    ControlPublisher,
+    GroundTruthPublisher,
+    ProprioceptionPublisher,
+    RobotPublisher,
+)
 from vinesim.ros.publishers.sound import SoundPublisher
-from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, PendingMessage, Topic
+from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, FlowControl, PendingMessage, Topic
 from vinesim.scene.values import ComponentStatus, ControllerSpec, HandGestures, Intention, RobotSample
 from vinesim.scene.values.signals import Color
 

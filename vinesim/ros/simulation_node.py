@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import Pose, Twist
 
-from vinesim.ros.commands.step_action import StepAction
+from vinesim.ros.commands.actions import StepAction
 from vinesim.ros.commands.types import (
     Entity,
     EntityArguments,

@@ -10,12 +10,11 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from vinesim.ros.messages import convert, message_packages
-from vinesim.ros.messages.transforms import SerializedTransforms
+from vinesim.ros.messages.convert import SerializedTransforms
 from vinesim.ros.names import ros_name
 from vinesim.ros.node import Node
 from vinesim.ros.publishers.clock import ClockPublisher
-from vinesim.ros.publishers.ground_truth import GroundTruthPublisher
-from vinesim.ros.publishers.robot import MAP_FRAME
+from vinesim.ros.publishers.robot import MAP_FRAME, GroundTruthPublisher
 from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values import RobotSample
 

@@ -39,3 +39,14 @@ def visitor_pose(scene: Scene) -> list[str] | None:
 
 def _pose_option(pose: np.ndarray) -> list[str]:
     return ["--pose", *(f"{value:.4f}" for value in (pose[0], pose[1], 2.0 * math.atan2(pose[5], pose[6])))]
+
+
+# Checks of a demo's options before any process starts.
+
+
+def check_device(device: str) -> None:
+    """Refuse a device that is not there: DeviceUnavailable. For the CPU nothing is imported, which takes a second."""
+    if device != "cpu":
+        from vinesim.plants.device_buffers import find_device
+
+        find_device(device)

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 
 from rich.console import Console
 
-from vinesim.cli.demo.options import check_device
-from vinesim.cli.demo.placement import APPROACH_DISTANCE, choose_poses
+from vinesim.cli.demo.placement import APPROACH_DISTANCE, check_device, choose_poses
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary

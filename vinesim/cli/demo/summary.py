@@ -15,7 +15,7 @@ from rich.table import Table
 
 from vinesim.cli.demo.progress import PICKER, VISITOR
 from vinesim.client.rate_loop import TickLog
-from vinesim.client.recording import contact_force_plot
+from vinesim.client.recording import bunch_trace
 from vinesim.client.recording.bunch_trace import Rows, remote_error
 from vinesim.core.errors import writing
 
@@ -85,7 +85,7 @@ def push_summary(
     reports = {name: report_of(out, name) for name in (PICKER, VISITOR)}
     traces = {name: Rows.load(out / name / "trace.npz") for name in (PICKER, VISITOR)}
     with writing(out / "touch.png"):
-        contact_force_plot.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
+        bunch_trace.touch(out / "touch.png", traces, f"bunch {bunch}, pushed by {PICKER}, seen by {VISITOR}")
     touch_keys = (
         "touch_to_motion_ticks",
         "force_peak_n",

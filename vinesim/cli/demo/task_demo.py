@@ -8,14 +8,12 @@ import pathlib
 
 from rich.console import Console
 
-from vinesim.cli.demo.options import check_device
-from vinesim.cli.demo.placement import visitor_pose
+from vinesim.cli.demo.placement import check_device, visitor_pose
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
 from vinesim.client.processes.child_process import START_TIMEOUT, process_group
-from vinesim.client.tasks.meet_planning import plan_meeting
+from vinesim.client.tasks.planning import UnknownTask, plan_meeting
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
-from vinesim.client.tasks.task_registry import UnknownTask
 from vinesim.core.errors import writing
 from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware

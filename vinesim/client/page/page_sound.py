@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 
 from vinesim.audio.frame import Codec
-from vinesim.audio.loudness import FADE, REACH, REFERENCE
+from vinesim.audio.hearing import FADE, REACH, REFERENCE
 from vinesim.client.client import Client
 from vinesim.client.sound.exchange import SoundStep
 from vinesim.scene.values import TONE_LEVEL

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -10,13 +11,12 @@ import numpy as np
 from vinesim.avatar.gestures import OPEN_HAND
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client.client import Client
-from vinesim.client.page import page_overlays
 from vinesim.client.page.first_view import first_view
 from vinesim.client.spectator import Spectator
 from vinesim.kernels.shading import materials
-from vinesim.rigid.human_shapes import SIDES
+from vinesim.rigid.human_posture import SIDES
 from vinesim.scene.appearance import load_shears
-from vinesim.scene.ids import Organ
+from vinesim.scene.ids import Organ, object_name
 from vinesim.scene.model import Model
 from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
 from vinesim.sensors.camera.exposure import usual_exposure
@@ -280,7 +280,7 @@ class PageWorld:
         rigid = np.asarray(snapshot.visual_q).reshape(-1, 7)
         haptics = self._haptics
         self._haptics = {}
-        shown: dict[str, Any] = {"owners": page_overlays.owners(self._client)} if self._overlay_pages else {}
+        shown: dict[str, Any] = {"owners": owners(self._client)} if self._overlay_pages else {}
         if self._replay is not None:
             shown["replay"] = self._replay.status()
         if self._person is not None:
@@ -303,7 +303,7 @@ class PageWorld:
                 "picked": np.flatnonzero(~snapshot.bunch_attached).astype(np.uint32),
                 **self._lamps,
                 **self._hands,
-                **page_overlays.contact_arrays(self._contacts),
+                **contact_arrays(self._contacts),
             },
         )
         return tick, state
@@ -485,3 +485,28 @@ def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, n
         "bunch": primitives.cluster_bunch[which].astype(np.int32),
         "ball": primitives.ball.numpy()[which].astype(np.float32),
     }
+
+
+# What pages draw over the picture on demand: contact forces, and who owns which tree, bunch or box.
+
+
+MAX_CONTACTS = 300
+"""Contacts of which a page is told, those with the largest forces."""
+
+
+def owners(client: Client) -> dict[str, str]:
+    """Names of the actors that own something now, by the name of the object."""
+    found = {}
+    for replicator in client.replicators.values():
+        for number in sorted(replicator.known):
+            if (owner := replicator.owner(number)) is not None:
+                found[object_name(number)] = owner
+    return found
+
+
+def contact_arrays(contacts: Sequence[Contact]) -> dict[str, np.ndarray]:
+    """Places [k, 3] m of contacts with plants, and the forces [k, 3] N on the plants there."""
+    force = -np.array([contact.force for contact in contacts], np.float32).reshape(-1, 3)
+    place = np.array([contact.position for contact in contacts], np.float32).reshape(-1, 3)
+    strongest = np.argsort(-np.linalg.norm(force, axis=1), kind="stable")[:MAX_CONTACTS]
+    return {"contact_place": place[strongest], "contact_force": force[strongest]}

@@ -18,7 +18,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import MessageError
 from vinesim.net.keys import sender_of

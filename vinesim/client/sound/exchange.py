@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, Codec
+from vinesim.audio.hearing import may_hear
 from vinesim.audio.loudspeaker import Loudspeaker
-from vinesim.audio.permission import may_hear
 from vinesim.avatar.local_human import LocalHuman
 from vinesim.client.world_time import WorldTime
 from vinesim.net.codec.voice import VoiceFrame

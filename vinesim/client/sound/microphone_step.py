@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from vinesim.audio.loudness import gain
+from vinesim.audio.hearing import gain
 from vinesim.audio.microphone import HeardFrame
 from vinesim.scene.values import TONE_LEVEL
 

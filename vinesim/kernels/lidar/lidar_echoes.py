@@ -2,8 +2,7 @@
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import normal_at
-from vinesim.kernels.raster.primitives import Shapes
+from vinesim.kernels.raster.primitives import Shapes, normal_at
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -6,8 +6,6 @@ and keeps the nearest hit (:mod:`vinesim.kernels.raster.pinhole`).
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import hit_box, hit_cylinder, hit_sphere, hit_triangle
-from vinesim.kernels.raster.oriented_box import OrientedBox, oriented_box
 from vinesim.kernels.raster.pinhole import (
     EMPTY_KEY,
     NEAR_DEPTH,
@@ -19,7 +17,22 @@ from vinesim.kernels.raster.pinhole import (
     pixel_ray,
     sphere_bounds,
 )
-from vinesim.kernels.raster.primitives import BOX, CYLINDER, ELLIPSOID, FAR, Clusters, Shapes, as_quat, xyz
+from vinesim.kernels.raster.primitives import (
+    BOX,
+    CYLINDER,
+    ELLIPSOID,
+    FAR,
+    Clusters,
+    OrientedBox,
+    Shapes,
+    as_quat,
+    hit_box,
+    hit_cylinder,
+    hit_sphere,
+    hit_triangle,
+    oriented_box,
+    xyz,
+)
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -5,15 +5,6 @@ Pixels are taken in runs, and loops over a run are written without branches, so 
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import hit_cone, hit_sphere
-from vinesim.kernels.raster.leaf_surface import (
-    hit_leaf,
-    hit_leaf_rectangle,
-    inside_outline,
-    leaf_bulge,
-    leaf_extent,
-    leaf_height,
-)
 from vinesim.kernels.raster.pinhole import (
     BATCH,
     NEAR_DEPTH,
@@ -28,7 +19,21 @@ from vinesim.kernels.raster.pinhole import (
     pixel_ray,
     sphere_bounds,
 )
-from vinesim.kernels.raster.primitives import FAR, Clusters, Shapes, scale_along, xyz
+from vinesim.kernels.raster.primitives import (
+    FAR,
+    Clusters,
+    Shapes,
+    hit_cone,
+    hit_leaf,
+    hit_leaf_rectangle,
+    hit_sphere,
+    inside_outline,
+    leaf_bulge,
+    leaf_extent,
+    leaf_height,
+    scale_along,
+    xyz,
+)
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -8,8 +8,6 @@ No kernel asks the host how long the lists have become: a frame is two launches.
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import hit_primitive
-from vinesim.kernels.raster.leaf_surface import leaf_heights
 from vinesim.kernels.raster.pinhole import (
     NEAR_DEPTH,
     SMOOTH_SIZE,
@@ -32,6 +30,8 @@ from vinesim.kernels.raster.primitives import (
     Clusters,
     Shapes,
     as_quat,
+    hit_primitive,
+    leaf_heights,
     xyz,
 )
 

@@ -6,9 +6,8 @@ under refits, and a robot that drives through the rows does not stretch it.
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import hit_primitive
 from vinesim.kernels.raster.pinhole import SMOOTH_SIZE, Pinhole, pixel_ray
-from vinesim.kernels.raster.primitives import FAR, LEAF, Shapes, xyz
+from vinesim.kernels.raster.primitives import FAR, LEAF, Shapes, hit_primitive, xyz
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 

@@ -2,7 +2,6 @@
 
 import warp as wp
 
-from vinesim.kernels.raster.leaf_surface import leaf_heights
 from vinesim.kernels.raster.primitives import (
     CONE,
     CYLINDER,
@@ -14,6 +13,7 @@ from vinesim.kernels.raster.primitives import (
     Clusters,
     Shapes,
     as_quat,
+    leaf_heights,
     with_w,
     xyz,
 )

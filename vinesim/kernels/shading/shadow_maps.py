@@ -2,8 +2,6 @@
 
 import warp as wp
 
-from vinesim.kernels.raster.intersections import hit_box, hit_sphere, hit_triangle
-from vinesim.kernels.raster.leaf_surface import leaf_bulge, leaf_height
 from vinesim.kernels.raster.pinhole import BATCH, FloatBatch, IntBatch
 from vinesim.kernels.raster.primitives import (
     BOX,
@@ -16,6 +14,11 @@ from vinesim.kernels.raster.primitives import (
     Clusters,
     Shapes,
     as_quat,
+    hit_box,
+    hit_sphere,
+    hit_triangle,
+    leaf_bulge,
+    leaf_height,
     xyz,
 )
 

@@ -14,8 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vinesim.audio.frame import FRAME, Codec
-from vinesim.audio.loudness import REACH
-from vinesim.audio.permission import may_hear
+from vinesim.audio.hearing import REACH, may_hear
 from vinesim.net.codec.messages import Hello, MessageError
 from vinesim.net.codec.voice import VoiceFrame, decode_voice, encode_voice
 from vinesim.net.counters import Counters

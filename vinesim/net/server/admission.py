@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec import messages
 from vinesim.net.codec.messages import PROTOCOL, Hello, MessageError, Welcome, WrongVersion
 

@@ -16,7 +16,7 @@ from typing import Any, Self
 
 import zenoh
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.core.errors import UsageError
 from vinesim.net import pace
 from vinesim.net.codec import messages

@@ -14,7 +14,7 @@ import threading
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 
 KEEP_LAST_1 = 1
 """History depth that keeps the newest sample of each key: poses."""

@@ -9,7 +9,7 @@ import random
 from collections.abc import Callable
 from typing import Self
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Reply, SampleStore, matches
 from vinesim.net.transport.name_holders import bound_name
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec import messages
 from vinesim.net.transport.bus import JoinRejected
 from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, has_match

@@ -22,7 +22,7 @@ from typing import Self
 
 import zenoh
 
-from vinesim.audio.permission import SpectatorsSpeakTo
+from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.core.errors import UsageError
 from vinesim.net.codec import messages
 from vinesim.net.transport.access_control import tls_config

@@ -1,17 +1,15 @@
-"""Message packages that no package index carries, built once from their definitions.
+"""Build one message package: from definitions to a Python package; runs in a process of its own.
 
-``vinesim/ros/messages/msgs/<package>/{msg,srv,action}`` holds the interface facts (fields, types, constants) of those
-types that vinesim uses. The rosidl generators that come with the rclpy wheels turn them into C, g++ into one Python
-extension; neither CMake nor ament is needed. A further package is added by dropping its definitions there. The result
-equals the official package on the wire: its type hash (REP-2011) is derived from the same facts.
-
-Results are cached by definitions, generators and Python version, so a build happens once per user and machine.
-An official package (ROS 2 from apt) is preferred wherever it can be imported.
+The rosidl generators that come with the rclpy wheels turn definitions into C, g++ into libraries and one Python
+extension. Sources of a kind are compiled together, which spares the compiler reading the same headers for each.
 """
 
 from __future__ import annotations
 
+import argparse
+import base64
 import concurrent.futures
+import functools
 import hashlib
 import importlib.metadata
 import importlib.util
@@ -25,9 +23,238 @@ import subprocess
 import sys
 import sysconfig
 import tempfile
+import zipfile
 from collections.abc import Iterable
 
-from vinesim.ros.messages import package_build
+KINDS = ("msg", "srv", "action")
+TYPESUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
+"""Both are mandatory: rmw_fastrtps refuses a type without the second."""
+LIBRARIES = ("rosidl_generator_c", *TYPESUPPORTS)
+"""What a package links into, beside its Python extension, in link order."""
+MARK = "built_by_vinesim.json"
+"""File in a built package that tells it from an official one; holds the key of the build and the hash of each type."""
+
+
+def definitions(folder: pathlib.Path) -> list[pathlib.Path]:
+    """The definitions of the package in ``folder``."""
+    return [file for kind in KINDS for file in sorted((folder / kind).glob(f"*.{kind}"))]
+
+
+def _generate_faster() -> None:
+    """Read every definition and every template once.
+
+    The generators parse each definition seven times and each template as often as it is used, which is three quarters
+    of their time.
+    """
+    import em
+    import rosidl_parser.parser
+
+    rosidl_parser.parser.get_ast_from_idl_string = functools.cache(rosidl_parser.parser.get_ast_from_idl_string)
+    if not hasattr(em, "Configuration"):
+        return  # EmPy 3
+
+    tokens_by_template = {}
+
+    def expand(self: em.Interpreter, string: str, locals: dict | None = None, dispatcher: object = None) -> None:
+        if string not in tokens_by_template:
+            # The prefix and a line end let EmPy know that a markup at the end is complete.
+            scanner = em.Scanner(self.config, self.getContext(), self.currents, f"{string}{self.config.prefix}\n")
+            tokens_by_template[string] = list(scanner.all())
+        self.runSeveral(tokens_by_template[string], locals)
+
+    em.Interpreter.string = expand
+
+
+class PackageBuild:
+    """One package on its way. ``source``: the folder of its definitions; ``scratch``: where all else is written."""
+
+    def __init__(self, source: pathlib.Path, scratch: pathlib.Path) -> None:
+        self.source = source
+        self.package = source.name
+        self.scratch = scratch
+        self.prefix = pathlib.Path(sys.prefix)
+        shares = (self.prefix / "share").iterdir()
+        self.known = [share for share in shares if any((share / kind).is_dir() for kind in KINDS)]
+
+    def run(self, into: pathlib.Path, key: str) -> None:
+        """Leave the Python package in ``into``, a new folder, marked with ``key``."""
+        _generate_faster()
+        sources = self.generate()
+        objects = self.compile(sources)
+        self.link(objects, into)
+        (into / self.package / MARK).write_text(json.dumps({"key": key, "type_hashes": self.type_hashes()}, indent=1))
+
+    def output(self, generator: str) -> pathlib.Path:
+        """Where a generator writes; ``#include "<package>/msg/..."`` resolves from its parent."""
+        folder = self.scratch / generator / self.package
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
+
+    def generate(self) -> dict[str, list[pathlib.Path]]:
+        """All C and C++ sources by the library they belong to; ``"python"`` is the extension."""
+        import rosidl_generator_c
+        import rosidl_typesupport_c
+        import rosidl_typesupport_fastrtps_c
+        import rosidl_typesupport_introspection_c
+        from rosidl_adapter import convert_to_idl
+        from rosidl_generator_py import generate_py
+        from rosidl_generator_type_description import generate_type_hash
+
+        files = [file.relative_to(self.source) for file in definitions(self.source)]
+        idl = self.output("idl")
+        for file in files:
+            convert_to_idl(self.source, self.package, file, idl)
+        self.idls = [file.with_suffix(".idl") for file in files]
+
+        hashes = self.output("rosidl_generator_type_description")
+        shares = [f"{share.name}:{share}" for share in self.known]
+        generate_type_hash(self.arguments("rosidl_generator_type_description", include_paths=shares))
+        described = [f"{path}:{hashes / path.with_suffix('.json')}" for path in self.idls]
+        originals = [str(self.source / file) for file in files]
+        rosidl_generator_c.generate_c(
+            self.arguments("rosidl_generator_c", type_description_tuples=described, ros_interface_files=originals)
+        )
+        rosidl_typesupport_fastrtps_c.generate_typesupport_fastrtps_c(self.arguments("rosidl_typesupport_fastrtps_c"))
+        rosidl_typesupport_introspection_c.generate_c(self.arguments("rosidl_typesupport_introspection_c"))
+        rosidl_typesupport_c.generate_c(self.arguments("rosidl_typesupport_c"), list(TYPESUPPORTS))
+        generate_py(self.arguments("rosidl_generator_py"), ["rosidl_typesupport_c"])
+        for generator in LIBRARIES:
+            self.visibility_header(generator)
+
+        structures = self.output("rosidl_generator_c")
+        python = self.output("rosidl_generator_py")
+        return {
+            "rosidl_generator_c": [
+                *self.together("functions.c", structures.rglob("*__functions.c")),
+                *self.together("type_support.c", structures.rglob("*__type_support.c")),
+                *structures.rglob("*__description.c"),  # their names collide
+                *self.together("type_support.cpp", self.output("rosidl_typesupport_c").rglob("*.cpp")),
+            ],
+            "rosidl_typesupport_fastrtps_c": self.together(
+                "fastrtps.cpp", self.output("rosidl_typesupport_fastrtps_c").rglob("*.cpp")
+            ),
+            "rosidl_typesupport_introspection_c": self.together(
+                "introspection.c", self.output("rosidl_typesupport_introspection_c").rglob("*.c")
+            ),
+            "python": self.together("python.c", [*python.rglob("*_s.c"), *python.glob("*.ep.rosidl_typesupport_c.c")]),
+        }
+
+    def together(self, name: str, sources: Iterable[pathlib.Path]) -> list[pathlib.Path]:
+        """One source that includes all of ``sources``."""
+        file = self.scratch / name
+        file.write_text("".join(f'#include "{source}"\n' for source in sorted(sources)))
+        return [file]
+
+    def type_hashes(self) -> dict[str, str]:
+        """The hash of every type of the package (REP-2011)."""
+        hashes = {}
+        for file in sorted(self.output("rosidl_generator_type_description").rglob("*.json")):
+            hashes |= {each["type_name"]: each["hash_string"] for each in json.loads(file.read_text())["type_hashes"]}
+        return {name: value for name, value in hashes.items() if name.startswith(f"{self.package}/")}
+
+    def arguments(self, generator: str, **more: object) -> str:
+        """The generator's argument file (what ament would have CMake write); returns its path."""
+        idl = self.output("idl")
+        described = [f"{share.name}:{file}" for share in self.known for file in sorted(share.rglob("*.idl"))]
+        file = self.scratch / f"{generator}.json"
+        arguments = {
+            "package_name": self.package,
+            "output_dir": str(self.output(generator)),
+            "template_dir": str(self.prefix / "share" / generator / "resource"),
+            "idl_tuples": [f"{idl}:{path}" for path in self.idls],
+            "ros_interface_dependencies": described,
+            "target_dependencies": [],
+        }
+        file.write_text(json.dumps(arguments | more))
+        return str(file)
+
+    def visibility_header(self, generator: str) -> None:
+        """The one header that CMake, not the generator, makes from its template."""
+        name = f"{generator}__visibility_control.h"
+        template = self.prefix / "share" / generator / "resource" / f"{name}.in"
+        text = template.read_text().replace("@PROJECT_NAME_UPPER@", self.package.upper())
+        header = self.output(generator) / "msg" / name
+        header.parent.mkdir(exist_ok=True)
+        header.write_text(text.replace("@PROJECT_NAME@", self.package))
+
+    def compile(self, sources: dict[str, list[pathlib.Path]]) -> dict[str, list[str]]:
+        """Object files by library."""
+        import numpy as np
+
+        headers = self.prefix / "include"
+        folders = [self.output(name).parent for name in (*LIBRARIES, "rosidl_generator_py")]
+        folders += [headers, *(folder for folder in sorted(headers.iterdir()) if folder.is_dir())]
+        folders += [sysconfig.get_path("include"), np.get_include()]
+        includes = [f"-I{folder}" for folder in folders]
+
+        def compile_one(source: pathlib.Path) -> str:
+            target = f"{source}.o"
+            dialect = ["-x", "c++", "-std=c++17"] if source.suffix == ".cpp" else ["-x", "c", "-std=gnu11"]
+            _run(["g++", *dialect, "-O0", "-fPIC", "-w", *includes, "-c", str(source), "-o", target])
+            return target
+
+        with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
+            return {name: list(pool.map(compile_one, sorted(files))) for name, files in sources.items()}
+
+    def link(self, objects: dict[str, list[str]], into: pathlib.Path) -> None:
+        """The finished Python package in ``into/<package>``: libraries that find each other, and the extension."""
+        generated = self.output("rosidl_generator_py")
+        package = into / self.package
+        shutil.copytree(generated, package, ignore=shutil.ignore_patterns("*.c", "*.o"))
+        for folder in (package, *(package / kind for kind in KINDS)):
+            if folder.is_dir():
+                (folder / "__init__.py").touch()
+
+        lib = self.prefix / "lib"
+        runtime = ("rosidl_runtime_c", "rosidl_typesupport_c", "rosidl_typesupport_fastrtps_c")
+        runtime += ("rosidl_typesupport_fastrtps_cpp", "rosidl_typesupport_introspection_c", "rcutils", "fastcdr")
+        base = [str(lib / f"lib{name}.so") for name in runtime]
+        for generator in (*LIBRARIES, "rosidl_generator_py", "rosidl_typesupport_c"):
+            base += [str(path) for path in sorted(lib.glob(f"lib*__{generator}.so"))]
+        options = ["-shared", "-s", "-Wl,-rpath,$ORIGIN", "-Wl,--allow-shlib-undefined"]
+
+        libraries = [package / f"lib{self.package}__{name}.so" for name in LIBRARIES]
+        for name, library in zip(LIBRARIES, libraries, strict=True):
+            before = [str(libraries[0])] if library is not libraries[0] else []
+            soname = f"-Wl,-soname,{library.name}"
+            _run(["g++", *options, soname, *objects[name], "-Wl,--as-needed", *before, *base, "-o", str(library)])
+        # The extension must pull all of them in: rmw looks the type supports up by name among loaded libraries.
+        extension = package / f"{self.package}_s__rosidl_typesupport_c{sysconfig.get_config_var('EXT_SUFFIX')}"
+        together = ["-Wl,--no-as-needed", *map(str, libraries), "-Wl,--as-needed"]
+        _run(["g++", *options, *objects["python"], *together, *base, "-o", str(extension)])
+
+
+def _run(command: list[str]) -> None:
+    finished = subprocess.run(command, capture_output=True, text=True, check=False)
+    if finished.returncode:
+        raise SystemExit(f"{' '.join(command[:1] + command[-3:])} failed: {finished.stderr.strip()[-2000:]}")
+
+
+def main() -> None:
+    """``python -m vinesim.ros.messages.message_packages SOURCE --into FOLDER --scratch FOLDER``."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument("source", type=pathlib.Path)
+    parser.add_argument("--into", type=pathlib.Path, required=True)
+    parser.add_argument("--scratch", type=pathlib.Path, required=True)
+    parser.add_argument("--key", required=True)
+    arguments = parser.parse_args()
+    PackageBuild(arguments.source, arguments.scratch).run(arguments.into, arguments.key)
+
+
+if __name__ == "__main__":
+    main()
+
+
+# Message packages that no package index carries, built once from their definitions.
+#
+# ``vinesim/ros/messages/msgs/<package>/{msg,srv,action}`` holds the interface facts (fields, types, constants) of those
+# types that vinesim uses. The rosidl generators that come with the rclpy wheels turn them into C, g++ into one Python
+# extension; neither CMake nor ament is needed. A further package is added by dropping its definitions there. The result
+# equals the official package on the wire: its type hash (REP-2011) is derived from the same facts.
+#
+# Results are cached by definitions, generators and Python version, so a build happens once per user and machine.
+# An official package (ROS 2 from apt) is preferred wherever it can be imported.
+
 
 log = logging.getLogger(__name__)
 
@@ -75,7 +302,7 @@ def place_of_official(package: str) -> pathlib.Path | None:
     if spec is None or not spec.submodule_search_locations:
         return None
     place = pathlib.Path(spec.submodule_search_locations[0])
-    return None if (place / package_build.MARK).is_file() else place
+    return None if (place / MARK).is_file() else place
 
 
 def is_installed(package: str) -> bool:
@@ -83,7 +310,7 @@ def is_installed(package: str) -> bool:
     spec = importlib.util.find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         return False
-    mark = pathlib.Path(spec.submodule_search_locations[0]) / package_build.MARK
+    mark = pathlib.Path(spec.submodule_search_locations[0]) / MARK
     return mark.is_file() and json.loads(mark.read_text())["key"] == key(package)
 
 
@@ -121,7 +348,7 @@ def _build(package: str) -> pathlib.Path:
         done = pathlib.Path(scratch) / "done"
         # In a process of its own: the generators print, and their template engine replaces sys.stdout.
         environment = os.environ | {"PYTHONPATH": _python_path()}
-        command = [sys.executable, "-m", package_build.__name__, str(DEFINITIONS / package)]
+        command = [sys.executable, "-m", __name__, str(DEFINITIONS / package)]
         command += ["--into", str(done), "--scratch", scratch, "--key", key(package)]
         finished = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
         if finished.returncode:
@@ -148,9 +375,9 @@ def _cache() -> pathlib.Path:
 def key(package: str) -> str:
     """What a build of ``package`` depends on: definitions, generators, Python and machine, as 16 hexadecimal digits."""
     digest = hashlib.sha256()
-    for file in package_build.definitions(DEFINITIONS / package):
+    for file in definitions(DEFINITIONS / package):
         digest.update(f"{file.relative_to(DEFINITIONS)}\0".encode() + file.read_bytes() + b"\0")
-    digest.update(pathlib.Path(package_build.__file__).read_bytes())
+    digest.update(pathlib.Path(__file__).read_bytes())
     for distribution in TOOLCHAIN:
         try:
             version = importlib.metadata.version(distribution)
@@ -182,3 +409,70 @@ def _check_toolchain(package: str) -> None:
     header = pathlib.Path(sysconfig.get_path("include")) / "Python.h"
     if not header.is_file():
         raise InterfacesError(f"{missing} {header} is missing; apt install python3-dev")
+
+
+# Built message packages as wheels, so that any node of an environment can import them and pip can remove them.
+
+
+def distribution(package: str) -> str:
+    """The name under which pip knows vinesim's build of ``package``."""
+    return f"vinesim-{package.replace('_', '-')}"
+
+
+def write(package: str, folder: pathlib.Path) -> pathlib.Path:
+    """Write the wheel of ``package`` (built if need be) into ``folder``; returns its path."""
+    place = build([package])[package]
+    name = distribution(package).replace("-", "_")
+    version = f"1.0+{key(package)}"
+    tag = sys.implementation.cache_tag.replace("cpython-", "cp")
+    platform_tag = f"{sys.platform}_{platform.machine()}"
+    information = f"{name}-{version}.dist-info"
+    members = {str(file.relative_to(place)): file.read_bytes() for file in sorted(place.rglob("*")) if file.is_file()}
+    members = {member: content for member, content in members.items() if "__pycache__" not in member}
+    members[f"{information}/METADATA"] = (
+        f"Metadata-Version: 2.1\nName: {distribution(package)}\nVersion: {version}\n"
+        f"Summary: ROS 2 message package {package}, those types that vinesim uses\n"
+    ).encode()
+    members[f"{information}/WHEEL"] = (
+        f"Wheel-Version: 1.0\nGenerator: vinesim\nRoot-Is-Purelib: false\nTag: {tag}-{tag}-{platform_tag}\n"
+    ).encode()
+    record = "".join(f"{member},sha256={_digest(content)},{len(content)}\n" for member, content in members.items())
+    members[f"{information}/RECORD"] = f"{record}{information}/RECORD,,\n".encode()
+    wheel = folder / f"{name}-{version}-{tag}-{tag}-{platform_tag}.whl"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
+            for member, content in members.items():
+                archive.writestr(member, content)
+    except OSError as bad:
+        raise InterfacesError(f"could not write {wheel}: {bad.strerror}; name another folder by --wheel") from None
+    return wheel
+
+
+def install(packages: list[str]) -> None:
+    """Install vinesim's builds of ``packages`` into the running environment, over older ones."""
+    if not packages:
+        return
+    build(packages)  # side by side
+    if importlib.util.find_spec("pip") is None:
+        raise InterfacesError(
+            f"pip is missing in {sys.prefix}; write wheels by vinesim ros build-interfaces --wheel DIR and install "
+            "them by the tool that made the environment"
+        )
+    with tempfile.TemporaryDirectory() as folder:
+        wheels = [str(write(package, pathlib.Path(folder))) for package in packages]
+        command = [sys.executable, "-m", "pip", "install", "--quiet", "--no-index", "--no-deps", "--force-reinstall"]
+        finished = subprocess.run(
+            [*command, *wheels],
+            env=os.environ | {"PIP_DISABLE_PIP_VERSION_CHECK": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if finished.returncode:
+            reason = (finished.stderr.strip().splitlines() or ["no reason given"])[-1]
+            raise InterfacesError(f"pip could not install the message packages into {sys.prefix}: {reason}")
+
+
+def _digest(content: bytes) -> str:
+    return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()

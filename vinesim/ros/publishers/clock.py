@@ -15,7 +15,7 @@ import rclpy.node
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from vinesim.ros.messages import convert
-from vinesim.ros.messages.serialized import stamp_writer
+from vinesim.ros.messages.convert import stamp_writer
 from vinesim.ros.topic import EVERY_STEP, Advertise, PendingMessage, Topic
 
 CLOCK = "/clock"

@@ -13,7 +13,7 @@ from std_msgs.msg import ColorRGBA
 from visualization_msgs.msg import Marker, MarkerArray
 
 from vinesim.ros.messages import convert
-from vinesim.ros.messages.serialized import stamp_writer
+from vinesim.ros.messages.convert import stamp_writer
 from vinesim.ros.publishers.robot import MAP_FRAME
 from vinesim.ros.topic import EVERY_STEP, RELIABLE, Advertise, PendingMessage
 from vinesim.scene.values import Contact, RobotSample

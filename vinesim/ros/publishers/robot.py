@@ -5,17 +5,25 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
+from geometry_msgs.msg import WrenchStamped
 from nav_msgs.msg import Odometry
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Imu, JointState
 from std_msgs.msg import String
 
 from vinesim.core import frames
-from vinesim.ros.messages.serialized import joint_state_writer, odometry_writer
-from vinesim.ros.messages.transforms import SerializedTransforms
-from vinesim.ros.topic import EVERY_STEP, TRANSIENT_LOCAL, Advertise, PendingMessage
-from vinesim.scene.values import JointSample, RobotSample
+from vinesim.ros.messages import convert
+from vinesim.ros.messages.convert import (
+    SerializedTransforms,
+    imu_writer,
+    joint_state_writer,
+    odometry_writer,
+    wrench_writer,
+)
+from vinesim.ros.topic import EVERY_STEP, RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessage
+from vinesim.scene.values import ControllerKind, ControllerSpec, JointSample, RobotSample
 
 MAP_FRAME = "map"
 ODOM_FRAME = "odom"
@@ -106,3 +114,124 @@ class RobotPublisher:
         above = [frames.compose(base, frames.inverse(odom))] * has_map
         poses = np.concatenate([[*above, odom], np.reshape(sample.transform_q, (-1, 7))])
         return self._transforms.message(sample.joints.time, poses)
+
+
+# Topics of true poses apart from the robot's own tf.
+
+
+class GroundTruthPublisher:
+    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map."""
+
+    def __init__(self, advertise: Advertise, tf_message: type) -> None:
+        self._moving = advertise(tf_message, "tf_environment", RELIABLE)
+        self._static = advertise(tf_message, "tf_environment_static", TRANSIENT_LOCAL)
+        self._poles: tuple[Sequence[str], np.ndarray] = (), np.zeros((0, 7))
+        self._names: Sequence[str] | None = None
+        self._transforms = SerializedTransforms([])
+        self._is_muted = False
+
+    def pending(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
+        """The message of true poses [name, 7] of what moves. Pass the same tuple object as long as the names stay."""
+        yield self._moving, partial(self._message, time, names, poses)
+
+    def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
+        """The message of true poses [name, 7] of what never moves."""
+        self._poles = names, poses
+        yield self._static, self._static_message
+
+    def mute(self, is_muted: bool) -> None:
+        """Whether true poses are kept back; late subscribers then receive an empty message of what never moves."""
+        self._is_muted = is_muted
+        self._moving.mute(is_muted)
+        self._static.send(self._static_message())
+
+    def _static_message(self) -> bytes:
+        names, poses = ((), np.zeros((0, 7))) if self._is_muted else self._poles
+        return SerializedTransforms([(MAP_FRAME, name) for name in names]).message(0.0, poses)
+
+    def _message(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> bytes:
+        if names is not self._names:
+            self._transforms = SerializedTransforms([(MAP_FRAME, name) for name in names])
+            self._names = names
+        return self._transforms.message(time, poses)
+
+
+# Topics of what a robot's body measures: inertial measurement units and force-torque sensors.
+
+
+class ProprioceptionPublisher:
+    """``<imu>`` and ``<sensor>/wrench`` after every step, of the sensors that are named."""
+
+    def __init__(self, advertise: Advertise, imus: Sequence[str], wrenches: Sequence[str]) -> None:
+        self._imus = {name: advertise(Imu, name, EVERY_STEP) for name in imus}
+        self._wrenches = {name: advertise(WrenchStamped, f"{name}/wrench", EVERY_STEP) for name in wrenches}
+        self._writers: dict[str, Callable[[Any], bytes]] = {}
+        """By sensor, once it has been read."""
+
+    def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
+        """All messages of one step."""
+        for imu in sample.imus:
+            if imu.name in self._imus:
+                yield self._imus[imu.name], partial(self._write, imu_writer, imu)
+        for wrench in sample.wrenches:
+            if wrench.name in self._wrenches:
+                yield self._wrenches[wrench.name], partial(self._write, wrench_writer, wrench)
+
+    def _write(self, writer: Callable[[Any], Callable[[Any], bytes]], reading: Any) -> bytes:
+        if reading.name not in self._writers:
+            self._writers[reading.name] = writer(reading)
+        return self._writers[reading.name](reading)
+
+
+# Topics of a robot's controllers: their states, and the series elastic elements of joints (CANOPIES D6.4, 3.1).
+
+
+STATE_PERIOD = 2
+"""Steps between two states of a trajectory controller: 50 Hz, the default of joint_trajectory_controller."""
+
+
+class ControlPublisher:
+    """``<controller>/controller_state`` every other step, ``see/<joint>/state`` after every one."""
+
+    def __init__(self, advertise: Advertise, controllers: Sequence[ControllerSpec]) -> None:
+        from control_msgs.msg import JointTrajectoryControllerState
+
+        self._state_type = JointTrajectoryControllerState
+        self._states = [
+            (spec.joints, advertise(JointTrajectoryControllerState, f"{spec.name}/controller_state", EVERY_STEP))
+            for spec in controllers
+            if spec.kind is ControllerKind.JOINT_TRAJECTORY
+        ]
+        self._elements = [
+            (joint, advertise(JointState, f"{spec.name}/{joint}/state", EVERY_STEP))
+            for spec in controllers
+            if spec.kind is ControllerKind.SERIES_ELASTIC
+            for joint in spec.joints
+        ]
+        self._names: tuple[str, ...] | None = None
+        self._places: dict[str, int] = {}
+        """Of joints in the arrays of samples."""
+        self._steps = 0
+
+    def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
+        """All messages of one step."""
+        if sample.joints.names is not self._names:  # the same tuple every step
+            self._names = sample.joints.names
+            self._places = {name: i for i, name in enumerate(self._names)}
+        self._steps += 1
+        if sample.reference is not None and self._steps % STATE_PERIOD == 0:
+            for joints, topic in self._states:
+                yield topic, partial(self._state, sample, joints, np.array([self._places[joint] for joint in joints]))
+        if sample.elements is not None:
+            for joint, topic in self._elements:
+                yield topic, partial(convert.elastic_state, sample.elements, self._places[joint])
+
+    def _state(self, sample: RobotSample, joints: tuple[str, ...], places: np.ndarray) -> Any:
+        points = convert.reference_points(sample, places)
+        return self._state_type(
+            header=convert.header(sample.joints.time, ""),
+            joint_names=list(joints),
+            reference=points["desired"],
+            feedback=points["actual"],
+            error=points["error"],
+        )

@@ -17,8 +17,7 @@ import numpy as np
 from vinesim.core import array_fields, disk_cache, frames, portable_math
 from vinesim.scene import berries, builder, leaves, plant_parameters
 from vinesim.scene.generation.fixed_structure import FixedStructure, build_fixed_structure
-from vinesim.scene.generation.foliage import place_leaves
-from vinesim.scene.generation.plant_bodies import Bodies, build_bodies
+from vinesim.scene.generation.plant_bodies import Bodies, build_bodies, place_leaves
 from vinesim.scene.generation.shoot_slots import CORE_SLOTS, MAX_BUNCHES, cluster_slots, peduncle_slots
 from vinesim.scene.generation.shoots import Shoots, sample_shoots
 from vinesim.scene.generation.ties import find_ties

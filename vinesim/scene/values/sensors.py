@@ -29,7 +29,7 @@ class CameraInfo:
     frame_id: str
     """Optical frame: z forward, x right, y down."""
     distortion: tuple[float, ...] = ()
-    """Coefficients of the lens (:mod:`vinesim.scene.lens_distortion`), 5 or 8; none: a pinhole."""
+    """Coefficients of the lens (:mod:`vinesim.scene.camera_geometry`), 5 or 8; none: a pinhole."""
 
 
 class SensorMode(enum.StrEnum):

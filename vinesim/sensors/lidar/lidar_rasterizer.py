@@ -12,7 +12,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.kernels.lidar import lidar_raster
-from vinesim.kernels.lidar.lidar_bounds import ELEVATION_SLOTS, LidarHead
+from vinesim.kernels.lidar.lidar_raster import ELEVATION_SLOTS, LidarHead
 from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.raster.pinhole import EMPTY_KEY
 from vinesim.sensors.primitives.scene_primitives import Primitives

@@ -7,7 +7,7 @@ import functools
 
 import numpy as np
 
-from vinesim.scene import lens_distortion
+from vinesim.scene import camera_geometry
 from vinesim.scene.camera_geometry import pixel_rays
 from vinesim.scene.values import CameraInfo
 
@@ -31,7 +31,7 @@ class LensMap:
         """The pixel there, counted row by row."""
         if not info.distortion:
             return
-        if len(info.distortion) not in lens_distortion.MODELS:
+        if len(info.distortion) not in camera_geometry.MODELS:
             raise LensError(f"distortion has {len(info.distortion)} coefficients; give 5 (plumb_bob) or 8 (rational)")
         across, down = pixel_rays(info)
         if not (np.isfinite(across).all() and np.isfinite(down).all()):

@@ -12,7 +12,8 @@ os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output belo
 import taichi as ti
 from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
 
-from vinesim.kernels.raster import leaf_surface, pinhole, primitives
+from vinesim.kernels.raster import pinhole, primitives
+from vinesim.kernels.raster import primitives as leaf_surface
 from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, LEAF, SPHEROID, TRIANGLE
 
 FAR = float(primitives.FAR)

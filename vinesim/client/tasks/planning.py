@@ -1,0 +1,490 @@
+"""The tasks of a robot client by name, and their plans: paths, picks, box exchanges, meetings."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import heapq
+import math
+from collections.abc import Callable, Iterator
+
+import numpy as np
+
+from vinesim.client.tasks.start_poses import PlacementError, bunch_centres, ground_clearance
+from vinesim.core import frames
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.tasks.meet_person import MeetPerson, MeetPlan
+from vinesim.robot.tasks.pick import PickBunch, PickPlan
+from vinesim.robot.tasks.swap_boxes import SwapBoxes, SwapPlan
+from vinesim.robot.tasks.task import Task
+from vinesim.scene.ids import Organ
+from vinesim.scene.model import Model
+from vinesim.world import Physics
+
+# Paths of a base on the ground, around posts, trunks, wires and boxes: A* on a grid, then straightened.
+
+
+GRID_SIZE = 0.1
+"""[m] Cell size of the grid on which paths are searched."""
+MARGIN = 3.0
+"""[m] By which the grid extends beyond start and goal."""
+
+Cell = tuple[int, int]
+
+
+def find_path(model: Model, start: np.ndarray, goal: np.ndarray, clearance: float) -> np.ndarray | None:
+    """Waypoints [n, 2] m of a short path with ``clearance`` [m] on either side, ends included; None if there is none.
+
+    Every waypoint of the grid is dropped that a straight line can replace.
+    """
+    low = np.minimum(start, goal) - MARGIN
+    shape = tuple((np.ceil((np.maximum(start, goal) + MARGIN - low) / GRID_SIZE)).astype(int))
+    at = np.stack(np.meshgrid(*(np.arange(n) for n in shape), indexing="ij"), -1).reshape(-1, 2)
+    free = (ground_clearance(model, low + GRID_SIZE * at) > clearance).reshape(shape)
+    first, last = (_cell(np.round((p - low) / GRID_SIZE)) for p in (start, goal))
+    if not free[last] or float(ground_clearance(model, np.array([start]))[0]) < clearance:
+        return None
+    cells = search_grid(free, first, last)
+    if cells is None:
+        return None
+    points = [start, *(low + GRID_SIZE * np.array(cell) for cell in cells[1:-1]), goal]
+    kept = [points[0]]
+    i = 0
+    while i < len(points) - 1:
+        i = next(
+            j
+            for j in range(len(points) - 1, i, -1)
+            if j == i + 1 or _is_line_free(model, points[i], points[j], clearance)
+        )
+        kept.append(points[i])
+    return np.array(kept)
+
+
+def search_grid(free: np.ndarray, first: Cell, last: Cell) -> list[Cell] | None:
+    """Shortest path over the cells that are ``free`` [n, m] bool, both ends included; None if there is none.
+
+    A* with eight neighbours and Euclidean costs (Hart, Nilsson and Raphael 1968).
+    """
+    moves = [(i, j, float(np.hypot(i, j))) for i in (-1, 0, 1) for j in (-1, 0, 1) if i or j]
+    previous: dict[Cell, Cell] = {first: first}
+    cost = {first: 0.0}
+    queue = [(0.0, first)]
+    while queue:
+        _, here = heapq.heappop(queue)
+        if here == last:
+            break
+        for i, j, length in moves:
+            there = (here[0] + i, here[1] + j)
+            if not (0 <= there[0] < free.shape[0] and 0 <= there[1] < free.shape[1] and free[there]):
+                continue
+            price = cost[here] + length
+            if price < cost.get(there, np.inf):
+                cost[there] = price
+                previous[there] = here
+                ahead = float(np.hypot(there[0] - last[0], there[1] - last[1]))
+                heapq.heappush(queue, (price + ahead, there))
+    if last not in previous:
+        return None
+    cells = [last]
+    while cells[-1] != first:
+        cells.append(previous[cells[-1]])
+    return cells[::-1]
+
+
+def _cell(index: np.ndarray) -> Cell:
+    """Whole indices of a cell from ``index`` [2]."""
+    return int(index[0]), int(index[1])
+
+
+def _is_line_free(model: Model, start: np.ndarray, end: np.ndarray, clearance: float) -> bool:
+    """Whether the straight line from ``start`` to ``end`` [2] m has ``clearance`` [m] on either side."""
+    count = max(int(np.linalg.norm(end - start) / (0.5 * GRID_SIZE)), 2)
+    line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
+    return bool((ground_clearance(model, line) > clearance - 0.5 * GRID_SIZE).all())
+
+
+# Planning of picks: which bunch, from which base pose, into which box, and along which path.
+#
+# All of it is geometry of the model at rest: clearances of bunches, room for the base, paths on the ground.
+
+
+BUNCH_AHEAD = 0.88
+BUNCH_ASIDE = 0.28
+"""[m] Position of the bunch in the base's frame at the pick: ahead, and to the arm's side."""
+HAND_LOWER = np.array([-0.45, -0.11, -0.05])
+HAND_UPPER = np.array([0.06, 0.11, 0.09])
+"""[m] Corners of the box that an open hand sweeps about the grasp; x along the hand, z up."""
+GRASP_HEIGHT = (1.3, 1.75)
+"""[m] Heights of the grasp that arm and lift reach with the hand level."""
+MAX_BUNCH_RADIUS = 0.060
+"""[m] Largest radius of a bunch that fits between the fingers."""
+GRASP_DEPTH = 0.06
+"""[m] Approximate distance of the grasp below the upper end of a bunch."""
+MIN_HAND_CLEARANCE = 0.005
+"""[m] Smallest gap between the moving hand and anything but its bunch. GUESSED"""
+FULL_CLEARANCE = 0.03
+"""[m] Wider gaps score no better. GUESSED"""
+BASE_CLEARANCE = 0.68
+"""[m] A base with its arms tucked needs this distance around its centre."""
+BOX_AHEAD = 0.10
+BASE_HALF_WIDTH = 0.35
+BOX_GAP = 0.06
+"""[m] Distance of a box ahead of the base's centre, half of the base's width, and the gap between both."""
+APPROACH_LENGTHS = (1.1, 0.8)
+"""[m] Lengths of the straight approach along a box; the first for which there is room is taken."""
+LANE_HALF_WIDTH = 0.36
+"""[m] A base that drives straight needs this on either side of its centre."""
+OBSTACLE_RADIUS = 0.8
+"""[m] Obstacles farther from a bunch than this cannot meet the hand."""
+OBSTACLE_SPACING = 0.04
+"""[m] Greatest distance of the spheres that stand for trellis and old wood."""
+MAX_CANDIDATES = 200
+"""Number of the nearest bunches that are tried."""
+
+
+def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
+    """Feasible plans, best first: bunches with most clearance, and among those nearer to ``near`` [2] m.
+
+    Raises :class:`PlacementError` if no box can be approached or no bunch can be picked.
+    """
+    approaches = list(box_approaches(model))
+    if not approaches:
+        raise PlacementError(
+            f"no box of this scene has {BASE_CLEARANCE} m of room beside it for a robot; place one in an alley"
+        )
+    found = False
+    for bunch, side, base, _ in _base_poses(model, near, MIN_HAND_CLEARANCE):
+        beside = [approach for approach in approaches if approach.side == side]
+        for approach in sorted(beside, key=lambda approach: float(np.linalg.norm(approach.start - base[:2]))):
+            points = find_path(model, base[:2], approach.start, BASE_CLEARANCE)
+            if points is not None:
+                found = True
+                path = np.concatenate([points[1:], [approach.place]])
+                yield PickPlan(bunch, side, base, approach.box, path, approach.heading)
+                break
+    if not found:
+        raise PlacementError(
+            "no bunch hangs free enough for a hand and a path for a robot to a box; choose another seed"
+        )
+
+
+def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """The bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, however narrow it is about them.
+
+    Of each bunch its number, the side, the pose [7] of the base where the hand has most room, and that room [m]:
+    negative where the open hand would overlap wood or fruit, and no more than :data:`FULL_CLEARANCE`.
+    """
+    seen: set[int] = set()
+    middles = bunch_centres(model)
+    for bunch, side, base, clearance in _base_poses(model, near, -np.inf):
+        if bunch not in seen and np.linalg.norm(middles[bunch, :2] - near) < distance:
+            seen.add(bunch)
+            yield bunch, side, base, clearance
+
+
+def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
+    """Bunch, side, pose [7] of the base and clearance of the hand [m] for all reachable grasps, best first."""
+    points, radius, owner = _obstacles(model)
+    body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
+    axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
+    hold = body_q[:, :3] + GRASP_DEPTH * axis
+    fits = (
+        (hold[:, 2] > GRASP_HEIGHT[0])
+        & (hold[:, 2] < GRASP_HEIGHT[1])
+        & (model.bunch_radius <= MAX_BUNCH_RADIUS)
+        & (axis[:, 2] < -0.95)
+    )
+    bunches = np.flatnonzero(fits)
+    away = np.linalg.norm(hold[bunches, :2] - near, axis=1)
+    bunches = np.sort(bunches[np.argsort(away, kind="stable")][:MAX_CANDIDATES])
+    middle = hold[bunches].mean(0) if len(bunches) else np.zeros(3)
+    reached = np.linalg.norm(hold[bunches] - middle, axis=1).max(initial=0.0) + OBSTACLE_RADIUS
+    region = np.linalg.norm(points - middle, axis=1) < reached
+    points = points[region]
+    radius = radius[region]
+    owner = owner[region]
+    heading = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
+    turn = frames.from_yaw(heading)
+    sides = np.stack(
+        [frames.rotate(turn, np.array([BUNCH_AHEAD, y, 0.0]))[:, :2] for y in (BUNCH_ASIDE, -BUNCH_ASIDE)], 1
+    )
+    base = hold[bunches, None, None, :2] - sides  # [bunch, heading, side, 2]
+    roomy = (ground_clearance(model, base.reshape(-1, 2)) > BASE_CLEARANCE).reshape(base.shape[:3])
+    found = []
+    for i, bunch in enumerate(bunches.tolist()):
+        here = (np.linalg.norm(points - hold[bunch], axis=1) < OBSTACLE_RADIUS) & (owner != bunch)
+        low = HAND_LOWER - [0.0, 0.0, max(float(model.bunch_length[bunch]) - GRASP_DEPTH - 0.05, 0.0)]
+        looking = np.flatnonzero(roomy[i].any(1))
+        local = frames.rotate(frames.conjugate(turn[looking])[:, None], points[here] - hold[bunch])
+        beyond = np.maximum(low - local, local - HAND_UPPER)
+        apart = np.linalg.norm(np.maximum(beyond, 0.0), axis=-1) + np.minimum(beyond.max(-1), 0.0)
+        for j, clear in zip(
+            looking.tolist(), (apart - radius[here]).min(-1, initial=FULL_CLEARANCE).tolist(), strict=True
+        ):
+            for k in np.flatnonzero(roomy[i, j]).tolist() if clear >= min_clearance else ():
+                score = clear - 0.01 * float(np.linalg.norm(base[i, j, k] - near))
+                pose = frames.pose(np.append(base[i, j, k], 0.0), turn[j])
+                found.append((-score, bunch, ("left", "right")[k], pose, clear))
+    for _, bunch, side, pose, clear in sorted(found, key=lambda entry: entry[:3]):
+        yield bunch, side, pose, clear
+
+
+def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Spheres that fill wood, trellis and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or
+    -1."""
+    body_q = model.forward_kinematics(model.joint_settled).astype(float)
+    owner = model.bunch_of_body()
+    wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
+    share = np.linspace(0.0, 1.0, 4)
+    along = share[None] * model.body_length[wood, None]
+    axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
+    points = body_q[wood, None, :3] + along[..., None] * axis[wood, None]
+    radius = np.full(points.shape[:2], 0.006)
+    middles = bunch_centres(model)[:, None]
+    depth = np.linspace(-0.8, 0.8, 5)
+    bunch_axis = axis[model.bunch_body]
+    fruit = middles + (0.5 * model.bunch_length[:, None] * depth)[..., None] * bunch_axis[:, None]
+    plump = model.bunch_radius[:, None] * np.sqrt(1.0 - depth**2)
+    still, thick = _fixed_spheres(model)
+    owners = np.repeat(owner[wood], len(share)), np.repeat(np.arange(len(model.bunch_body)), len(depth))
+    return (
+        np.concatenate([points.reshape(-1, 3), fruit.reshape(-1, 3), still]),
+        np.concatenate([radius.ravel(), plump.ravel(), thick]),
+        np.concatenate([*owners, np.full(len(still), -1)]),
+    )
+
+
+def _fixed_spheres(model: Model) -> tuple[np.ndarray, np.ndarray]:
+    """Spheres along everything that stands still: centres [n, 3] m and radii [n] m."""
+    along = (model.fixed_end - model.fixed_start).astype(float)
+    count = np.ceil(np.linalg.norm(along, axis=1) / OBSTACLE_SPACING).astype(int) + 1
+    piece = np.repeat(np.arange(len(count)), count)
+    number = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count)
+    share = number / np.maximum(count - 1, 1)[piece]
+    return model.fixed_start[piece] + share[:, None] * along[piece], model.fixed_radius[piece].max(1).astype(float)
+
+
+@dataclasses.dataclass(frozen=True)
+class BoxApproach:
+    """A place of the base with a box beside it, and the start of the straight approach to it."""
+
+    box: int
+    side: str
+    place: np.ndarray
+    """[2] m"""
+    start: np.ndarray
+    """[2] m"""
+    heading: float
+    """[rad]"""
+
+
+def box_approaches(model: Model) -> Iterator[BoxApproach]:
+    """All places along the long sides of boxes with room for a base and its approach."""
+    for box, (pose, size) in enumerate(zip(model.box_pose.astype(float), model.box_size.astype(float), strict=True)):
+        long = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]) if size[0] >= size[1] else np.array([0.0, 1.0, 0.0]))
+        apart = BASE_HALF_WIDTH + BOX_GAP + 0.5 * float(size[:2].min())
+        for along in (1.0, -1.0):
+            ahead = along * long[:2]
+            for side, hand in (("left", 1.0), ("right", -1.0)):
+                place = pose[:2] - BOX_AHEAD * ahead - hand * apart * np.array([-ahead[1], ahead[0]])
+                for run in APPROACH_LENGTHS:
+                    start = place - run * ahead
+                    line = start + np.linspace(0.0, run + 0.1, 16)[:, None] * ahead
+                    room = float(ground_clearance(model, line, without=box).min())
+                    if room > LANE_HALF_WIDTH and float(ground_clearance(model, start[None])[0]) > BASE_CLEARANCE:
+                        yield BoxApproach(box, side, place, start, float(np.arctan2(ahead[1], ahead[0])))
+                        break
+
+
+# Planning of box exchanges: paths between the boxes; and a box filled with bunches for the start.
+
+
+TURNING_RADIUS = 0.92
+"""[m] A carrier with a box at either end needs this distance around its centre to turn."""
+TURNING_DISTANCES = (1.20, 1.35, 1.50)
+"""[m] Distances from the centre of a box at which it turns; the first with room is taken."""
+CARRYING_HALF_WIDTH = 0.40
+"""[m] It needs this on either side of its centre while it drives straight."""
+BUNCHES_PER_LAYER = 6
+"""Bunches side by side in one layer of a filled box."""
+
+
+def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
+    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room for
+    it."""
+    if max(full, empty) >= len(model.box_pose):
+        raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
+    here = start[:2]
+    legs = []
+    for box in (empty, full):
+        ways = [find_path(model, here, place, TURNING_RADIUS) for place in turning_places(model, box)]
+        ways = [points for points in ways if points is not None]
+        if not ways:
+            raise PlacementError(
+                f"no way for a carrier to turn before box {box}: it needs {TURNING_RADIUS} m around it; move the box"
+            )
+        shortest = min(ways, key=lambda points: float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
+        legs.append(shortest[1:])
+        here = shortest[-1]
+    return SwapPlan(start, full, empty, *legs)
+
+
+def turning_places(model: Model, box: int) -> list[np.ndarray]:
+    """Places [2] m straight before the long sides of a box, with room to turn and a free lane to the box."""
+    pose = model.box_pose[box].astype(float)
+    size = model.box_size[box].astype(float)
+    across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])
+    normal = frames.rotate(pose[3:], across)[:2]
+    places = []
+    for side in (1.0, -1.0):
+        for far in TURNING_DISTANCES:
+            place = pose[:2] + far * side * normal
+            lane = pose[:2] + np.linspace(0.1, far, 12)[:, None] * side * normal
+            if (
+                ground_clearance(model, place[None])[0] > TURNING_RADIUS
+                and ground_clearance(model, lane, without=box).min() > CARRYING_HALF_WIDTH
+            ):
+                places.append(place)
+                break
+    return places
+
+
+def fill_box(physics: Physics, box: int, count: int = 6) -> None:
+    """Detach ``count`` bunches and put them into a box in layers, as the start of an exchange.
+
+    Call it between steps. The bunches farthest from the box are taken, so that those around it stay.
+    """
+    model = physics.model
+    pose = model.box_pose[box].astype(float)
+    size = model.box_size[box].astype(float)
+    apart = np.linalg.norm(physics.state.body_q[model.bunch_body, :2] - pose[:2], axis=1)
+    attached = np.flatnonzero(physics.state.bunch_attached)
+    chosen = attached[np.argsort(-apart[attached], kind="stable")][:count]
+    columns = BUNCHES_PER_LAYER // 2
+    for i, bunch in enumerate(chosen.tolist()):
+        layer, place = divmod(i, BUNCHES_PER_LAYER)
+        column = place % columns
+        row = place // columns
+        x = (column - 0.5 * (columns - 1)) * (size[0] - 0.04) / columns
+        y = (row - 0.5) * 0.5 * (size[1] - 0.04)
+        # along y, centred at (x, y)
+        start = np.array([x, y - 0.5 * float(model.bunch_length[bunch]), 0.10 + 0.14 * layer])
+        physics.pick(bunch)
+        turned = frames.pose(start, frames.from_yaw(0.5 * np.pi))
+        physics.rigid.place_bunch(bunch, frames.compose(pose, turned), np.zeros(6))
+
+
+# Planning of a meeting: the bunch that a person picks, and where a carrier waits with a box beside it.
+
+
+REACH = 0.55
+"""[m] Horizontal distance from a bunch or a box at which a person stands to reach it. GUESSED"""
+CLAMPED_BOX_DISTANCE = 0.75
+"""[m] Approximate distance of a clamped box from the centre of the carrier."""
+PERSON_CLEARANCE = 0.30
+"""[m] A person needs this distance around where it stands and walks. GUESSED"""
+BUNCH_HEIGHT = (1.1, 1.75)
+"""[m] Heights of a bunch's centre that a hand takes with ease. GUESSED"""
+MAX_PULL = 75.0
+"""[N] A bunch that holds on with more is left alone: a hand pulls with 100 N."""
+KEPT_AWAY = 2.2
+"""[m] The carrier stays so far from where the person picks: its half length, the box, and some steps back. GUESSED"""
+MAX_PATHS = 3
+"""Waiting places that are tried for each place of a person: a search takes a second."""
+DISTANCES = (1.2, 1.5, 1.8, 2.2)
+"""[m] From where the person picks to where it gives; the first with room for both is taken."""
+
+
+def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
+    """The bunch nearest to a base at ``near`` [7] for which there is room; :class:`PlacementError` if there is none."""
+    if box >= len(model.box_pose):
+        raise PlacementError(f"no box {box}: this scene has {len(model.box_pose)}; name more in its file")
+    ways = [find_path(model, near[:2], place, TURNING_RADIUS) for place in turning_places(model, box)]
+    ways = [points for points in ways if points is not None]
+    if not ways:
+        raise PlacementError(f"no way for a carrier to box {box}: it needs {TURNING_RADIUS} m around it; move the box")
+    to_box = min(ways, key=lambda points: float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum()))
+    centres = bunch_centres(model)
+    fits = (centres[:, 2] > BUNCH_HEIGHT[0]) & (centres[:, 2] < BUNCH_HEIGHT[1]) & (model.bunch_pull < MAX_PULL)
+    order = np.argsort(np.linalg.norm(centres[:, :2] - to_box[-1], axis=1), kind="stable")
+    for bunch in order[fits[order]].tolist():
+        for stand in _standing_places(model, centres[bunch, :2]):
+            if not _keeps_away(to_box, stand):
+                continue
+            for heading, base in _waiting_places(model, stand)[:MAX_PATHS]:
+                path = find_path(model, to_box[-1], base, TURNING_RADIUS)
+                if path is not None and _keeps_away(path, stand):
+                    return MeetPlan(bunch, stand, box, to_box[1:], path[1:], heading)
+    raise PlacementError("no bunch hangs where a person and a carrier have room beside each other; choose another seed")
+
+
+def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
+    """Whether a ``path`` [n, 2] m of a carrier leaves a person room, who goes some steps back from ``stand`` [2] m."""
+    start = path[:-1]
+    way = np.diff(path, axis=0)
+    share = np.clip(((stand - start) * way).sum(1) / np.maximum((way * way).sum(1), 1e-12), 0.0, 1.0)
+    return bool(np.linalg.norm(start + share[:, None] * way - stand, axis=1).min() > KEPT_AWAY)
+
+
+def _standing_places(model: Model, bunch: np.ndarray) -> np.ndarray:
+    """Places [k, 2] m around a bunch [2] m with room for a person, those with most room first."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
+    places = bunch + REACH * np.stack([np.cos(angles), np.sin(angles)], 1)
+    room = ground_clearance(model, places)
+    return places[np.argsort(-room, kind="stable")][: int((room > PERSON_CLEARANCE).sum())]
+
+
+def _waiting_places(model: Model, stand: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """Headings [rad] and places [2] m of a carrier whose box a person reaches by a free straight way from ``stand``."""
+    found = []
+    for far in DISTANCES:
+        for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
+            ahead = np.array([math.cos(angle), math.sin(angle)])
+            gives = stand + far * ahead
+            base = gives + (REACH + CLAMPED_BOX_DISTANCE) * ahead
+            way = stand + np.linspace(0.0, far, 12)[:, None] * ahead
+            if (
+                ground_clearance(model, way).min() > PERSON_CLEARANCE
+                and ground_clearance(model, base[None])[0] > TURNING_RADIUS
+            ):
+                found.append((math.atan2(-ahead[1], -ahead[0]), base))
+    return found
+
+
+# The tasks of a robot client by name: planned before the start, begun once physics and robot exist.
+
+
+TASKS = ("pick", "exchange", "meet")
+"""Names of the tasks that :func:`plan_task` plans."""
+
+
+class UnknownTask(ValueError):
+    """There is no task of that name; the text lists those that there are."""
+
+
+def validate_task_name(job: str | None) -> str | None:
+    """The name ``job``, or None; :class:`UnknownTask` if there is no such task."""
+    if job is not None and job not in TASKS:
+        raise UnknownTask(f"no job {job!r}; give {', '.join(TASKS[:-1])} or {TASKS[-1]}")
+    return job
+
+
+def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
+    """Plan a task: a function that begins it, and the pose [7] at which the robot must start.
+
+    ``near`` [7]: its start pose otherwise. Takes 1 to 2 s: not for the real-time loop. Raises :class:`UnknownTask`, and
+    :class:`PlacementError` if the scene has no room for the task.
+    """
+    if validate_task_name(job) == "pick":
+        plan = next(plan_picks(model, near[:2]))
+        return functools.partial(PickBunch, plan=plan), plan.base_pose
+    if job == "meet":
+        return functools.partial(MeetPerson, plan=plan_meeting(model, near)), near
+    boxes = plan_swap(model, near)
+    return functools.partial(_begin_swap, swap=boxes), near
+
+
+def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
+    """Fill the box that is to be full, and begin the exchange."""
+    fill_box(physics, swap.full_box)
+    return SwapBoxes(physics, robot, swap)

@@ -1,0 +1,94 @@
+"""Checks of trees after a step: how fast they are, how long they have been slow, and for how long peduncles carry too much."""
+
+import warp as wp
+
+# How long the joints of trees have been slow.
+
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel
+def count_quiet_steps(
+    # in
+    limit: wp.array(dtype=float),
+    trees: wp.array(dtype=wp.int32),
+    tree_rate: wp.array(dtype=float),
+    # out
+    quiet_steps_out: wp.array(dtype=wp.int32),
+    is_at_rest_out: wp.array(dtype=wp.bool),
+    seen_tick_out: wp.array(dtype=wp.int64),
+    longest_out: wp.array(dtype=wp.int32),
+):
+    """One thread per listed tree: a step more, or none if a joint was not slower than the limit (or not a number).
+
+    limit: [1] rad/s. tree_rate: [tree] rad/s. A tree that moves is not at rest, and was not seen still (-1) before.
+    longest_out: [1] most steps of all.
+    """
+    tree = trees[wp.tid()]
+    if tree_rate[tree] < limit[0]:
+        quiet_steps_out[tree] = quiet_steps_out[tree] + 1
+        wp.atomic_max(longest_out, 0, quiet_steps_out[tree])
+    else:
+        quiet_steps_out[tree] = 0
+        is_at_rest_out[tree] = False
+        seen_tick_out[tree] = wp.int64(-1)
+
+
+# The fastest of some trees.
+
+
+@wp.kernel
+def find_fastest(
+    # in
+    trees: wp.array(dtype=wp.int32),
+    tree_rate: wp.array(dtype=float),
+    # out
+    fastest_out: wp.array(dtype=float),
+):
+    """One thread per listed tree: the largest rate of all, infinite if one is not a number.
+
+    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, 0 before.
+    """
+    rate = tree_rate[trees[wp.tid()]]
+    if wp.isnan(rate):
+        rate = wp.inf
+    wp.atomic_max(fastest_out, 0, rate)
+
+
+# How long peduncles have carried more than they can.
+
+
+@wp.kernel
+def count_overloaded_steps(
+    # model
+    bunch_body: wp.array(dtype=wp.int32),
+    body_tree: wp.array(dtype=wp.int32),
+    bunch_pull: wp.array(dtype=float),
+    bunch_bend: wp.array(dtype=float),
+    # in
+    bunches: wp.array(dtype=wp.int32),
+    carried: wp.array(dtype=wp.spatial_vector),
+    is_attached: wp.array(dtype=wp.bool),
+    is_remote: wp.array(dtype=wp.bool),
+    # out
+    overloaded_steps_out: wp.array(dtype=wp.int32),
+    longest_out: wp.array(dtype=wp.int32),
+):
+    """One thread per listed bunch: a step more if its peduncle is pulled or bent beyond its strength, none otherwise.
+
+    bunch_pull, bunch_bend: [bunch] N, N m. carried: [thread] force and moment of its joint, N, N m. is_attached: [bunch];
+    is_remote: [tree]; picked bunches and those of remote trees are left out. longest_out: [1] most steps of all.
+    """
+    i = wp.tid()
+    bunch = bunches[i]
+    if is_attached[bunch] and not is_remote[body_tree[bunch_body[bunch]]]:
+        force = wp.spatial_top(carried[i])
+        moment = wp.spatial_bottom(carried[i])
+        pulled = wp.dot(force, force) / (bunch_pull[bunch] * bunch_pull[bunch])
+        bent = wp.dot(moment, moment) / (bunch_bend[bunch] * bunch_bend[bunch])
+        steps = int(0)
+        if wp.max(pulled, bent) > 1.0:
+            steps = overloaded_steps_out[bunch] + 1
+        overloaded_steps_out[bunch] = steps
+        wp.atomic_max(longest_out, 0, steps)

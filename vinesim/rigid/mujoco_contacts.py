@@ -1,0 +1,378 @@
+"""Contacts that MuJoCo finds itself: which shapes collide, their friction, thin walls, and wires that give."""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
+
+import mujoco
+import numpy as np
+
+from vinesim.core import frames
+from vinesim.rigid.recompile import compile_without_contacts
+from vinesim.rigid.static_world import CRATE_WALL, FIRST_FIXED_GEOM, GROUND
+from vinesim.scene.materials import Material, pair_table
+from vinesim.scene.physics_parameters import PhysicsParameters
+from vinesim.scene.values import RobotSpec
+from vinesim.wires.deflected_wires import MAX_DEFLECTION, NO_TREE, DeflectedWires, WireContacts
+from vinesim.wires.elastic_supports import WIRE_DAMPING_TIME
+
+# Friction between two rigid bodies by their materials: MuJoCo itself takes one of the two geoms' coefficients.
+
+
+class PairFriction:
+    """Gives the contacts that MuJoCo found the coefficients of ``data/materials``, between its two stages."""
+
+    def __init__(self, parameters: PhysicsParameters) -> None:
+        self._table = pair_table("friction", parameters.friction)
+        self._is_listed = self._table != parameters.friction
+        self._material = np.zeros(0, np.int32)
+        """[geom] material; unknown where the geom has a coefficient of its own, which MuJoCo then takes."""
+
+    def find_materials(self, m: mujoco.MjModel) -> None:
+        """Find the materials of all geoms of a world that was compiled anew."""
+        material = m.geom_user[:, 0]
+        has_own = m.geom_user[:, 1] > 0.0
+        self._material = np.where(has_own, int(Material.UNKNOWN), material).astype(np.int32)
+
+    def apply(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        """After ``mj_step1``: write the coefficients of listed pairs and, if there are any, the constraints anew."""
+        if d.ncon == 0:
+            return
+        first, second = self._material[d.contact.geom].T
+        listed = np.flatnonzero(self._is_listed[first, second])
+        if len(listed) == 0:
+            return
+        d.contact.friction[listed, :2] = self._table[first[listed], second[listed], None]
+        mujoco.mj_makeConstraint(m, d)
+        mujoco.mj_island(m, d)
+        mujoco.mj_projectConstraint(m, d)
+        mujoco.mj_fwdVelocity(m, d)
+
+
+# Which links of a robot touch each other, and which shapes the ground.
+#
+# Links on both sides of a joint never touch; MuJoCo leaves those out by itself. Links that overlap while the robot
+# stands in its home pose do so by the shape that their collision hulls were given, not by their motion: such pairs
+# are left out, as MoveIt's Setup Assistant does. So are the pairs of the ``disable_collisions`` elements that an SRDF
+# file gives.
+
+
+HOME_CLEARANCE = 1e-3
+"""[m] Links that are nearer than this to each other, or to the ground, in the home pose count as overlapping. GUESSED:
+collision shapes are as exact, and servos hold the pose to that."""
+
+
+def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> None:
+    """Let the links of a ``parsed`` robot touch each other and the ground; ``code``: its collision code.
+
+    Shapes that are fixed to the base do not touch the ground: the base moves in a plane at its own height.
+    """
+    alone = parsed.copy()
+    for number, geom in enumerate(alone.geoms):
+        geom.name = str(number)
+        geom.contype = geom.conaffinity = 1
+        geom.margin = HOME_CLEARANCE
+    ground = alone.worldbody.add_geom(
+        type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], pos=[0.0, 0.0, -float(given.pose[2])]
+    )
+    ground.contype = ground.conaffinity = 1
+    m = compile_without_contacts(alone)
+    geoms = _touching_at_home(m, given)
+    bodies = m.geom_bodyid[geoms]
+    on_ground = m.geom_type[geoms] == mujoco.mjtGeom.mjGEOM_PLANE
+    for row in np.unique(np.sort(bodies[~on_ground.any(1)], axis=1), axis=0).tolist():
+        parsed.add_exclude(bodyname1=m.body(row[0]).name, bodyname2=m.body(row[1]).name)
+    links = {link.name for link in parsed.bodies}
+    for pair in disabled_pairs(given.urdf):
+        if links.issuperset(pair):
+            parsed.add_exclude(bodyname1=pair[0], bodyname2=pair[1])
+    standing = set(geoms[on_ground.any(1)].ravel().tolist())
+    for number, geom in enumerate(parsed.geoms):
+        geom.conaffinity |= code
+        compiled = m.geom(str(number))
+        if m.body_weldid[compiled.bodyid[0]] != 0 and compiled.id not in standing:
+            geom.conaffinity |= GROUND
+
+
+def disabled_pairs(urdf: str) -> list[tuple[str, str]]:
+    """Pairs of links in the elements ``disable_collisions`` of a URDF, where loading puts those of an SRDF."""
+    root = ElementTree.fromstring(urdf)
+    return [(pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")]
+
+
+def _touching_at_home(m: mujoco.MjModel, given: RobotSpec) -> np.ndarray:
+    """Geoms [pair, 2] that touch in the home pose; ``m``: the robot alone, with its base fixed."""
+    d = mujoco.MjData(m)
+    for drive, position in zip(given.drives, given.home, strict=True):
+        d.joint(drive.joint).qpos[0] = position
+    for e in np.flatnonzero(m.eq_type == mujoco.mjtEq.mjEQ_JOINT).tolist():
+        polynomial = np.polynomial.Polynomial(m.eq_data[e, :5])
+        d.qpos[m.jnt_qposadr[m.eq_obj1id[e]]] = polynomial(d.qpos[m.jnt_qposadr[m.eq_obj2id[e]]])
+    mujoco.mj_kinematics(m, d)
+    mujoco.mj_comPos(m, d)
+    mujoco.mj_collision(m, d)
+    return d.contact.geom.reshape(-1, 2).copy()
+
+
+# Contacts of crates that are about to close within the step, so that thin walls do not end up inside each other.
+#
+# A crate that falls by half a metre moves 31 mm a step, its walls are 12 mm thick: found only where they overlap,
+# they would be pushed apart sideways, or not at all. Crates that are fast and approach another get a margin of what
+# they move in a step. A contact within it lets its gap close, but no further (a *speculative contact*).
+
+
+MAX_STEP = CRATE_WALL / 4.0
+"""[m] A crate that moves less in a step has no margin. TUNED."""
+MAX_MARGIN = 0.1
+"""[m] Of a crate at 10 m/s."""
+
+PASSING = 0.1
+"""[1] A crate whose motion relative to another points so little towards it passes it. TUNED."""
+STIFFNESS = 100.0
+"""[1] times an effective mass over dt^2: of a gap that would close further, so much is left as 1 is to it."""
+NEVER_REACHED = 1e4
+"""[m] No gap closes by as much in a step."""
+
+
+class SpeculativeContacts:
+    """Margins of fast crates, and the accelerations that close the gaps within them."""
+
+    def __init__(self) -> None:
+        self._bodies = self._geoms = self._crate_of_geom = np.zeros(0, int)
+        self._dof = np.zeros((0, 6), int)
+        self._radius = np.zeros(0)
+        self._has_margins = False
+
+    def find_crates(self, m: mujoco.MjModel, numbers: Iterable[int]) -> None:
+        """Find the bodies and geoms of the boxes of these ``numbers`` in a world that was compiled anew."""
+        self._bodies = bodies = np.array(sorted(m.body(f"box/{number}").id for number in numbers), int)
+        self._dof = m.body_dofadr[bodies][:, None] + np.arange(6)
+        self._geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies))
+        self._crate_of_geom = np.searchsorted(bodies, m.geom_bodyid[self._geoms])
+        corner = np.linalg.norm(m.geom_pos[self._geoms], axis=1) + m.geom_rbound[self._geoms]
+        self._radius = np.zeros(len(bodies))
+        np.maximum.at(self._radius, self._crate_of_geom, corner)
+
+    def set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> bool:
+        """Before ``mj_step1``: the margin of each crate; whether one has any."""
+        if len(self._bodies) == 0:
+            return False
+        velocity = d.qvel[self._dof]
+        if not self._has_margins and not velocity.any():
+            return False
+        linear = velocity[:, :3]
+        angular = velocity[:, 3:]
+        step = m.opt.timestep * (np.linalg.norm(linear, axis=1) + np.linalg.norm(angular, axis=1) * self._radius)
+        margin = np.zeros(len(step))
+        for crate in np.flatnonzero(step > MAX_STEP).tolist():
+            if self._is_approaching(crate, linear, step, d.xpos[self._bodies]):
+                margin[crate] = min(1.5 * step[crate], MAX_MARGIN)
+        m.body_margin[self._bodies] = margin
+        m.geom_margin[self._geoms] = margin[self._crate_of_geom]
+        self._has_margins = bool(margin.any())
+        return self._has_margins
+
+    def _is_approaching(self, crate: int, velocity: np.ndarray, step: np.ndarray, position: np.ndarray) -> bool:
+        """Whether a crate is near another in the next step, and not just passing it."""
+        offset = position - position[crate]
+        relative = velocity - velocity[crate]
+        distance = np.linalg.norm(offset, axis=1)
+        closing = -(offset * relative).sum(1)
+        is_met = closing > PASSING * distance * np.linalg.norm(relative, axis=1)
+        return bool((is_met & (distance < self._radius + self._radius[crate] + step + step[crate])).any())
+
+    def limit_closing(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        """After the constraints are made: contacts that are open may close, and no further, within the step.
+
+        Those that do not close at the speed of now are given up: MuJoCo's friction would push a body away from what it
+        slides along. MuJoCo computes stiffness and damping anew from ``solref`` whenever it solves. Without damping
+        there is no friction either.
+        """
+        contact = d.contact
+        dt = m.opt.timestep
+        is_open = np.flatnonzero((contact.dist > 0.0) & (contact.efc_address >= 0))
+        row = contact.efc_address[is_open]
+        gap = contact.dist[is_open]
+        is_closing = d.efc_vel[row] * dt < -gap
+        d.efc_margin[row] = np.where(is_closing, d.efc_pos[row] - gap, -NEVER_REACHED)
+        contact.solref[is_open] = -STIFFNESS / dt**2, 0.0
+
+
+# Contacts of rigid bodies with wires: MuJoCo's constraints, made as soft as the wires are.
+#
+# MuJoCo's step ``discrete`` treats a contact as an implicit spring and damper with a mass m of its own: impedance d and
+# reference (k, b) of a contact with an effective mass 1 / A at rest mean m = d / ((1 - d) A), stiffness m k and damping
+# m b. Here m is that of the piece of wire, so that the force is that of the wire's spring.
+
+
+WIRE_MASS = 0.02
+"""[kg] of a piece of wire where it moves most. DERIVED: a third of 2 m of steel, 2.8 mm thick, weigh 0.03 kg."""
+MARGIN_LEVELS = (0.005, 0.02, 0.05, 0.1)
+"""[m] by which contacts with wires are found early; that which is enough for the fastest body is taken."""
+# MuJoCo's mjMINIMP, mjMAXIMP
+_LEAST_IMPEDANCE = 1e-4
+_MOST_IMPEDANCE = 0.9999
+# of an impedance that is the same at all depths
+_WIDTH = 1.0
+_MIDPOINT = 0.5
+_POWER = 2.0
+
+
+class SoftWires:
+    """What a MuJoCo world needs so that wires give."""
+
+    def __init__(self, wires: DeflectedWires) -> None:
+        self._wires = wires
+        self._geoms = np.append(np.zeros(FIRST_FIXED_GEOM, bool), wires.gives)
+        """[MuJoCo geom, up to the last fixed piece] whether it is a wire that gives."""
+        self._numbers = np.flatnonzero(self._geoms)
+        self._contacts = WireContacts(wires)
+        self._at = self._row = np.zeros(0, int)
+        self._gap = self._damping_time = self._mobility = self._impedance = self._rate = np.zeros(0)
+        self._measured: dict[int, float] = {}
+        self._moved = np.zeros(0, int)
+        self._world: mujoco.MjModel | None = None
+
+    def use_world(self, m: mujoco.MjModel) -> None:
+        """Take over a world that was compiled anew, in which all wires are straight."""
+        self._margin = m.geom_margin[: len(self._geoms)].copy()
+        self._body_margin = float(m.body_margin[0])
+        self._level = 0.0
+        self._pos, self._quat = (values[: len(self._geoms)].copy() for values in (m.geom_pos, m.geom_quat))
+        self._at = self._at[:0]
+        self._moved = np.zeros(0, int)
+        before = self._world
+        self._world = m
+        self._wires.renumber_rigid(lambda key: self._renumber(key, before), m.ntree)
+        measured = [(self._renumber(key, before), value) for key, value in self._measured.items()]
+        self._measured = {key: value for (key, tree), value in measured if tree != NO_TREE}
+        _widen_boxes(m, self._geoms)
+
+    def _renumber(self, key: int, before: mujoco.MjModel | None) -> tuple[int, int]:
+        """The key that a pair of a wire and a geom of the world ``before`` has in this one, and its tree."""
+        m = self._world
+        if before is None or m is None or key >= 0:
+            return 0, NO_TREE
+        wire, other = divmod(-1 - key, before.ngeom)
+        body = before.geom_bodyid[other]
+        now = mujoco.mj_name2id(m, mujoco.mjtObj.mjOBJ_BODY, before.body(body).name)
+        if now < 0:
+            return 0, NO_TREE
+        geom = m.body_geomadr[now] + other - before.body_geomadr[body]
+        return -1 - int(wire * m.ngeom + geom), -1 - int(m.body_treeid[now])
+
+    def place_geoms(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        """Before ``mj_step1``: put the geoms of wires where they are. MuJoCo computes static poses only once."""
+        wires = self._wires
+        for piece in {*self._moved.tolist(), *wires.deflected.tolist()}:
+            geom = FIRST_FIXED_GEOM + piece
+            offset = wires.offset[piece]
+            way = wires.end[piece] - wires.start[piece]
+            mujoco.mju_mulQuat(m.geom_quat[geom], _turn(way, way + offset[1] - offset[0]), self._quat[geom])
+            m.geom_pos[geom] = d.geom_xpos[geom] = self._pos[geom] + 0.5 * (offset[0] + offset[1])
+            mujoco.mju_quat2Mat(d.geom_xmat[geom], m.geom_quat[geom])
+        self._moved = wires.deflected.copy()
+        self._set_margins(m, d)
+
+    def _set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        """Find contacts with wires as early as anything may come to them, or a deflected one spring back, in the step:
+        with the axis of a wire inside a box, MuJoCo would push the box along the wire."""
+        rates = d.cvel
+        reach = m.opt.timestep * max(float(rates.max()), -float(rates.min()))
+        level = next((level for level in MARGIN_LEVELS if reach <= level), MARGIN_LEVELS[-1])
+        if len(self._wires.deflected):
+            offset = self._wires.offset[self._wires.deflected]
+            level = max(level, math.sqrt((offset * offset).sum(2).max()))
+        if level != self._level:
+            self._level = level
+            m.geom_margin[self._numbers] = np.maximum(self._margin[self._numbers], level)
+            m.body_margin[0] = max(self._body_margin, level)
+
+    def soften(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
+        """After the constraints are made: contacts with wires end at the wires' springs."""
+        self._at = self._at[:0]
+        if d.ncon == 0:
+            return
+        geom = d.contact.geom
+        is_wire = (geom < len(self._geoms)) & self._geoms[np.minimum(geom, len(self._geoms) - 1)]
+        at = np.flatnonzero(is_wire.any(1) & (d.contact.efc_address >= 0))
+        if len(at) == 0:
+            return
+        contact = d.contact
+        first = is_wire[at, 0]
+        wire = np.where(first, *geom[at].T)
+        other = np.where(first, *geom[at].T[::-1])
+        body = m.geom_bodyid[other]
+        row = contact.efc_address[at]
+        normal = np.where(first, 1.0, -1.0)[:, None] * contact.frame[at, :3]
+        gap = contact.dist[at] - self._margin[wire]
+        key = -1 - (wire * np.int64(m.ngeom) + other)
+        self._contacts.find_springs(
+            wire - FIRST_FIXED_GEOM, contact.pos[at], normal, gap, -d.efc_vel[row], key, -1 - m.body_treeid[body]
+        )
+        self._at = at
+        self._row = row
+        self._gap = gap + self._contacts.shift
+        self._damping_time = np.where(self._gap > 0.0, 0.0, WIRE_DAMPING_TIME)  # nor does it damp before it is touched
+        self._mobility = np.array([self._measured.get(k, 0.0) for k in key.tolist()])
+        is_new = self._mobility == 0.0
+        self._mobility[is_new] = np.maximum(m.body_invweight0[body[is_new], 0], 1e-9)
+        self._write(d)
+        d.efc_margin[row] = d.efc_pos[row] - self._gap
+        if is_new.any():
+            mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
+            self._measure(d, m.opt.timestep)
+            self._write(d)
+
+    def _write(self, d: mujoco.MjData) -> None:
+        """Write impedance and reference of the contacts."""
+        share = self._mobility * WIRE_MASS
+        self._impedance = impedance = np.clip(share / (1.0 + share), _LEAST_IMPEDANCE, _MOST_IMPEDANCE)
+        mass = impedance / ((1.0 - impedance) * self._mobility)
+        self._rate = self._contacts.stiffness / mass
+        d.contact.solimp[self._at, 0] = d.contact.solimp[self._at, 1] = impedance
+        d.contact.solimp[self._at, 2:] = _WIDTH, _MIDPOINT, _POWER
+        d.contact.solref[self._at, 0] = -impedance * self._rate
+        d.contact.solref[self._at, 1] = -impedance * self._damping_time * self._rate
+
+    def _measure(self, d: mujoco.MjData, dt: float) -> None:
+        """Find by which effective masses MuJoCo has scaled the contacts: those of its implicit step, which it does not
+        tell. They change little from step to step."""
+        implicit = 1.0 + (self._damping_time + dt) * dt * self._rate
+        self._mobility = d.efc_R[self._row] * implicit * self._impedance / (1.0 - self._impedance)
+        self._measured = dict(zip(self._contacts.key.tolist(), self._mobility.tolist(), strict=True))
+
+    def report(self, d: mujoco.MjData, dt: float) -> None:
+        """After the second half of a step: tell the wires what has pressed on them."""
+        if len(self._at):
+            self._measure(d, dt)
+            force = d.efc_force[self._row]
+            stiffness = self._contacts.stiffness
+            # of the spring and damper: force = -stiffness (gap + dt v) - damping v
+            velocity = -(force + stiffness * self._gap) / (stiffness * (dt + self._damping_time))
+            self._contacts.add_presses(force, velocity)
+
+
+def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """The shortest rotation [4], MuJoCo's order, from the direction of ``before`` [3] to that of ``after`` [3]."""
+    size = math.sqrt((before @ before) * (after @ after))
+    return frames.to_wxyz(frames.normalize(np.append(frames.cross(before, after), size + before @ after)))
+
+
+def _widen_boxes(m: mujoco.MjModel, is_wire: np.ndarray) -> None:
+    """Let MuJoCo's tree of boxes around static geoms hold wires wherever they may be."""
+    first = int(m.body_bvhadr[0])
+    count = int(m.body_bvhnum[0])
+    if count == 0:
+        return
+    child = m.bvh_child[first : first + count]
+    geom = m.bvh_nodeid[first : first + count]
+    holds = np.zeros(count, bool)
+    leaf = (geom >= 0) & (geom < len(is_wire))
+    holds[leaf] = is_wire[geom[leaf]]
+    for depth in range(int(m.bvh_depth[:count].max()) - 1, -1, -1):
+        inner = np.flatnonzero((m.bvh_depth[first : first + count] == depth) & (child[:, 0] >= 0))
+        holds[inner] = holds[child[inner]].any(1)
+    m.bvh_aabb[first : first + count][holds, 3:] += MAX_DEFLECTION
