@@ -39,11 +39,11 @@ def _kill(times: int, seed: int) -> Iterator[Measurement]:
     return _call("kill:kill")(times, seed, _announce)
 
 
-def _fuzz(messages: int, lies: int) -> Iterator[Measurement]:
-    for option, value in (("messages", messages), ("lies", lies)):
+def _fuzz(messages: int, false_messages: int) -> Iterator[Measurement]:
+    for option, value in (("messages", messages), ("false-messages", false_messages)):
         if value < 0:
             raise UsageError(f"--{option} is {value}: give 0 or more")
-    return _call("message_fuzz:fuzz")(messages, lies)
+    return _call("message_fuzz:fuzz")(messages, false_messages)
 
 
 def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measurement]:
@@ -83,7 +83,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         "broken messages, and well-formed false ones",
         {
             "messages": {"type": int, "default": 100_000, "help": "number of corrupted messages"},
-            "lies": {"type": int, "default": 0, "help": "number of series of false messages (needs hypothesis)"},
+            "false-messages": {
+                "type": int,
+                "default": 0,
+                "help": "number of series of false messages (needs hypothesis)",
+            },
         },
     ),
     "kill": (

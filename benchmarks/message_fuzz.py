@@ -5,7 +5,7 @@ states of trees, objects that there are not), and is then corrupted: bits flippe
 another, filled with extreme values, sent again later, sent under the key of another kind or under an odd key, or
 replaced by noise or by a megabyte. It comes from an admitted actor, or from a stranger under any name. It reaches a
 client with physics, another client without, and the server's store of records; after every step they are held against
-the laws of :mod:`benchmarks.support.fuzz_world`. Well-formed lies: :mod:`benchmarks.support.lies`.
+the laws of :mod:`benchmarks.support.fuzz_world`. well-formed false messages: :mod:`benchmarks.support.false_messages`.
 """
 
 from __future__ import annotations
@@ -428,8 +428,8 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
     return done
 
 
-def fuzz(count: int = MESSAGE_COUNT, lies: int = 0) -> Iterator[Measurement]:
-    """Rows of the benchmark: ``count`` corrupted messages and ``lies`` series of well-formed lies."""
+def fuzz(count: int = MESSAGE_COUNT, false_messages: int = 0) -> Iterator[Measurement]:
+    """Rows of the benchmark: ``count`` corrupted messages and ``false_messages`` series of well-formed false ones."""
     for case, share, kind, is_stranger in (
         ("a person that was admitted", 0.45, "human", False),
         ("a robot that was admitted", 0.45, "robot", False),
@@ -445,8 +445,8 @@ def fuzz(count: int = MESSAGE_COUNT, lies: int = 0) -> Iterator[Measurement]:
             (f"a step with {MESSAGES_PER_TICK} of them, two clients, mean", 1e3 * done.tick, "ms"),
         ):
             yield Measurement("fuzz", f"{case}: {what}", float(value), unit)
-    for kind in ("human", "robot") if lies else ():
-        from benchmarks.support.lies import tell_lies  # needs hypothesis
+    for kind in ("human", "robot") if false_messages else ():
+        from benchmarks.support.false_messages import send_false_messages  # needs hypothesis
 
-        told = tell_lies(lies // 2, kind=kind)
-        yield Measurement("fuzz", f"a {kind} that lies: well-formed lies told, no law broken", float(told), "")
+        told = send_false_messages(false_messages // 2, kind=kind)
+        yield Measurement("fuzz", f"well-formed false messages of a {kind}, no law broken", float(told), "")

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from benchmarks.support.ear import Ear
 from benchmarks.support.fake_client import tree_row
+from benchmarks.support.sound_recorder import SoundRecorder
 from vinesim.audio.frame import FRAME_SAMPLES, SAMPLE_RATE, Codec, to_pcm
 from vinesim.client.client import Client
 from vinesim.client.sound.exchange import SoundStep
@@ -88,7 +88,7 @@ class _World:
             )
             for name, description, x in (("bot", robot, 0.0), ("anna", None, 3.0))
         )
-        self.at_bot = Ear(self.bot, "bot")
+        self.at_bot = SoundRecorder(self.bot, "bot")
         self.at_anna = _PageEars()
         self.anna.sound.listen("anna", self.at_anna)
         self.run(1.0)

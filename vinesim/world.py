@@ -41,8 +41,8 @@ from vinesim.wires.deflected_wires import DeflectedWires
 from vinesim.wires.elastic_supports import ElasticSupports
 from vinesim.wires.wire_segments import WireShapes
 
-LEAST_SHARED_TREES = 16
-"""Threads are woken for a step of so many trees: two groups of eight, 30 us of work. TUNED."""
+MIN_TREES_FOR_THREADS = 16
+"""Minimum number of awake trees for which worker threads are used: two groups of eight, 30 us of work. TUNED."""
 
 
 class Physics:
@@ -77,9 +77,9 @@ class Physics:
         self.elastic_supports = ElasticSupports(self.plants, p)
         self.wires = DeflectedWires(model, self.elastic_supports, self.state.tree_awake, p.dt)
         self.wire_shapes = WireShapes(model, self.elastic_supports, self.wires)
-        wires = self.wires if self.wires.gives.any() else None
+        wires = self.wires if self.wires.is_compliant.any() else None
         if wires is not None:
-            self.rigid.let_wires_give(wires)
+            self.rigid.use_compliant_wires(wires)
         self.contact_solver = ContactSolver(model, self.plants, self.rigid, wires)
         self.detachment_monitor = DetachmentMonitor(self.plants, self.rigid, self.contact_solver, p)
         self.grasp_manager = GraspManager(self.plants, self.rigid, self.contact_solver)
@@ -128,7 +128,7 @@ class Physics:
 
     def step(self) -> None:
         """Advance by ``dt``. Commands received before the call act in this step."""
-        if len(self.plants.awake) >= LEAST_SHARED_TREES:
+        if len(self.plants.awake) >= MIN_TREES_FOR_THREADS:
             self.plants.launch_pool.wake()  # while MuJoCo works
         for _, stage in self.stages:
             stage()

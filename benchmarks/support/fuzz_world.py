@@ -17,8 +17,8 @@ from typing import Self
 import msgspec
 import numpy as np
 
-from benchmarks.support.ear import Ear
 from benchmarks.support.fake_client import FakeClient
+from benchmarks.support.sound_recorder import SoundRecorder
 from vinesim.client.client import Client
 from vinesim.core import frames
 from vinesim.net.codec import messages
@@ -103,7 +103,7 @@ class FuzzWorld:
             clock=lambda: self.now,
         )
         self.client.physics.wind = None
-        self.ear = Ear(self.client, "ada")
+        self.ear = SoundRecorder(self.client, "ada")
         self.bob = FakeClient(
             self.hub.bus("bob"), self.model, (float(BOB[0]), float(BOB[1])), kind="human", digest=self.model.digest()
         )

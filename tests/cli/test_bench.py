@@ -29,7 +29,7 @@ def test_a_bench_without_such_a_name_is_refused_with_all_names() -> None:
         (["soak", "--minutes", "0"], "--minutes is 0: give more than 0"),
         (["soak", "--real-time-factor", "2"], "--real-time-factor is 2: give 0.01 to 1"),
         (["kill", "--times", "0"], "--times is 0: give 1 or more"),
-        (["fuzz", "--lies", "-1"], "--lies is -1: give 0 or more"),
+        (["fuzz", "--false-messages", "-1"], "--false-messages is -1: give 0 or more"),
     ],
 )
 def test_unfit_options_of_a_benchmark_are_refused_in_one_line(words: list[str], message: str) -> None:

@@ -107,7 +107,7 @@ def test_what_cannot_be_read_from_another_actor_is_counted(client) -> None:
 def test_what_the_parts_of_a_client_count_is_added_up(client) -> None:
     """Commands that were refused, of each robot; and none is shown as long as there is none."""
     counts = [0, 0]
-    client.faults_elsewhere += [lambda: {"commands_refused": counts[0]}, lambda: {"commands_refused": counts[1]}]
+    client.other_faults += [lambda: {"commands_refused": counts[0]}, lambda: {"commands_refused": counts[1]}]
     status = Status(client, RateLoop(0.01))
     assert status.current()["faults"] == {}
     counts[:] = 2, 3

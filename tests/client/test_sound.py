@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.sound_delay import AS_WAVEFORM, LIGHT, TONE_OF_LIGHTS, VOICE, sound
-from benchmarks.support.ear import Ear
+from benchmarks.support.sound_recorder import SoundRecorder
 from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, to_pcm
@@ -44,7 +44,7 @@ class World:
                 pose=frames.pose(np.array([x, 0.0, 0.0])),
                 clock=lambda: self.now,
             )
-            self.ears[name] = Ear(self.clients[name], name)
+            self.ears[name] = SoundRecorder(self.clients[name], name)
         self._phase = 0.0
         self.run(0.7)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from benchmarks.support.browser import AS_RECORDED, browser_page, microphone, write_tone
-from benchmarks.support.ear import Ear
+from benchmarks.support.sound_recorder import SoundRecorder
 from tests.audio.test_microphone import amplitude
 from tests.support.waiting import wait
 from vinesim.avatar.gestures import Gestures
@@ -109,7 +109,7 @@ class Meeting:
                 client.post_step.append(lambda _, world=world, server=server: world.collect(server))
         self.anna, self.ben, self.robot = self.clients.values()
         self.primitives = Primitives(self.model, grass=0.0)
-        self.ear = Ear(self.robot, "robot", decodes_opus=False)
+        self.ear = SoundRecorder(self.robot, "robot", decodes_opus=False)
 
     @contextlib.contextmanager
     def run(self):

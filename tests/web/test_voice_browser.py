@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.support.browser import AS_RECORDED, browser_page, microphone, write_tone
-from benchmarks.support.ear import Ear
+from benchmarks.support.sound_recorder import SoundRecorder
 from tests.audio.test_microphone import amplitude
 from tests.support.contact_scenes import cane
 from tests.support.live_page import SteppedPage
@@ -38,7 +38,7 @@ class LiveTalk(SteppedPage):
         self.anna = Client(scene, model, None, self.hub.bus("anna"), name="anna", pose=start, source=source)
         there = frames.pose(np.array([2.0, 0.0, 0.0]))
         self.bot = Client(scene, model, load_description("vinebot"), self.hub.bus("bot"), name="bot", pose=there)
-        self.ear = Ear(self.bot, "bot", decodes_opus=opus.is_available())
+        self.ear = SoundRecorder(self.bot, "bot", decodes_opus=opus.is_available())
         world = PageWorld(self.anna, source)
         super().__init__(PageServer(world, sound=PageSound(self.anna)), self._tick)
         self.anna.post_step.append(lambda _: world.collect(self.server))

@@ -141,7 +141,7 @@ class ClientSession:
             server = self.enter(PageServer(world, port, sound=sound))
         print(f"the vineyard in a browser: {server.address}", file=sys.stderr, flush=True)
         client.post_step.append(lambda _: world.collect(server))
-        client.faults_elsewhere.append(lambda: {"page_messages_refused": server.refused_messages})
+        client.other_faults.append(lambda: {"page_messages_refused": server.refused_messages})
 
     def run(
         self,

@@ -148,7 +148,7 @@ class Client:
         """Called after :meth:`reset`: parts that keep the physics or a robot take the new ones."""
         self.earlier_faults: collections.Counter[str] = collections.Counter()
         """Faults of the physics and of couplings before the last reset."""
-        self.faults_elsewhere: list[Callable[[], dict[str, int]]] = []  # counts of parts that serve it: of its page
+        self.other_faults: list[Callable[[], dict[str, int]]] = []  # counts of parts that serve it: of its page
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
         """How much there is to see now; the picture with the highest score is kept."""
         self.trace: Trace | None = None

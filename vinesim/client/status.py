@@ -172,7 +172,7 @@ def count_faults(client: Client, steps_skipped: int = 0) -> dict[str, int]:
             "steps_skipped": steps_skipped,
         }
     )
-    for others in client.faults_elsewhere:
+    for others in client.other_faults:
         counts.update(others())
     return {name: count for name, count in counts.items() if count}
 

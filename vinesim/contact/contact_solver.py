@@ -253,9 +253,9 @@ class ContactSolver:
         """Bring the boxes of trees [k] that sleep up to date after they were moved."""
         self.detection.update_tree_bounds(trees)
 
-    def let_pass(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """See :meth:`ContactDetection.let_pass`."""
-        self.detection.let_pass(bunch, low, high)
+    def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
+        """See :meth:`ContactDetection.ignore_overlaps`."""
+        self.detection.ignore_overlaps(bunch, low, high)
 
     def _update_rigid_world(self) -> None:
         """Take over the rigid world after an actor came or went, a hand opened or closed, or a bunch took a body."""

@@ -178,7 +178,7 @@ class ContactDetection:
 
     # ------------------------------------------------------------------ narrowphase
 
-    def let_pass(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
+    def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
         """Let a bunch that was picked within the box ``low`` [3] to ``high`` [3] m pass through the trees that it
         overlaps, until it is clear of them: as it hung there, that overlap was no contact."""
         near = np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1))

@@ -267,8 +267,8 @@ class DetachmentMonitor:
             radius=shapes.radius[of].astype(float),
         )
         self.rigid.add_bunch(bunch, loose, plants.state.body_q[body], velocity)
-        self.rigid.let_pass(bunch)
-        self.contact_solver.let_pass(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
+        self.rigid.ignore_overlaps(bunch)
+        self.contact_solver.ignore_overlaps(bunch, *_box_around(loose, plants.state.body_q[body].astype(float)))
         plants.state.bunch_attached[bunch] = False
         self._overloaded_steps[bunch] = 0
         plants.set_mass(body, STUB_MASS)

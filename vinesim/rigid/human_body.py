@@ -47,7 +47,7 @@ STILL_SPEED = 0.05
 """[m/s] A part that is slower stands still: more than the noise of tracked points. TUNED."""
 
 
-class PassingParts:
+class YieldingParts:
     """Which parts [k] of one remote person are light, and which touch nothing now."""
 
     def __init__(self, count: int) -> None:
@@ -160,7 +160,7 @@ class HumanBody:
         self.part_dofs = np.zeros((0, 6), int)
         """[part, 6] MuJoCo's degrees of freedom of the same."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
-        self._passing = PassingParts(len(BODY_PARTS))
+        self._passing = YieldingParts(len(BODY_PARTS))
         self._part_force = np.full(len(BODY_PARTS), np.inf)  # not known before the first step
         self._pushes_too_hard = np.zeros(len(BODY_PARTS), bool)
         self._posture = PostureSolver(spec.height)

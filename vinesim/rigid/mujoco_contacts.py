@@ -225,7 +225,7 @@ class SoftWires:
 
     def __init__(self, wires: DeflectedWires) -> None:
         self._wires = wires
-        self._geoms = np.append(np.zeros(FIRST_FIXED_GEOM, bool), wires.gives)
+        self._geoms = np.append(np.zeros(FIRST_FIXED_GEOM, bool), wires.is_compliant)
         """[MuJoCo geom, up to the last fixed piece] whether it is a wire that gives."""
         self._numbers = np.flatnonzero(self._geoms)
         self._contacts = WireContacts(wires)

@@ -176,7 +176,7 @@ class RigidWorld(MujocoWorld):
             found.append((names[0], names[1], -float(contact.dist)))
         return found
 
-    def let_wires_give(self, wires: DeflectedWires) -> None:
+    def use_compliant_wires(self, wires: DeflectedWires) -> None:
         """From now on what presses on a wire deflects it; before, wires are rigid."""
         self._soft_wires = SoftWires(wires)
         self._soft_wires.use_world(self.mj_model)
@@ -625,7 +625,7 @@ class RigidWorld(MujocoWorld):
         self._passing_bunches.discard(bunch)
         self._recompile()
 
-    def let_pass(self, bunch: int) -> None:
+    def ignore_overlaps(self, bunch: int) -> None:
         """Let a bunch that has just been picked pass through the fixed pieces (wood, wires, poles) if it overlaps one,
         until it is clear of them: as it hung there, that overlap was no contact."""
         self.update_kinematics()

@@ -44,7 +44,7 @@ LEAST_WEIGHT = 0.05
 which one is taken to press at least. TUNED."""
 TOUCHING = 1e-3
 """[m] A contact with a larger gap to the geom of a wire does not touch it, however far others deflect it. TUNED."""
-MOST_ALONG = 0.5
+MAX_NORMAL_ALONG_WIRE = 0.5
 OUT_OF_REACH = 1e3
 """[1] Largest cosine between a contact's normal and the wire; [m] where the wire is taken to be for others."""
 SAME_PLACE = 0.05
@@ -63,7 +63,7 @@ class DeflectedWires:
     def __init__(self, model: Model, supports: ElasticSupports, tree_awake: np.ndarray, dt: float) -> None:
         """``tree_awake``: [tree] what sleeps presses on as it did."""
         self._supports = supports
-        self.gives = model.fixed_tension > 0.0
+        self.is_compliant = model.fixed_tension > 0.0
         """[piece] Whether it is a wire under tension."""
         self.start = model.fixed_start.astype(float)
         self.end = model.fixed_end.astype(float)
@@ -222,6 +222,6 @@ def _numbers(dt: float) -> kernels.WireNumbers:
     made.max_deflection = MAX_DEFLECTION
     made.touching = TOUCHING
     made.same_place = SAME_PLACE
-    made.most_along = MOST_ALONG
+    made.max_normal_along_wire = MAX_NORMAL_ALONG_WIRE
     made.out_of_reach = OUT_OF_REACH
     return made

@@ -155,7 +155,7 @@ class RosProcess:
             client.world_time,
             lambda pcm: client.sound.play(self.robot.name, pcm),
         )
-        client.faults_elsewhere.append(lambda: {"commands_refused": self.commands_refused})
+        client.other_faults.append(lambda: {"commands_refused": self.commands_refused})
         client.sound.listen(self.robot.name, _Microphone(self))
         client.pre_step.insert(0, self._control)
         client.after_reset.append(self._begin_anew)

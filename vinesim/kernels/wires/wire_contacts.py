@@ -27,7 +27,7 @@ class WireNumbers:
     max_deflection: wp.float64
     touching: wp.float64
     same_place: wp.float64
-    most_along: wp.float64
+    max_normal_along_wire: wp.float64
     out_of_reach: wp.float64
 
 
@@ -228,7 +228,7 @@ def find_wire_springs(
         shift = wp.dot(geom - rest, normal) - numbers.followed * now - (one - numbers.followed) * mean
         if contacts_out.gap[i] > numbers.touching:
             shift = zero  # another holds the wire off it
-        if wp.abs(wp.dot(normal, geoms.axis[piece])) > numbers.most_along:
+        if wp.abs(wp.dot(normal, geoms.axis[piece])) > numbers.max_normal_along_wire:
             # with its axis inside a box, the nearest way out may be along it, where a wire does not push
             shift = numbers.out_of_reach
         contacts_out.stiffness[i] = stiffness

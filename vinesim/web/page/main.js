@@ -8,7 +8,7 @@ import { ARM, Hand } from "./hand.js";
 import { Headset } from "./headset.js";
 import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
-import { LateHands } from "./late.js";
+import { LateHands } from "./late_latching.js";
 import { Pace, WalkingEyes } from "./person.js";
 import { Detail, FirstPictures, TRIANGLES } from "./rate.js";
 import { Shears } from "./shears.js";

@@ -10,7 +10,7 @@ from vinesim.client.sound.exchange import SoundStep
 from vinesim.client.sound.microphone_step import at_place
 
 
-class Ear:
+class SoundRecorder:
     """Listens for an actor of a client from now on."""
 
     is_open = True

@@ -1,6 +1,6 @@
-"""Well-formed lies: messages of every kind that the encoders make, whose content the model forbids or that contradict.
+"""Well-formed false messages, of every kind that the encoders make: the model forbids their content, or they contradict.
 
-Strategies of Hypothesis. A lie that carries a time is encoded for time zero plus an error, and moved to the present
+Strategies of Hypothesis. A message that carries a time is encoded for time zero plus an error, and moved to the present
 when it is told.
 """
 
@@ -35,7 +35,7 @@ Draw = Callable[[st.SearchStrategy], Any]
 
 
 @dataclasses.dataclass(frozen=True)
-class Lie:
+class FalseMessage:
     """A message under a key, or a greeting with which the attacker comes back, or an offered mesh."""
 
     kind: str
@@ -56,22 +56,22 @@ class Lie:
 
 
 class Liar:
-    """Tells lies in a world that goes on from one example to the next; anew after a broken law, so that Hypothesis can
-    find the shortest lies that break it."""
+    """Sends false messages in a world that goes on from one example to the next. It starts again after a broken law,
+    so that Hypothesis can find the shortest list of messages that breaks it."""
 
     def __init__(self, *, kind: str = "robot") -> None:
         self.kind = kind
         self.told = 0
         self.world: FuzzWorld | None = None
 
-    def tell(self, lies_at_once: list[Lie]) -> None:
-        """Tell these lies, one a step, then let the world go on and hold it to its laws."""
+    def tell(self, messages: list[FalseMessage]) -> None:
+        """Send these messages, one a step, then let the world go on and check its laws."""
         world = self.world or FuzzWorld(kind=self.kind)
         self.world = None
         try:
             world.admit(self.kind)
-            for lie in lies_at_once:
-                lie.tell(world)
+            for one in messages:
+                one.tell(world)
                 world.step()
                 world.check()
             world.step()
@@ -79,7 +79,7 @@ class Liar:
         except BaseException:
             world.close()
             raise
-        self.told += len(lies_at_once)
+        self.told += len(messages)
         self.world = world
 
     def close(self) -> None:
@@ -98,8 +98,8 @@ _HEALTH_CHECKS = (
 )
 
 
-def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
-    """Tell that many series of up to eight lies, found by Hypothesis; the number of lies.
+def send_false_messages(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
+    """Send that many series of up to eight messages, found by Hypothesis; the number of messages.
 
     Raises what the product raises, or :class:`benchmarks.support.fuzz_world.LawBroken`.
     """
@@ -113,8 +113,8 @@ def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
         print_blob=False,
         suppress_health_check=_HEALTH_CHECKS,
     )
-    @hypothesis.given(st.lists(lies(small_vineyard()), min_size=1, max_size=8))
-    def tell(series: list[Lie]) -> None:
+    @hypothesis.given(st.lists(false_messages(small_vineyard()), min_size=1, max_size=8))
+    def tell(series: list[FalseMessage]) -> None:
         liar.tell(series)
 
     try:
@@ -124,7 +124,7 @@ def tell_lies(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
     return liar.told
 
 
-def lies(model: Model) -> st.SearchStrategy[Lie]:
+def false_messages(model: Model) -> st.SearchStrategy[FalseMessage]:
     """Lies about a model, of all kinds alike."""
     return st.one_of(
         _composite(_about_trees, model),
@@ -141,15 +141,15 @@ def lies(model: Model) -> st.SearchStrategy[Lie]:
     )
 
 
-def _composite(make: Callable[[Draw, Model], Lie | None], model: Model) -> st.SearchStrategy[Lie]:
+def _composite(make: Callable[[Draw, Model], FalseMessage | None], model: Model) -> st.SearchStrategy[FalseMessage]:
     @st.composite
-    def strategy(draw: Draw) -> Lie | None:
+    def strategy(draw: Draw) -> FalseMessage | None:
         try:
             return make(draw, model)
         except MessageError:  # not well-formed
             return None
 
-    return strategy().filter(lambda lie: lie is not None)  # type: ignore[return-value]
+    return strategy().filter(lambda one: one is not None)  # type: ignore[return-value]
 
 
 CELL = st.integers(-2, 1)
@@ -180,7 +180,7 @@ def _object(draw: Draw, model: Model, kinds: tuple[ObjectKind, ...]) -> int:
     return object_id(kind, draw(st.integers(0, object_counts(model)[kind])))
 
 
-def _about_trees(draw: Draw, model: Model) -> Lie:
+def _about_trees(draw: Draw, model: Model) -> FalseMessage:
     """Absurd states of trees, and bodies cut off that cannot be, far away."""
     trees = sorted(draw(st.sets(st.integers(0, len(model.tree_first) - 1), min_size=1, max_size=2)))
     sizes = np.array([int(model.tree_size[tree]) + draw(st.sampled_from((0, 0, 0, 0, 1))) for tree in trees])
@@ -204,10 +204,10 @@ def _about_trees(draw: Draw, model: Model) -> Lie:
         _vectors(draw, UNIT, cut, 3, scale=32.7),
     )
     family = draw(st.sampled_from(("tree", "near", "own")))
-    return Lie("put", messages.encode_trees(states)[0][0], f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+    return FalseMessage("put", messages.encode_trees(states)[0][0], f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
-def _about_objects(draw: Draw, model: Model) -> Lie:
+def _about_objects(draw: Draw, model: Model) -> FalseMessage:
     """Boxes and bunches that hang, of others or that there are not, at absurd places and speeds."""
     numbers = sorted({_object(draw, model, (ObjectKind.BUNCH, ObjectKind.BOX)) for _ in range(draw(st.integers(1, 3)))})
     count = len(numbers)
@@ -224,16 +224,16 @@ def _about_objects(draw: Draw, model: Model) -> Lie:
         pose,
         velocity,
     )
-    return Lie("put", messages.encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
+    return FalseMessage("put", messages.encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
 
 
-def _about_owners(draw: Draw, model: Model) -> Lie:
+def _about_owners(draw: Draw, model: Model) -> FalseMessage:
     """Claims for others, for objects that there are not, and of all sequences."""
     claims = []
     for _ in range(draw(st.integers(1, 4))):
         claim = Claim(draw(SEQUENCE), draw(SEQUENCE), draw(OWNERS))
         claims.append((_object(draw, model, tuple(ObjectKind)), claim, draw(st.booleans())))
-    return Lie("put", messages.encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+    return FalseMessage("put", messages.encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
 PARENTS = st.sampled_from(
@@ -261,7 +261,7 @@ PARENTS = st.sampled_from(
 )
 
 
-def _records(draw: Draw, model: Model) -> Lie:
+def _records(draw: Draw, model: Model) -> FalseMessage:
     """Records: cuts of bodies that cannot be cut, states of other trees, supports that lie in each other."""
     records = []
     for _ in range(draw(st.integers(1, 3))):
@@ -281,20 +281,20 @@ def _records(draw: Draw, model: Model) -> Lie:
                 pose,
                 draw(PARENTS),
                 tuple(cut) if draw(st.booleans()) else (),
-                state.payload if isinstance(state, Lie) else state,
+                state.payload if isinstance(state, FalseMessage) else state,
                 draw(st.booleans()),
             )
         )
     payload = messages.encode_records(records)
     messages.decode_records(payload)
-    return Lie("put", payload, f"fact/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+    return FalseMessage("put", payload, f"fact/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
 def _pose_key(draw: Draw) -> str:
     return f"a/{ATTACKER}" + draw(st.sampled_from(("", "/far", "/mid", "/near")))
 
 
-def _robot_pose(draw: Draw, _: Model) -> Lie:
+def _robot_pose(draw: Draw, _: Model) -> FalseMessage:
     """Robots with any number of joints, at any distance and speed, turned over."""
     count = draw(st.sampled_from((27, 27, 27, 0, 1, 256)))
     near = draw(st.booleans())
@@ -307,10 +307,10 @@ def _robot_pose(draw: Draw, _: Model) -> Lie:
         _vectors(draw, UNIT, count, scale=draw(st.sampled_from((1.0, 10.0, 9e8)))) if count > 12 else np.zeros(count),
         _vectors(draw, UNIT, count, scale=83.0),
     )
-    return Lie("put", encode_robot(update), _pose_key(draw))
+    return FalseMessage("put", encode_robot(update), _pose_key(draw))
 
 
-def _human_pose(draw: Draw, _: Model) -> Lie:
+def _human_pose(draw: Draw, _: Model) -> FalseMessage:
     """People turned and stretched, far away, and near others at absurd speeds."""
     place = frames.pose(_vectors(draw, NEAR if draw(st.booleans()) else FAR, 3))
     points = human_at(place).points + np.pad(_vectors(draw, UNIT, 7, 3, scale=2.0), ((0, 0), (0, 4)))
@@ -318,25 +318,25 @@ def _human_pose(draw: Draw, _: Model) -> Lie:
     update = HumanUpdate(
         ATTACKER, draw(TIME_ERROR), human_at(place).with_points(points), _vectors(draw, UNIT, 7, 6, scale=40.0)
     )
-    return Lie("put", encode_human(update), _pose_key(draw))
+    return FalseMessage("put", encode_human(update), _pose_key(draw))
 
 
-def _wrenches(draw: Draw, _: Model) -> Lie:
+def _wrenches(draw: Draw, _: Model) -> FalseMessage:
     """Forces beyond all limits, on links out of reach, of other robots, or that there are not."""
     links = draw(
         st.sets(st.sampled_from(("base_link", "arm_left_7_link", "torso_lift_link", "no link", "")), max_size=3)
     )
     wrenches = {link: _vectors(draw, st.floats(-2000.0, 2000.0, width=32), 6) for link in sorted(links)}
-    return Lie("put", encode_wrenches(WrenchMessage(draw(TIME_ERROR), wrenches)), f"force/ada/{ATTACKER}")
+    return FalseMessage("put", encode_wrenches(WrenchMessage(draw(TIME_ERROR), wrenches)), f"force/ada/{ATTACKER}")
 
 
-def _couplings(draw: Draw, model: Model) -> Lie:
+def _couplings(draw: Draw, model: Model) -> FalseMessage:
     """Springs to bodies without an owner, that cannot be held, or that there are not, from far away."""
     bodies = sorted(draw(st.sets(st.integers(0, len(model.body_tree)), max_size=8)))
     couplings = tuple(
         Coupling(body, _vectors(draw, st.floats(-10.0, 10.0, width=32), 3), _vectors(draw, FAR, 3)) for body in bodies
     )
-    return Lie("put", encode_couplings(CouplingMessage(draw(TIME_ERROR), couplings)), f"force/ada/{ATTACKER}")
+    return FalseMessage("put", encode_couplings(CouplingMessage(draw(TIME_ERROR), couplings)), f"force/ada/{ATTACKER}")
 
 
 def _urdf(links: str) -> str:
@@ -375,7 +375,7 @@ URDFS = (
 SIDECARS = (None, "", "{}", "[]", "null", '{"groups": 3}', '{"base_limits": [1e999, -1]}', "\x00", '{"a": ' * 50)
 
 
-def _greeting(draw: Draw, model: Model) -> Lie:
+def _greeting(draw: Draw, model: Model) -> FalseMessage:
     """Greetings whose parts contradict each other, of robots that cannot be."""
     robot = load_description("vinebot")
     urdf = draw(st.sampled_from(URDFS))
@@ -394,10 +394,10 @@ def _greeting(draw: Draw, model: Model) -> Lie:
         height=draw(st.sampled_from((1.0, 1.75, 2.5))),
         outfit=draw(st.sampled_from(("", "green", "no-such-outfit"))),
     )
-    return Lie(draw(st.sampled_from(("greet", "greet", "join"))), messages.encode_hello(hello))
+    return FalseMessage(draw(st.sampled_from(("greet", "greet", "join"))), messages.encode_hello(hello))
 
 
-def _mesh(draw: Draw, _: Model) -> Lie:
+def _mesh(draw: Draw, _: Model) -> FalseMessage:
     """Parts of meshes with lying digests and sizes."""
     corners = _vectors(draw, UNIT, 4, 3, 3, scale=draw(st.sampled_from((1.0, 1e6, 1e38)))).astype("<f4").tobytes()
     data = draw(st.sampled_from((corners, corners[:-1], b"", b"\xff" * 36)))
@@ -406,10 +406,10 @@ def _mesh(draw: Draw, _: Model) -> Lie:
     size = draw(st.sampled_from((len(data), len(data) + offset, 36, triangles.MAX_BYTES)))
     payload = messages.encode_part(MeshPart(digest, size, offset, data))
     messages.decode_part(payload)
-    return Lie("mesh", draw(st.sampled_from((payload, messages.encode_request(offset)))))
+    return FalseMessage("mesh", draw(st.sampled_from((payload, messages.encode_request(offset)))))
 
 
-def _control(draw: Draw, model: Model) -> Lie:
+def _control(draw: Draw, model: Model) -> FalseMessage:
     """Answers that were not asked for, under keys of other kinds; clocks."""
     number = draw(st.floats(allow_nan=False, allow_infinity=False))
     payload = draw(
@@ -422,4 +422,4 @@ def _control(draw: Draw, model: Model) -> Lie:
         )
     )
     family = draw(st.sampled_from(("own", "fact", "c", "tree", "near")))
-    return Lie("put", payload, f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+    return FalseMessage("put", payload, f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")

@@ -1,6 +1,6 @@
-"""Broken messages and well-formed lies against a client with physics and the server's store: no law is broken.
+"""Broken and well-formed false messages to a client with physics and to the server's store: no law is broken.
 
-Few here; ``python -m benchmarks fuzz --messages N --lies N`` sends as many as are wanted.
+Few here; ``python -m benchmarks fuzz --messages N --false-messages N`` sends as many as are wanted.
 """
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks.message_fuzz import attack
+from benchmarks.support.false_messages import send_false_messages
 from benchmarks.support.fuzz_world import ATTACKER, FuzzWorld, LawBroken
-from benchmarks.support.lies import tell_lies
 from tests.support.long_rows import long
 
 
@@ -24,8 +24,8 @@ def test_broken_messages_break_no_law(kind, is_stranger):
 
 
 @pytest.mark.parametrize("kind", ["human", *long("robot")])
-def test_well_formed_lies_break_no_law(kind):
-    assert tell_lies(20, seed=2, kind=kind) > 40
+def test_well_formed_false_messages_break_no_law(kind):
+    assert send_false_messages(20, seed=2, kind=kind) > 40
 
 
 def test_the_laws_notice_what_they_forbid():
