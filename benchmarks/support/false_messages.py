@@ -1,4 +1,4 @@
-"""Well-formed false messages, of every kind that the encoders make: the model forbids their content, or they contradict.
+"""Well-formed false messages of every kind: the model forbids their content, or they contradict each other.
 
 Strategies of Hypothesis. A message that carries a time is encoded for time zero plus an error, and moved to the present
 when it is told.

@@ -1,4 +1,4 @@
-"""Decoding of Opus by PyAV, if it is installed; who cannot decode asks speakers for PCM16 instead."""
+"""Decoding of Opus by PyAV. A client without PyAV asks speakers to send PCM16 instead."""
 
 from __future__ import annotations
 

@@ -25,13 +25,14 @@ CHECK_PERIOD = 0.05
 prediction of a step. TUNED."""
 
 CONTACT_SHARE = 0.05
-"""[1] Share of ``sleep_distance`` within which trees that are not moved to rest must be: those in contact, and what was
-cut off. TUNED: 0.01 mm, the thousandth part of a travel of 1 cm."""
+"""[1] Trees in contact and cut-off parts are not moved to their rest pose when they fall asleep. So they must be within
+this share of ``sleep_distance`` of it. TUNED: 0.01 mm, a thousandth of a travel of 1 cm."""
 
 STILL_DURATION = 5.0
-"""[s] What is in contact or cut off is at rest, too, if no body of it has moved by that share in so long: what bears
-it is not in the tangent stiffness, so it may be measured far from a rest in which it is. What creeps with a time
-constant of five times as much is then 0.05 mm from where it ends. TUNED."""
+"""[s] A tree in contact, or a cut-off part, also counts as at rest if none of its bodies has moved by more than this
+share of ``sleep_distance`` for this long. The tangent stiffness does not contain the contacts that support it, so its
+distance from rest may be overestimated. A tree that creeps with a time constant of five times this duration falls
+asleep 0.05 mm from its rest. TUNED."""
 
 _NO_PAIRS = np.zeros((0, 2), np.int32)
 

@@ -64,7 +64,7 @@ class Parameters:
             self._changed[name] = changed
 
     def apply(self) -> None:
-        """When all are declared: call what is to be called for those that have not their defaults."""
+        """Call the change handlers of parameters that differ from their defaults; after all have been declared."""
         for name, changed in self._changed.items():
             if self._values[name] != self._defaults[name]:
                 changed()

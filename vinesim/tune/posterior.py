@@ -78,8 +78,10 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
 
 
 def _correlation_time(residuals: np.ndarray) -> float:
-    """Samples that tell as much as one independent one, from residuals [sample, column] in standard deviations: 1
-    unless neighbours are clearly correlated."""
+    """Number of correlated samples that carry as much information as one independent sample.
+
+    From residuals [sample, column] in standard deviations. 1 unless neighbours are clearly correlated.
+    """
     table = np.clip(residuals, -SOFT, SOFT)
     pairs = table[:-1] * table[1:]
     count = int(np.isfinite(pairs).sum())

@@ -34,19 +34,22 @@ LEAST_DEFLECTION = 1e-6
 LEAST_SPREAD = 0.1
 """[1] Of a wire's length: contacts that are further apart tilt it; others move it as a whole. TUNED."""
 FOLLOWED = 0.7
+"""[1] Share of the deflection by other contacts' forces that a contact with the same wire takes over within a step. For
+the rest it takes the mean deflection over :data:`MEMORY`. DERIVED: the largest share for which a mass on two such
+springs is stable, whatever its mass, with a wire's damping."""
 EXTRAPOLATED = 0.5
-"""[1] What several contacts with wires know of each other in a step: so much of the deflections by the others' forces,
-and these extrapolated by so many steps; of the rest, its mean over :data:`MEMORY`. DERIVED: the largest share with
-which a mass on two such springs is stable whatever it weighs, with a wire's damping."""
+"""[steps] Time by which the deflection that :data:`FOLLOWED` refers to is extrapolated. DERIVED with it."""
 MEMORY = 0.5
+"""[s] Time constant of the mean forces by which several contacts share a wire. TUNED."""
 LEAST_WEIGHT = 0.05
-"""[s] over which the forces are averaged by which several contacts share a wire, and [1] the share of the largest with
-which one is taken to press at least. TUNED."""
+"""[1] Smallest force that a contact counts with in this sharing, as a share of the largest force. TUNED."""
 TOUCHING = 1e-3
 """[m] A contact with a larger gap to the geom of a wire does not touch it, however far others deflect it. TUNED."""
 MAX_NORMAL_ALONG_WIRE = 0.5
+"""[1] Largest cosine between the normal of a contact and the wire. A contact with a larger one is not on the wire's
+side, and is ignored."""
 OUT_OF_REACH = 1e3
-"""[1] Largest cosine between a contact's normal and the wire; [m] where the wire is taken to be for others."""
+"""[m] Shift of the wire that is assumed for an ignored contact, so that it pushes nothing."""
 SAME_PLACE = 0.05
 """[m] Contacts of the same pair of shapes that are further apart in two steps are different ones. TUNED: less than any
 box is long, more than anything slides in a step."""

@@ -5,15 +5,15 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 LOADED = wp.constant(0)
-"""Place in ``numbers`` of how many bodies the last step loaded."""
+"""Index in ``numbers``: number of bodies that the last step loaded."""
 GIVEN = wp.constant(1)
-"""Of how many are loaded now."""
+"""Index: number of bodies that are loaded now."""
 TICK = wp.constant(2)
-"""Of the number of this step."""
+"""Index: number of this step."""
 ONSET_STEPS = wp.constant(3)
-"""Of the steps with phi = 1 that follow on the first one of a contact, and that one."""
+"""Index: number of steps with phi = 1 at the begin of a contact, the first one included."""
 REFUSED = wp.constant(4)
-"""Of the number of the first given body that cannot be loaded, counted from 1; 0 if all can."""
+"""Index: the first given body that cannot be loaded, counted from 1; 0 if all can be loaded."""
 NUMBERS = 5
 
 

@@ -153,7 +153,7 @@ def choose_budget(
 
 @wp.func
 def is_close(budget: int, phi: float):
-    """Whether a tree of which this phi is asked is always watched closely."""
+    """Whether the energy of a tree with this phi is checked in every step."""
     return budget == CLOSELY or phi < MIN_PHI
 
 

@@ -62,8 +62,8 @@ MAX_COORDINATE = 1e5
 """Magnitude that positions stay below [m]."""
 
 LARGEST_COORDINATE = MAX_COORDINATE - 1.0
-"""Positions beyond it are clipped to it where they are sent [m]: what one actor accepts near the bound, and then moves
-farther, no other would."""
+"""Positions are clipped to this magnitude before they are sent [m]. Without the margin an actor could accept an object
+near the bound and move it beyond, and all others would refuse it."""
 
 HEADER = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
 """Magic, version, kind, count, time [s]: 14 bytes."""

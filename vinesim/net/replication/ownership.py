@@ -42,9 +42,9 @@ class ObjectRecord:
     listener_count: int = 0
     """Peers within the interest radius when its state was last published."""
     published_to_all_at: float = LONG_AGO
-    """Of a tree: time of the newest own state that left on the first layer."""
+    """Of a tree: time of the newest own state that was published to all listeners."""
     near_listener_count: int = 0
-    """Of a tree: peers within the distance of the last layer when its state last left on any."""
+    """Of a tree: number of peers near enough for its full rate when its state was last published."""
     corrected_at: float = LONG_AGO
     """When the claim was last repeated as a correction."""
 

@@ -33,7 +33,7 @@ CONNECT_TIMEOUT = 2.0
 """Time limit of connecting and of every query [s]."""
 
 EXIT_TIMEOUT = 10.0
-"""How long the exit of a program waits for the last callbacks [s]: they have to get a processor."""
+"""Longest time that a program waits at its exit for running callbacks to end [s]."""
 
 
 class ServerUnreachable(BusError):

@@ -118,8 +118,10 @@ def load_human_model(height: float, name: str = "worker", outfit: str = "") -> H
 
 @functools.lru_cache(16)
 def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[str]]]:
-    """The human model of this height [m] in the colours of its paints, which all outfits share the meshes of; the
-    paint of every shape, by part."""
+    """The human model of this height [m], and the name of the paint of every shape, by part.
+
+    All outfits share the meshes of this model; :func:`load_human_model` gives them their colours.
+    """
     file = _load_file(find_data_file("figures", name, ".toml"))
     scale = height / file.height
     parts: dict[str, tuple[Shape, ...]] = {}

@@ -19,11 +19,11 @@ import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
-const SHADOW_PERIOD = 250, SHADOW_PICTURES = 4; // what the sun sees is drawn anew after so many ms, and so many pictures
-const LONGEST = 0.1; // s: what moves by keys moves no further in one picture
-const FINGER = 22; // px: a tap so far beside a thing means it
-/** rad: eyes that have turned so far need another list of plants; in a headset, half of what the eyes see, corner to corner,
- * and a pixel of the finest ones. */
+const SHADOW_PERIOD = 250, SHADOW_PICTURES = 4; // the shadow map is drawn again after this time [ms] and this number of pictures
+const LONGEST = 0.1; // s: longest time by which the keys move the viewpoint in one picture
+const FINGER = 22; // px: a tap within this distance of a thing selects it
+/** Turn of the view after which the list of visible plants is made again [rad]. In a headset: half the diagonal field of
+ * view, the same turn, and the angle of one pixel of the finest displays [rad]. */
 const TURN = 0.35, IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
