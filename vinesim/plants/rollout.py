@@ -1,10 +1,11 @@
 """Gradients through time: how a loss on the motion of trees depends on their springs, dampers, masses and first state.
 
-The kernels are those that :class:`vinesim.plants.articulation_solver.ArticulationSolver` launches, compiled
-once more with their adjoints. Each tick has arrays of its own, so that the backward pass finds the values of the forward
-pass. Checkpoints bound the memory: the forward pass keeps only the joints, every ``checkpoint`` ticks; the backward pass
-runs each segment forward once more before its adjoint. You compute the loss, in NumPy, PyTorch or by hand: :meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient`
-takes the loss's derivatives by them. docs/gradients.md shows it at work.
+The kernels are those that :class:`vinesim.plants.articulation_solver.ArticulationSolver` launches, compiled once more
+with their adjoints. Each tick has arrays of its own, so that the backward pass finds the values of the forward pass.
+Checkpoints bound the memory: the forward pass keeps only the joints, every ``checkpoint`` ticks; the backward pass
+runs each segment forward once more before its adjoint. You compute the loss, in NumPy, PyTorch or by hand:
+:meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient` takes the loss's derivatives by them.
+docs/gradients.md shows it at work.
 
 A rollout takes whole steps, where the solver divides those of trees that swing above 5 Hz: give those a shorter ``dt``.
 It keeps no energy budget (:mod:`vinesim.kernels.plants.energy_budget`).
