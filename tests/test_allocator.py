@@ -13,7 +13,7 @@ from tests.support.waiting import deadline
 MEASURE = """
 import sys
 import numpy as np
-from vinesim import allocator
+from vinesim.core import allocator
 if sys.argv[1] == "apart":
     allocator.keep_large_blocks_apart()
 def resident():
@@ -40,7 +40,7 @@ def test_freed_tables_leave_no_gaps_in_the_heap() -> None:
 GAPS = """
 import time
 import numpy as np
-from vinesim import allocator
+from vinesim.core import allocator
 allocator.trim_regularly(0.2)
 def resident():
     return next(int(line.split()[1]) for line in open("/proc/self/status") if line.startswith("VmRSS")) / 1024.0

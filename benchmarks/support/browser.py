@@ -39,7 +39,7 @@ OPTIONS = (
 )
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options of a browser that draws without a graphics card."""
-IWER = pathlib.Path(__file__).parents[3] / "build" / "page" / "iwer.min.js"
+IWER = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 """The emulator of headsets; ``tools/build_page`` puts it there."""
 
 GUARD = '"$@" & read -r _; kill -9 $!'

@@ -84,7 +84,7 @@ ALLOWED = {
     "client/recording/recorder.py": "first estimate of the network clock",
     "client/recording/replay.py": "first estimate of the network clock",
     "cli/record.py": "when a recording was made",
-    "disk_cache.py": "age of files",
+    "core/disk_cache.py": "age of files",
     "kernels/compilation.py": "age of files",
     "ros/dead_segments.py": "age of files",
     "ros/tools/topic_monitor.py": "age of stamps, which are the time of day in ROS",
