@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 
 from tests.support.shared_vineyard import vineyard
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, decode_couplings, encode_couplings
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.forces import MAX_COUPLINGS, CouplingMessage, decode_couplings, encode_couplings
+from vinesim.net.codec.header import HEADER, MessageError
+from vinesim.net.codec.messages import Counters
 from vinesim.net.replication.couplings import ARM_REACH, MAX_AGE, CouplingSync
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.values import Coupling, RobotUpdate
@@ -42,7 +42,7 @@ def message(*couplings: Coupling, time: float = 1.0) -> bytes:
 def test_a_message_survives_the_way_and_is_28_bytes_a_coupling():
     sent = CouplingMessage(3.5, (coupling(3), coupling(7, -2.0)))
     payload = encode_couplings(sent)
-    assert len(payload) == messages.HEADER.size + 2 * 28
+    assert len(payload) == HEADER.size + 2 * 28
     received = decode_couplings(payload)
     assert received.time == 3.5
     assert [one.body for one in received.couplings] == [3, 7]
@@ -54,7 +54,7 @@ def test_a_message_survives_the_way_and_is_28_bytes_a_coupling():
 
 @given(st.binary(max_size=80), st.integers(0, 120))
 def test_any_bytes_are_decoded_or_refused(tail, cut):
-    for payload in (message(coupling())[:cut] + tail, messages.HEADER.pack(b"VS", 1, 8, len(tail) // 28, 1.0) + tail):
+    for payload in (message(coupling())[:cut] + tail, HEADER.pack(b"VS", 1, 8, len(tail) // 28, 1.0) + tail):
         try:
             found = decode_couplings(payload)
         except MessageError:

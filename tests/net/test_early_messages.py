@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.test_replicator import Client, run
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import RetainedRecord, encode_records
 from vinesim.net.replication import early_messages
 from vinesim.net.replication.early_messages import (
     MAX_EARLY_BYTES,
@@ -66,7 +65,7 @@ def test_a_client_holds_a_bounded_amount_of_messages_of_strangers():
     run(hub, [ada], 0.1)
     stranger = hub.bus("stranger", live=False)
     record = RetainedRecord(3, 1, 0, "stranger")
-    payload = messages.encode_records([record]) + bytes(MAX_EARLY_BYTES // 4)
+    payload = encode_records([record]) + bytes(MAX_EARLY_BYTES // 4)
     before = ada.replicator.counters.dropped
     sent = 0
     for name in range(3 * MAX_EARLY_SENDERS):

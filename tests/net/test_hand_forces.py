@@ -9,9 +9,10 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from vinesim.core import frames
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.codec.wrenches import MAX_WRENCH, WrenchMessage, encode_wrenches
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.forces import MAX_WRENCH, WrenchMessage, encode_wrenches
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.messages import Counters
 from vinesim.net.replication.hand_forces import (
     HAND_FORCE,
     HAND_LEVER,

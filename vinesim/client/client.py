@@ -36,7 +36,7 @@ from vinesim.client.sound.exchange import SoundExchange
 from vinesim.client.world_time import WorldTime
 from vinesim.core import frames
 from vinesim.core.allocator import release_free_memory
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator

@@ -12,9 +12,10 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
-from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, decode_couplings, encode_couplings
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.forces import MAX_COUPLINGS, CouplingMessage, decode_couplings, encode_couplings
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.messages import Counters
 from vinesim.net.replication.hand_forces import SEND_PERIOD
 from vinesim.net.transport.bus import Bus, Publisher
 from vinesim.scene.model import Model

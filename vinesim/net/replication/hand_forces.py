@@ -14,9 +14,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.forces import WrenchMessage, decode_wrenches, encode_wrenches
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.messages import Counters
 from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 

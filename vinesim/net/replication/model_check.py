@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError, RetainedRecord, TreeStates
+from vinesim.net.codec.control import RetainedRecord
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.objects import check_object_id
+from vinesim.net.codec.trees import TreeStates, decode_trees
 from vinesim.scene.ids import is_tree, parse_object_name
 from vinesim.scene.model import Model
 
@@ -22,7 +24,7 @@ def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) 
         raise MessageError(f"record of object {record.object} with cuts or the state of a tree; it is none")
     parent = parse_object_name(record.parent)
     if parent is not None:
-        messages.check_object_id(parent, counts)
+        check_object_id(parent, counts)
         if parent == record.object:
             raise MessageError(f"record of object {record.object} that rests on itself")
 
@@ -35,7 +37,7 @@ def _check_tree_record(record: RetainedRecord, model: Model) -> None:
     if wrong is not None:
         raise MessageError(f"record of tree {tree} cut at body {wrong}; it has wood from {first} to {first + core - 1}")
     if record.trees:
-        states = messages.decode_trees(record.trees, model.tree_size)
+        states = decode_trees(record.trees, model.tree_size)
         if states.tree.tolist() != [tree]:
             raise MessageError(f"record of tree {tree} with the state of {states.tree.tolist()}")
         check_tree_states(states, model)

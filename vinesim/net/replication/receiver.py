@@ -6,17 +6,12 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import CLAIMS, Hello, RetainedRecord, decode_claims, decode_records, encode_claims
+from vinesim.net.codec.forces import COUPLINGS
+from vinesim.net.codec.header import MessageError, is_valid_name, kind_of
 from vinesim.net.codec.human import decode_pose
-from vinesim.net.codec.messages import (
-    Hello,
-    MessageError,
-    MessageKind,
-    ObjectStates,
-    RetainedRecord,
-    TreeStates,
-    is_valid_name,
-)
+from vinesim.net.codec.objects import OBJECTS, ObjectStates, check_object_id, decode_objects
+from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, decode_trees
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import NO_OWNER, Claim
 from vinesim.net.replication.early_messages import EarlyMessages
@@ -43,7 +38,7 @@ class Inbox:
     people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
     """The same for people."""
     wrenches: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Sum of the wrenches [6] of peers on each own link: :class:`vinesim.net.codec.wrenches.WrenchMessage`."""
+    """Sum of the wrenches [6] of peers on each own link: :class:`vinesim.net.codec.forces.WrenchMessage`."""
     couplings: dict[str, tuple[Coupling, ...]] = dataclasses.field(default_factory=dict)
     """Couplings of peers to trees that they or this actor own, by actor."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
@@ -157,7 +152,7 @@ class Receiver:
             elif family == "force":
                 assert peer is not None
                 pose = peer.update if peer.update and step.time - peer.update.time <= MAX_POSE_AGE else None
-                if messages.kind_of(payload) == MessageKind.COUPLINGS:
+                if kind_of(payload) == COUPLINGS:
                     state.coupling_sync.receive(payload, peer.hello, pose, step.now, state.ownership.owner)
                 else:
                     state.wrench_sync.receive(payload, peer.hello, pose, step.now, step.link_centre)
@@ -169,19 +164,19 @@ class Receiver:
     def _receive_in_cell(self, family: str, cell: Cell, payload: bytes, sender: str, step: _Step) -> None:
         """Apply a message about objects in a cell."""
         state = self._state
-        kind = messages.kind_of(payload)
+        kind = kind_of(payload)
         if family == "fact":
-            for record in messages.decode_records(payload, state.object_counts):
+            for record in decode_records(payload, state.object_counts):
                 if record.author != sender:
                     raise MessageError(f"record by {record.author!r} published by {sender!r}")
                 self._receive_record(cell, record, sender, step, is_remote=sender not in state.peers.local_actors)
-        elif kind == MessageKind.CLAIMS:
-            for object_id, claim, touching in messages.decode_claims(payload, state.object_counts):
+        elif kind == CLAIMS:
+            for object_id, claim, touching in decode_claims(payload, state.object_counts):
                 state.ownership.receive_claim(object_id, claim, touching, sender, step.time)
-        elif kind == MessageKind.OBJECTS:
-            self._receive_objects(messages.decode_objects(payload, cell), cell, sender, step)
+        elif kind == OBJECTS:
+            self._receive_objects(decode_objects(payload, cell), cell, sender, step)
         else:
-            self._receive_trees(messages.decode_trees(payload, state.model.tree_size), sender, step)
+            self._receive_trees(decode_trees(payload, state.model.tree_size), sender, step)
 
     def _keep_early(self, sender: str, key: str, payload: bytes) -> int:
         """Keep records of an actor that may be admitted soon until then, for they are published only once; the number
@@ -198,8 +193,8 @@ class Receiver:
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
         columns = (trees.tree, trees.ownership, trees.authority, trees.flags)
         for row, (tree, ownership, sequence, flags) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-            claim = Claim(ownership, sequence, NO_OWNER if flags & messages.RESTING else sender)
-            touching = bool(flags & messages.TOUCHED)
+            claim = Claim(ownership, sequence, NO_OWNER if flags & RESTING else sender)
+            touching = bool(flags & TOUCHED)
             is_accepted = state.ownership.receive_state(tree, claim, touching, trees.time, step.time)
             if is_accepted and is_near[row]:
                 step.new_trees[tree] = (trees, sender)
@@ -211,11 +206,11 @@ class Receiver:
         state = self._state
         updates = objects.updates(sender)
         for update in updates:
-            messages.check_object_id(update.object, state.object_counts)
+            check_object_id(update.object, state.object_counts)
         is_near = state.cells.is_within_radius(objects.pose[:, :3])
         for row, (update, flags) in enumerate(zip(updates, objects.flags.tolist(), strict=True)):
             claim = Claim(update.ownership, update.authority, sender)
-            touching = bool(flags & messages.TOUCHED)
+            touching = bool(flags & TOUCHED)
             is_accepted = state.ownership.receive_state(update.object, claim, touching, objects.time, step.time)
             if is_accepted and is_near[row]:
                 state.object_stream.receive(update, cell)
@@ -250,7 +245,7 @@ class Receiver:
             return
         try:
             cell = int(chunks[0]), int(chunks[1])
-            records = messages.decode_records(reply.payload, state.object_counts)
+            records = decode_records(reply.payload, state.object_counts)
         except (MessageError, ValueError) as error:
             state.peers.count_malformed("the server", MessageError(str(error)))
             return
@@ -264,5 +259,5 @@ class Receiver:
         entry = state.ownership[object_id]
         publisher = state.cells.event_publisher(state.cell_of(object_id))
         if publisher is not None:
-            payload = messages.encode_claims([(object_id, entry.claim, entry.touching)])
+            payload = encode_claims([(object_id, entry.claim, entry.touching)])
             put_counted(publisher, payload, state.counters.event)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.net.codec.messages import Hello
-from vinesim.net.counters import Counters, Traffic
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.messages import Counters, Traffic
 from vinesim.net.replication import authority, interest
 from vinesim.net.replication.cell_channels import CellChannels
 from vinesim.net.replication.couplings import CouplingSync

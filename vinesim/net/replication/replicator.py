@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 
-from vinesim.net.codec.messages import Hello, RetainedRecord
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello, RetainedRecord
+from vinesim.net.codec.messages import Counters
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim

@@ -16,9 +16,10 @@ import numpy as np
 from vinesim.audio.frame import FRAME, Codec
 from vinesim.audio.loudness import REACH
 from vinesim.audio.permission import may_hear
-from vinesim.net.codec.messages import Hello, MessageError
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.messages import Counters
 from vinesim.net.codec.voice import VoiceFrame, decode_voice, encode_voice
-from vinesim.net.counters import Counters
 from vinesim.net.replication.interest import LAYER_HYSTERESIS
 from vinesim.net.replication.remote_pose import RemotePose
 from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
