@@ -1,8 +1,8 @@
 """Writes recordings: every network message of a world, in an MCAP file that any MCAP reader opens.
 
-One channel for each key. A message is a JSON object (:func:`~vinesim.net.codec.messages.describe_message`) that holds the decoded
-content and, in ``raw``, the bytes that crossed the network, for replays. Log time is the network time at which the
-recorder received it [ns], publish time the one in its header.
+One channel for each key. A message is a JSON object (:func:`~vinesim.net.codec.messages.describe_message`) that holds
+the decoded content and, in ``raw``, the bytes that crossed the network, for replays. Log time is the network time at
+which the recorder received it [ns], publish time the one in its header.
 """
 
 from __future__ import annotations
