@@ -37,7 +37,14 @@ from vinesim.net.codec.control import (
     encode_time,
     encode_welcome,
 )
-from vinesim.net.codec.forces import MAX_COUPLINGS, CouplingMessage, WrenchMessage, encode_couplings, encode_wrenches
+from vinesim.net.codec.forces import (
+    MAX_COUPLINGS,
+    Coupling,
+    CouplingMessage,
+    WrenchMessage,
+    encode_couplings,
+    encode_wrenches,
+)
 from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.meshes import MeshPart, MeshWanted, encode_part, encode_request, encode_wanted
@@ -51,7 +58,7 @@ from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
-from vinesim.scene.values import Coupling, HumanUpdate, Measurement, RobotUpdate
+from vinesim.scene.values import HumanUpdate, Measurement, RobotUpdate
 
 MESSAGE_COUNT = 100_000
 MESSAGES_PER_TICK = 200

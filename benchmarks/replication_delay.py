@@ -26,7 +26,6 @@ from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.codec.robot import decode_robot, encode_robot
 from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees
 from vinesim.net.replication import dead_reckoning
-from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.interest import POSE_RATE
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.receiver import Inbox
@@ -101,8 +100,8 @@ class Pair:
         """What the second client was told in its last tick."""
         receive = self.second.replicator.receive
 
-        def receive_and_keep(now: float, link_centre: LinkCentre | None = None) -> Inbox:
-            self.inbox = receive(now, link_centre)
+        def receive_and_keep(now: float) -> Inbox:
+            self.inbox = receive(now)
             return self.inbox
 
         self.second.replicator.receive = receive_and_keep

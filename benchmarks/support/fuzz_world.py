@@ -26,7 +26,7 @@ from vinesim.net.codec.header import MAX_COORDINATE, MessageError
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.codec.meshes import MESH_PART, MESH_REQUEST, decode_part, decode_request, encode_part, encode_wanted
 from vinesim.net.codec.objects import check_object_id
-from vinesim.net.replication.model_check import check_record
+from vinesim.net.replication.receiver import check_record
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.admission import AdmissionControl, SceneId
 from vinesim.net.server.journal import load_all

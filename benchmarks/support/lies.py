@@ -27,7 +27,7 @@ from vinesim.net.codec.control import (
     encode_time,
     encode_welcome,
 )
-from vinesim.net.codec.forces import CouplingMessage, WrenchMessage, encode_couplings, encode_wrenches
+from vinesim.net.codec.forces import Coupling, CouplingMessage, WrenchMessage, encode_couplings, encode_wrenches
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.human import encode_human
 from vinesim.net.codec.meshes import MeshPart, MeshWanted, decode_part, encode_part, encode_request, encode_wanted
@@ -42,7 +42,7 @@ from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.scene import triangles
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
-from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate
+from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 Draw = Callable[[st.SearchStrategy], Any]
 

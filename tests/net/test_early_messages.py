@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from tests.net.test_replicator import Client, run
 from vinesim.net.codec.control import RetainedRecord, encode_records
-from vinesim.net.replication import early_messages
-from vinesim.net.replication.early_messages import (
+from vinesim.net.replication import receiver
+from vinesim.net.replication.receiver import (
     MAX_EARLY_BYTES,
     MAX_EARLY_MESSAGES,
     MAX_EARLY_SENDERS,
@@ -32,8 +32,8 @@ def test_messages_are_taken_in_order_and_once():
 @given(_PUTS)
 def test_bytes_messages_and_senders_are_bounded_and_every_message_is_kept_or_counted(puts):
     bounds = {"MAX_EARLY_MESSAGES": 5, "MAX_EARLY_BYTES": 100, "MAX_EARLY_SENDERS": 4, "MAX_EARLY_TOTAL": 250}
-    before = {name: getattr(early_messages, name) for name in bounds}
-    vars(early_messages).update(bounds)
+    before = {name: getattr(receiver, name) for name in bounds}
+    vars(receiver).update(bounds)
     try:
         early = EarlyMessages()
         discarded = 0
@@ -43,7 +43,7 @@ def test_bytes_messages_and_senders_are_bounded_and_every_message_is_kept_or_cou
             assert early.size <= 250
         kept = [early.take(f"{sender}") for sender in range(10)]
     finally:
-        vars(early_messages).update(before)
+        vars(receiver).update(before)
     assert all(len(messages) <= 5 and sum(len(payload) for _, payload in messages) <= 100 for messages in kept)
     assert sum(map(len, kept)) + discarded == len(puts)
 

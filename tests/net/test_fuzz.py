@@ -28,7 +28,7 @@ from vinesim.net.codec.robot import encode_robot
 from vinesim.net.codec.trees import TOUCHED, TreeStates, encode_trees
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.model_check import check_record
+from vinesim.net.replication.receiver import check_record
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.server import Server
 from vinesim.net.transport.memory_bus import MemoryHub

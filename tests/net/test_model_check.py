@@ -12,7 +12,7 @@ from vinesim.core import frames
 from vinesim.net.codec.control import RetainedRecord, decode_records, encode_records
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees
-from vinesim.net.replication.model_check import check_record, check_tree_states
+from vinesim.net.replication.receiver import check_record, check_tree_states
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate

@@ -14,7 +14,6 @@ import numpy as np
 
 from vinesim.net.codec.header import HEADER, MAX_COORDINATE, MessageError, pack_header, unpack_header
 from vinesim.net.codec.json_values import COUNT, NUMBER, TEXT, list_of, object_of
-from vinesim.scene.values import Coupling
 
 WRENCHES = 7
 COUPLINGS = 8
@@ -103,6 +102,21 @@ MAX_LEVER = 10.0
 """Farthest point of a body from its origin [m]."""
 
 _COUPLING = np.dtype([("body", "<u4"), ("point", "<f4", 3), ("anchor", "<f4", 3)])
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Coupling:
+    """Force of an actor on one body of a tree that another client owns, as a spring of fixed stiffness.
+
+    Where both clients hold the body at the same place the spring pulls with just the force of the contact.
+    """
+
+    body: int
+    """Plant body in the model."""
+    point: np.ndarray
+    """[3] m where the force acts, in the body's frame."""
+    anchor: np.ndarray
+    """[3] m where the spring pulls that point, world."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

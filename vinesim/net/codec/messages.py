@@ -268,6 +268,10 @@ class Counters:
     network_failures: int = 0
     """Puts, declarations and queries of the bus that the network refused."""
 
+    def of(self, family: str) -> Traffic:
+        """Traffic of a family of keys."""
+        return getattr(self, FAMILIES[family].traffic)
+
     def to_report(self) -> dict[str, Any]:
         """All counters under the keys of ``report.json``, where retained records are called ``fact``."""
         return {"fact" if name == "retained" else name: value for name, value in dataclasses.asdict(self).items()}

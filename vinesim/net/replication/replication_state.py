@@ -7,17 +7,16 @@ import numpy as np
 from vinesim.net.codec.control import Hello
 from vinesim.net.codec.messages import Counters, Traffic
 from vinesim.net.replication import authority, interest
-from vinesim.net.replication.cell_channels import CellChannels
-from vinesim.net.replication.couplings import CouplingSync
-from vinesim.net.replication.hand_forces import WrenchSync
+from vinesim.net.replication.cell_channels import CellChannels, TreeChannels
+from vinesim.net.replication.forces import CouplingSync, WrenchSync
 from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.message_sync import MessageSync
 from vinesim.net.replication.ownership import Ownership
 from vinesim.net.replication.peers import PeerRegistry
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.replication.streams import ObjectStream, TreeStream, object_counts
-from vinesim.net.replication.tree_channels import TreeChannels
 from vinesim.net.replication.voices import VoiceSync
-from vinesim.net.transport.bus import Bus, Publisher
+from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher
 from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
 
@@ -38,10 +37,15 @@ class ReplicationState:
         self.tree_channels = TreeChannels(bus, interest_radius)
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
-        self.wrench_sync = WrenchSync(bus, hello.name, self.counters, hand_force)
-        self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
-        self.voices = VoiceSync(bus, hello, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
+        owner = self.ownership.owner
+        known = self.peers.known
+        bus.subscribe(f"force/{hello.name}/*", KEEP_LAST_64)
+        self.wrenches = WrenchSync(bus, hello.name, self.counters, hand_force)
+        self.couplings = CouplingSync(bus, hello.name, model, self.counters, owner, known)
+        self.voices = VoiceSync(bus, hello, self.counters)
+        self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (self.wrenches, self.couplings, self.voices)}
+        """What actors tell each other directly, by kind of message: the one place where a new kind is added."""
         self.siblings: tuple[ReplicationState, ...] = ()
         """Of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)
@@ -83,8 +87,8 @@ class ReplicationState:
             peer.shift_time(step)
         self.ownership.shift_time(step)
         self.object_stream.shift_time(step)
-        self.wrench_sync.shift_time(step)
-        self.coupling_sync.shift_time(step)
+        for sync in self.syncs.values():
+            sync.shift_time(step)
 
     def count_listeners(self, positions: np.ndarray, distance: float | None = None) -> np.ndarray:
         """Number of peers within ``distance`` [m], by default the interest radius, of each position [k, 3] m: [k]."""

@@ -19,8 +19,9 @@ from vinesim.audio.permission import may_hear
 from vinesim.net.codec.control import Hello
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.messages import Counters
-from vinesim.net.codec.voice import VoiceFrame, decode_voice, encode_voice
+from vinesim.net.codec.voice import VOICE, VoiceFrame, decode_voice, encode_voice
 from vinesim.net.replication.interest import LAYER_HYSTERESIS
+from vinesim.net.replication.message_sync import MessageSync
 from vinesim.net.replication.remote_pose import RemotePose
 from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
 from vinesim.scene.values import HumanUpdate, RobotUpdate
@@ -73,8 +74,10 @@ class _Source:
         return True
 
 
-class VoiceSync:
+class VoiceSync(MessageSync):
     """Voices to and from one actor."""
+
+    kind = VOICE
 
     def __init__(self, bus: Bus, hello: Hello, counters: Counters) -> None:
         self._bus = bus
