@@ -13,7 +13,7 @@ from vinesim.net.codec.control import Hello
 from vinesim.net.codec.forces import MAX_COUPLINGS, Coupling, CouplingMessage, decode_couplings, encode_couplings
 from vinesim.net.codec.header import HEADER, MessageError
 from vinesim.net.codec.messages import Counters
-from vinesim.net.replication.forces import ARM_REACH, COUPLING_MAX_AGE, CouplingSync
+from vinesim.net.replication.direct_messages import ARM_REACH, COUPLING_MAX_AGE, CouplingSync
 from vinesim.net.replication.remote_pose import RemotePose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.values import RobotUpdate

@@ -13,7 +13,7 @@ from vinesim.net.codec.control import Hello
 from vinesim.net.codec.forces import MAX_WRENCH, WrenchMessage, encode_wrenches
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.messages import Counters
-from vinesim.net.replication.forces import (
+from vinesim.net.replication.direct_messages import (
     HAND_FORCE,
     HAND_LEVER,
     MAX_PUSHING_PEOPLE,
@@ -50,9 +50,7 @@ def robot_sync(
     bus: MemoryBus | None = None, counters: Counters | None = None, hand_force: float = HAND_FORCE
 ) -> WrenchSync:
     """Of a robot with two links."""
-    sync = WrenchSync(bus or MemoryHub().bus("anna"), "anna", counters or Counters(), hand_force)
-    sync.link_centre = LINKS.get
-    return sync
+    return WrenchSync(bus or MemoryHub().bus("anna"), "anna", counters or Counters(), hand_force, LINKS.get)
 
 
 def receive(sync: WrenchSync, wrenches: dict[str, np.ndarray], sender: str = "eva", time: float = 1.0) -> None:

@@ -76,10 +76,10 @@ class Exchange(NamedTuple):
 
     say: Callable[[str], Any]
     """What a local actor tells others in this step: the value for
-    :meth:`vinesim.net.replication.message_sync.MessageSync.publish`."""
+    :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`."""
     apply: Callable[[Mapping[str, Any]], None]
     """Applies, before a step, what holds now of what others told each local actor:
-    :meth:`vinesim.net.replication.message_sync.MessageSync.current`, by its name."""
+    :meth:`vinesim.net.replication.direct_messages.MessageSync.current`, by its name."""
 
 
 class Client:
@@ -251,7 +251,6 @@ class Client:
             seed=self.scene.seed,
         )
         replicator = self._new_replicator(bus, hello)
-        replicator.be_pushed(functools.partial(self._link_centre, name))
         robot = self._add_robot_body(description, name, pose)
         self.meshes.offer(bus, description.urdf)
         self._add_replicator(name, replicator)
@@ -293,6 +292,7 @@ class Client:
             interest_radius=self._interest_radius,
             jitter_buffer=self._jitter_buffer,
             hand_force=self.physics.parameters.hand_force,
+            link_centre=functools.partial(self._link_centre, hello.name),
         )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
@@ -506,9 +506,9 @@ class Client:
         return bool(owners) and not owners & self.replicators.keys()
 
     def _link_centre(self, name: str, link: str) -> np.ndarray | None:
-        """Centre of mass [3] m of a link of a local robot; None if it has no such link."""
+        """Centre of mass [3] m of a link of a local robot; None if it is no robot or has no such link."""
         try:
-            return self.physics.rigid.link_centre(name, link)
+            return self.physics.rigid.link_centre(name, link) if name in self.robots else None
         except ValueError:
             return None
 

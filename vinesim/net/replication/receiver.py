@@ -55,7 +55,7 @@ class Inbox:
     """The same for people."""
     messages: dict[int, Any] = dataclasses.field(default_factory=dict)
     """What holds now of what peers have told this actor, by kind:
-    :meth:`vinesim.net.replication.message_sync.MessageSync.current`."""
+    :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees with a new state: the last state of each, extrapolated by at most 150 ms."""
     objects: list[ObjectUpdate] = dataclasses.field(default_factory=list)

@@ -8,15 +8,14 @@ from vinesim.net.codec.control import Hello
 from vinesim.net.codec.messages import Counters, Traffic
 from vinesim.net.replication import authority, interest
 from vinesim.net.replication.cell_channels import CellChannels, TreeChannels
-from vinesim.net.replication.forces import CouplingSync, WrenchSync
+from vinesim.net.replication.direct_messages import LinkCentre, MessageSync, make_syncs
 from vinesim.net.replication.interest import Cell
-from vinesim.net.replication.message_sync import MessageSync
 from vinesim.net.replication.ownership import Ownership
 from vinesim.net.replication.peers import PeerRegistry
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.replication.streams import ObjectStream, TreeStream, object_counts
 from vinesim.net.replication.voices import VoiceSync
-from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher
+from vinesim.net.transport.bus import Bus, Publisher
 from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
 
@@ -28,7 +27,15 @@ class ReplicationState:
     """The replicated state as one actor knows it."""
 
     def __init__(
-        self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float, hand_force: float
+        self,
+        bus: Bus,
+        hello: Hello,
+        model: Model,
+        *,
+        interest_radius: float,
+        jitter_buffer: float,
+        hand_force: float,
+        link_centre: LinkCentre,
     ) -> None:
         self.bus = bus
         self.hello = hello
@@ -38,14 +45,19 @@ class ReplicationState:
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
         self.ownership = Ownership(hello.name, self.peers.known)
-        owner = self.ownership.owner
-        known = self.peers.known
-        bus.subscribe(f"force/{hello.name}/*", KEEP_LAST_64)
-        self.wrenches = WrenchSync(bus, hello.name, self.counters, hand_force)
-        self.couplings = CouplingSync(bus, hello.name, model, self.counters, owner, known)
         self.voices = VoiceSync(bus, hello, self.counters)
-        self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (self.wrenches, self.couplings, self.voices)}
-        """What actors tell each other directly, by kind of message: the one place where a new kind is added."""
+        direct = make_syncs(
+            bus,
+            hello.name,
+            model,
+            self.counters,
+            owner=self.ownership.owner,
+            peers=self.peers.known,
+            hand_force=hand_force,
+            link_centre=link_centre,
+        )
+        self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (*direct, self.voices)}
+        """What actors tell each other directly, by kind of message."""
         self.siblings: tuple[ReplicationState, ...] = ()
         """Of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)

@@ -22,7 +22,7 @@ from vinesim.net.pace import PaceReport
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.clock_sync import STEP_THRESHOLD
-from vinesim.net.replication.forces import HAND_FORCE, LinkCentre
+from vinesim.net.replication.direct_messages import HAND_FORCE, LinkCentre
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
@@ -51,11 +51,13 @@ class Replicator:
         interest_radius: float = interest.INTEREST_RADIUS,
         jitter_buffer: float = 0.0,
         hand_force: float = HAND_FORCE,
+        link_centre: LinkCentre = lambda _: None,
     ) -> None:
         """``interest_radius`` [m]: peers nearer than this to an object receive its states; at most 5 m.
 
         ``jitter_buffer`` [s]: delay with which poses of peers are shown (:mod:`vinesim.net.replication.jitter_buffer`).
-        ``hand_force`` [N]: limit of each hand of a peer that pushes this robot.
+        ``hand_force`` [N]: limit of each hand of a peer that pushes this robot. ``link_centre(link)``: centre of mass
+        [3] m of a link of this robot, None for a link that it has not; without it people of other clients push nothing.
         Raises ValueError if the hello has another name than the bus.
         """
         if hello.name != bus.name:
@@ -63,7 +65,15 @@ class Replicator:
         self.bus = bus
         self.hello = hello
         self.model = model
-        self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer, hand_force)
+        self._state = ReplicationState(
+            bus,
+            hello,
+            model,
+            interest_radius=interest_radius,
+            jitter_buffer=jitter_buffer,
+            hand_force=hand_force,
+            link_centre=link_centre,
+        )
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self.step_time: Callable[[], float] | None = None
@@ -83,11 +93,6 @@ class Replicator:
     def voices(self) -> VoiceSync:
         """What this actor says and hears."""
         return self._state.voices
-
-    def be_pushed(self, link_centre: LinkCentre) -> None:
-        """Take wrenches of other clients' people from now on. ``link_centre(link)``: centre of mass [3] m of a link of
-        this robot, None for a link that it has not."""
-        self._state.wrenches.link_centre = link_centre
 
     @property
     def interest_radius(self) -> float:
@@ -220,7 +225,7 @@ class Replicator:
         ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
         ``messages``: what this actor tells others in this step, by kind:
-        :meth:`vinesim.net.replication.message_sync.MessageSync.publish`.
+        :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`.
         ``carried_on``: objects at rest on this actor that it has carried on so far that their records are published
         again, with the place where they are now.
         """

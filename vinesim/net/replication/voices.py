@@ -20,8 +20,8 @@ from vinesim.net.codec.control import Hello
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.messages import Counters
 from vinesim.net.codec.voice import VOICE, VoiceFrame, decode_voice, encode_voice
+from vinesim.net.replication.direct_messages import MessageSync
 from vinesim.net.replication.interest import LAYER_HYSTERESIS
-from vinesim.net.replication.message_sync import MessageSync
 from vinesim.net.replication.remote_pose import RemotePose
 from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
 from vinesim.scene.values import HumanUpdate, RobotUpdate

@@ -1,6 +1,10 @@
-"""Forces between actors of different clients: of people's hands on robots, and of two actors on one tree.
+"""What actors tell each other directly, apart from poses and states of objects: forces so far.
 
-Each force is computed by the client of the actor that applies it, and is applied by the client of what is pushed; keys
+A :class:`MessageSync` of each kind sends and receives. :func:`make_syncs` lists them all. The receiver gives each the
+messages of its kind, the replicator the values of each step to publish; what it knows stands in the inbox of each step
+under its kind.
+
+Forces are computed by the client of the actor that applies them, and applied by the client of what is pushed; keys
 ``force/<to>/<from>`` (``docs/decisions/forces-between-clients.md``).
 
 Wrenches: the mean wrench of a person's hands on each link of a robot over a sixtieth of a second, best effort, during
@@ -17,6 +21,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Container, Iterable, Mapping
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -34,11 +39,13 @@ from vinesim.net.codec.forces import (
 )
 from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.messages import Counters
-from vinesim.net.replication.message_sync import DirectedSync
 from vinesim.net.replication.remote_pose import RemotePose
-from vinesim.net.transport.bus import Bus
+from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher
 from vinesim.scene.model import Model
 from vinesim.scene.values import HumanUpdate, RobotUpdate
+
+SEND_PERIOD = 1.0 / 60.0
+"""Time between two forces that are sent to one actor [s]."""
 
 MAX_POSE_AGE = 1.0
 """An actor whose last pose is older than this pushes nothing [s]."""
@@ -70,8 +77,93 @@ LinkCentre = Callable[[str], np.ndarray | None]
 """Centre of mass [3] m of a link of the own robot; None if it has no such link."""
 
 
-def _no_link(_: str) -> None:
-    """The actor is no robot."""
+class MessageSync:
+    """Messages of one kind to and from one actor."""
+
+    kind: ClassVar[int]
+    """Of :data:`vinesim.net.codec.messages.MESSAGES`."""
+
+    def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
+        """Take a message of a peer at own time ``now`` and network ``time`` [s]; ``MessageError`` if it is invalid."""
+        raise NotImplementedError
+
+    def current(self, now: float) -> Any:
+        """What holds at own time ``now`` [s] of all that was received: for the inbox."""
+
+    def publish(self, value: Any, now: float, time: float) -> list[bytes]:
+        """Publish what the own actor says in the step at own time ``now`` and network ``time`` [s], None if nothing;
+        the messages that were sent."""
+        return []
+
+    def remove_peer(self, name: str) -> None:
+        """An actor has left."""
+
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+
+
+@dataclasses.dataclass(slots=True)
+class _Partner:
+    """An actor to which messages are sent."""
+
+    publisher: Publisher
+    due: float
+    """Own time of the next message [s]."""
+    is_active: bool = False
+    """The last message was not empty."""
+
+
+class ForceSync(MessageSync):
+    """Messages to single actors: at most 60 a second while there is something to say, then one empty message and
+    silence. The last message of each sender is kept; all have a field ``time``.
+
+    :func:`make_syncs` subscribes to their keys, once for all kinds.
+    """
+
+    def __init__(self, bus: Bus, name: str, counters: Counters) -> None:
+        self._bus = bus
+        self._name = name
+        self._counters = counters
+        self._partners: dict[str, _Partner] = {}
+        self._received: dict[str, tuple[float, Any]] = {}
+        """Own time of arrival [s] and message, by sender."""
+
+    def remove_peer(self, name: str) -> None:
+        """An actor has left."""
+        self._received.pop(name, None)
+        if (partner := self._partners.pop(name, None)) is not None:
+            partner.publisher.close()
+
+    def shift_time(self, step: float) -> None:
+        """The network clock was set by ``step`` [s]."""
+        for sender, (arrived, message) in self._received.items():
+            self._received[sender] = arrived, dataclasses.replace(message, time=message.time + step)
+
+    def _is_outdated(self, sender: str, message: Any) -> bool:
+        """Whether a message is not newer than the last one of its sender; that is counted."""
+        is_outdated = sender in self._received and message.time <= self._received[sender][1].time
+        self._counters.dropped += is_outdated
+        return is_outdated
+
+    def _recent(self, now: float, max_age: float) -> list[tuple[str, Any]]:
+        """Senders and their last messages, of those that arrived within the last ``max_age`` [s]."""
+        return [
+            (sender, message)
+            for sender, (arrived, message) in sorted(self._received.items())
+            if now - arrived <= max_age
+        ]
+
+    def _add_partners(self, names: Iterable[str], now: float) -> None:
+        """Be ready to send to these actors from own time ``now`` [s] on."""
+        for name in names:
+            if name not in self._partners:
+                self._partners[name] = _Partner(self._bus.publisher(f"force/{name}/{self._name}"), now)
+
+    def _send(self, partner: _Partner, payload: bytes, now: float, *, is_empty: bool) -> list[bytes]:
+        """Send a message that is due; the messages that were sent: this one, or none without a subscriber."""
+        partner.due = max(partner.due, now - SEND_PERIOD) + SEND_PERIOD
+        partner.is_active = not is_empty
+        return [payload] if partner.publisher.put(payload) else []
 
 
 def _recent_pose(actor: RemotePose, time: float) -> HumanUpdate | RobotUpdate | None:
@@ -120,17 +212,23 @@ class _Push:
     ticks: int = 0
 
 
-class WrenchSync(DirectedSync):
+class WrenchSync(ForceSync):
     """Wrenches of the own hands on others' robots, and of others' hands on the own robot."""
 
     kind = WRENCHES
 
-    def __init__(self, bus: Bus, name: str, counters: Counters, hand_force: float = HAND_FORCE) -> None:
-        """``hand_force`` [N]: limit of each hand."""
+    def __init__(
+        self,
+        bus: Bus,
+        name: str,
+        counters: Counters,
+        hand_force: float = HAND_FORCE,
+        link_centre: LinkCentre = lambda _: None,
+    ) -> None:
+        """``hand_force`` [N]: limit of each hand. ``link_centre``: of the own robot; without it people push nothing."""
         super().__init__(bus, name, counters)
-        self.link_centre: LinkCentre = _no_link
-        """Of the own robot; unless it is set, people of other clients push nothing."""
         self._hand_force = hand_force
+        self._link_centre = link_centre
         self._pushes: dict[str, _Push] = {}
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
@@ -147,7 +245,7 @@ class WrenchSync(DirectedSync):
         pose = _recent_pose(sender, time)
         reach: dict[str, frozenset[str]] = {}
         if isinstance(pose, HumanUpdate):
-            reach = {link: hands_within_reach(pose, self.link_centre(link)) for link in message.wrenches}
+            reach = {link: hands_within_reach(pose, self._link_centre(link)) for link in message.wrenches}
         reached = {link: wrench for link, wrench in message.wrenches.items() if reach.get(link)}
         self._counters.wrenches_refused += len(message.wrenches) - len(reached)
         reached, is_limited = limit_by_hands(reached, {link: reach[link] for link in reached}, self._hand_force)
@@ -190,7 +288,7 @@ class WrenchSync(DirectedSync):
         return sent
 
 
-class CouplingSync(DirectedSync):
+class CouplingSync(ForceSync):
     """Couplings of the own actor's contacts, and those of others to the same trees."""
 
     kind = COUPLINGS
@@ -278,3 +376,25 @@ def _check_body(body: int, model: Model) -> None:
     tree = int(model.body_tree[body])
     if body - int(model.tree_first[tree]) >= int(model.tree_core[tree]):
         raise MessageError(f"a coupling to body {body}, a berry cluster")
+
+
+def make_syncs(
+    bus: Bus,
+    name: str,
+    model: Model,
+    counters: Counters,
+    *,
+    owner: Callable[[int], str | None],
+    peers: Mapping[str, RemotePose],
+    hand_force: float = HAND_FORCE,
+    link_centre: LinkCentre = lambda _: None,
+) -> tuple[MessageSync, ...]:
+    """All kinds of messages that the actor ``name`` and its ``peers`` send each other directly, but voices.
+
+    ``owner(object_id)``: name of the actor that owns an object. The others: see :class:`WrenchSync`.
+    """
+    bus.subscribe(f"force/{name}/*", KEEP_LAST_64)
+    return (
+        WrenchSync(bus, name, counters, hand_force, link_centre),
+        CouplingSync(bus, name, model, counters, owner, peers),
+    )
