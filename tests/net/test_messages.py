@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 
 import msgspec
 import numpy as np
@@ -39,7 +40,7 @@ from vinesim.net.codec.header import (
     kind_of,
 )
 from vinesim.net.codec.meshes import MeshPart, MeshWanted, encode_part, encode_request, encode_wanted
-from vinesim.net.codec.messages import shift_time, time_of
+from vinesim.net.codec.messages import FAMILIES, MESSAGES, Counters, Traffic, schema_of, shift_time, time_of
 from vinesim.net.codec.objects import ObjectStates, check_object_id, decode_objects, encode_objects
 from vinesim.net.codec.robot import MAX_JOINTS, decode_robot, encode_robot
 from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees, quantise_tree
@@ -487,3 +488,17 @@ def test_messages_about_meshes_have_no_time(payload):
     """Their first bytes were once taken for one, and replaced when a recording was played at another time."""
     assert time_of(payload) is None
     assert shift_time(payload, 5.0) == payload
+
+
+def test_every_family_of_keys_has_a_counter_and_every_published_one_a_kind():
+    counters = Counters()
+    assert all(isinstance(counters.of(name), Traffic) for name in FAMILIES)
+    published = {name for name, family in FAMILIES.items() if family.is_published}
+    assert published <= {name for row in MESSAGES.values() for name in row.families}
+
+
+def test_the_schemas_of_recordings_stay_as_they_are():
+    """Their text is part of the file format."""
+    keys = ("a/x", "c/0/0/x", "tree/0/0/x", "near/0/0/x", "own/0/0/x", "fact/0/0/x", "force/y/x", "snap/0/0", "hello/x")
+    text = b"".join(name.encode() + schema for name, schema in map(schema_of, (*keys, "live/x", "other/x")))
+    assert hashlib.blake2b(text, digest_size=8).hexdigest() == "86147581532c9b54"

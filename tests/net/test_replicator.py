@@ -617,6 +617,20 @@ def test_malformed_messages_are_counted_logged_once_and_do_not_stop_the_tick(cap
     assert "bob" in ada.inbox.robots
 
 
+def test_a_message_under_a_key_of_other_kinds_is_malformed():
+    hub = MemoryHub()
+    bob = Client(hub, "bob", 1.0)
+    ada = Client(hub, "ada", 1.5)
+    run(hub, [bob, ada], 1.0)
+    claims = encode_claims([(3, Claim(1, 1, "ada"), True)])
+    wrong = ("c/0/0/ada", "fact/0/0/ada", "force/bob/ada", "a/ada/far")
+    for key in wrong:
+        assert ada.bus.publisher(key).put(claims)
+    run(hub, [bob, ada], 0.1)
+    assert bob.replicator.counters.malformed == len(wrong)
+    assert bob.replicator.claim(3) == Claim()
+
+
 def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
     hub = MemoryHub()
     ada = Client(hub, "ada", 1.0)

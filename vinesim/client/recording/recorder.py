@@ -128,7 +128,7 @@ class Recorder:
     def _subscribe(self) -> None:
         self._is_subscribed = True
         for name, family in FAMILIES.items():
-            if family.recorded_with in self._choices - {"poses"}:
+            if name != "a" and family.recorded_with in self._choices:  # poses: see _update_pose_subscriptions
                 self.bus.subscribe(f"{name}/**", KEEP_ALL)
         if "facts" in self._choices:
             self.bus.query("snap/*/*")  # what became true before

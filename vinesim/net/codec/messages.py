@@ -38,27 +38,28 @@ class Message(NamedTuple):
     """JSON schemas of what ``describe`` returns. Their text is part of the file format."""
 
 
-MESSAGES = {
-    row.kind: row
-    for row in (
-        Message(robot.ROBOT, ("a",), True, human.describe_pose, human.POSE_FIELDS),
-        Message(human.HUMAN, ("a",), True, human.describe_pose, human.POSE_FIELDS),
-        Message(trees.TREES, ("tree", "near", "own"), True, trees.describe_trees, trees.TREES_FIELDS),
-        Message(objects.OBJECTS, ("c",), True, objects.describe_objects, objects.OBJECTS_FIELDS),
-        Message(control.CLAIMS, ("own",), False, control.describe_claims, control.CLAIMS_FIELDS),
-        Message(control.RETAINED, ("fact", "snap"), False, control.describe_records, control.RECORDS_FIELDS),
-        Message(forces.WRENCHES, ("force",), True, forces.describe_wrenches, forces.WRENCHES_FIELDS),
-        Message(forces.COUPLINGS, ("force",), True, forces.describe_couplings, forces.COUPLINGS_FIELDS),
-        Message(voice.VOICE, ("voice",), True),
-        Message(control.HELLO, ("hello", "join"), False, control.describe_hello, control.HELLO_FIELDS),
-        Message(control.WELCOME, ("join",)),
-        Message(control.CLOCK, ("clock",)),
-        Message(meshes.MESH_PART, ("mesh", "offer")),
-        Message(meshes.MESH_REQUEST, ("mesh",)),
-        Message(meshes.MESH_WANTED, ("offer",)),
-    )
-}
+_ROWS = (
+    Message(robot.ROBOT, ("a",), True, human.describe_pose, human.POSE_FIELDS),
+    Message(human.HUMAN, ("a",), True, human.describe_pose, human.POSE_FIELDS),
+    Message(trees.TREES, ("tree", "near", "own"), True, trees.describe_trees, trees.TREES_FIELDS),
+    Message(objects.OBJECTS, ("c",), True, objects.describe_objects, objects.OBJECTS_FIELDS),
+    Message(control.CLAIMS, ("own",), False, control.describe_claims, control.CLAIMS_FIELDS),
+    Message(control.RETAINED, ("fact", "snap"), False, control.describe_records, control.RECORDS_FIELDS),
+    Message(forces.WRENCHES, ("force",), True, forces.describe_wrenches, forces.WRENCHES_FIELDS),
+    Message(forces.COUPLINGS, ("force",), True, forces.describe_couplings, forces.COUPLINGS_FIELDS),
+    Message(voice.VOICE, ("voice",), True),
+    Message(control.HELLO, ("hello", "join"), False, control.describe_hello, control.HELLO_FIELDS),
+    Message(control.WELCOME, ("join",)),
+    Message(control.CLOCK, ("clock",)),
+    Message(meshes.MESH_PART, ("mesh", "offer")),
+    Message(meshes.MESH_REQUEST, ("mesh",)),
+    Message(meshes.MESH_WANTED, ("offer",)),
+)
+
+MESSAGES = {row.kind: row for row in _ROWS}
 """By kind."""
+
+assert len(MESSAGES) == len(_ROWS), "two kinds of messages have the same number"
 
 
 class Family(NamedTuple):
