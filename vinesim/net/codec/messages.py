@@ -186,7 +186,7 @@ def schema_of(key: str) -> tuple[str, bytes]:
     fields: dict[str, Any] = {"live": YES} if name == "live" else {}
     for row in MESSAGES.values() if name in FAMILIES else ():
         if name in row.families and row.describe is not None:
-            fields |= ({"timestamp": TIME} if row.has_time else {}) | row.fields
+            fields |= {"timestamp": TIME, **row.fields} if row.has_time else row.fields
     return family.schema, msgspec.json.encode(object_of(family.schema, family.purpose, **fields, **_COMMON))
 
 
