@@ -20,7 +20,7 @@ import numpy as np
 
 from vinesim.client.client import Client, label_index
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_records, encode_records
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -145,7 +145,7 @@ class Crowd:
         self.busy = 0.0
 
     def _reply(self, cell: tuple[int, int], _: bytes) -> bytes:
-        return messages.encode_records(self._records.in_cell(cell))
+        return encode_records(self._records.in_cell(cell))
 
     def _walk(self, x: float, y: float) -> Callable[[float], HumanPose]:
         """The pose of a person who walks against its box and stops."""
@@ -165,7 +165,7 @@ class Crowd:
         self.ticks = self.ticks + 1
         for key, payload in self._server.poll():
             _, x, y, _ = key.split("/")
-            for record in messages.decode_records(payload):
+            for record in decode_records(payload):
                 self._records.merge((int(x), int(y)), record)
         self.hub.advance(DT)
         self.now += DT

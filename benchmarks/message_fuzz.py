@@ -26,19 +26,39 @@ from benchmarks.support.fuzz_world import ATTACKER, DT, WORLD, FuzzWorld
 from vinesim.audio.frame import Codec
 from vinesim.client.client import Client
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.couplings import MAX_COUPLINGS, CouplingMessage, encode_couplings
+from vinesim.net.codec.control import (
+    Hello,
+    RetainedRecord,
+    Welcome,
+    decode_time,
+    encode_claims,
+    encode_hello,
+    encode_records,
+    encode_time,
+    encode_welcome,
+)
+from vinesim.net.codec.forces import (
+    MAX_COUPLINGS,
+    Coupling,
+    CouplingMessage,
+    WrenchMessage,
+    encode_couplings,
+    encode_wrenches,
+)
+from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.codec.human import encode_pose
-from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.codec.meshes import MeshPart, MeshWanted, encode_part, encode_request, encode_wanted
+from vinesim.net.codec.messages import shift_time
+from vinesim.net.codec.objects import ObjectStates, encode_objects
+from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, encode_trees
 from vinesim.net.codec.voice import VoiceFrame, encode_voice
-from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
-from vinesim.scene.values import Coupling, HumanUpdate, Measurement, RobotUpdate
+from vinesim.scene.values import HumanUpdate, Measurement, RobotUpdate
 
 MESSAGE_COUNT = 100_000
 MESSAGES_PER_TICK = 200
@@ -94,8 +114,8 @@ def valid_message(model: Model, actor: Sender, now: float, chance: random.Random
         return chance.choice(("tree", "near")), _trees_message(model, tree, claim, now, chance)
     if kind == "things":
         number = np.array([_object_id(model, chance.choice((ObjectKind.BUNCH, ObjectKind.BOX)), chance)])
-        flags = np.array([messages.TOUCHED])
-        record = messages.ObjectStates(
+        flags = np.array([TOUCHED])
+        record = ObjectStates(
             now,
             number,
             np.array([claim.ownership]),
@@ -104,21 +124,21 @@ def valid_message(model: Model, actor: Sender, now: float, chance: random.Random
             frames.pose(np.array([[0.5, 0.5, 1.0]])),
             np.zeros((1, 6)),
         )
-        return "c", messages.encode_objects(record, (0, 0))[0][0]
+        return "c", encode_objects(record, (0, 0))[0][0]
     if kind == "own":
         number = _object_id(model, chance.choice(tuple(ObjectKind)), chance)
-        return kind, messages.encode_claims([(number, claim, chance.random() < 0.5)])
+        return kind, encode_claims([(number, claim, chance.random() < 0.5)])
     if kind == "fact":
         records = [_record(model, claim, now, chance) for _ in range(chance.randint(1, 3))]
-        return kind, messages.encode_records(records)
+        return kind, encode_records(records)
     return chance.choice(("own", "fact", "c", "tree", "near")), chance.choice(
         (
-            messages.encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
-            messages.encode_time(now, chance.uniform(-1e9, 1e9)),
-            messages.encode_welcome(messages.Welcome("go away")),
-            messages.encode_part(messages.MeshPart("0" * 40, 36, 0, chance.randbytes(36))),
-            messages.encode_request(chance.randrange(100)),
-            messages.encode_wanted(messages.MeshWanted(chance.randrange(100))),
+            encode_hello(Hello(actor.name, scene="fake_clients", digest="fake_clients")),
+            encode_time(now, chance.uniform(-1e9, 1e9)),
+            encode_welcome(Welcome("go away")),
+            encode_part(MeshPart("0" * 40, 36, 0, chance.randbytes(36))),
+            encode_request(chance.randrange(100)),
+            encode_wanted(MeshWanted(chance.randrange(100))),
         )
     )
 
@@ -131,9 +151,9 @@ def _object_id(model: Model, kind: ObjectKind, chance: random.Random) -> int:
 def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: random.Random) -> bytes:
     """A state of one tree, now and then with bodies that were cut off it."""
     q, qd = swinging_state(model, tree, now)
-    flags = chance.choice((0, messages.TOUCHED, messages.RESTING))
+    flags = chance.choice((0, TOUCHED, RESTING))
     count = chance.randint(1, min(3, len(q))) if chance.random() < 0.3 else 0
-    states = messages.TreeStates(
+    states = TreeStates(
         now,
         np.array([tree]),
         np.array([claim.ownership]),
@@ -147,7 +167,7 @@ def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: ra
         root_x=np.array([[chance.uniform(-3.0, 3.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
         root_xd=np.array([[chance.uniform(-30.0, 30.0) for _ in range(3)] for _ in range(count)]).reshape(-1, 3),
     )
-    return messages.encode_trees(states)[0][0]
+    return encode_trees(states)[0][0]
 
 
 def _couplings_message(model: Model, now: float, chance: random.Random) -> bytes:
@@ -260,7 +280,7 @@ def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
     elif how == 6:
         data = bytearray(chance.randbytes(chance.randint(0, 200)))
     elif how == 7 and chance.random() < 0.002:
-        data = bytearray(b"VS\x01\x02") + bytes(messages.MAX_MESSAGE + 1)
+        data = bytearray(b"VS\x01\x02") + bytes(MAX_MESSAGE + 1)
     return bytes(data)
 
 
@@ -293,7 +313,7 @@ def storm(
                     pool[chance.randrange(pool_size)] = pool.pop()
         else:
             family, payload, made = chance.choice(pool)
-            payload = messages.shift_time(payload, now - made)
+            payload = shift_time(payload, now - made)
         bad = corrupt(payload, chance.choice(earlier), chance)
         if len(bad) < 1000:
             earlier = [*earlier[-50:], bad]
@@ -324,7 +344,7 @@ def run_storm(
     hub = MemoryHub(delay=0.005, seed=seed)
     hub.binds_names = binds_names
     server = hub.bus("server")
-    server.declare_queryable("clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], hub.time))
+    server.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], hub.time))
     model = tree_row()
     ada, bob = (FakeClient(hub.bus(name), model, (x, 0.0)) for name, x in (("ada", 1.0), ("bob", 2.0)))
     evil = FakeClient((MemoryHub() if is_stranger else hub).bus(ATTACKER), model, (3.0, 0.0), kind=kind)
@@ -398,7 +418,7 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
             world.model, world, seed, world.now, [ATTACKER, *names], pool_size=2000, period=DT / MESSAGES_PER_TICK
         )
         before = received_count(world.client)
-        greeting = messages.encode_hello(world.hello(kind))
+        greeting = encode_hello(world.hello(kind))
         for step in range(-(-count // MESSAGES_PER_TICK)):
             for key, payload in itertools.islice(wild, MESSAGES_PER_TICK):
                 world.put(key, payload)

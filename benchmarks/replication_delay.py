@@ -22,9 +22,10 @@ from vinesim.client.client import Client
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, spawn_pose
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
+from vinesim.net.codec.robot import decode_robot, encode_robot
+from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees
 from vinesim.net.replication import dead_reckoning
-from vinesim.net.replication.hand_forces import LinkCentre
 from vinesim.net.replication.interest import POSE_RATE
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.receiver import Inbox
@@ -78,9 +79,7 @@ class Pair:
         self.now = 100.0
         self.hub = MemoryHub(delay=delay, jitter=jitter * delay, loss=loss if delay else 0.0, seed=seed)
         server = self.hub.bus("server")
-        server.declare_queryable(
-            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
-        )
+        server.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], self.now))
         start = spawn_pose(self.scene, 0)
         self.bunch = find_reachable_bunch(self.model, start)
         self.tree = int(self.model.body_tree[self.model.bunch_body[self.bunch]])
@@ -101,8 +100,8 @@ class Pair:
         """What the second client was told in its last tick."""
         receive = self.second.replicator.receive
 
-        def receive_and_keep(now: float, link_centre: LinkCentre | None = None) -> Inbox:
-            self.inbox = receive(now, link_centre)
+        def receive_and_keep(now: float) -> Inbox:
+            self.inbox = receive(now)
             return self.inbox
 
         self.second.replicator.receive = receive_and_keep
@@ -177,9 +176,9 @@ class RemoteAuthority:
         pair = self.pair
         physics = self.physics
         robot = pair.first.robot
-        self._say.put(messages.encode_robot(robot.update(pair.now)))
+        self._say.put(encode_robot(robot.update(pair.now)))
         for _, payload in self._bus.poll():
-            update = messages.decode_robot(payload, "first")
+            update = decode_robot(payload, "first")
             if self._copy is None:
                 self._copy = RemoteRobot(physics.rigid, robot.description, "first", 1, update.base_q)
             self._copy.follow(update)
@@ -188,7 +187,7 @@ class RemoteAuthority:
         if len(awake):
             bodies = np.concatenate([np.arange(b.start, b.stop) for b in map(pair.model.bodies_of, awake.tolist())])
             zeros = np.zeros(len(awake), int)
-            said = messages.TreeStates(
+            said = TreeStates(
                 pair.now,
                 awake,
                 zeros,
@@ -198,10 +197,10 @@ class RemoteAuthority:
                 physics.state.joint_q[bodies].astype(float),
                 physics.state.joint_qd[bodies].astype(float),
             )
-            for message in messages.encode_trees(said)[0]:
+            for message in encode_trees(said)[0]:
                 self._answer.put(message)
         for _, payload in self._screen.poll():
-            for update in messages.decode_trees(payload).updates("authority"):
+            for update in decode_trees(payload).updates("authority"):
                 if update.tree == pair.tree:
                     self.joint_q = update.joint_q
 

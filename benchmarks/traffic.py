@@ -16,7 +16,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.support.fake_client import FakeClient
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.codec.human import encode_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
@@ -91,9 +91,7 @@ def traffic() -> Iterator[Measurement]:
     for case, share in (("all over the block", 1.0), ("in a quarter of it", 0.5)):
         hub = MemoryHub(delay=LAN, seed=1)
         server = hub.bus("server")
-        server.declare_queryable(
-            "clock/*", lambda asked, hub=hub: messages.encode_time(messages.decode_time(asked)[0], hub.time)
-        )
+        server.declare_queryable("clock/*", lambda asked, hub=hub: encode_time(decode_time(asked)[0], hub.time))
         fake_clients = place_actors(hub, model, places(model, share))
         for _ in range(round(SETTLE * 100)):
             _tick(hub, fake_clients)

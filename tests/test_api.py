@@ -17,7 +17,7 @@ import vinesim
 from tests.support.waiting import deadline
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import Hello, encode_hello
 from vinesim.net.recording.mcap_writer import RecordingWriter
 
 G = 9.81
@@ -362,7 +362,7 @@ def test_cameras_and_lidars_render_the_current_state():
 
 def test_a_recording_is_read_message_by_message(tmp_path):
     path = tmp_path / "run.mcap"
-    hello = messages.encode_hello(messages.Hello(name="ada", kind="spectator", scene="demo", digest="0" * 16, index=1))
+    hello = encode_hello(Hello(name="ada", kind="spectator", scene="demo", digest="0" * 16, index=1))
     with RecordingWriter(path, {"scene": "demo"}) as file:
         file.put(1_000_000_000, "live/ada", b"1")
         file.put(1_500_000_000, "hello/ada", hello)

@@ -25,7 +25,7 @@ from typing import Any, Self
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.replication import interest
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus

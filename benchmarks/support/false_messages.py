@@ -16,12 +16,25 @@ from hypothesis import strategies as st
 
 from benchmarks.support.fuzz_world import ATTACKER, WORLD, FuzzWorld, human_at, small_vineyard
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.couplings import CouplingMessage, encode_couplings
+from vinesim.net.codec.control import (
+    Hello,
+    RetainedRecord,
+    Welcome,
+    decode_records,
+    encode_claims,
+    encode_hello,
+    encode_records,
+    encode_time,
+    encode_welcome,
+)
+from vinesim.net.codec.forces import Coupling, CouplingMessage, WrenchMessage, encode_couplings, encode_wrenches
+from vinesim.net.codec.header import MessageError
 from vinesim.net.codec.human import encode_human
-from vinesim.net.codec.messages import Hello, MeshPart, MessageError, ObjectStates, RetainedRecord, TreeStates
+from vinesim.net.codec.meshes import MeshPart, MeshWanted, decode_part, encode_part, encode_request, encode_wanted
+from vinesim.net.codec.messages import shift_time
+from vinesim.net.codec.objects import ObjectStates, encode_objects
 from vinesim.net.codec.robot import encode_robot
-from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
+from vinesim.net.codec.trees import TreeStates, encode_trees
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.streams import object_counts
 from vinesim.robot.description.loader import load_description
@@ -29,7 +42,7 @@ from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.scene import triangles
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.model import Model
-from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate
+from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 Draw = Callable[[st.SearchStrategy], Any]
 
@@ -46,7 +59,7 @@ class FalseMessage:
     def tell(self, world: FuzzWorld) -> None:
         """Send it."""
         if self.kind == "put":
-            world.put(self.key, messages.shift_time(self.payload, world.now))
+            world.put(self.key, shift_time(self.payload, world.now))
         elif self.kind == "greet":
             world.greet(self.payload)
         elif self.kind == "join":
@@ -204,7 +217,7 @@ def _about_trees(draw: Draw, model: Model) -> FalseMessage:
         _vectors(draw, UNIT, cut, 3, scale=32.7),
     )
     family = draw(st.sampled_from(("tree", "near", "own")))
-    return FalseMessage("put", messages.encode_trees(states)[0][0], f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+    return FalseMessage("put", encode_trees(states)[0][0], f"{family}/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
 def _about_objects(draw: Draw, model: Model) -> FalseMessage:
@@ -224,7 +237,7 @@ def _about_objects(draw: Draw, model: Model) -> FalseMessage:
         pose,
         velocity,
     )
-    return FalseMessage("put", messages.encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
+    return FalseMessage("put", encode_objects(states, cell)[0][0], f"c/{cell[0]}/{cell[1]}/{ATTACKER}")
 
 
 def _about_owners(draw: Draw, model: Model) -> FalseMessage:
@@ -233,7 +246,7 @@ def _about_owners(draw: Draw, model: Model) -> FalseMessage:
     for _ in range(draw(st.integers(1, 4))):
         claim = Claim(draw(SEQUENCE), draw(SEQUENCE), draw(OWNERS))
         claims.append((_object(draw, model, tuple(ObjectKind)), claim, draw(st.booleans())))
-    return FalseMessage("put", messages.encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
+    return FalseMessage("put", encode_claims(claims), f"own/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
 PARENTS = st.sampled_from(
@@ -285,8 +298,8 @@ def _records(draw: Draw, model: Model) -> FalseMessage:
                 draw(st.booleans()),
             )
         )
-    payload = messages.encode_records(records)
-    messages.decode_records(payload)
+    payload = encode_records(records)
+    decode_records(payload)
     return FalseMessage("put", payload, f"fact/{draw(CELL)}/{draw(CELL)}/{ATTACKER}")
 
 
@@ -394,7 +407,7 @@ def _greeting(draw: Draw, model: Model) -> FalseMessage:
         height=draw(st.sampled_from((1.0, 1.75, 2.5))),
         outfit=draw(st.sampled_from(("", "green", "no-such-outfit"))),
     )
-    return FalseMessage(draw(st.sampled_from(("greet", "greet", "join"))), messages.encode_hello(hello))
+    return FalseMessage(draw(st.sampled_from(("greet", "greet", "join"))), encode_hello(hello))
 
 
 def _mesh(draw: Draw, _: Model) -> FalseMessage:
@@ -404,9 +417,9 @@ def _mesh(draw: Draw, _: Model) -> FalseMessage:
     digest = draw(st.sampled_from((triangles.digest_of(data), "0" * 40)))
     offset = draw(st.sampled_from((0, 0, 0, 1, 36)))
     size = draw(st.sampled_from((len(data), len(data) + offset, 36, triangles.MAX_BYTES)))
-    payload = messages.encode_part(MeshPart(digest, size, offset, data))
-    messages.decode_part(payload)
-    return FalseMessage("mesh", draw(st.sampled_from((payload, messages.encode_request(offset)))))
+    payload = encode_part(MeshPart(digest, size, offset, data))
+    decode_part(payload)
+    return FalseMessage("mesh", draw(st.sampled_from((payload, encode_request(offset)))))
 
 
 def _control(draw: Draw, model: Model) -> FalseMessage:
@@ -415,9 +428,9 @@ def _control(draw: Draw, model: Model) -> FalseMessage:
     payload = draw(
         st.sampled_from(
             (
-                messages.encode_time(number, -number),
-                messages.encode_welcome(messages.Welcome("go away")),
-                messages.encode_wanted(messages.MeshWanted(0, "no")),
+                encode_time(number, -number),
+                encode_welcome(Welcome("go away")),
+                encode_wanted(MeshWanted(0, "no")),
             )
         )
     )

@@ -21,10 +21,12 @@ from benchmarks.support.fake_client import FakeClient
 from benchmarks.support.sound_recorder import SoundRecorder
 from vinesim.client.client import Client
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import Hello, RetainedRecord, decode_records, decode_time, encode_hello, encode_time
+from vinesim.net.codec.header import MAX_COORDINATE, MessageError
 from vinesim.net.codec.human import encode_pose
-from vinesim.net.codec.messages import Hello, MessageError, MessageKind
-from vinesim.net.replication.model_check import check_record
+from vinesim.net.codec.meshes import MESH_PART, MESH_REQUEST, decode_part, decode_request, encode_part, encode_wanted
+from vinesim.net.codec.objects import check_object_id
+from vinesim.net.replication.receiver import check_record
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.admission import AdmissionControl, SceneId
 from vinesim.net.server.journal import load_all
@@ -53,7 +55,7 @@ MAX_DRIFT = 0.1
 """[m/s] At which an admitted actor's body may push a robot whose base holds still, beyond the first metre."""
 HONEST_ERROR = 0.3
 """Largest distance of the middle of the copy of ``bob`` from its hips [m]."""
-FARTHEST = 2.0 * messages.MAX_COORDINATE
+FARTHEST = 2.0 * MAX_COORDINATE
 """No object moves farther [m]: none is believed beyond half of it, and none is fast."""
 
 
@@ -119,9 +121,7 @@ class FuzzWorld:
         """The server's part: a store that takes every record, whoever sent it, a clock, and snapshots."""
         self._server = self.hub.bus("server", live=False)
         self._server.subscribe("fact/**", KEEP_ALL)
-        self._server.declare_queryable(
-            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
-        )
+        self._server.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], self.now))
         for x, y in CELLS:
             self._server.declare_queryable(
                 f"snap/{x}/{y}", lambda _, cell=(x, y): self.store.snapshot(WORLD, [cell])[0][1]
@@ -148,7 +148,7 @@ class FuzzWorld:
         """Leave, and come back with this greeting."""
         if self.is_stranger:
             return
-        self.greeting = hello if isinstance(hello, bytes) else messages.encode_hello(hello)
+        self.greeting = hello if isinstance(hello, bytes) else encode_hello(hello)
         self.admission.decide(WORLD, ATTACKER, "session", self.greeting, self.now)
         self.bus.close()
         self.step()
@@ -180,15 +180,15 @@ class FuzzWorld:
 
     def offer(self, payload: bytes) -> None:
         """Offer the server a part of a mesh, or ask for one."""
-        if len(payload) < 4 or payload[3] not in (MessageKind.MESH_PART, MessageKind.MESH_REQUEST):
+        if len(payload) < 4 or payload[3] not in (MESH_PART, MESH_REQUEST):
             return
         try:
-            if payload[3] == MessageKind.MESH_PART:
-                part = messages.decode_part(payload)
-                messages.encode_wanted(self.meshes.offer((WORLD, ATTACKER), part))
-                messages.encode_part(self.meshes.part(part.digest, part.offset))
+            if payload[3] == MESH_PART:
+                part = decode_part(payload)
+                encode_wanted(self.meshes.offer((WORLD, ATTACKER), part))
+                encode_part(self.meshes.part(part.digest, part.offset))
             else:
-                messages.decode_request(payload)
+                decode_request(payload)
         except MessageError:
             pass
 
@@ -295,7 +295,7 @@ class FuzzWorld:
         journals = load_all(pathlib.Path(self._folder.name))
         found = journals[WORLD].state if WORLD in journals else None
         for cell, parts in kept.items():
-            known = [record for _, payload in parts for record in messages.decode_records(payload)]
+            known = [record for _, payload in parts for record in decode_records(payload)]
             if found is None or found.in_cell(cell) != known:
                 raise LawBroken(f"the journal has other records of cell {cell} than the store had")
 
@@ -306,12 +306,12 @@ class FuzzWorld:
 
     def _is_object(self, number: int) -> bool:
         try:
-            messages.check_object_id(number, self.counts)
+            check_object_id(number, self.counts)
         except MessageError:
             return False
         return True
 
-    def _contradiction(self, record: messages.RetainedRecord) -> str:
+    def _contradiction(self, record: RetainedRecord) -> str:
         try:
             check_record(record, self.model, self.counts)
         except MessageError as error:

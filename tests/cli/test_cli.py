@@ -14,7 +14,7 @@ import warp as wp
 
 from tests.support import programs
 from tests.support.waiting import deadline
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import Hello, encode_hello
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
@@ -206,7 +206,7 @@ def test_the_server_reports_actors_and_ends_cleanly(tmp_path):
         assert figures["actors"] == []
         (endpoint,) = figures["endpoints"]
         with ZenohBus("ada", connect=endpoint) as ada:
-            ada.join(messages.encode_hello(messages.Hello("ada", digest="D1")))
+            ada.join(encode_hello(Hello("ada", digest="D1")))
             while (figures := json.loads(process.stdout.readline()))["actors"] != ["vineyard/ada"]:
                 assert process.poll() is None
         process.send_signal(signal.SIGTERM)

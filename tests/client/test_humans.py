@@ -18,7 +18,7 @@ from vinesim.client.remote.remote_human import human_spec
 from vinesim.client.tasks.start_poses import bunch_centres, find_reachable_bunch, start_pose
 from vinesim.core import frames
 from vinesim.net.codec import human as poses
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import BODY_PARTS, standing_pose
 from vinesim.robot.description.description import RobotDescription

@@ -20,8 +20,7 @@ from vinesim.client.client import Client
 from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.status import count_faults
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MeshPart
+from vinesim.net.codec.meshes import MAX_PART, MeshPart, decode_request, encode_part
 from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.robot.description.description import RobotDescription
@@ -240,9 +239,9 @@ NAN = struct.pack("<9f", *[0.0] * 8, np.nan)
 )
 def test_a_mesh_that_is_not_what_its_digest_says_is_counted_and_never_used(payload, digest, empty_cache):
     def reply(key: str, question: bytes) -> list[bytes]:
-        offset = messages.decode_request(question)
-        part = MeshPart(digest, len(payload), offset, payload[offset : offset + messages.MAX_PART])
-        return [messages.encode_part(part)]
+        offset = decode_request(question)
+        part = MeshPart(digest, len(payload), offset, payload[offset : offset + MAX_PART])
+        return [encode_part(part)]
 
     exchange = exchange_over(reply)
     exchange.want("anna", text_of(digest))
@@ -257,7 +256,7 @@ def test_random_replies_never_end_the_exchange(empty_cache):
     """Bytes of any kind, replies cut short or with other numbers: no mesh comes, the thread goes on, then a right one
     arrives."""
     random = np.random.default_rng(3)
-    right = messages.encode_part(MeshPart(DIGEST, len(PAYLOAD), 0, PAYLOAD))
+    right = encode_part(MeshPart(DIGEST, len(PAYLOAD), 0, PAYLOAD))
     asked = 0
 
     def reply(key: str, question: bytes) -> list[bytes]:
@@ -285,7 +284,7 @@ def test_random_replies_never_end_the_exchange(empty_cache):
 
 
 def test_a_broken_cache_is_filled_anew(empty_cache):
-    reply = [messages.encode_part(MeshPart(DIGEST, len(PAYLOAD), 0, PAYLOAD))]
+    reply = [encode_part(MeshPart(DIGEST, len(PAYLOAD), 0, PAYLOAD))]
     for broken in (b"no archive", None):
         empty_cache.mkdir(exist_ok=True)
         file = empty_cache / f"mesh-{DIGEST}.npz"

@@ -8,7 +8,8 @@ import pytest
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.core import frames
-from vinesim.net.codec.messages import RESTING, RetainedRecord, TreeStates, encode_trees
+from vinesim.net.codec.control import RetainedRecord
+from vinesim.net.codec.trees import RESTING, TreeStates, encode_trees
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description

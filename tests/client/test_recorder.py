@@ -10,9 +10,11 @@ import pytest
 from mcap.reader import make_reader
 
 from tests.support.recorded_world import TICK, MinimalClient, vineyard
-from vinesim.client.recording.recorder import FAMILIES, AreaTooLarge, Observer, Recorder, observer_grid
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.client.recording.recorder import CHOICES, AreaTooLarge, Observer, Recorder, observer_grid
+from vinesim.net.codec.control import RetainedRecord, decode_hello, decode_time, encode_records, encode_time
+from vinesim.net.codec.header import PROTOCOL, kind_of
+from vinesim.net.codec.messages import time_of
+from vinesim.net.codec.trees import TREES, decode_trees
 from vinesim.net.recording.mcap_reader import Recording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication.interest import INTEREST_RADIUS
@@ -29,11 +31,9 @@ class World:
     def __init__(self, path: pathlib.Path | None, distance: float = 2.0, **options) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
-        server.declare_queryable(
-            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], EPOCH + self.hub.time)
-        )
+        server.declare_queryable("clock/*", lambda payload: encode_time(decode_time(payload)[0], EPOCH + self.hub.time))
         record = RetainedRecord(object_id(ObjectKind.BUNCH, 3), 1, 0, "gone", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
-        server.declare_queryable("snap/0/0", lambda _: messages.encode_records([record]))
+        server.declare_queryable("snap/0/0", lambda _: encode_records([record]))
         self.ada, self.bob = MinimalClient(self.hub.bus("ada"), 0.5), MinimalClient(self.hub.bus("bob"), 0.5 + distance)
         self.clients = [self.ada, self.bob]
         self.steps = [lambda: None]
@@ -84,7 +84,7 @@ def test_all_messages_are_recorded(tmp_path):
         "seed": "5",
         "digest": vineyard().digest(),
         "world": "memory",
-        "protocol": str(messages.PROTOCOL),
+        "protocol": str(PROTOCOL),
     }
     assert recorded.metadata.items() >= about.items()
     assert [(e.key, bool(e.payload)) for e in recorded.messages if e.key.startswith("live")] == [
@@ -92,27 +92,23 @@ def test_all_messages_are_recorded(tmp_path):
         ("live/bob", True),
         ("live/bob", False),
     ]
-    assert {messages.decode_hello(e.payload).name for e in recorded.messages if e.key.startswith("hello")} == {
+    assert {decode_hello(e.payload).name for e in recorded.messages if e.key.startswith("hello")} == {
         "ada",
         "bob",
     }
 
     # all tree updates and events that bob received are recorded, in order and bitwise
-    updates = [messages.decode_trees(e.payload) for e in recorded.messages if e.key in ("tree/0/0/ada", "near/0/0/ada")]
+    updates = [decode_trees(e.payload) for e in recorded.messages if e.key in ("tree/0/0/ada", "near/0/0/ada")]
     assert len(updates) > 90
-    last = [
-        e
-        for e in recorded.messages
-        if e.key == "own/0/0/ada" and messages.kind_of(e.payload) == messages.MessageKind.TREES
-    ][-1]
-    rest = messages.decode_trees(last.payload)
+    last = [e for e in recorded.messages if e.key == "own/0/0/ada" and kind_of(e.payload) == TREES][-1]
+    rest = decode_trees(last.payload)
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.ada.read(0)[0])
     np.testing.assert_array_equal(rest.joint_q.astype(np.float32), world.bob.read(0)[0])
 
     # log time is network time: a delay and a poll after the author's time stamp
     for entry in recorded.messages:
         if entry.key in ("tree/0/0/ada", "near/0/0/ada"):
-            assert 0.0 < entry.time - messages.time_of(entry.payload) < 0.03
+            assert 0.0 < entry.time - time_of(entry.payload) < 0.03
     assert recorded.start == pytest.approx(EPOCH, abs=0.2)
 
 
@@ -179,7 +175,7 @@ def test_two_recorders_do_not_keep_each_others_subscriptions(tmp_path):
         assert not world.ada.replicator._state.peers._layers[-1].matching
 
 
-@pytest.mark.parametrize("only", FAMILIES)
+@pytest.mark.parametrize("only", CHOICES)
 def test_only_selected_families_are_recorded(tmp_path, only):
     world = World(tmp_path / "run.mcap", only=[only])
     world.run(0.5)

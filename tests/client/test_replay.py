@@ -11,8 +11,17 @@ import pytest
 from tests.client.test_recorder import EPOCH, World
 from tests.support.recorded_world import TICK, MinimalClient, vineyard
 from vinesim.client.recording.replay import Replay, ReplayBus
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import (
+    RetainedRecord,
+    decode_hello,
+    decode_records,
+    decode_time,
+    encode_records,
+    encode_time,
+)
+from vinesim.net.codec.header import kind_of
+from vinesim.net.codec.messages import time_of
+from vinesim.net.codec.trees import RESTING, TREES, TreeStates, decode_trees
 from vinesim.net.recording.mcap_reader import Recording, read_recording
 from vinesim.net.transport.bus import KEEP_ALL, NameTaken
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -30,7 +39,7 @@ def original(tmp_path_factory) -> Recording:
     world.clients.remove(world.bob)
     world.run(0.3)
     record = RetainedRecord(object_id(ObjectKind.BUNCH, 4), 1, 0, "ada", pose=(1.0, 0.0, 0.1, 0.0, 0.0, 0.0, 1.0))
-    assert world.ada.bus.publisher("fact/0/0/ada", reliable=True).put(messages.encode_records([record]))
+    assert world.ada.bus.publisher("fact/0/0/ada", reliable=True).put(encode_records([record]))
     world.run(0.2)
     return world.recorded()
 
@@ -50,13 +59,11 @@ def watch(original: Recording, **span: float) -> tuple[MinimalClient, list[bytes
     return viewer, states, updates
 
 
-def recorded_trees(original: Recording) -> list[messages.TreeStates]:
+def recorded_trees(original: Recording) -> list[TreeStates]:
     kinds = (
         entry.payload for entry in original.messages if entry.key in ("tree/0/0/ada", "near/0/0/ada", "own/0/0/ada")
     )
-    return [
-        messages.decode_trees(payload) for payload in kinds if messages.kind_of(payload) == messages.MessageKind.TREES
-    ]
+    return [decode_trees(payload) for payload in kinds if kind_of(payload) == TREES]
 
 
 def test_a_viewer_receives_what_was_recorded(original):
@@ -65,7 +72,7 @@ def test_a_viewer_receives_what_was_recorded(original):
     assert viewer.bus.bytes_out == 0
     recorded = recorded_trees(original)
     rest = recorded[-1]
-    assert rest.flags[0] == messages.RESTING
+    assert rest.flags[0] == RESTING
     np.testing.assert_array_equal(viewer.received[-1].joint_q, rest.joint_q)
     np.testing.assert_array_equal(viewer.read(0)[0], rest.joint_q.astype(np.float32))
     # of all updates of a tick the last one is applied, in order; their rates are zero, so none is extrapolated
@@ -101,12 +108,12 @@ def test_a_part_of_a_recording_is_replayed(original):
     bus.subscribe("a/*/far", KEEP_ALL)
     assert bus.time == pytest.approx(original.start + start)
     bus.query("hello/bob")  # an actor that joined before is alive
-    assert messages.decode_hello(bus.replies()[0].payload).name == "bob"
+    assert decode_hello(bus.replies()[0].payload).name == "bob"
     for _ in range(100):
         bus.play(TICK)
     assert bus.ended
     assert bus.time == pytest.approx(original.start + start + 0.5, abs=1e-6)  # no later than the end
-    times = [messages.time_of(payload) - original.start for _, payload in bus.poll()]
+    times = [time_of(payload) - original.start for _, payload in bus.poll()]
     assert start - 0.1 < min(times) < max(times) < start + 0.5
 
 
@@ -117,7 +124,7 @@ def test_queries_for_retained_records_are_answered(original):
 
     def recorded_objects() -> set[int]:
         bus.query("snap/0/0")
-        return {record.object for answer in bus.replies() for record in messages.decode_records(answer.payload)}
+        return {record.object for answer in bus.replies() for record in decode_records(answer.payload)}
 
     assert recorded_objects() == {before}
     while not bus.ended:
@@ -125,7 +132,7 @@ def test_queries_for_retained_records_are_answered(original):
     assert recorded_objects() == {before, later}
     bus.query("snap/9/9")
     (empty,) = bus.replies()
-    assert (empty.key, messages.decode_records(empty.payload)) == ("snap/9/9", [])
+    assert (empty.key, decode_records(empty.payload)) == ("snap/9/9", [])
     bus.query("snap/*/*")
     assert {answer.key for answer in bus.replies()} == {"snap/0/0"}
     bus.query("snap/nonsense")
@@ -139,8 +146,8 @@ def test_a_recorded_actor_name_is_taken(original):
 
 def test_the_clock_is_that_of_the_recording(original):
     bus = ReplayBus(original, "viewer", start=0.5)
-    bus.query("clock/viewer", messages.encode_time(3.0))
-    reply = messages.decode_time(bus.replies()[0].payload)
+    bus.query("clock/viewer", encode_time(3.0))
+    reply = decode_time(bus.replies()[0].payload)
     assert (reply.asked, reply.factor) == (3.0, 1.0)
     assert reply.world == pytest.approx(EPOCH + 0.6, abs=0.2)
 
@@ -151,9 +158,7 @@ class ReplayNetwork:
     def __init__(self, original: Recording, **span: float) -> None:
         self.hub = MemoryHub(delay=0.004)
         server = self.hub.bus("server", live=False)
-        server.declare_queryable(
-            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 5e8 + self.hub.time)
-        )
+        server.declare_queryable("clock/*", lambda payload: encode_time(decode_time(payload)[0], 5e8 + self.hub.time))
         self.kept: list[RetainedRecord] = []
         self.server = server
         server.subscribe("fact/**", KEEP_ALL)
@@ -169,7 +174,7 @@ class ReplayNetwork:
         self.hub.advance(TICK)
         self.replay.step(self.hub.time)
         self.viewer.tick(self.hub.time)
-        self.kept += [record for _, payload in self.server.poll() for record in messages.decode_records(payload)]
+        self.kept += [record for _, payload in self.server.poll() for record in decode_records(payload)]
 
 
 def test_a_replay_to_a_network(original):

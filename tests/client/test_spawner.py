@@ -13,7 +13,7 @@ import pytest
 from tests.support.contact_scenes import cane
 from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.core import frames
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description

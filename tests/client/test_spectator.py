@@ -19,7 +19,8 @@ from vinesim.client.spectator import EYE_HEIGHT, FOLLOW_DISTANCE, Spectator, fol
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
+from vinesim.net.codec.trees import RESTING
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -67,7 +68,7 @@ def test_two_replays_move_the_trees_equally(bent):
     errors = []
     for number, displayed in tree.items():
         earlier = [record for record in records if record.time <= times[number] - 0.1]
-        if earlier and not earlier[-1].flags[0] & messages.RESTING:
+        if earlier and not earlier[-1].flags[0] & RESTING:
             nearest = min(
                 float(np.abs((record.joint_q * displayed).sum(1)).min() - 1.0) ** 2
                 for record in records
@@ -121,9 +122,7 @@ def robot_recording(tmp_path_factory) -> pathlib.Path:
     path = tmp_path_factory.mktemp("robot") / "run.mcap"
     hub = MemoryHub(delay=0.004)
     clock = hub.bus("server", live=False)
-    clock.declare_queryable(
-        "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], 1e9 + hub.time)
-    )
+    clock.declare_queryable("clock/*", lambda payload: encode_time(decode_time(payload)[0], 1e9 + hub.time))
     scene = load_scene("demo")
     model = generate(scene)
     start = spawn_pose(scene, 0)

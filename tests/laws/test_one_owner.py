@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tests.support.examples import share
 from tests.support.shared_vineyard import BOX, BUNCH, Server, vineyard
 from vinesim.core import frames
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.memory_bus import MemoryHub

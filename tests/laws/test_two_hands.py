@@ -11,7 +11,7 @@ from tests.support.contact_scenes import bunch_scene
 from tests.support.long_rows import long
 from vinesim.client.client import Client
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import HAND_HALF_THICKNESS, standing_pose
 from vinesim.scene.spec import load_scene
@@ -33,9 +33,7 @@ class TwoHands:
     def __init__(self, delay: float, *, jitter: float = 0.0, loss: float = 0.0) -> None:
         self.now = 100.0
         self.hub = MemoryHub(delay=delay, jitter=jitter, loss=loss, seed=3)
-        self.hub.bus("server").declare_queryable(
-            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.now)
-        )
+        self.hub.bus("server").declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], self.now))
         scene = load_scene("demo")
         self.model, self.body, self.rest = bunch_scene(0.5)
         self.model.bunch_pull[:] = self.model.bunch_bend[:] = 1e6

@@ -13,8 +13,17 @@ import pytest
 import zenoh
 
 from tests.support.waiting import wait
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello, MeshPart, RetainedRecord
+from vinesim.net.codec.control import (
+    Hello,
+    RetainedRecord,
+    decode_hello,
+    decode_records,
+    decode_time,
+    encode_hello,
+    encode_records,
+    encode_time,
+)
+from vinesim.net.codec.meshes import MeshPart, decode_part, decode_wanted, encode_part, encode_request
 from vinesim.net.replication.interest import POSE_LAYERS
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.server import Server
@@ -49,7 +58,7 @@ def bus(name, server, certs, **options):
 
 
 def hello(name, digest="D1"):
-    return messages.encode_hello(Hello(name, digest=digest, scene="vsp"))
+    return encode_hello(Hello(name, digest=digest, scene="vsp"))
 
 
 @contextlib.contextmanager
@@ -103,7 +112,7 @@ def keys_received(certs, server, name, keys):
         for key in keys:
             writer.put(key, b"x", congestion_control=zenoh.CongestionControl.BLOCK)
         # samples put before in this session have arrived when the reply to a query has
-        list(writer.get(f"vs/1/vineyard/clock/{name}", payload=messages.encode_time(1.0)))
+        list(writer.get(f"vs/1/vineyard/clock/{name}", payload=encode_time(1.0)))
         end.put(b"end")
         wait(lambda: "vs/1/vineyard/own/9/9/ada" in received, "the end mark")
         return [key for key in received if key != "vs/1/vineyard/own/9/9/ada"]
@@ -202,7 +211,7 @@ def test_all_bus_functions_work_under_access_control(server, certs):
         record = RetainedRecord(object_id(ObjectKind.BOX, 1), 1, 0, "ada")
         publisher = ada.publisher("fact/0/0/ada", reliable=True)
         wait(lambda: publisher.matching, "the server's subscription")
-        publisher.put(messages.encode_records([record]))
+        publisher.put(encode_records([record]))
         wait(lambda: server.store.count() == 1, "the record to be stored")
         ada.declare_queryable("hello/ada", lambda _: hello("ada"))
         guest.declare_queryable("hello/guest", lambda _: hello("guest"))
@@ -210,23 +219,23 @@ def test_all_bus_functions_work_under_access_control(server, certs):
 
         def all_replied():
             for key in ("hello/ada", "clock/guest", "snap/0/0"):
-                guest.query(key, messages.encode_time(1.0))
+                guest.query(key, encode_time(1.0))
             ada.query("hello/guest")
             time.sleep(0.02)
             answers.update({answer.key: answer.payload for answer in [*guest.replies(), *ada.replies()]})
             return len(answers) == 4
 
         wait(all_replied, "four answers")
-        assert messages.decode_records(answers["snap/0/0"]) == [record]
-        assert messages.decode_hello(answers["hello/guest"]).name == "guest"
+        assert decode_records(answers["snap/0/0"]) == [record]
+        assert decode_hello(answers["hello/guest"]).name == "guest"
 
 
 def test_a_robot_offers_its_own_meshes_and_all_may_ask_for_them(server, certs, monkeypatch):
     """Under another name nothing is offered; a spectator offers nothing; neither answers for the server."""
     payload = encode_triangles(np.eye(3)[None])
     digest = digest_of(payload)
-    part = messages.encode_part(MeshPart(digest, len(payload), 0, payload))
-    forged = messages.encode_part(MeshPart(digest, len(payload), 0, bytes(36)))
+    part = encode_part(MeshPart(digest, len(payload), 0, payload))
+    forged = encode_part(MeshPart(digest, len(payload), 0, bytes(36)))
     with (
         bus("ada", server, certs) as ada,
         bus("bob", server, certs) as bob,
@@ -246,10 +255,10 @@ def test_a_robot_offers_its_own_meshes_and_all_may_ask_for_them(server, certs, m
                 assert each.fetch(key, part) == []
         assert len(server.meshes) == 0
         (reply,) = ada.fetch("offer/ada", part)
-        assert messages.decode_wanted(reply).offset == len(payload)
+        assert decode_wanted(reply).offset == len(payload)
         for each in (bob, guest):
-            (reply,) = each.fetch(f"mesh/{digest}", messages.encode_request(0))
-            assert messages.decode_part(reply).data == payload
+            (reply,) = each.fetch(f"mesh/{digest}", encode_request(0))
+            assert decode_part(reply).data == payload
         assert not answers
         for each in (served, heard):
             each.undeclare()
@@ -264,11 +273,11 @@ def test_liveliness_and_replies_of_another_name_are_blocked(server, certs):
         wait(lambda: "ada" in bob.alive(), "ada herself")
         assert "carl" not in bob.alive()
         bob.query("hello/carl")
-        bob.query("clock/bob", messages.encode_time(1.0))
+        bob.query("clock/bob", encode_time(1.0))
         answers: list = []
         wait(lambda: answers.extend(bob.replies()) or answers, "the clock")
         assert [answer.key for answer in answers] == ["clock/bob"]
-        assert messages.decode_time(answers[0].payload)[0] == 1.0
+        assert decode_time(answers[0].payload)[0] == 1.0
         for each in (served, clock, forged, own):
             each.undeclare()
 
@@ -325,7 +334,7 @@ def test_linked_servers_check_names_of_their_own_actors(certs, protocol):
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's subscription")
         impostor.put("vs/1/vineyard/own/0/0/bob", b"forged", congestion_control=zenoh.CongestionControl.BLOCK)
-        list(impostor.get("vs/1/vineyard/clock/bob", payload=messages.encode_time(1.0)))
+        list(impostor.get("vs/1/vineyard/clock/bob", payload=encode_time(1.0)))
         event.put(b"event")
         received: list = []
         wait(lambda: received.extend(bob.poll()) or received, "the event")

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello, Welcome, encode_hello, encode_welcome
+from vinesim.net.codec.header import PROTOCOL
 from vinesim.net.server.admission import PROVISIONAL_TIMEOUT, AdmissionControl, SceneId
 from vinesim.net.transport import zenoh_admission
 
@@ -20,13 +20,13 @@ from vinesim.net.transport import zenoh_admission
 def join(admission, name, digest="D1", *, world="w", session="", scene="vsp", now=0.0):
     session = session or name
     admission.on_join(world, name, session)
-    hello = messages.encode_hello(Hello(name, scene=scene, digest=digest))
+    hello = encode_hello(Hello(name, scene=scene, digest=digest))
     return admission.decide(world, name, session, hello, now)
 
 
 def test_the_first_actor_decides_the_scene_and_another_is_refused_with_both_names():
     admission = AdmissionControl()
-    assert join(admission, "ada") == messages.Welcome("", "vsp", "D1")
+    assert join(admission, "ada") == Welcome("", "vsp", "D1")
     reason = join(admission, "bob", "D2", scene="tendone").refused
     for word in ("'bob'", "'tendone'", "'D2'", "'vsp'", "'D1'", "same scene, seed"):
         assert word in reason
@@ -56,22 +56,22 @@ def test_a_server_started_for_a_scene_refuses_others():
 
 
 def test_another_protocol_is_refused_with_both_versions():
-    hello = bytearray(messages.encode_hello(Hello("ada")))
+    hello = bytearray(encode_hello(Hello("ada")))
     hello[2] = 9
     reason = AdmissionControl().decide("w", "ada", "s", bytes(hello), 0.0).refused
     assert "version 9" in reason
-    assert f"version {messages.PROTOCOL}" in reason
-    inner = messages.encode_hello(msgspec.structs.replace(Hello("ada"), protocol=messages.PROTOCOL + 1))
-    assert f"version {messages.PROTOCOL + 1}" in AdmissionControl().decide("w", "ada", "s", inner, 0.0).refused
+    assert f"version {PROTOCOL}" in reason
+    inner = encode_hello(msgspec.structs.replace(Hello("ada"), protocol=PROTOCOL + 1))
+    assert f"version {PROTOCOL + 1}" in AdmissionControl().decide("w", "ada", "s", inner, 0.0).refused
 
 
-@pytest.mark.parametrize("payload", [b"", b"VS", b"nonsense", messages.encode_hello(Hello("ada"))[:-3], bytes(1 << 21)])
+@pytest.mark.parametrize("payload", [b"", b"VS", b"nonsense", encode_hello(Hello("ada"))[:-3], bytes(1 << 21)])
 def test_an_invalid_hello_is_refused_with_the_reason(payload):
     assert "cannot be read" in AdmissionControl().decide("w", "ada", "s", payload, 0.0).refused
 
 
 def test_a_hello_under_another_name_is_refused():
-    hello = messages.encode_hello(Hello("bob"))
+    hello = encode_hello(Hello("bob"))
     assert "introduces itself as 'bob'" in AdmissionControl().decide("w", "ada", "s", hello, 0.0).refused
 
 
@@ -98,7 +98,7 @@ def test_the_number_of_actors_is_limited():
 
 def test_an_admitted_actor_that_never_joins_loses_its_place():
     admission = AdmissionControl(max_actors=1)
-    hello = messages.encode_hello(Hello("ghost"))
+    hello = encode_hello(Hello("ghost"))
     assert not admission.decide("w", "ghost", "g", hello, 0.0).refused
     assert join(admission, "ada", now=1.0).refused
     assert not join(admission, "ada", now=PROVISIONAL_TIMEOUT + 1.0).refused
@@ -141,7 +141,7 @@ class _SlowlyRouted:
         self.queries += 1
         if self.queries <= self.lost:
             return []
-        payload = types.SimpleNamespace(to_bytes=lambda: messages.encode_welcome(messages.Welcome()))
+        payload = types.SimpleNamespace(to_bytes=lambda: encode_welcome(Welcome()))
         server = types.SimpleNamespace(zid="b2")
         return [types.SimpleNamespace(ok=types.SimpleNamespace(payload=payload), replier_id=server)]
 

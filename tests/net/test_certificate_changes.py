@@ -11,8 +11,7 @@ import pytest
 from cryptography import x509
 
 from tests.support.waiting import wait
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.codec.control import Hello, RetainedRecord, encode_hello, encode_records
 from vinesim.net.server.server import Server
 from vinesim.net.transport import certificate_watch
 from vinesim.net.transport.access_control import CertificateError, Role
@@ -31,7 +30,7 @@ def joined(name: str, server: Server, certs: pathlib.Path) -> ZenohBus | None:
     """A bus whose actor was let in; None if it was refused."""
     bus = ZenohBus(name, connect=server.endpoint, certificates=certs)
     try:
-        bus.join(messages.encode_hello(Hello(name, digest="D1", scene="vsp")))
+        bus.join(encode_hello(Hello(name, digest="D1", scene="vsp")))
     except BusError:
         bus.close()
         return None
@@ -62,7 +61,7 @@ def test_a_running_server_takes_new_certificates_and_its_actors_and_records_stay
             record = RetainedRecord(object_id(ObjectKind.BOX, 1), 1, 0, "ada")
             publisher = ada.publisher("fact/0/0/ada", reliable=True)
             wait(lambda: publisher.matching, "the server's subscription")
-            publisher.put(messages.encode_records([record]))
+            publisher.put(encode_records([record]))
             wait(lambda: server.store is not None and server.store.count() == 1, "the record to be stored")
 
             create(certs, "server", Role.SERVER)
@@ -73,7 +72,7 @@ def test_a_running_server_takes_new_certificates_and_its_actors_and_records_stay
             wait(lambda: "vineyard/ada" in server.actors and not ada.status_message, "ada to come back")
             assert server.store is not None
             assert server.store.count() == 1
-            publisher.put(messages.encode_records([RetainedRecord(object_id(ObjectKind.BOX, 2), 1, 0, "ada")]))
+            publisher.put(encode_records([RetainedRecord(object_id(ObjectKind.BOX, 2), 1, 0, "ada")]))
             wait(lambda: server.store is not None and server.store.count() == 2, "a record after that")
 
             for suffix in (".pem", ".key"):

@@ -9,7 +9,7 @@ import pytest
 
 import vinesim
 from benchmarks.support.fake_client import FakeClient, tree_row
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.replication.clock_sync import ClockEstimate, Ping
 from vinesim.net.transport.memory_bus import MemoryHub
 
@@ -24,7 +24,7 @@ class World:
         self.hub = MemoryHub(delay=0.02)
         self.server_offset = 1e6
         self.hub.bus("server").declare_queryable(
-            "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], self.server_time)
+            "clock/*", lambda asked: encode_time(decode_time(asked)[0], self.server_time)
         )
         model = tree_row(2)
         self.ada, self.bob = (

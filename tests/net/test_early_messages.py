@@ -6,10 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.net.test_replicator import Client, run
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.replication import early_messages
-from vinesim.net.replication.early_messages import (
+from vinesim.net.codec.control import RetainedRecord, encode_records
+from vinesim.net.replication import receiver
+from vinesim.net.replication.receiver import (
     MAX_EARLY_BYTES,
     MAX_EARLY_MESSAGES,
     MAX_EARLY_SENDERS,
@@ -33,8 +32,8 @@ def test_messages_are_taken_in_order_and_once():
 @given(_PUTS)
 def test_bytes_messages_and_senders_are_bounded_and_every_message_is_kept_or_counted(puts):
     bounds = {"MAX_EARLY_MESSAGES": 5, "MAX_EARLY_BYTES": 100, "MAX_EARLY_SENDERS": 4, "MAX_EARLY_TOTAL": 250}
-    before = {name: getattr(early_messages, name) for name in bounds}
-    vars(early_messages).update(bounds)
+    before = {name: getattr(receiver, name) for name in bounds}
+    vars(receiver).update(bounds)
     try:
         early = EarlyMessages()
         discarded = 0
@@ -44,7 +43,7 @@ def test_bytes_messages_and_senders_are_bounded_and_every_message_is_kept_or_cou
             assert early.size <= 250
         kept = [early.take(f"{sender}") for sender in range(10)]
     finally:
-        vars(early_messages).update(before)
+        vars(receiver).update(before)
     assert all(len(messages) <= 5 and sum(len(payload) for _, payload in messages) <= 100 for messages in kept)
     assert sum(map(len, kept)) + discarded == len(puts)
 
@@ -66,7 +65,7 @@ def test_a_client_holds_a_bounded_amount_of_messages_of_strangers():
     run(hub, [ada], 0.1)
     stranger = hub.bus("stranger", live=False)
     record = RetainedRecord(3, 1, 0, "stranger")
-    payload = messages.encode_records([record]) + bytes(MAX_EARLY_BYTES // 4)
+    payload = encode_records([record]) + bytes(MAX_EARLY_BYTES // 4)
     before = ada.replicator.counters.dropped
     sent = 0
     for name in range(3 * MAX_EARLY_SENDERS):

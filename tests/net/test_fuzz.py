@@ -21,11 +21,14 @@ from tests.support.long_rows import long
 from tests.support.waiting import deadline
 from vinesim.client.client import Client
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import encode_claims
 from vinesim.net.codec.human import encode_pose
+from vinesim.net.codec.objects import check_object_id
+from vinesim.net.codec.robot import encode_robot
+from vinesim.net.codec.trees import TOUCHED, TreeStates, encode_trees
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
-from vinesim.net.replication.model_check import check_record
+from vinesim.net.replication.receiver import check_record
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.server import Server
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -77,7 +80,7 @@ def _assert_possible(fake_client: FakeClient) -> None:
     model = fake_client.model
     counts = object_counts(model)
     for number in replicator.known:
-        messages.check_object_id(number, counts)
+        check_object_id(number, counts)
     records = [record for record in map(replicator.record, sorted(fake_client.facts)) if record is not None]
     assert records
     for record in records:
@@ -105,12 +108,12 @@ def test_a_message_from_the_far_future_does_not_block_its_sender():
     run(0.5)
     bus = ada.replicator.bus
     pose = ada.pose(hub.time)
-    bus.publisher("a/ada").put(messages.encode_robot(type(pose)(**_fields(pose) | {"time": 1e300})))
+    bus.publisher("a/ada").put(encode_robot(type(pose)(**_fields(pose) | {"time": 1e300})))
     q, qd = ada.read(0)
     claim = ada.replicator.claim(0)
-    header = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([messages.TOUCHED])
-    invalid = messages.TreeStates(1e300, *header, np.array([len(q)]), q, qd)
-    bus.publisher("tree/0/0/ada").put(messages.encode_trees(invalid)[0][0])
+    header = np.array([0]), np.array([claim.ownership]), np.array([claim.authority]), np.array([TOUCHED])
+    invalid = TreeStates(1e300, *header, np.array([len(q)]), q, qd)
+    bus.publisher("tree/0/0/ada").put(encode_trees(invalid)[0][0])
     hub.advance(0.01)
     bob.tick(hub.time)
     ada.place[0] = 1.5
@@ -235,7 +238,7 @@ def test_a_hanging_bunch_that_is_claimed_by_an_actor_who_leaves_goes_on_hanging(
         tick()
     bunch = object_id(ObjectKind.BUNCH, 5)
     x, y = interest.cell_of(pose[:3])
-    claims = messages.encode_claims([(bunch, Claim(1, 1, "bob"), True)])
+    claims = encode_claims([(bunch, Claim(1, 1, "bob"), True)])
     assert other.bus.publisher(f"own/{x}/{y}/bob", reliable=True).put(claims)
     tick()
     assert client.replicator.owner(bunch) == "bob"

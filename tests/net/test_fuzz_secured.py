@@ -13,7 +13,7 @@ import zenoh
 from benchmarks.message_fuzz import ATTACKER, storm
 from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.waiting import wait
-from vinesim.net.codec import messages
+from vinesim.net.codec.objects import check_object_id
 from vinesim.net.replication.streams import object_counts
 from vinesim.net.server.server import Server
 from vinesim.net.transport.access_control import tls_config
@@ -115,7 +115,7 @@ def test_over_tls_no_message_of_any_kind_or_key_stops_a_thread_or_is_believed_ag
         assert threads <= {thread.name for thread in threading.enumerate()}, "no thread ended"
         assert set(ada.robots) == {ATTACKER}
         for known in ada.replicator.known:
-            messages.check_object_id(known, object_counts(model))
+            check_object_id(known, object_counts(model))
         figures = server.figures()
         assert figures["facts_failed"] == 0
         ada.touching = {1}

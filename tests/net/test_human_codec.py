@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.forces import WRENCHES, WrenchMessage, decode_wrenches, encode_wrenches
+from vinesim.net.codec.header import MessageError, kind_of
 from vinesim.net.codec.human import (
     decode_human,
     decode_pose,
@@ -18,8 +19,6 @@ from vinesim.net.codec.human import (
     encode_pose,
     quantise_pose,
 )
-from vinesim.net.codec.messages import MessageError
-from vinesim.net.codec.wrenches import WrenchMessage, decode_wrenches, encode_wrenches
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanUpdate, RobotUpdate
 
@@ -139,11 +138,7 @@ def test_damaged_messages_are_decoded_or_refused(payload, data):
 
 @pytest.mark.parametrize("payload", MESSAGES)
 def test_a_truncated_message_is_refused(payload):
-    read = (
-        decode_wrenches
-        if messages.kind_of(payload) == messages.MessageKind.WRENCHES
-        else lambda raw: decode_human(raw, "eva")
-    )
+    read = decode_wrenches if kind_of(payload) == WRENCHES else lambda raw: decode_human(raw, "eva")
     for length in range(len(payload)):
         with pytest.raises(MessageError):
             read(payload[:length])

@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from benchmarks.support.fake_client import FakeClient, tree_row
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello, decode_time, encode_time
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.jitter_buffer import MAX_DELAY, MAX_SAMPLES, JitterBuffer
 from vinesim.net.replication.replicator import Replicator
@@ -95,9 +94,7 @@ def test_a_buffered_robot_is_delayed_and_accurate():
     def errors(buffer: float) -> np.ndarray:
         hub = MemoryHub(delay=0.05, jitter=0.04, seed=3)
         server = hub.bus("server")
-        server.declare_queryable(
-            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], hub.time)
-        )
+        server.declare_queryable("clock/*", lambda payload: encode_time(decode_time(payload)[0], hub.time))
         model = tree_row(1)
         hello = Hello("bob", digest="fake_clients", joints=0)
         ada = FakeClient(hub.bus("ada"), model, (1.0, 0.0))

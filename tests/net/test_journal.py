@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import RetainedRecord, encode_records
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.server import journal as journal_module
 from vinesim.net.server.admission import SceneId
@@ -166,7 +165,7 @@ def test_obsolete_records_are_compacted(tmp_path, monkeypatch):
         for ownership in range(1, 200):
             add(journal, (0, 0), record(0, ownership))
             journal.sync()
-        assert journal.path.stat().st_size < 30 * len(messages.encode_records([record(0, 199)]))
+        assert journal.path.stat().st_size < 30 * len(encode_records([record(0, 199)]))
         add(journal, (0, 0), record(0, 200))
     assert records_of(Journal.load(journal.path)) == [((0, 0), record(0, 200))]
 

@@ -9,9 +9,21 @@ import numpy as np
 import pytest
 
 from tests.support.waiting import wait
-from vinesim.net.codec import messages
-from vinesim.net.codec.control import pack
-from vinesim.net.codec.messages import MAX_PART, Hello, MeshPart, MeshWanted, MessageError, MessageKind
+from vinesim.net.codec.control import Hello, encode_hello, pack
+from vinesim.net.codec.header import MAGIC, PROTOCOL, MessageError
+from vinesim.net.codec.meshes import (
+    MAX_PART,
+    MESH_PART,
+    MESH_REQUEST,
+    MESH_WANTED,
+    MeshPart,
+    MeshWanted,
+    decode_part,
+    decode_request,
+    decode_wanted,
+    encode_part,
+    encode_request,
+)
 from vinesim.net.server.mesh_store import MeshLimits, MeshStore
 from vinesim.net.server.server import Server
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -148,16 +160,16 @@ DIGEST = digest_of(b"")
 )
 def test_impossible_parts_are_malformed(part: MeshPart) -> None:
     with pytest.raises(MessageError):
-        messages.decode_part(messages.encode_part(part))
+        decode_part(encode_part(part))
 
 
-@pytest.mark.parametrize("decode", [messages.decode_part, messages.decode_request, messages.decode_wanted])
+@pytest.mark.parametrize("decode", [decode_part, decode_request, decode_wanted])
 def test_random_bytes_are_malformed(decode) -> None:
     random = np.random.default_rng(2)
-    kinds = [MessageKind.MESH_PART, MessageKind.MESH_REQUEST, MessageKind.MESH_WANTED]
+    kinds = [MESH_PART, MESH_REQUEST, MESH_WANTED]
     for _ in range(5000):
         value = random.bytes(int(random.integers(0, 60)))
-        head = messages.MAGIC + bytes((messages.PROTOCOL, int(random.choice(kinds))))
+        head = MAGIC + bytes((PROTOCOL, int(random.choice(kinds))))
         try:
             decode(head + value if random.random() < 0.9 else value)
         except MessageError:
@@ -166,20 +178,20 @@ def test_random_bytes_are_malformed(decode) -> None:
         for kind in kinds:
             with pytest.raises(MessageError):
                 decode(pack(kind, value))
-    assert msgspec.msgpack.decode(messages.encode_request(3)[4:]) == [3]
+    assert msgspec.msgpack.decode(encode_request(3)[4:]) == [3]
 
 
 def test_only_an_actor_that_has_joined_offers_and_only_right_keys_are_answered() -> None:
     payload = mesh(2 * MAX_PART // FACE_BYTES)
     digest = digest_of(payload)
-    begin = messages.encode_part(MeshPart(digest_of(payload), len(payload)))
+    begin = encode_part(MeshPart(digest_of(payload), len(payload)))
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("anna", connect=server.endpoint) as anna:
         assert anna.fetch("offer/anna", begin) == []  # it has not joined
-        anna.join(messages.encode_hello(Hello("anna", digest="D", scene="demo")))
+        anna.join(encode_hello(Hello("anna", digest="D", scene="demo")))
         assert anna.admissions == 1
         (reply,) = anna.fetch("offer/anna", begin)
-        assert messages.decode_wanted(reply) == MeshWanted(0)
-        request = messages.encode_request(0)
+        assert decode_wanted(reply) == MeshWanted(0)
+        request = encode_request(0)
         for key, question in (
             ("offer/bert", begin),
             ("offer/*", begin),
@@ -194,14 +206,14 @@ def test_only_an_actor_that_has_joined_offers_and_only_right_keys_are_answered()
             assert anna.fetch(key, question) == [], key
         assert server.malformed >= 8
         (reply,) = anna.fetch(f"mesh/{digest}", request)
-        assert messages.decode_part(reply) == MeshPart(digest, 0)
+        assert decode_part(reply) == MeshPart(digest, 0)
         offset = 0
         while offset < len(payload):
             part = MeshPart(digest, len(payload), offset, payload[offset : offset + MAX_PART])
-            (reply,) = anna.fetch("offer/anna", messages.encode_part(part))
-            offset = messages.decode_wanted(reply).offset
-        (reply,) = anna.fetch(f"mesh/{digest}", messages.encode_request(MAX_PART))
-        assert messages.decode_part(reply).data == payload[MAX_PART : 2 * MAX_PART]
+            (reply,) = anna.fetch("offer/anna", encode_part(part))
+            offset = decode_wanted(reply).offset
+        (reply,) = anna.fetch(f"mesh/{digest}", encode_request(MAX_PART))
+        assert decode_part(reply).data == payload[MAX_PART : 2 * MAX_PART]
         figures = server.figures()
         assert (figures["meshes"], figures["mesh_bytes"]) == (1, len(payload))
         server.meshes.limits = dataclasses.replace(server.meshes.limits, count=1)

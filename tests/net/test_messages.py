@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import hashlib
 
 import msgspec
 import numpy as np
@@ -13,8 +14,36 @@ from hypothesis import strategies as st
 
 from tests.support.examples import share
 from vinesim.core import frames
-from vinesim.net.codec import messages, rotation
-from vinesim.net.codec.messages import Hello, MessageError, TreeStates, WrongVersion
+from vinesim.net.codec import rotation
+from vinesim.net.codec.control import (
+    HELLO,
+    RETAINED,
+    Hello,
+    RetainedRecord,
+    decode_claims,
+    decode_hello,
+    decode_records,
+    decode_time,
+    encode_claims,
+    encode_hello,
+    encode_records,
+    encode_time,
+)
+from vinesim.net.codec.header import (
+    HEADER,
+    MAGIC,
+    MAX_DATAGRAM,
+    MAX_MESSAGE,
+    PROTOCOL,
+    MessageError,
+    WrongVersion,
+    kind_of,
+)
+from vinesim.net.codec.meshes import MeshPart, MeshWanted, encode_part, encode_request, encode_wanted
+from vinesim.net.codec.messages import FAMILIES, MESSAGES, Counters, Traffic, schema_of, shift_time, time_of
+from vinesim.net.codec.objects import ObjectStates, check_object_id, decode_objects, encode_objects
+from vinesim.net.codec.robot import MAX_JOINTS, decode_robot, encode_robot
+from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees, quantise_tree
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene import ids
@@ -45,13 +74,13 @@ def cut(batch: TreeStates, roots: list[int], rng: np.random.Generator) -> TreeSt
     return dataclasses.replace(batch, roots=np.array(roots), root=np.concatenate(where), root_x=x, root_xd=xd)
 
 
-def objects(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> messages.ObjectStates:
+def objects(rng: np.random.Generator, count: int, cell=(0, 0), speed: float = 3.0) -> ObjectStates:
     kinds = rng.choice([ids.ObjectKind.BUNCH, ids.ObjectKind.BOX], count) * ids.OBJECT_STRIDE
     numbers = np.sort(kinds + rng.choice(10000, count, replace=False))
     at = rng.uniform([0.0, 0.0, -0.5], [6.0, 6.0, 5.5], (count, 3)) + 6.0 * np.array([*cell, 0.0])
     pose = np.concatenate([at, frames.normalize(rng.standard_normal((count, 4)))], -1)
     sequences = rng.integers(0, 65536, (2, count))
-    return messages.ObjectStates(
+    return ObjectStates(
         7.5, numbers, *sequences, rng.integers(0, 2, count), pose, rng.uniform(-speed, speed, (count, 6))
     )
 
@@ -61,15 +90,15 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def one_message(batch: TreeStates) -> bytes:
-    (payload,), _ = messages.encode_trees(batch)
+    (payload,), _ = encode_trees(batch)
     return payload
 
 
 @pytest.mark.parametrize("joints", [0, 1, 14, 256])
 def test_a_robot_pose_is_decoded_within_quantisation(joints):
     sent = robot(np.random.default_rng(joints), joints)
-    payload = messages.encode_robot(sent)
-    received = messages.decode_robot(payload, "tiago")
+    payload = encode_robot(sent)
+    received = decode_robot(payload, "tiago")
     assert len(payload) == 50 + 3 * joints
     assert (received.actor, received.time) == ("tiago", 12.5)
     np.testing.assert_allclose(received.base_q[:3], sent.base_q[:3], atol=1e-5)
@@ -80,36 +109,34 @@ def test_a_robot_pose_is_decoded_within_quantisation(joints):
     np.testing.assert_allclose(received.velocity, sent.velocity, atol=0.004 * fastest + 1e-5)
     for pattern in LightPattern:
         lights = Lights(pattern, (0, 128, 255))
-        assert (
-            messages.decode_robot(messages.encode_robot(dataclasses.replace(sent, lights=lights)), "a").lights == lights
-        )
-    at = messages.HEADER.size + 12 + 6 + 12 + 2
+        assert decode_robot(encode_robot(dataclasses.replace(sent, lights=lights)), "a").lights == lights
+    at = HEADER.size + 12 + 6 + 12 + 2
     with pytest.raises(MessageError, match="unknown pattern, 4"):
-        messages.decode_robot(payload[:at] + b"\4" + payload[at + 1 :], "tiago")
+        decode_robot(payload[:at] + b"\4" + payload[at + 1 :], "tiago")
 
 
 def test_joint_angles_beyond_a_turn_are_decoded():
     sent = robot(np.random.default_rng(3), 5)
     sent.position[[1, 4]] = 6.6, -1234.5678
-    payload = messages.encode_robot(sent)
-    received = messages.decode_robot(payload, "tiago")
+    payload = encode_robot(sent)
+    received = decode_robot(payload, "tiago")
     assert len(payload) == 50 + 3 * 5 + 4 * 2
     np.testing.assert_allclose(received.position[[1, 4]], [6.6, -1234.5678], rtol=1e-7)
     np.testing.assert_allclose(received.position[[0, 2, 3]], sent.position[[0, 2, 3]], atol=1e-4 + 1e-9)
     with pytest.raises(MessageError, match="2 wide joints and 4 B"):
-        messages.decode_robot(payload[:-4], "tiago")
+        decode_robot(payload[:-4], "tiago")
 
 
 def test_a_decoded_message_encodes_to_the_same_bytes():
-    payload = messages.encode_robot(robot(np.random.default_rng(1)))
-    assert messages.encode_robot(messages.decode_robot(payload, "tiago")) == payload
+    payload = encode_robot(robot(np.random.default_rng(1)))
+    assert encode_robot(decode_robot(payload, "tiago")) == payload
 
 
 @pytest.mark.parametrize("rate", [0.0, 1e-3, 5.0, 60.0])
 def test_trees_are_decoded_within_quantisation(rate):
     sent = trees(np.random.default_rng(7), [5, 1, 12], rate)
     payload = one_message(sent)
-    received = messages.decode_trees(payload)
+    received = decode_trees(payload)
     assert received.time == sent.time
     for field in ("tree", "ownership", "authority", "flags", "bodies"):
         np.testing.assert_array_equal(getattr(received, field), getattr(sent, field))
@@ -123,16 +150,16 @@ def test_trees_are_decoded_within_quantisation(rate):
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(1, 20), min_size=1, max_size=40))
 def test_owner_and_receivers_hold_the_same_bits_and_messages_fit_a_datagram(seed, sizes):
     sent = trees(np.random.default_rng(seed), sizes)
-    payloads, quantised = messages.encode_trees(sent)
-    parts = [messages.decode_trees(payload) for payload in payloads]
-    assert all(len(payload) <= messages.MAX_DATAGRAM for payload in payloads)
+    payloads, quantised = encode_trees(sent)
+    parts = [decode_trees(payload) for payload in payloads]
+    assert all(len(payload) <= MAX_DATAGRAM for payload in payloads)
     for field in ("tree", "ownership", "authority", "flags", "bodies"):
         np.testing.assert_array_equal(np.concatenate([getattr(part, field) for part in parts]), getattr(sent, field))
     for field in ("joint_q", "joint_qd"):
         received = np.concatenate([getattr(part, field) for part in parts])
         assert received.tobytes() == getattr(quantised, field).tobytes()
     first = slice(0, sizes[0])
-    q, qd = messages.quantise_tree(sent.joint_q[first], sent.joint_qd[first])
+    q, qd = quantise_tree(sent.joint_q[first], sent.joint_qd[first])
     assert q.tobytes() == quantised.joint_q[first].tobytes()
     assert qd.tobytes() == quantised.joint_qd[first].tobytes()
 
@@ -169,7 +196,7 @@ def test_updates_split_a_batch_by_tree():
 def test_an_invalid_robot_pose_is_not_encoded(change, reason):
     update = dataclasses.replace(robot(np.random.default_rng(0)), **change)
     with pytest.raises(MessageError, match=reason):
-        messages.encode_robot(update)
+        encode_robot(update)
 
 
 def test_invalid_trees_are_not_encoded():
@@ -183,67 +210,67 @@ def test_invalid_trees_are_not_encoded():
         dataclasses.replace(batch, time=float("inf")),
     ):
         with pytest.raises(MessageError):
-            messages.encode_trees(invalid)
+            encode_trees(invalid)
 
 
 @pytest.mark.parametrize("cut", [0, 3, 4, 13, 14, 30, -1])
 def test_truncated_messages_are_refused(cut):
     rng = np.random.default_rng(0)
-    pose = messages.encode_robot(robot(rng))
+    pose = encode_robot(robot(rng))
     batch = one_message(trees(rng, [4, 4]))
     with pytest.raises(MessageError):
-        messages.decode_robot(pose[:cut], "tiago")
+        decode_robot(pose[:cut], "tiago")
     with pytest.raises(MessageError):
-        messages.decode_trees(batch[:cut])
+        decode_trees(batch[:cut])
     with pytest.raises(MessageError):
-        messages.decode_trees(batch + b"\0")
+        decode_trees(batch + b"\0")
 
 
 def test_errors_name_other_versions_kinds_and_programs():
-    payload = messages.encode_robot(robot(np.random.default_rng(0)))
-    with pytest.raises(WrongVersion, match=rf"version 9.*speaks {messages.PROTOCOL}\b"):
-        messages.decode_robot(payload[:2] + b"\x09" + payload[3:], "tiago")
+    payload = encode_robot(robot(np.random.default_rng(0)))
+    with pytest.raises(WrongVersion, match=rf"version 9.*speaks {PROTOCOL}\b"):
+        decode_robot(payload[:2] + b"\x09" + payload[3:], "tiago")
     with pytest.raises(MessageError, match="not from vinesim"):
-        messages.decode_robot(b"GET / HTTP/1.1", "tiago")
+        decode_robot(b"GET / HTTP/1.1", "tiago")
     with pytest.raises(MessageError, match="kind 1 where trees"):
-        messages.decode_trees(payload)
+        decode_trees(payload)
     with pytest.raises(MessageError, match="at most"):
-        messages.kind_of(bytes(messages.MAX_MESSAGE + 1))
+        kind_of(bytes(MAX_MESSAGE + 1))
 
 
 def test_tree_numbers_and_sizes_are_checked_against_the_scene():
     batch = dataclasses.replace(trees(np.random.default_rng(0), [4, 6]), tree=np.array([1, 2]))
     payload = one_message(batch)
-    messages.decode_trees(payload, np.array([9, 4, 6]))
+    decode_trees(payload, np.array([9, 4, 6]))
     with pytest.raises(MessageError, match="tree 2, this scene has 2"):
-        messages.decode_trees(payload, np.array([9, 4]))
+        decode_trees(payload, np.array([9, 4]))
     with pytest.raises(MessageError, match="tree 2 with 6 bodies, in this scene it has 5"):
-        messages.decode_trees(payload, np.array([9, 4, 5]))
+        decode_trees(payload, np.array([9, 4, 5]))
 
 
 def test_a_pose_that_is_not_finite_or_rotated_by_more_than_a_half_turn_is_refused():
-    payload = bytearray(messages.encode_robot(robot(np.random.default_rng(0))))
+    payload = bytearray(encode_robot(robot(np.random.default_rng(0))))
     nan = payload.copy()
     nan[14:18] = np.float32(np.nan).tobytes()
     with pytest.raises(MessageError, match="finite"):
-        messages.decode_robot(bytes(nan), "tiago")
+        decode_robot(bytes(nan), "tiago")
     turned = payload.copy()
     turned[26:32] = np.full(3, 32767, "<i2").tobytes()
     with pytest.raises(MessageError, match="half a turn"):
-        messages.decode_robot(bytes(turned), "tiago")
+        decode_robot(bytes(turned), "tiago")
 
 
 def test_a_hello_is_decoded_and_invalid_ones_are_refused():
     hello = Hello("robot-1.a", "robot", "tiago", "<robot/>", "tendone", "0123456789abcdef", index=3, joints=14)
-    assert messages.decode_hello(messages.encode_hello(hello)) == hello
+    assert decode_hello(encode_hello(hello)) == hello
     for name in ("", "a/b", "a*", "ä", "x" * 49):
         with pytest.raises(MessageError, match="actor name"):
-            messages.encode_hello(Hello(name))
-    other = messages.PROTOCOL + 1
+            encode_hello(Hello(name))
+    other = PROTOCOL + 1
     with pytest.raises(WrongVersion, match=f"version {other}"):
-        messages.decode_hello(messages.encode_hello(Hello("a", protocol=other)))
+        decode_hello(encode_hello(Hello("a", protocol=other)))
     with pytest.raises(MessageError, match="too long"):
-        messages.encode_hello(Hello("a", urdf="x" * messages.MAX_MESSAGE))
+        encode_hello(Hello("a", urdf="x" * MAX_MESSAGE))
 
 
 _NAN = float("nan")
@@ -254,7 +281,7 @@ _INF = float("inf")
     "change",
     [
         *({"index": index} for index in (-1, ids.LABEL_STRIDE, 1 << 40)),
-        *({"joints": joints} for joints in (-2, messages.MAX_JOINTS + 1, 1 << 40)),
+        *({"joints": joints} for joints in (-2, MAX_JOINTS + 1, 1 << 40)),
         *({"seed": seed} for seed in (-2, 1 << 63)),
         *({"height": height} for height in (_NAN, _INF, -_INF, 0.0, 0.9, 2.6, 1e9)),
         {"kind": "ghost"},
@@ -266,14 +293,14 @@ def test_a_number_of_a_hello_that_is_out_of_its_range_is_refused(change):
     (field,) = change
     hello = Hello("ada", **change)
     with pytest.raises(MessageError, match=f"'ada' with {field}"):
-        messages.encode_hello(hello)
-    payload = messages.MAGIC + bytes((messages.PROTOCOL, messages.MessageKind.HELLO)) + msgspec.msgpack.encode(hello)
+        encode_hello(hello)
+    payload = MAGIC + bytes((PROTOCOL, HELLO)) + msgspec.msgpack.encode(hello)
     with pytest.raises(MessageError, match=f"'ada' with {field}"):
-        messages.decode_hello(payload)
+        decode_hello(payload)
 
 
 def test_every_index_of_a_hello_fits_a_label_of_any_organ():
-    hello = messages.decode_hello(messages.encode_hello(Hello("ada", index=ids.LABEL_STRIDE - 1)))
+    hello = decode_hello(encode_hello(Hello("ada", index=ids.LABEL_STRIDE - 1)))
     for organ in ids.Organ:
         value = np.array(ids.label(organ, hello.index), np.int32)
         assert ids.unlabel(int(value)) == (organ, hello.index)
@@ -281,7 +308,7 @@ def test_every_index_of_a_hello_fits_a_label_of_any_organ():
 
 def test_claims_are_decoded_and_invalid_ones_are_refused():
     claims = [(3, Claim(1, 65535, "ada"), True), (4, Claim(0, 7, ""), False)]
-    assert messages.decode_claims(messages.encode_claims(claims), (5, 0, 0)) == claims
+    assert decode_claims(encode_claims(claims), (5, 0, 0)) == claims
     for invalid in (
         (5, Claim(), False),
         (-1, Claim(), False),
@@ -289,27 +316,27 @@ def test_claims_are_decoded_and_invalid_ones_are_refused():
         (0, Claim(0, 0, "a/b"), True),
     ):
         with pytest.raises(MessageError):
-            messages.decode_claims(messages.encode_claims([invalid]), (5, 0, 0))
+            decode_claims(encode_claims([invalid]), (5, 0, 0))
 
 
 def test_clock_messages_are_decoded():
     report = PaceReport(7.0, 1.25, "sensors")
-    whole = messages.decode_time(messages.encode_time(1.5, 2.5, 0.2, 3.5, "ada: sensors", report))
+    whole = decode_time(encode_time(1.5, 2.5, 0.2, 3.5, "ada: sensors", report))
     assert whole == (1.5, 2.5, 0.2, 3.5, "ada: sensors", report)
     with pytest.raises(MessageError, match="finite"):
-        messages.decode_time(messages.encode_time(float("nan")))
+        decode_time(encode_time(float("nan")))
 
 
 DECODERS = (
-    lambda payload: messages.decode_robot(payload, "a"),
-    lambda payload: messages.decode_trees(payload, np.array([3, 4])),
-    messages.decode_trees,
-    messages.decode_hello,
-    lambda payload: messages.decode_claims(payload, (5, 0, 0)),
-    lambda payload: messages.decode_objects(payload, (0, 0)),
-    lambda payload: messages.decode_records(payload, (5, 3, 2)),
-    messages.decode_time,
-    messages.kind_of,
+    lambda payload: decode_robot(payload, "a"),
+    lambda payload: decode_trees(payload, np.array([3, 4])),
+    decode_trees,
+    decode_hello,
+    lambda payload: decode_claims(payload, (5, 0, 0)),
+    lambda payload: decode_objects(payload, (0, 0)),
+    lambda payload: decode_records(payload, (5, 3, 2)),
+    decode_time,
+    kind_of,
 )
 
 
@@ -331,14 +358,14 @@ def test_arbitrary_bytes_raise_only_message_errors(tail, kind, framed):
 def test_damaged_messages_raise_only_message_errors(data):
     rng = np.random.default_rng(5)
     sound = [
-        messages.encode_robot(robot(rng, 3)),
+        encode_robot(robot(rng, 3)),
         one_message(trees(rng, [3, 4])),
         one_message(cut(trees(rng, [3, 4]), [1, 2], rng)),
-        messages.encode_objects(objects(rng, 3), (0, 0))[0][0],
-        messages.encode_records([record(), record(object=3)]),
-        messages.encode_hello(Hello("a", urdf="<robot/>")),
-        messages.encode_claims([(1, Claim(1, 2, "a"), True)]),
-        messages.encode_time(1.0, 2.0),
+        encode_objects(objects(rng, 3), (0, 0))[0][0],
+        encode_records([record(), record(object=3)]),
+        encode_hello(Hello("a", urdf="<robot/>")),
+        encode_claims([(1, Claim(1, 2, "a"), True)]),
+        encode_time(1.0, 2.0),
     ]
     payload = bytearray(data.draw(st.sampled_from(sound)))
     for _ in range(data.draw(st.integers(1, 4))):
@@ -352,11 +379,11 @@ def test_damaged_messages_raise_only_message_errors(data):
 def test_objects_are_decoded_within_quantisation(seed, count, where, speed):
     sent = objects(np.random.default_rng(seed), count, (where, -where), speed)
     cell = (where, -where)
-    payloads, received = messages.encode_objects(sent, cell)
-    assert max(len(payload) for payload in payloads) <= messages.MAX_DATAGRAM
+    payloads, received = encode_objects(sent, cell)
+    assert max(len(payload) for payload in payloads) <= MAX_DATAGRAM
     assert sum(len(payload) - 14 for payload in payloads) == 26 * count
-    parts = [messages.decode_objects(payload, cell) for payload in payloads]
-    for field in dataclasses.fields(messages.ObjectStates)[1:]:
+    parts = [decode_objects(payload, cell) for payload in payloads]
+    for field in dataclasses.fields(ObjectStates)[1:]:
         decoded = np.concatenate([getattr(part, field.name) for part in parts])
         assert decoded.tobytes() == getattr(received, field.name).tobytes(), "owner and copies hold the same bits"
         if field.name not in ("pose", "velocity"):
@@ -374,23 +401,23 @@ def test_an_object_at_an_absurd_speed_is_refused_and_never_sent(column, limit):
     """A box that was believed to spin at 16,000 rad/s, as the format could say, made MuJoCo unstable where it hit."""
     sent = objects(np.random.default_rng(0), 2)
     sent.velocity[1, column] = 4000.0
-    (payload,), received = messages.encode_objects(sent, (0, 0))
+    (payload,), received = encode_objects(sent, (0, 0))
     assert 0.9 * limit < received.velocity[1, column] < limit
-    assert messages.decode_objects(payload, (0, 0)).velocity.tobytes() == received.velocity.tobytes()
-    scale = messages.HEADER.size + 26 + 9  # of the second object
+    assert decode_objects(payload, (0, 0)).velocity.tobytes() == received.velocity.tobytes()
+    scale = HEADER.size + 26 + 9  # of the second object
     payload = payload[:scale] + bytes([0xFF]) + payload[scale + 1 :]
     with pytest.raises(MessageError, match="faster than anything"):
-        messages.decode_objects(payload, (0, 0))
+        decode_objects(payload, (0, 0))
 
 
 @pytest.mark.parametrize("number", [5, 3 * ids.OBJECT_STRIDE])
 def test_an_invalid_object_id_is_refused(number):
     batch = objects(np.random.default_rng(0), 1)
-    (payload,), _ = messages.encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
+    (payload,), _ = encode_objects(dataclasses.replace(batch, object=np.array([number])), (0, 0))
     with pytest.raises(MessageError, match="of no kind"):
-        messages.decode_objects(payload, (0, 0))
+        decode_objects(payload, (0, 0))
     with pytest.raises(MessageError, match="bunch 17, this scene has 17"):
-        messages.check_object_id(ids.object_id(ids.ObjectKind.BUNCH, 17), (100, 17, 2))
+        check_object_id(ids.object_id(ids.ObjectKind.BUNCH, 17), (100, 17, 2))
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.tuples(st.integers(1, 20), st.integers(0, 4)), min_size=1, max_size=40))
@@ -398,8 +425,8 @@ def test_trees_are_decoded_with_their_cut_bodies(seed, shapes):
     rng = np.random.default_rng(seed)
     sent = trees(rng, [size for size, _ in shapes])
     sent = cut(sent, [min(k, size) for size, k in shapes], rng)
-    payloads, received = messages.encode_trees(sent)
-    parts = [update for payload in payloads for update in messages.decode_trees(payload).updates("ada")]
+    payloads, received = encode_trees(sent)
+    parts = [update for payload in payloads for update in decode_trees(payload).updates("ada")]
     ends = np.cumsum(sent.roots)
     for update, here, end, count in zip(parts, received.updates("ada"), ends, sent.roots, strict=True):
         assert update.joint_q.tobytes() == here.joint_q.tobytes()
@@ -409,20 +436,18 @@ def test_trees_are_decoded_with_their_cut_bodies(seed, shapes):
         np.testing.assert_allclose(update.root_xd, sent.root_xd[end - count : end], atol=0.51e-3)
 
 
-def record(**change) -> messages.RetainedRecord:
+def record(**change) -> RetainedRecord:
     usual = {"object": ids.object_id(ids.ObjectKind.BUNCH, 17), "ownership": 3, "authority": 65535, "author": "picker"}
-    return messages.RetainedRecord(
-        **{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change}
-    )
+    return RetainedRecord(**{**usual, "pose": (1.0, 2.0, 0.1, 0.0, 0.6, 0.0, 0.8), "parent": "box/2", **change})
 
 
 def test_records_are_decoded_as_encoded():
     sent = [record(), record(object=ids.object_id(ids.ObjectKind.TREE, 5), parent="", cut=(7, 9), trees=b"abc")]
-    received = messages.decode_records(messages.encode_records(sent))
+    received = decode_records(encode_records(sent))
     assert received == sent
     assert received[0].claim == Claim(3, 65535, "picker")
     assert ids.split_object_id(received[0].object) == (ids.ObjectKind.BUNCH, 17)
-    assert messages.kind_of(messages.encode_records(sent)) == messages.MessageKind.RETAINED
+    assert kind_of(encode_records(sent)) == RETAINED
 
 
 @pytest.mark.parametrize(
@@ -443,23 +468,37 @@ def test_records_are_decoded_as_encoded():
 )
 def test_an_invalid_record_is_refused_with_the_reason(change, reason):
     with pytest.raises(MessageError, match=reason):
-        messages.decode_records(messages.encode_records([record(**change)]))
+        decode_records(encode_records([record(**change)]))
 
 
 def test_too_many_records_are_refused():
     with pytest.raises(MessageError, match="at most 4096"):
-        messages.decode_records(messages.encode_records([record()] * 4097))
+        decode_records(encode_records([record()] * 4097))
 
 
 @pytest.mark.parametrize(
     "payload",
     [
-        messages.encode_part(messages.MeshPart("0" * 40, 36, 0, b"\xff" * 36)),
-        messages.encode_request(5),
-        messages.encode_wanted(messages.MeshWanted(5)),
+        encode_part(MeshPart("0" * 40, 36, 0, b"\xff" * 36)),
+        encode_request(5),
+        encode_wanted(MeshWanted(5)),
     ],
 )
 def test_messages_about_meshes_have_no_time(payload):
     """Their first bytes were once taken for one, and replaced when a recording was played at another time."""
-    assert messages.time_of(payload) is None
-    assert messages.shift_time(payload, 5.0) == payload
+    assert time_of(payload) is None
+    assert shift_time(payload, 5.0) == payload
+
+
+def test_every_family_of_keys_has_a_counter_and_every_published_one_a_kind():
+    counters = Counters()
+    assert all(isinstance(counters.of(name), Traffic) for name in FAMILIES)
+    published = {name for name, family in FAMILIES.items() if family.is_published}
+    assert published <= {name for row in MESSAGES.values() for name in row.families}
+
+
+def test_the_schemas_of_recordings_stay_as_they_are():
+    """Their text is part of the file format."""
+    keys = ("a/x", "c/0/0/x", "tree/0/0/x", "near/0/0/x", "own/0/0/x", "fact/0/0/x", "force/y/x", "snap/0/0", "hello/x")
+    text = b"".join(name.encode() + schema for name, schema in map(schema_of, (*keys, "live/x", "other/x")))
+    assert hashlib.blake2b(text, digest_size=8).hexdigest() == "86147581532c9b54"

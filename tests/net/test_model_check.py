@@ -9,9 +9,10 @@ import pytest
 from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.net.test_replicator import TICK, Client, run, vineyard
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError, RetainedRecord, TreeStates
-from vinesim.net.replication.model_check import check_record, check_tree_states
+from vinesim.net.codec.control import RetainedRecord, decode_records, encode_records
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.trees import TreeStates, decode_trees, encode_trees
+from vinesim.net.replication.receiver import check_record, check_tree_states
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.generation.vineyard import generate
@@ -39,7 +40,7 @@ def state_of(tree: int, **others) -> bytes:
         np.zeros((size, 3)),
         **others,
     )
-    return messages.encode_trees(states)[0][0]
+    return encode_trees(states)[0][0]
 
 
 def record(**values) -> RetainedRecord:
@@ -115,7 +116,7 @@ def test_what_moves_beyond_the_range_of_positions_is_still_published() -> None:
         hub.advance(TICK)
         ada.carrying -= {bunch} if step == 100 else set()
         ada.tick(hub.time)
-        records += [one for _, payload in server.poll() for one in messages.decode_records(payload)]
+        records += [one for _, payload in server.poll() for one in decode_records(payload)]
     positions = [one.pose[:3] for one in records if one.object == bunch]
     assert positions == 2 * [(99_999.0, -99_999.0, 0.5)], "when it was picked, and at rest"
 
@@ -125,7 +126,7 @@ def test_a_body_beyond_the_range_of_positions_is_still_published() -> None:
         TREE, roots=np.array([1]), root=np.array([3]), root_x=np.array([[1e9, 0.0, -1e5]]), root_xd=np.zeros((1, 3))
     )
     check_record(record(trees=far), vineyard(), COUNTS)
-    assert messages.decode_trees(far).root_x.tolist() == [[99_999.0, 0.0, -99_999.0]]
+    assert decode_trees(far).root_x.tolist() == [[99_999.0, 0.0, -99_999.0]]
 
 
 def test_the_other_records_of_a_message_are_received() -> None:
@@ -139,7 +140,7 @@ def test_the_other_records_of_a_message_are_received() -> None:
     lies = [record(object=1, cut=(1_000_000,)), record(object=3, trees=b"abc")]
     publisher = ada.bus.publisher("fact/0/0/ada", reliable=True)
     received = []
-    publisher.put(messages.encode_records([lies[0], truth, lies[1]]))
+    publisher.put(encode_records([lies[0], truth, lies[1]]))
     for _ in range(100):
         run(hub, [ada, bob], TICK)
         received += bob.inbox.records

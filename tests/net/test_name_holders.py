@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 
 from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.waiting import wait
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello, RetainedRecord
+from vinesim.net.codec.control import Hello, RetainedRecord, encode_claims, encode_hello, encode_records, encode_time
 from vinesim.net.replication.authority import Claim
 from vinesim.net.server.server import Server
 from vinesim.net.transport.bus import KEEP_ALL
@@ -38,7 +37,7 @@ KEYS = (
 
 
 def hello(name: str, kind: str = "robot") -> bytes:
-    return messages.encode_hello(Hello(name, kind=kind, digest="D1", scene="vsp"))
+    return encode_hello(Hello(name, kind=kind, digest="D1", scene="vsp"))
 
 
 @pytest.fixture
@@ -85,7 +84,7 @@ def test_messages_under_a_name_count_only_from_the_session_that_joined_with_it(s
 
 
 def test_records_that_the_server_keeps_come_from_the_session_that_joined(server):
-    record = messages.encode_records([RetainedRecord(object_id(ObjectKind.BOX, 1), 9, 0, "ada")])
+    record = encode_records([RetainedRecord(object_id(ObjectKind.BOX, 1), 9, 0, "ada")])
     with ZenohBus("ada", connect=server.endpoint) as ada, stranger(server) as evil:
         ada.join(hello("ada"))
         evil.put("vs/1/vineyard/fact/0/0/ada", record)
@@ -104,7 +103,7 @@ def test_a_spectator_publishes_no_records(server):
         guest.join(hello("guest", "spectator"))
         publisher = guest.publisher("fact/0/0/guest", reliable=True)
         wait(lambda: publisher.matching, "the server's subscription")
-        publisher.put(messages.encode_records([RetainedRecord(object_id(ObjectKind.BOX, 1), 9, 0, "guest")]))
+        publisher.put(encode_records([RetainedRecord(object_id(ObjectKind.BOX, 1), 9, 0, "guest")]))
         wait(lambda: server.foreign == 1, "the record to be counted")
         assert server.store.count() == 0
 
@@ -131,7 +130,7 @@ def test_only_the_server_answers_what_is_asked_of_it_and_an_actor_for_itself(ser
 
             def is_answered() -> bool:
                 for key in ("clock/bob", "snap/0/0", "hello/ada"):
-                    bob.query(key, messages.encode_time(1.0))
+                    bob.query(key, encode_time(1.0))
                 answers.extend(bob.replies())
                 return {answer.key for answer in answers} == {"clock/bob", "snap/0/0", "hello/ada"} and bob.foreign > 0
 
@@ -156,8 +155,8 @@ def test_a_spectator_moves_nothing_on_clients():
 
     run(100)
     assert "guest" in ada.replicator.peers
-    claims = messages.encode_claims([(1, Claim(5, 5, "guest"), True)])
-    record = messages.encode_records([RetainedRecord(object_id(ObjectKind.BUNCH, 1), 9, 0, "guest", moving=True)])
+    claims = encode_claims([(1, Claim(5, 5, "guest"), True)])
+    record = encode_records([RetainedRecord(object_id(ObjectKind.BUNCH, 1), 9, 0, "guest", moving=True)])
     for key, payload in (("own/0/0/guest", claims), ("fact/0/0/guest", record)):
         guest.bus.publisher(key, reliable=True).put(payload)
     run(5)

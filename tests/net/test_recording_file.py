@@ -19,13 +19,16 @@ from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 
 from tests.support.waiting import deadline
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import RetainedRecord, encode_records
+from vinesim.net.codec.forces import WrenchMessage, encode_wrenches
+from vinesim.net.codec.header import PROTOCOL
 from vinesim.net.codec.human import encode_human
-from vinesim.net.codec.wrenches import WrenchMessage, encode_wrenches
+from vinesim.net.codec.messages import describe_message, shift_time, time_of
+from vinesim.net.codec.objects import ObjectStates, encode_objects
+from vinesim.net.codec.trees import TOUCHED
 from vinesim.net.recording import mcap_reader, mcap_writer
 from vinesim.net.recording.mcap_reader import InvalidRecording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingStopped, RecordingWriter, free_path
-from vinesim.net.recording.message_json import describe_message
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import POINT_NAMES, HumanUpdate
@@ -76,16 +79,16 @@ def test_messages_are_described_as_json():
     """Every kind of message is described as JSON for other programs, with the raw bytes beside it."""
     pose = np.array([13.0, -3.5, 0.2, 0.0, 0.0, 0.6, 0.8])
     box = object_id(ObjectKind.BOX, 2)
-    objects = messages.ObjectStates(
+    objects = ObjectStates(
         1e9 + 0.5,
         np.array([box]),
         np.array([3]),
         np.array([4]),
-        np.array([messages.TOUCHED]),
+        np.array([TOUCHED]),
         pose[None],
         np.array([[0.5, 0.0, 0.0, 0.0, 0.0, 1.0]]),
     )
-    (payload,), quantised = messages.encode_objects(objects, (2, -1))
+    (payload,), quantised = encode_objects(objects, (2, -1))
     description = describe_message("c/2/-1/ada", payload)
     assert base64.b64decode(description["raw"]) == payload
     assert description["actor"] == "ada"
@@ -95,11 +98,11 @@ def test_messages_are_described_as_json():
     assert list(one["pose"]["position"].values()) == pytest.approx(pose[:3], abs=2e-4)
     assert list(one["pose"]["orientation"].values()) == pytest.approx(pose[3:], abs=2e-3)
     assert one["velocity"] == quantised.velocity[0].tolist()
-    assert messages.time_of(messages.shift_time(payload, 2.0)) == 1e9 + 2.5
-    assert messages.shift_time(payload, 2.0)[14:] == payload[14:]
+    assert time_of(shift_time(payload, 2.0)) == 1e9 + 2.5
+    assert shift_time(payload, 2.0)[14:] == payload[14:]
 
-    record = messages.RetainedRecord(box, 1, 2, "ada", pose=tuple(pose.tolist()), parent="bob/arm", moving=True)
-    (described,) = describe_message("fact/2/-1/ada", messages.encode_records([record]))["facts"]
+    record = RetainedRecord(box, 1, 2, "ada", pose=tuple(pose.tolist()), parent="bob/arm", moving=True)
+    (described,) = describe_message("fact/2/-1/ada", encode_records([record]))["facts"]
     assert (described["kind"], described["index"], described["parent"], described["moving"]) == (
         "box",
         2,
@@ -107,7 +110,7 @@ def test_messages_are_described_as_json():
         True,
     )
     assert described["pose"]["position"]["x"] == 13.0
-    assert messages.time_of(messages.encode_records([record])) is None
+    assert time_of(encode_records([record])) is None
 
     pose_of_human = standing_pose(pose, 1.8)
     description = describe_message("a/eva", encode_human(HumanUpdate("eva", 5.0, pose_of_human, np.zeros((7, 6)))))
@@ -116,7 +119,7 @@ def test_messages_are_described_as_json():
     assert description["pose"] == description["points"]["hips"]
     wrenches = encode_wrenches(WrenchMessage(6.0, {"hand": np.array([1.0, 2.0, 3.0, 0.0, 0.0, 0.5])}))
     assert describe_message("force/bob/eva", wrenches)["links"] == [{"link": "hand", "wrench": [1, 2, 3, 0, 0, 0.5]}]
-    assert messages.time_of(messages.shift_time(wrenches, 1.5)) == 7.5
+    assert time_of(shift_time(wrenches, 1.5)) == 7.5
 
     assert describe_message("live/ada", b"\x01")["live"] is True
     assert describe_message("live/ada", b"")["live"] is False
@@ -228,7 +231,7 @@ def test_missing_files_folders_and_other_mcap_files_are_refused(tmp_path):
 
 def test_another_protocol_version_is_refused(tmp_path):
     path = write(tmp_path / "old.mcap", [(1, "live/ada", b"\x01")], protocol="0", release="0.0.9")
-    with pytest.raises(InvalidRecording, match=rf"version 0.*version {messages.PROTOCOL}.*0\.0\.9"):
+    with pytest.raises(InvalidRecording, match=rf"version 0.*version {PROTOCOL}.*0\.0\.9"):
         read_recording(path)
 
 

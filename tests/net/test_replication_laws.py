@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.examples import share
 from tests.support.shared_vineyard import Server
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.replication import interest
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.scene.ids import ObjectKind, object_id
@@ -29,9 +29,7 @@ class RetainedServer(Server):
 
     def open(self) -> None:
         super().open()
-        self.bus.declare_queryable(
-            "clock/*", lambda payload: messages.encode_time(messages.decode_time(payload)[0], self.hub.time)
-        )
+        self.bus.declare_queryable("clock/*", lambda payload: encode_time(decode_time(payload)[0], self.hub.time))
 
 
 class World:

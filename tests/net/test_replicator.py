@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from tests.support.examples import share
 from vinesim.core import frames
-from vinesim.net.codec import control, messages
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec import control
+from vinesim.net.codec.control import HELLO, Hello, decode_time, encode_claims, encode_hello, encode_time
+from vinesim.net.codec.header import PROTOCOL
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.peers import WorldMismatch
@@ -194,7 +195,7 @@ def test_another_scene_or_protocol_is_refused_with_both_values(change):
     hub = MemoryHub()
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 0.1)
-    cy = Client(hub, "cy", 2.0, **({"digest": "other"} if change == "digest" else {"protocol": messages.PROTOCOL + 1}))
+    cy = Client(hub, "cy", 2.0, **({"digest": "other"} if change == "digest" else {"protocol": PROTOCOL + 1}))
     expected = "'same'.*'other'|'other'.*'same'" if change == "digest" else "version"
     if change == "digest":
         with pytest.raises(WorldMismatch, match=expected):
@@ -207,10 +208,10 @@ def test_another_scene_or_protocol_is_refused_with_both_values(change):
 def test_a_protocol_mismatch_names_both_versions():
     hub = MemoryHub()
     old = hub.bus("old")
-    hello = Hello("old", digest="same", protocol=messages.PROTOCOL + 1)
-    old.declare_queryable("hello/old", lambda _: control.pack(messages.MessageKind.HELLO, hello))
+    hello = Hello("old", digest="same", protocol=PROTOCOL + 1)
+    old.declare_queryable("hello/old", lambda _: control.pack(HELLO, hello))
     new = Client(hub, "new", 1.0)
-    with pytest.raises(WorldMismatch, match=f"version {messages.PROTOCOL + 1}, 'new' version {messages.PROTOCOL}"):
+    with pytest.raises(WorldMismatch, match=f"version {PROTOCOL + 1}, 'new' version {PROTOCOL}"):
         run(hub, [new], 0.2)
 
 
@@ -616,14 +617,28 @@ def test_malformed_messages_are_counted_logged_once_and_do_not_stop_the_tick(cap
     assert "bob" in ada.inbox.robots
 
 
+def test_a_message_under_a_key_of_other_kinds_is_malformed():
+    hub = MemoryHub()
+    bob = Client(hub, "bob", 1.0)
+    ada = Client(hub, "ada", 1.5)
+    run(hub, [bob, ada], 1.0)
+    claims = encode_claims([(3, Claim(1, 1, "ada"), True)])
+    wrong = ("c/0/0/ada", "fact/0/0/ada", "force/bob/ada", "a/ada/far")
+    for key in wrong:
+        assert ada.bus.publisher(key).put(claims)
+    run(hub, [bob, ada], 0.1)
+    assert bob.replicator.counters.malformed == len(wrong)
+    assert bob.replicator.claim(3) == Claim()
+
+
 def test_an_unknown_peer_an_invalid_tree_and_a_repeated_message_are_ignored():
     hub = MemoryHub()
     ada = Client(hub, "ada", 1.0)
     bob = Client(hub, "bob", 2.0)
     run(hub, [ada, bob], 0.3)
     unknown = hub.bus("unknown")
-    unknown.publisher("own/0/0/unknown", True).put(messages.encode_claims([(0, Claim(5, 5, "unknown"), True)]))
-    bob.bus.publisher("own/0/0/bob", True).put(messages.encode_claims([(TREES, Claim(5, 5, "bob"), True)]))
+    unknown.publisher("own/0/0/unknown", True).put(encode_claims([(0, Claim(5, 5, "unknown"), True)]))
+    bob.bus.publisher("own/0/0/bob", True).put(encode_claims([(TREES, Claim(5, 5, "bob"), True)]))
     run(hub, [ada, bob], 0.2)
     assert ada.replicator.claim(0) == Claim()
     assert ada.replicator.counters.malformed == 1
@@ -658,10 +673,8 @@ def test_a_pose_with_another_number_of_joints_is_malformed():
 def test_the_clock_offset_to_the_server_is_estimated():
     hub = MemoryHub(delay=0.02, jitter=0.01)
     server = hub.bus("server")
-    server.declare_queryable(
-        "hello/server", lambda _: messages.encode_hello(Hello("server", "spectator", digest="same"))
-    )
-    server.declare_queryable("clock/*", lambda q: messages.encode_time(messages.decode_time(q)[0], hub.time + 1000.0))
+    server.declare_queryable("hello/server", lambda _: encode_hello(Hello("server", "spectator", digest="same")))
+    server.declare_queryable("clock/*", lambda q: encode_time(decode_time(q)[0], hub.time + 1000.0))
     ada = Client(hub, "ada", 1.0)
     run(hub, [ada], 1.5)
     assert ada.replicator.offset == pytest.approx(1000.0, abs=0.012)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import RetainedRecord
 from vinesim.net.replication.retained import RetainedState
 from vinesim.scene.ids import ObjectKind, object_id
 

@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.support.waiting import wait
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import RetainedRecord, decode_records, encode_records
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.server import journal, retained_store
 from vinesim.net.server.admission import SceneId
@@ -27,13 +26,13 @@ def record(index=0, ownership=1, author="ada", cut=()):
 
 
 def submit(store, record, cell=(0, 0), world="w"):
-    store.submit(f"{world}/fact/{cell[0]}/{cell[1]}/{record.author}", messages.encode_records([record]))
+    store.submit(f"{world}/fact/{cell[0]}/{cell[1]}/{record.author}", encode_records([record]))
 
 
 def all_records(store, world="w"):
     """All records of a world with their cells, from its snapshots."""
     parts = store.snapshot(world, store.cells(world))
-    found = [(cell, record) for cell, payload in parts for record in messages.decode_records(payload)]
+    found = [(cell, record) for cell, payload in parts for record in decode_records(payload)]
     return sorted(found, key=lambda row: row[1].object)
 
 
@@ -69,7 +68,7 @@ def test_an_empty_cell_gives_an_empty_reply():
     store = RetainedStore()
     store.close()
     ((cell, payload),) = store.snapshot("w", [(7, 7)])
-    assert (cell, messages.decode_records(payload)) == ((7, 7), [])
+    assert (cell, decode_records(payload)) == ((7, 7), [])
 
 
 def test_replies_are_split_at_the_size_limit(monkeypatch):
@@ -144,7 +143,7 @@ def test_records_stay_in_memory_while_the_disk_is_full_and_are_written_afterward
 def test_a_key_without_a_valid_cell_is_malformed(key):
     store = RetainedStore()
     store.open("w", SCENE)
-    store.submit(key, messages.encode_records([record()]))
+    store.submit(key, encode_records([record()]))
     store.close()
     assert (store.counters.malformed, store.count()) == (1, 0)
 
@@ -152,9 +151,10 @@ def test_a_key_without_a_valid_cell_is_malformed(key):
 def test_a_message_that_ends_in_an_error_does_not_end_the_thread(monkeypatch, caplog):
     store = RetainedStore(quota=UNLIMITED)
     store.open("w", SCENE)
-    original = messages.decode_records
     failing = [True, True, False]
-    monkeypatch.setattr(messages, "decode_records", lambda payload: 1 // 0 if failing.pop(0) else original(payload))
+    monkeypatch.setattr(
+        retained_store, "decode_records", lambda payload: 1 // 0 if failing.pop(0) else decode_records(payload)
+    )
     for _ in range(3):
         submit(store, record())
     wait(lambda: store.count() == 1, "the third to be kept")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import RetainedRecord, decode_records, encode_records
+from vinesim.net.codec.header import MAX_DATAGRAM
+from vinesim.net.codec.messages import Counters
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -19,7 +19,7 @@ def record(box: int, x: float = 0.0, author: str = "ada", authority: int = 1) ->
 
 
 def received(bus) -> list[tuple[str, int]]:
-    return [(key, len(messages.decode_records(payload))) for key, payload in bus.poll()]
+    return [(key, len(decode_records(payload))) for key, payload in bus.poll()]
 
 
 def run(hub: MemoryHub, sync: RetainedSync, ticks: int = 3) -> None:
@@ -44,7 +44,7 @@ def test_a_record_waits_for_a_subscriber_and_is_sent_once():
     ada.publish(THERE, record(1, 41.0, authority=2))
     run(hub, ada)
     ((_, payload),) = server.poll()
-    assert [one.pose[0] for one in messages.decode_records(payload)] == [41.0]
+    assert [one.pose[0] for one in decode_records(payload)] == [41.0]
 
 
 def test_many_records_share_messages_below_the_datagram_size():
@@ -56,8 +56,8 @@ def test_many_records_share_messages_below_the_datagram_size():
         ada.publish(HERE, record(box))
     run(hub, ada, 10)
     messages_received = server.poll()
-    assert sum(len(messages.decode_records(payload)) for _, payload in messages_received) == 40
-    assert max(len(payload) for _, payload in messages_received) <= messages.MAX_DATAGRAM
+    assert sum(len(decode_records(payload)) for _, payload in messages_received) == 40
+    assert max(len(payload) for _, payload in messages_received) <= MAX_DATAGRAM
     assert len(messages_received) <= 5
 
 
@@ -77,7 +77,7 @@ def test_own_latest_records_are_sent_again_after_a_server_outage():
     hub.down = False
     run(hub, ada)
     ((_, payload),) = server.poll()
-    assert [one.object for one in messages.decode_records(payload)] == [object_id(ObjectKind.BOX, 0)]
+    assert [one.object for one in decode_records(payload)] == [object_id(ObjectKind.BOX, 0)]
     run(hub, ada, 100)
     assert server.poll() == []
 
@@ -87,14 +87,12 @@ def test_each_cell_is_queried_once_and_again_when_it_is_entered_again():
     queries = []
     ada = RetainedSync(hub.bus("ada"), Counters())
     server = hub.bus("server")
-    server.declare_queryable(
-        "snap/0/0", lambda _: queries.append(hub.time) or messages.encode_records([record(3, 1.0, "bob")])
-    )
+    server.declare_queryable("snap/0/0", lambda _: queries.append(hub.time) or encode_records([record(3, 1.0, "bob")]))
     run(hub, ada)
     assert len(queries) == 1
     ((key, payload, _),) = ada.bus.replies()
     ada.mark_answered(HERE)
-    assert (key, messages.decode_records(payload)[0].object) == ("snap/0/0", object_id(ObjectKind.BOX, 3))
+    assert (key, decode_records(payload)[0].object) == ("snap/0/0", object_id(ObjectKind.BOX, 3))
     run(hub, ada, 500)
     assert len(queries) == 1
     for _ in range(2000):

@@ -15,9 +15,19 @@ import zenoh
 
 from tests.support import programs
 from tests.support.waiting import deadline, wait
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello, RetainedRecord, Welcome
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import (
+    Hello,
+    RetainedRecord,
+    Welcome,
+    decode_records,
+    decode_time,
+    encode_hello,
+    encode_records,
+    encode_time,
+    encode_welcome,
+)
+from vinesim.net.codec.header import MAX_MESSAGE, PROTOCOL
+from vinesim.net.codec.messages import Counters
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.server import retained_store
@@ -67,10 +77,10 @@ def test_the_list_of_actors_follows_joins_and_leaves():
 def test_a_clock_query_returns_the_time_of_day():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.query("clock/ada", b"nonsense")
-        ada.query("clock/ada", messages.encode_time(12.5))
+        ada.query("clock/ada", encode_time(12.5))
         answers: list = []
         wait(lambda: answers.extend(ada.replies()) or answers, "the time")
-        reply = messages.decode_time(answers[0].payload)
+        reply = decode_time(answers[0].payload)
         assert (reply.asked, reply.factor) == (12.5, 1.0)
         assert abs(reply.world - time.time()) < 10.0
         assert (server.pings, server.malformed) == (1, 1)
@@ -80,10 +90,10 @@ def test_a_clock_query_returns_the_time_of_day():
 def test_a_step_of_the_time_of_day_does_not_move_the_network_time(monkeypatch, step):
     def server_minus_own_time(bus: ZenohBus) -> float:
         asked = time.monotonic()
-        bus.query(f"clock/{bus.name}", messages.encode_time(asked))
+        bus.query(f"clock/{bus.name}", encode_time(asked))
         answers: list = []
         wait(lambda: answers.extend(bus.replies()) or answers, "the time")
-        return messages.decode_time(answers[0].payload)[1] - asked
+        return decode_time(answers[0].payload)[1] - asked
 
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         before = server_minus_own_time(ada)
@@ -96,7 +106,7 @@ def test_questions_with_wildcards_or_missing_parts_are_counted_and_nothing_ends(
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         session = ada.session_for(reliable=True)
         for key in ("vs/1/**", "vs/1/*/*/*/*", "**"):
-            for payload in (b"", messages.encode_time(1.0)):
+            for payload in (b"", encode_time(1.0)):
                 assert [reply for reply in session.get(key, payload=payload, timeout=2.0) if reply.ok] == []
         assert server.malformed >= 6
         for key in ("fact", "fact/0/0/ada/more", "fact/0/0/eve"):
@@ -135,7 +145,7 @@ def test_the_server_simulates_nothing():
 
 
 def hello(name, digest="D1", scene="vsp"):
-    return messages.encode_hello(Hello(name, scene=scene, digest=digest))
+    return encode_hello(Hello(name, scene=scene, digest=digest))
 
 
 def test_another_scene_is_refused_with_both_names():
@@ -157,8 +167,8 @@ def test_scene_protocol_and_actor_limit_of_the_server_are_enforced():
         with pytest.raises(JoinRejected, match="the server was started for 'vsp' with 'D1'"):
             ada.join(hello("ada", "D2"))
         other = bytearray(hello("ada"))
-        other[2] = messages.PROTOCOL + 1
-        with pytest.raises(JoinRejected, match=f"version {messages.PROTOCOL + 1}, the server version"):
+        other[2] = PROTOCOL + 1
+        with pytest.raises(JoinRejected, match=f"version {PROTOCOL + 1}, the server version"):
             ada.join(bytes(other))
         ada.join(hello("ada"))
         with pytest.raises(JoinRejected, match="admits 1 actors"):
@@ -169,7 +179,7 @@ def test_scene_protocol_and_actor_limit_of_the_server_are_enforced():
 
 def test_a_reply_of_another_protocol_is_refused_with_both_versions():
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
-        newer = bytearray(messages.encode_welcome(Welcome()))
+        newer = bytearray(encode_welcome(Welcome()))
         newer[2] = 9
         for answer, words in ((bytes(newer), "protocol version 9"), (b"junk", "cannot be decoded")):
             # another program answers
@@ -224,7 +234,7 @@ def snapshot(bus, cell, count):
         for answer in bus.replies():
             answered = True
             assert answer.key == f"snap/{cell[0]}/{cell[1]}"
-            found.update({record.object: record for record in messages.decode_records(answer.payload)})
+            found.update({record.object: record for record in decode_records(answer.payload)})
         return answered and len(found) >= count
 
     wait(complete, f"{count} records of cell {cell}")
@@ -234,7 +244,7 @@ def snapshot(bus, cell, count):
 def publish(bus, cell, *records):
     publisher = bus.publisher(f"fact/{cell[0]}/{cell[1]}/{bus.name}", reliable=True)
     wait(lambda: publisher.matching, "the server's subscription")
-    assert publisher.put(messages.encode_records(list(records)))
+    assert publisher.put(encode_records(list(records)))
     publisher.close()
 
 
@@ -281,14 +291,14 @@ def test_a_wildcard_query_returns_one_reply_per_cell():
 def test_invalid_records_are_dropped_counted_and_logged_once(caplog):
     with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
         ada.join(hello("ada"))
-        good = messages.encode_records([box()])
+        good = encode_records([box()])
         publisher = ada.publisher("fact/0/0/ada", reliable=True)
         nowhere = ada.publisher("fact/0/ada", reliable=True)
         wait(lambda: publisher.matching and nowhere.matching, "the server's subscription")
-        for payload in (b"", b"junk", good[:-2], b"VS\x09\x04" + good[4:], bytes(messages.MAX_MESSAGE + 1)):
+        for payload in (b"", b"junk", good[:-2], b"VS\x09\x04" + good[4:], bytes(MAX_MESSAGE + 1)):
             publisher.put(payload)
         nowhere.put(good)
-        publisher.put(messages.encode_records([box(author="bob")]))
+        publisher.put(encode_records([box(author="bob")]))
         wait(lambda: server.malformed == 7, "seven to be dropped")
         publisher.put(good)
         assert snapshot(ada, (0, 0), 1) == [box()]
@@ -308,7 +318,7 @@ def test_a_quota_limits_only_the_client_that_exceeds_it(caplog):
         flood = ada.publisher("fact/0/0/ada", reliable=True)
         wait(lambda: flood.matching, "the server's subscription")
         for number in range(50):
-            flood.put(messages.encode_records([box(number)]))
+            flood.put(encode_records([box(number)]))
         publish(bob, (1, 1), box(99, author="bob"))
         assert snapshot(bob, (1, 1), 1) == [box(99, author="bob")]
         wait(lambda: server.store.counters.received == 51, "all to arrive")
@@ -356,7 +366,7 @@ def test_a_killed_server_loses_no_record_that_it_published(tmp_path):
         flood = ada.publisher("fact/0/0/ada", reliable=True)
         wait(lambda: flood.matching, "the server's subscription")
         for number in range(50, 150):
-            flood.put(messages.encode_records([box(number)]))
+            flood.put(encode_records([box(number)]))
         process.kill()
         process.wait()
         with serving(endpoint, tmp_path):
@@ -388,9 +398,7 @@ def test_records_are_published_again_to_a_server_that_lost_them(tmp_path):
 
         def complete():
             late.query("snap/0/0")
-            received[:] = [
-                record for answer in late.replies() for record in messages.decode_records(answer.payload)
-            ] or received
+            received[:] = [record for answer in late.replies() for record in decode_records(answer.payload)] or received
             return received == [box(number) for number in range(30)]
 
         for number in range(30):
@@ -463,7 +471,7 @@ def test_of_two_linked_servers_one_admits_and_stores_for_both(protocol):
             with pytest.raises(NameTaken):
                 ZenohBus("ada", connect=relay.endpoint)
             answers: list = []
-            bob.query("clock/bob", messages.encode_time(1.0))
+            bob.query("clock/bob", encode_time(1.0))
             wait(lambda: answers.extend(bob.replies()) or answers, "the time")
             assert (hub.pings, relay.pings) == (1, 0)
 
@@ -520,14 +528,14 @@ def test_the_documented_configuration_for_stock_routers_works():
 
 def test_only_actors_with_a_body_that_were_admitted_slow_their_own_world():
     """A spectator, a stranger and an actor of another world report that they can follow a tenth of real time."""
-    slow = messages.encode_time(0.0, report=PaceReport(0.0, 0.1, "steps"))
+    slow = encode_time(0.0, report=PaceReport(0.0, 0.1, "steps"))
 
     def reported_by(bus: ZenohBus, factor_falls: bool) -> None:
         answers: list = []
 
         def told() -> bool:
             bus.query(f"clock/{bus.name}", slow)
-            answers.extend(messages.decode_time(reply.payload) for reply in bus.replies())
+            answers.extend(decode_time(reply.payload) for reply in bus.replies())
             return any(one.factor < 0.5 for one in answers) if factor_falls else len(answers) > 20
 
         wait(told, "replies")
@@ -538,9 +546,9 @@ def test_only_actors_with_a_body_that_were_admitted_slow_their_own_world():
             stack.enter_context(ZenohBus(name, connect=server.endpoint, world=world))
             for name, world in (("eve", "vineyard"), ("kim", "vineyard"), ("bob", "vineyard"), ("far", "row-2"))
         )
-        eve.join(messages.encode_hello(Hello("eve", kind="spectator", scene="s", digest="1")))
-        bob.join(messages.encode_hello(Hello("bob", scene="s", digest="1")))
-        far.join(messages.encode_hello(Hello("far", scene="s", digest="1")))
+        eve.join(encode_hello(Hello("eve", kind="spectator", scene="s", digest="1")))
+        bob.join(encode_hello(Hello("bob", scene="s", digest="1")))
+        far.join(encode_hello(Hello("far", scene="s", digest="1")))
         wait(lambda: len(server.actors) == 4, "all")
         for bus in (eve, kim):
             reported_by(bus, factor_falls=False)

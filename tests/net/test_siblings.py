@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.support.fake_client import tree_row
 from vinesim.core import frames
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.replication.sender import ADOPTION_DELAY
 from vinesim.net.transport.memory_bus import MemoryHub

@@ -12,7 +12,8 @@ from benchmarks.support.fake_client import FakeClient, tree_row
 from tests.support.waiting import wait
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
+from vinesim.net.codec.header import MessageError
 from vinesim.net.server.server import Server
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -56,9 +57,7 @@ class World:
         self._time = START
         self.hub.bus("server").declare_queryable(
             "clock/*",
-            lambda asked: messages.encode_time(
-                messages.decode_time(asked)[0], self.time, self.factor, real=self.hub.time
-            ),
+            lambda asked: encode_time(decode_time(asked)[0], self.time, self.factor, real=self.hub.time),
         )
         model = tree_row(2)
         self.ada, self.bob = (
@@ -166,5 +165,5 @@ def test_a_linked_server_has_no_factor_of_its_own() -> None:
 
 @pytest.mark.parametrize("factor", [0.0, -1.0, 1.5, float("nan"), float("inf")])
 def test_an_impossible_factor_is_not_believed(factor: float) -> None:
-    with pytest.raises(messages.MessageError, match="real-time factor"):
-        messages.decode_time(messages.encode_time(1.0, 2.0, factor))
+    with pytest.raises(MessageError, match="real-time factor"):
+        decode_time(encode_time(1.0, 2.0, factor))

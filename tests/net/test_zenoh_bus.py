@@ -17,8 +17,8 @@ import pytest
 from tests.support import programs
 from tests.support.waiting import deadline, wait
 from vinesim.core import frames
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.server.server import Server
 from vinesim.net.transport import zenoh_bus, zenoh_session
@@ -234,10 +234,10 @@ def test_an_oversized_sample_is_dropped(server):
         bob.subscribe("own/0/0/*", KEEP_ALL)
         event = ada.publisher("own/0/0/ada", reliable=True)
         wait(lambda: event.matching, "bob's subscription")
-        event.put(bytes(messages.MAX_MESSAGE + 1))
-        event.put(bytes(5 * messages.MAX_MESSAGE))  # the router does not even reassemble this
+        event.put(bytes(MAX_MESSAGE + 1))
+        event.put(bytes(5 * MAX_MESSAGE))  # the router does not even reassemble this
         event.put(b"small")
-        wait(lambda: bob.bytes_in == messages.MAX_MESSAGE + 6, "both samples")
+        wait(lambda: bob.bytes_in == MAX_MESSAGE + 6, "both samples")
         assert bob.poll() == [("own/0/0/ada", b"small")]
         assert bob.dropped == 1
 

@@ -26,7 +26,7 @@ from vinesim.client.client import Client
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.recording.ros_replay import RosReplay
 from vinesim.client.tasks.start_poses import spawn_pose
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.recording.mcap_reader import read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -44,9 +44,7 @@ def record(path: pathlib.Path) -> tuple[Client, float]:
     """A robot turns its head; the client, and the network time at the end [s]."""
     hub = MemoryHub(delay=0.004)
     server = hub.bus("server", live=False)
-    server.declare_queryable(
-        "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], EPOCH + hub.time)
-    )
+    server.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], EPOCH + hub.time))
     scene = load_scene("demo")
     client = Client(
         scene,

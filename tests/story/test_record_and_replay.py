@@ -21,7 +21,9 @@ from tests.support.long_rows import long
 from tests.support.recorded_world import TICK, MinimalClient
 from tests.support.waiting import deadline
 from vinesim.client.recording.recorder import Recorder
-from vinesim.net.codec import messages
+from vinesim.net.codec.header import kind_of
+from vinesim.net.codec.messages import time_of
+from vinesim.net.codec.trees import RESTING, TREES, TreeStates, decode_trees
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication.interest import POSE_LAYERS
@@ -126,13 +128,11 @@ def killed_recording(tmp_path_factory) -> Iterator[tuple[str, pathlib.Path, floa
         yield endpoint, path, killed
 
 
-def rest_updates(path: pathlib.Path) -> list[messages.TreeStates]:
+def rest_updates(path: pathlib.Path) -> list[TreeStates]:
     recording = partial_recording(path)
     events = [entry.payload for entry in recording.messages if entry.key == "own/0/0/ada"] if recording else []
-    trees = [
-        messages.decode_trees(payload) for payload in events if messages.kind_of(payload) == messages.MessageKind.TREES
-    ]
-    return [batch for batch in trees if batch.flags[0] & messages.RESTING]
+    trees = [decode_trees(payload) for payload in events if kind_of(payload) == TREES]
+    return [batch for batch in trees if batch.flags[0] & RESTING]
 
 
 def test_a_killed_recorder_loses_at_most_one_second(killed_recording):
@@ -173,7 +173,7 @@ def test_a_second_recorder_writes_a_second_file(killed_recording):
 
 
 def without_time(payload: bytes) -> bytes:
-    return payload if messages.time_of(payload) is None else payload[:6] + payload[14:]
+    return payload if time_of(payload) is None else payload[:6] + payload[14:]
 
 
 @pytest.mark.parametrize("listen", [False, True])

@@ -22,7 +22,9 @@ from tests.laws import test_determinism
 from tests.net import test_messages
 from tests.robot.test_pick import picker, vineyard
 from vinesim.client.tasks import start_poses
-from vinesim.net.codec import messages
+from vinesim.net.codec.objects import encode_objects
+from vinesim.net.codec.robot import encode_robot
+from vinesim.net.codec.trees import encode_trees
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.pick import PickBunch
@@ -114,13 +116,13 @@ def scan() -> str:
 def message() -> str:
     """Messages of robots, branches and rigid objects."""
     rng = np.random.default_rng(11)
-    robot = messages.encode_robot(test_messages.robot(rng))
+    robot = encode_robot(test_messages.robot(rng))
     trees = test_messages.cut(test_messages.trees(rng, [14, 3, 25]), [1, 0, 2], rng)
     objects = test_messages.objects(rng, 40)
     return _hash(
         robot if isinstance(robot, bytes) else b"".join(robot),
-        *messages.encode_trees(trees)[0],
-        *messages.encode_objects(objects, (0, 0))[0],
+        *encode_trees(trees)[0],
+        *encode_objects(objects, (0, 0))[0],
     )
 
 

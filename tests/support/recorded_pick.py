@@ -9,7 +9,7 @@ from vinesim.client.client import Client
 from vinesim.client.page.page_replay import PageReplay
 from vinesim.client.recording.recorder import Recorder
 from vinesim.client.tasks.start_poses import find_reachable_bunch, spawn_pose
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.recording.mcap_reader import read_recording
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.transport.memory_bus import MemoryHub
@@ -27,9 +27,7 @@ def record_a_pick(path: pathlib.Path) -> int:
     hub = MemoryHub(delay=0.004)
     scene = load_scene("demo")
     clock = hub.bus("server", live=False)
-    clock.declare_queryable(
-        "clock/*", lambda asked: messages.encode_time(messages.decode_time(asked)[0], 1e6 + hub.time)
-    )
+    clock.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], 1e6 + hub.time))
     model = generate(scene)
     start = spawn_pose(scene, 0)
     bunch = find_reachable_bunch(model, start)

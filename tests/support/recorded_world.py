@@ -7,7 +7,7 @@ import functools
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus

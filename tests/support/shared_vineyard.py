@@ -12,7 +12,7 @@ import pytest
 from tests.support.contact_scenes import cane
 from vinesim.client.client import Client
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_records, encode_records
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryBus, MemoryHub
@@ -114,12 +114,12 @@ class Server:
                 self.bus.declare_queryable(f"snap/{x}/{y}", functools.partial(self.reply, (x, y)))
 
     def reply(self, cell: tuple[int, int], _: bytes) -> bytes:
-        return messages.encode_records(self.records.in_cell(cell))
+        return encode_records(self.records.in_cell(cell))
 
     def tick(self) -> None:
         for key, payload in self.bus.poll():
             _, x, y, _ = key.split("/")
-            for record in messages.decode_records(payload):
+            for record in decode_records(payload):
                 self.records.merge((int(x), int(y)), record)
 
 

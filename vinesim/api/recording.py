@@ -13,9 +13,8 @@ import pathlib
 from collections.abc import Iterator
 from typing import Any
 
-from vinesim.net.keys import sender_of
+from vinesim.net.codec.messages import describe_message, sender_of
 from vinesim.net.recording.mcap_reader import read_recording
-from vinesim.net.recording.message_json import describe_message
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

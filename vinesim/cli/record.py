@@ -11,7 +11,7 @@ import threading
 import time
 
 from vinesim.cli.signals import stop_at_signals
-from vinesim.client.recording.recorder import FAMILIES, Observer, Recorder, observer_grid
+from vinesim.client.recording.recorder import CHOICES, Observer, Recorder, observer_grid
 from vinesim.core.errors import UsageError
 from vinesim.net.recording.mcap_writer import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -34,9 +34,9 @@ def run(
     seconds: float | None,
 ) -> int:
     """Record until asked to stop; 0 if the file is complete."""
-    families = FAMILIES if only is None else tuple(filter(None, only.split(",")))
-    if unknown := [family for family in families if family not in FAMILIES] or ([] if families else [only]):
-        raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(FAMILIES)}")
+    families = CHOICES if only is None else tuple(filter(None, only.split(",")))
+    if unknown := [family for family in families if family not in CHOICES] or ([] if families else [only]):
+        raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(CHOICES)}")
     stands = observer_grid(area) if area is not None else []
     about = {"world": world, "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
     about["asked"] = "what is sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)

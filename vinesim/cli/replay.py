@@ -14,9 +14,9 @@ import numpy as np
 
 from vinesim.cli.signals import stop_at_signals
 from vinesim.core.errors import UsageError, writing
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_hello
 from vinesim.net.codec.human import decode_pose
-from vinesim.net.keys import sender_of
+from vinesim.net.codec.messages import sender_of
 from vinesim.net.recording.mcap_reader import InvalidRecording, Recording, read_recording
 from vinesim.net.transport.endpoints import check_exposure
 
@@ -297,7 +297,7 @@ def _first_pose(tape: Recording) -> np.ndarray:
         such = {
             sender_of(entry.key)
             for entry in tape.messages
-            if entry.key.startswith("hello/") and messages.decode_hello(entry.payload).kind == kind
+            if entry.key.startswith("hello/") and decode_hello(entry.payload).kind == kind
         }
         for entry in tape.messages:
             if entry.key.startswith("a/") and sender_of(entry.key) in such:

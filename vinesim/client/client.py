@@ -17,8 +17,9 @@ import functools
 import logging
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Executor
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -36,7 +37,8 @@ from vinesim.client.sound.exchange import SoundExchange
 from vinesim.client.world_time import WorldTime
 from vinesim.core import frames
 from vinesim.core.allocator import release_free_memory
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.forces import COUPLINGS, WRENCHES, Coupling
 from vinesim.net.replication import interest
 from vinesim.net.replication.receiver import Inbox
 from vinesim.net.replication.replicator import Replicator
@@ -50,7 +52,7 @@ from vinesim.robot.drives.remote_robot import RemoteRobot
 from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
-from vinesim.scene.values import Coupling, HumanPose, HumanSpec, HumanUpdate, RobotUpdate
+from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate, RobotUpdate
 from vinesim.scene.wind import wind_of
 from vinesim.world import Physics
 
@@ -67,6 +69,17 @@ def label_index(name: str) -> int:
 
 CLOCK_POLL_PERIOD = 0.005
 """Time between two looks for the server's first reply [s]."""
+
+
+class Exchange(NamedTuple):
+    """What a client does with one kind of the messages that actors send each other directly."""
+
+    say: Callable[[str], Any]
+    """What a local actor tells others in this step: the value for
+    :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`."""
+    apply: Callable[[Mapping[str, Any]], None]
+    """Applies, before a step, what holds now of what others told each local actor:
+    :meth:`vinesim.net.replication.direct_messages.MessageSync.current`, by its name."""
 
 
 class Client:
@@ -123,6 +136,11 @@ class Client:
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
         self.couplings = PlantCouplings(self.physics)
+        self.exchanges = {
+            WRENCHES: Exchange(self._say_wrenches, self._apply_wrenches),
+            COUPLINGS: Exchange(self._say_couplings, self._apply_couplings),
+        }
+        """What the actors of this client and of others tell each other, by kind of message."""
         self._description = description
         self._executor = executor
         self._outfit = outfit
@@ -274,6 +292,7 @@ class Client:
             interest_radius=self._interest_radius,
             jitter_buffer=self._jitter_buffer,
             hand_force=self.physics.parameters.hand_force,
+            link_centre=functools.partial(self._link_centre, hello.name),
         )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
@@ -414,8 +433,7 @@ class Client:
                 is_changed=objects.is_changed,
                 pose_on_support=self.physics.support_tracker.pose_on_support,
                 has_body=self.physics.support_tracker.__contains__,
-                couplings=self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees),
-                wrenches=actor.hand_wrenches_on(self.remote_actors) if isinstance(actor, LocalHuman) else None,
+                messages={kind: exchange.say(name) for kind, exchange in self.exchanges.items()},
                 carried_on=carried_on,
             )
             for update in settled:
@@ -451,17 +469,9 @@ class Client:
 
     def _receive_all(self, now: float) -> Inbox:
         """Merge the inboxes of all local actors; of each remote actor the update of its nearest one counts."""
-        inboxes = {
-            name: replicator.receive(now, functools.partial(self._link_centre, name) if name in self.robots else None)
-            for name, replicator in self.replicators.items()
-        }
-        for name in self.robots:
-            self._apply_remote_wrenches(name, inboxes[name].wrenches)
-        couplings: dict[str, tuple[Coupling, ...]] = {}
-        for one in inboxes.values():
-            for actor, theirs in one.couplings.items():
-                couplings[actor] = couplings.get(actor, ()) + theirs
-        self.couplings.apply(couplings)
+        inboxes = {name: replicator.receive(now) for name, replicator in self.replicators.items()}
+        for kind, exchange in self.exchanges.items():
+            exchange.apply({name: one.messages[kind] for name, one in inboxes.items()})
         inbox = inboxes[self.name]
         if len(inboxes) == 1:
             return inbox
@@ -496,18 +506,35 @@ class Client:
         return bool(owners) and not owners & self.replicators.keys()
 
     def _link_centre(self, name: str, link: str) -> np.ndarray | None:
-        """Centre of mass [3] m of a link of a local robot; None if it has no such link."""
+        """Centre of mass [3] m of a link of a local robot; None if it is no robot or has no such link."""
         try:
-            return self.physics.rigid.link_centre(name, link)
+            return self.physics.rigid.link_centre(name, link) if name in self.robots else None
         except ValueError:
             return None
 
-    def _apply_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
-        """Apply the wrenches [6] N, N m of remote humans to the links of a local robot."""
-        try:
-            self.physics.rigid.set_remote_wrenches(name, wrenches)
-        except RobotError as error:
-            log.debug("a wrench on an unknown link: %s", error)
+    def _say_wrenches(self, name: str) -> dict[str, dict[str, np.ndarray]] | None:
+        """Wrenches [6] N, N m of a local human's hands on remote robots."""
+        return self.humans[name].hand_wrenches_on(self.remote_actors) if name in self.humans else None
+
+    def _apply_wrenches(self, received: Mapping[str, dict[str, np.ndarray]]) -> None:
+        """Apply the wrenches [6] N, N m of remote humans to the links of local robots."""
+        for name in self.robots:
+            try:
+                self.physics.rigid.set_remote_wrenches(name, received[name])
+            except RobotError as error:
+                log.debug("a wrench on an unknown link: %s", error)
+
+    def _say_couplings(self, name: str) -> list[Coupling]:
+        """Couplings of a local actor's contacts with trees that others move or touch, too."""
+        return self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees)
+
+    def _apply_couplings(self, received: Mapping[str, dict[str, tuple[Coupling, ...]]]) -> None:
+        """Hold trees by the couplings of remote actors."""
+        couplings: dict[str, tuple[Coupling, ...]] = {}
+        for by_actor in received.values():
+            for actor, theirs in by_actor.items():
+                couplings[actor] = couplings.get(actor, ()) + theirs
+        self.couplings.apply(couplings)
 
 
 class InterestAudit:

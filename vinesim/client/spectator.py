@@ -10,7 +10,7 @@ import numpy as np
 from vinesim.client.client import Client, label_index
 from vinesim.core import frames
 from vinesim.core.errors import writing
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.net.replication.replication_state import SPECTATOR
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus

@@ -16,10 +16,11 @@ from collections.abc import Callable, Collection
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import Hello, decode_hello, encode_hello
+from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion, kind_of
 from vinesim.net.codec.human import decode_pose
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.keys import sender_of
+from vinesim.net.codec.messages import FAMILIES, sender_of
+from vinesim.net.codec.robot import encode_robot
 from vinesim.net.recording.mcap_writer import RecordingWriter
 from vinesim.net.replication import interest
 from vinesim.net.replication.interest import PoseLayer
@@ -30,7 +31,7 @@ from vinesim.scene.values import RobotUpdate
 
 log = logging.getLogger(__name__)
 
-FAMILIES = ("poses", "trees", "things", "events", "facts", "forces")
+CHOICES = tuple(dict.fromkeys(family.recorded_with for family in FAMILIES.values() if family.recorded_with))
 """Choices of ``--only``. Presence and hellos are always recorded."""
 
 OBSERVER_SPACING = 7.0
@@ -55,7 +56,7 @@ class Recorder:
         bus: Bus,
         recording: RecordingWriter,
         *,
-        only: Collection[str] = FAMILIES,
+        only: Collection[str] = CHOICES,
         everything: bool = False,
         digest: str = "",
         clock: Callable[[], float] = time.monotonic,
@@ -73,7 +74,7 @@ class Recorder:
         """Hellos of the actors, by name."""
         self.malformed = 0
         """Messages that were recorded but cannot be decoded."""
-        self._families = frozenset(only)
+        self._choices = frozenset(only)
         self._everything = everything
         self._clock = clock
         now = clock()
@@ -126,18 +127,11 @@ class Recorder:
 
     def _subscribe(self) -> None:
         self._is_subscribed = True
-        if "trees" in self._families:
-            for layer in interest.TREE_LAYERS:
-                self.bus.subscribe(f"{layer.family}/**", KEEP_ALL)
-        if "things" in self._families:
-            self.bus.subscribe("c/**", KEEP_ALL)
-        if "events" in self._families:
-            self.bus.subscribe("own/**", KEEP_ALL)
-        if "facts" in self._families:
-            self.bus.subscribe("fact/**", KEEP_ALL)
+        for name, family in FAMILIES.items():
+            if name != "a" and family.recorded_with in self._choices:  # poses: see _update_pose_subscriptions
+                self.bus.subscribe(f"{name}/**", KEEP_ALL)
+        if "facts" in self._choices:
             self.bus.query("snap/*/*")  # what became true before
-        if "forces" in self._families:
-            self.bus.subscribe("force/**", KEEP_ALL)
 
     def _put(self, key: str, payload: bytes) -> None:
         self.recording.put(self._log_time, key, payload)
@@ -176,9 +170,9 @@ class Recorder:
     def _admit(self, name: str, payload: bytes) -> None:
         """Record the hello of an actor; one of another scene is ignored, as other actors ignore it."""
         try:
-            hello = messages.decode_hello(payload)
-        except messages.WrongVersion as error:
-            self._reject(name, f"speaks protocol version {error.theirs}, this recorder version {messages.PROTOCOL}")
+            hello = decode_hello(payload)
+        except WrongVersion as error:
+            self._reject(name, f"speaks protocol version {error.theirs}, this recorder version {PROTOCOL}")
             return
         if self.digest and hello.digest != self.digest:
             wanted = f"{self.recording.metadata.get('scene', '?')!r} with {self.digest!r}"
@@ -201,13 +195,13 @@ class Recorder:
     def _record(self, key: str, payload: bytes) -> None:
         family, _, rest = key.partition("/")
         try:
-            messages.kind_of(payload)
+            kind_of(payload)
             if family == "a":
                 name = rest.partition("/")[0]
                 self._positions[name] = decode_pose(payload, name).base_q[:3]
         except MessageError:
             self.malformed += 1
-        if family == "a" and "poses" not in self._families:
+        if family == "a" and "poses" not in self._choices:
             return
         self._put(key, payload)
 
@@ -231,7 +225,7 @@ class Recorder:
             if (name, layer) not in self._faster:
                 self._faster[name, layer] = self.bus.publisher(key), None
             publisher, subscription = self._faster[name, layer]
-            wanted = "poses" in self._families and (
+            wanted = "poses" in self._choices and (
                 self._everything or (publisher.matching and self._has_company(name, layer))
             )
             if wanted and subscription is None:
@@ -279,7 +273,7 @@ class Observer:
     def __init__(self, bus: Bus, place: tuple[float, float], scene: str, digest: str, now: float) -> None:
         """At ``place`` [m], through a live bus of its own, from own time ``now`` [s] on."""
         self.bus = bus
-        hello = messages.encode_hello(Hello(bus.name, kind="spectator", scene=scene, digest=digest, joints=0))
+        hello = encode_hello(Hello(bus.name, kind="spectator", scene=scene, digest=digest, joints=0))
         bus.join(hello)
         bus.declare_queryable(f"hello/{bus.name}", lambda _: hello)
         self._positions = frames.pose([*place, 1.6])
@@ -299,4 +293,4 @@ class Observer:
             update = RobotUpdate(
                 self.bus.name, self._network_clock.time, self._positions, np.zeros(6), np.zeros(0), np.zeros(0)
             )
-            self._pose.put(messages.encode_robot(update))
+            self._pose.put(encode_robot(update))

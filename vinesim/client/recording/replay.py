@@ -19,21 +19,24 @@ import time
 from collections.abc import Callable, Iterable
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError
-from vinesim.net.keys import sender_of
+from vinesim.net.codec.control import (
+    Hello,
+    RetainedRecord,
+    decode_hello,
+    decode_records,
+    decode_time,
+    encode_hello,
+    encode_records,
+    encode_time,
+)
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.messages import family_of, sender_of, shift_time
 from vinesim.net.recording.mcap_reader import RecordedMessage, Recording
 from vinesim.net.replication.network_clock import NetworkClock
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_LAST_1, Bus, NameTaken, Publisher, Reply, SampleStore, matches
 
 log = logging.getLogger(__name__)
-
-RELIABLE = ("own", "fact")
-"""Families of keys that are published reliably."""
-
-_ANSWERED = ("live", "hello", "snap")
-"""Families of keys that are replies to queries, not publications."""
 
 MAX_REPLY = 4096
 """A reply with retained records is split beyond this size [B]."""
@@ -99,16 +102,16 @@ class Playhead:
         elif family == "fact":
             self._merge(entry.key, _decode_records(entry.payload))
 
-    def _merge(self, key: str, records: Iterable[messages.RetainedRecord]) -> None:
+    def _merge(self, key: str, records: Iterable[RetainedRecord]) -> None:
         cell = _cell(key)
         if cell is not None:
             for record in records:
                 self.records.merge(cell, record)
 
 
-def _decode_records(payload: bytes) -> list[messages.RetainedRecord]:
+def _decode_records(payload: bytes) -> list[RetainedRecord]:
     try:
-        return messages.decode_records(payload)
+        return decode_records(payload)
     except MessageError:
         return []
 
@@ -192,8 +195,8 @@ class ReplayBus:
     def query(self, key: str, payload: bytes = b"") -> None:
         family, _, rest = key.partition("/")
         if family == "clock":
-            asked, *_ = messages.decode_time(payload)
-            self._reply(key, messages.encode_time(asked, self.time))
+            asked, *_ = decode_time(payload)
+            self._reply(key, encode_time(asked, self.time))
         elif family == "hello" and rest in self._playhead.live and rest in self._playhead.greetings:
             self._reply(key, self._playhead.greetings[rest])
         elif family == "snap":
@@ -202,7 +205,7 @@ class ReplayBus:
             cells = {cell for cell, _ in records if matches(key, f"snap/{cell[0]}/{cell[1]}")}
             for x, y in sorted(cells if asked is None else {asked}):
                 for part in _split_records(records.in_cell((x, y))):
-                    self._reply(f"snap/{x}/{y}", messages.encode_records(part))
+                    self._reply(f"snap/{x}/{y}", encode_records(part))
 
     def replies(self) -> list[Reply]:
         answers = self._answers
@@ -258,9 +261,9 @@ class _NullPublisher:
         pass
 
 
-def _split_records(records: list[messages.RetainedRecord]) -> Iterable[list[messages.RetainedRecord]]:
+def _split_records(records: list[RetainedRecord]) -> Iterable[list[RetainedRecord]]:
     """Records in parts that are small enough to send; at least one part, perhaps empty."""
-    part: list[messages.RetainedRecord] = []
+    part: list[RetainedRecord] = []
     size = 0
     for record in records:
         part.append(record)
@@ -307,10 +310,10 @@ class Replay:
         self._begun: float | None = None
         self._begun_at = 0.0
         self._initial_messages = [
-            (_record_key(cell, record), messages.encode_records([record])) for cell, record in self.playhead.records
+            (_record_key(cell, record), encode_records([record])) for cell, record in self.playhead.records
         ]
         self._keys: dict[str, list[str]] = {}
-        for key in sorted({entry.key for entry in recording.messages if entry.key.partition("/")[0] not in _ANSWERED}):
+        for key in sorted({entry.key for entry in recording.messages if family_of(entry.key).is_published}):
             self._keys.setdefault(sender_of(key), []).append(key)
 
     @property
@@ -338,10 +341,10 @@ class Replay:
             if not self._initial_messages:
                 self._close_absent(set(self._absent))
         for entry in entries:
-            if entry.key.partition("/")[0] not in _ANSWERED:
+            if family_of(entry.key).is_published:
                 # as old as it was when the recorder had it
                 due = self._begun_at + (entry.time - self._start) / self._speed
-                self._publish(entry.key, messages.shift_time(entry.payload, due - entry.time))
+                self._publish(entry.key, shift_time(entry.payload, due - entry.time))
 
     def close(self) -> None:
         """Let all actors leave."""
@@ -363,14 +366,14 @@ class Replay:
                 bus.join(greeting)
                 bus.declare_queryable(f"hello/{name}", lambda _, greeting=greeting: greeting)
                 for key in self._keys.get(name, ()):
-                    self._publishers[key] = bus.publisher(key, key.partition("/")[0] in RELIABLE)
+                    self._publishers[key] = bus.publisher(key, family_of(key).is_reliable)
 
     def _publish(self, key: str, payload: bytes) -> bool:
         """Whether there was a subscriber."""
         if key not in self._publishers:
             name = sender_of(key)
             bus = self._buses.get(name) or self._absent.get(name) or self._join_absent(name)
-            self._publishers[key] = bus.publisher(key, key.partition("/")[0] in RELIABLE)
+            self._publishers[key] = bus.publisher(key, family_of(key).is_reliable)
         was_sent = self._publishers[key].put(payload)
         self.sent += was_sent
         return was_sent
@@ -380,8 +383,8 @@ class Replay:
         bus = self._absent[name] = self._live_bus(name)
         greeting = self.playhead.greetings.get(name)
         if greeting is None:
-            other = messages.decode_hello(next(iter(self.playhead.greetings.values())))
-            greeting = messages.encode_hello(messages.Hello(name, scene=other.scene, digest=other.digest))
+            other = decode_hello(next(iter(self.playhead.greetings.values())))
+            greeting = encode_hello(Hello(name, scene=other.scene, digest=other.digest))
         bus.join(greeting)
         return bus
 
@@ -391,5 +394,5 @@ class Replay:
             self._publishers = {k: p for k, p in self._publishers.items() if sender_of(k) != name}
 
 
-def _record_key(cell: tuple[int, int], record: messages.RetainedRecord) -> str:
+def _record_key(cell: tuple[int, int], record: RetainedRecord) -> str:
     return f"fact/{cell[0]}/{cell[1]}/{record.author}"

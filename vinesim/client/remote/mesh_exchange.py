@@ -17,8 +17,16 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from vinesim.core import disk_cache
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MeshPart, MessageError
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.meshes import (
+    MAX_PART,
+    MeshPart,
+    MeshWanted,
+    decode_part,
+    decode_wanted,
+    encode_part,
+    encode_request,
+)
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.meshes import list_meshes, read_triangles
 from vinesim.scene import triangles
@@ -166,7 +174,7 @@ class MeshExchange:
                     self.refused_offers += 1
                     continue
                 while not wanted.refused and wanted.offset < len(payload) and not self._closing.is_set():
-                    data = payload[wanted.offset : wanted.offset + messages.MAX_PART]
+                    data = payload[wanted.offset : wanted.offset + MAX_PART]
                     wanted = _ask(bus, MeshPart(digest, len(payload), wanted.offset, data))
                     if wanted is None:
                         return False
@@ -233,11 +241,11 @@ class MeshExchange:
         return corners
 
 
-def _ask(bus: Bus, part: MeshPart) -> messages.MeshWanted | None:
+def _ask(bus: Bus, part: MeshPart) -> MeshWanted | None:
     """Offer a part of a mesh; the reply of the server, None if there was none that can be decoded."""
-    for reply in bus.fetch(f"offer/{bus.name}", messages.encode_part(part)):
+    for reply in bus.fetch(f"offer/{bus.name}", encode_part(part)):
         try:
-            return messages.decode_wanted(reply)
+            return decode_wanted(reply)
         except MessageError as error:
             log.debug("reply to an offered mesh: %s", error)
     return None
@@ -250,8 +258,8 @@ def _fetch(bus: Bus, digest: str, is_closing: Callable[[], bool]) -> bytes:
     while len(arrived) < size:
         if is_closing():
             raise _Missing
-        replies = bus.fetch(f"mesh/{digest}", messages.encode_request(len(arrived)))
-        parts = [part for part in map(messages.decode_part, replies) if part.size]
+        replies = bus.fetch(f"mesh/{digest}", encode_request(len(arrived)))
+        parts = [part for part in map(decode_part, replies) if part.size]
         if not parts:
             raise _Missing
         part = parts[0]

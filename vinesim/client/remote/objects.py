@@ -11,8 +11,8 @@ from collections.abc import Callable, Collection, Container, Iterable
 import numpy as np
 
 from vinesim.interaction.support_tracking import GROUND
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import RetainedRecord
+from vinesim.net.codec.trees import decode_trees
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.authority import wins
 from vinesim.net.replication.receiver import Inbox
@@ -162,7 +162,7 @@ class ObjectSync:
     def _apply_tree_record(self, record: RetainedRecord) -> list[TreeUpdate]:
         """Take over the state of a tree that a record has; that state if the tree rests in it."""
         self._changed_trees.add(record.object)
-        (update,) = messages.decode_trees(record.trees, self.physics.model.tree_size).updates(record.author)
+        (update,) = decode_trees(record.trees, self.physics.model.tree_size).updates(record.author)
         self.blend_tree(update, 1.0)
         return [] if record.moving else [update]
 

@@ -17,8 +17,8 @@ from collections.abc import Collection, Mapping
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.net.codec.forces import Coupling
 from vinesim.plants.ties import TieLimitError
-from vinesim.scene.values import Coupling
 from vinesim.world import Physics
 
 STIFFNESS = 300.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vinesim.net.codec.messages import Hello
+from vinesim.net.codec.control import Hello
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene import appearance
 from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate

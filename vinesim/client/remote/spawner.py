@@ -13,7 +13,8 @@ import numpy as np
 
 from vinesim.client.remote.mesh_exchange import MeshExchange
 from vinesim.client.remote.remote_human import RemoteHuman, human_spec
-from vinesim.net.codec.messages import Hello, is_valid_name
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.header import is_valid_name
 from vinesim.rigid.mujoco_world import CompiledWorld
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription

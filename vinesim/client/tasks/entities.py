@@ -15,7 +15,7 @@ import numpy as np
 from vinesim.client.client import Client, label_index
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.core import frames
-from vinesim.net.codec.messages import is_valid_name
+from vinesim.net.codec.header import is_valid_name
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.ros.commands.types import (

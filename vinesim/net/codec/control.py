@@ -6,6 +6,7 @@ import math
 from typing import Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec.header import (
@@ -14,17 +15,24 @@ from vinesim.net.codec.header import (
     MAX_MESSAGE,
     PROTOCOL,
     MessageError,
-    MessageKind,
     WrongVersion,
     is_valid_name,
     kind_of,
 )
+from vinesim.net.codec.json_values import COUNT, NUMBER, POSE, TEXT, THING, YES, list_of, named, object_of, pose_value
 from vinesim.net.codec.objects import check_object_id
 from vinesim.net.codec.robot import MAX_JOINTS
 from vinesim.net.codec.trees import MAX_BODIES, MAX_TREES
 from vinesim.net.pace import MIN_FACTOR, PaceReport
 from vinesim.net.replication.authority import Claim
 from vinesim.scene.ids import LABEL_STRIDE
+
+CLAIMS = 3
+RETAINED = 4
+HELLO = 16
+CLOCK = 17
+WELCOME = 18
+"""Kinds of the messages."""
 
 MAX_RECORDS = 4096
 """Retained records in one message."""
@@ -140,7 +148,7 @@ def encode_hello(hello: Hello) -> bytes:
     if not is_valid_name(hello.name):
         raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
     _check_hello(hello)
-    payload = pack(MessageKind.HELLO, hello)
+    payload = pack(HELLO, hello)
     if len(payload) > MAX_MESSAGE:
         raise MessageError(f"greeting of {len(payload)} B, at most {MAX_MESSAGE} B: the URDF is too long")
     return payload
@@ -148,7 +156,7 @@ def encode_hello(hello: Hello) -> bytes:
 
 def decode_hello(payload: bytes) -> Hello:
     """Decode a hello; :class:`MessageError`, or :class:`WrongVersion` for another protocol version."""
-    hello = unpack(payload, MessageKind.HELLO, "greeting", _hello_decoder)
+    hello = unpack(payload, HELLO, "greeting", _hello_decoder)
     if not is_valid_name(hello.name):
         raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
     if hello.protocol != PROTOCOL:
@@ -177,17 +185,17 @@ def _check_hello(hello: Hello) -> None:
 
 def encode_welcome(welcome: Welcome) -> bytes:
     """Encode a welcome."""
-    return pack(MessageKind.WELCOME, welcome)
+    return pack(WELCOME, welcome)
 
 
 def decode_welcome(payload: bytes) -> Welcome:
     """Decode a welcome; :class:`WrongVersion` from a server of another protocol version."""
-    return unpack(payload, MessageKind.WELCOME, "welcome", _welcome_decoder)
+    return unpack(payload, WELCOME, "welcome", _welcome_decoder)
 
 
 def encode_claims(claims: list[tuple[int, Claim, bool]]) -> bytes:
     """Encode claims: (object id, claim, whether the owner is in contact with the object)."""
-    return pack(MessageKind.CLAIMS, [(int(object_id), *claim, touching) for object_id, claim, touching in claims])
+    return pack(CLAIMS, [(int(object_id), *claim, touching) for object_id, claim, touching in claims])
 
 
 def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list[tuple[int, Claim, bool]]:
@@ -195,7 +203,7 @@ def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list
 
     ``counts``: number of objects of each kind in the scene.
     """
-    rows = unpack(payload, MessageKind.CLAIMS, "claims", _claims_decoder)
+    rows = unpack(payload, CLAIMS, "claims", _claims_decoder)
     if len(rows) > MAX_TREES:
         raise MessageError(f"{len(rows)} claims in one message, at most {MAX_TREES}")
     for object_id, ownership, authority, owner, _ in rows:
@@ -210,7 +218,7 @@ def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list
 
 def encode_records(records: list[RetainedRecord]) -> bytes:
     """Encode retained records."""
-    return pack(MessageKind.RETAINED, records)
+    return pack(RETAINED, records)
 
 
 def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> list[RetainedRecord]:
@@ -219,7 +227,7 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
     ``counts``: number of objects of each kind in the scene, if known. Records of trees are not checked against the
     model.
     """
-    records = unpack(payload, MessageKind.RETAINED, "retained records", _records_decoder)
+    records = unpack(payload, RETAINED, "retained records", _records_decoder)
     if len(records) > MAX_RECORDS:
         raise MessageError(f"{len(records)} records in one message, at most {MAX_RECORDS}")
     for record in records:
@@ -265,7 +273,7 @@ def encode_time(
     time."""
     real = world if real is None else real
     return pack(
-        MessageKind.CLOCK,
+        CLOCK,
         (float(asked), float(world), float(factor), float(real), cause[:MAX_CAUSE], report and _plain(report)),
     )
 
@@ -276,7 +284,7 @@ def _plain(report: PaceReport) -> tuple[float, float, str]:
 
 def decode_time(payload: bytes) -> ClockMessage:
     """Decode a question or a reply of the clock; all numbers are finite, and factors possible."""
-    asked, world, factor, real, cause, report = unpack(payload, MessageKind.CLOCK, "clock", _time_decoder)
+    asked, world, factor, real, cause, report = unpack(payload, CLOCK, "clock", _time_decoder)
     if not all(map(math.isfinite, (asked, world, real, *(report or ())[:2]))):
         raise MessageError(f"clock message ({asked}, {world}, {real}) that is not finite")
     if not MIN_FACTOR <= factor <= 1.0:
@@ -286,6 +294,78 @@ def decode_time(payload: bytes) -> ClockMessage:
     if max(len(cause), len(report[2]) if report else 0) > MAX_CAUSE:
         raise MessageError(f"clock message with a cause of more than {MAX_CAUSE} letters")
     return ClockMessage(asked, world, factor, real, cause, None if report is None else PaceReport(*report))
+
+
+HELLO_FIELDS = {
+    "name": TEXT,
+    "kind": TEXT,
+    "robot": TEXT,
+    "urdf": TEXT,
+    "sidecar": TEXT,
+    "scene": TEXT,
+    "digest": TEXT,
+    "seed": COUNT,
+    "protocol": COUNT,
+    "index": COUNT,
+    "joints": COUNT,
+    "height": NUMBER,
+    "outfit": TEXT,
+}
+"""JSON schema of what :func:`describe_hello` returns."""
+
+
+def describe_hello(payload: bytes, _: str) -> dict[str, Any]:
+    """A hello for JSON."""
+    return msgspec.to_builtins(decode_hello(payload))
+
+
+CLAIMS_FIELDS = {"claims": list_of(object_of("claim", "who says to own a thing", owner=TEXT, touched=YES, **THING))}
+"""JSON schema of what :func:`describe_claims` returns."""
+
+
+def describe_claims(payload: bytes, _: str) -> dict[str, Any]:
+    """Claims for JSON."""
+    return {
+        "claims": [
+            {
+                **named(object_id),
+                "ownership": claim.ownership,
+                "authority": claim.authority,
+                "owner": claim.owner,
+                "touched": touching,
+            }
+            for object_id, claim, touching in decode_claims(payload)
+        ]
+    }
+
+
+RECORDS_FIELDS = {
+    "facts": list_of(
+        object_of(
+            "fact", "what stays true", author=TEXT, parent=TEXT, moving=YES, pose=POSE, cut=list_of(COUNT), **THING
+        )
+    )
+}
+"""JSON schema of what :func:`describe_records` returns."""
+
+
+def describe_records(payload: bytes, _: str) -> dict[str, Any]:
+    """Retained records for JSON."""
+    return {
+        "facts": [
+            {
+                **named(record.object),
+                "ownership": record.ownership,
+                "authority": record.authority,
+                "author": record.author,
+                "moving": record.moving,
+                "pose": pose_value(np.array(record.pose)),
+                "parent": record.parent,
+                "cut": list(record.cut),
+            }
+            for record in decode_records(payload)
+        ]
+    }
 
 
 _encoder = msgspec.msgpack.Encoder()

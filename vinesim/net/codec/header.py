@@ -1,14 +1,14 @@
 """Header of every network message: protocol version and kind, and for frequent kinds a count and a time; errors.
 
-Every message starts with four bytes: ``VS``, the protocol version, the kind (:class:`MessageKind`). Kinds that are sent
-often go on with a u16 count and the network time as f64, little-endian (:data:`HEADER`); rare kinds continue in
-msgpack. A decoder raises :class:`MessageError` and nothing else for a message that is malformed, truncated, too large,
-of another version or not finite.
+Every message starts with four bytes: ``VS``, the protocol version, the kind
+(:data:`vinesim.net.codec.messages.MESSAGES` lists all). Kinds that are sent often go on with a u16 count and the
+network time as f64, little-endian (:data:`HEADER`); rare kinds continue in msgpack. A decoder raises
+:class:`MessageError` and nothing else for a message that is malformed, truncated, too large, of another version or not
+finite.
 """
 
 from __future__ import annotations
 
-import enum
 import math
 import struct
 
@@ -16,41 +16,6 @@ PROTOCOL = 7
 """Version of the wire format. Messages of any other version are refused."""
 
 MAGIC = b"VS"
-
-
-class MessageKind(enum.IntEnum):
-    """Fourth byte of every message."""
-
-    ROBOT = 1
-    TREES = 2
-    CLAIMS = 3
-    RETAINED = 4
-    OBJECTS = 5
-    HUMAN = 6
-    WRENCHES = 7
-    COUPLINGS = 8
-    VOICE = 9
-    HELLO = 16
-    CLOCK = 17
-    WELCOME = 18
-    MESH_PART = 19
-    MESH_REQUEST = 20
-    MESH_WANTED = 21
-
-
-_RARE = (
-    MessageKind.CLAIMS,
-    MessageKind.RETAINED,
-    MessageKind.HELLO,
-    MessageKind.CLOCK,
-    MessageKind.WELCOME,
-    MessageKind.MESH_PART,
-    MessageKind.MESH_REQUEST,
-    MessageKind.MESH_WANTED,
-)
-
-TIMESTAMPED = frozenset(MessageKind).difference(_RARE)
-"""Kinds whose header holds the network time [s] at which the content was sampled."""
 
 MAX_DATAGRAM = 1100
 """Largest message of an unreliable stream [B], so that it fits one UDP datagram; a single large tree may exceed it."""
@@ -102,24 +67,6 @@ def kind_of(payload: bytes) -> int:
     if payload[2] != PROTOCOL:
         raise WrongVersion(payload[2])
     return payload[3]
-
-
-def time_of(payload: bytes) -> float | None:
-    """Network time [s] in the header of a message; None if its kind has none."""
-    if kind_of(payload) not in TIMESTAMPED or len(payload) < HEADER.size:
-        return None
-    time = HEADER.unpack_from(payload)[4]
-    return time if math.isfinite(time) else None
-
-
-def shift_time(payload: bytes, shift: float) -> bytes:
-    """Copy of a message with ``shift`` [s] added to its time; the message itself if its kind has no time."""
-    time = time_of(payload)
-    return (
-        payload
-        if time is None
-        else payload[: HEADER.size - 8] + struct.pack("<d", time + shift) + payload[HEADER.size :]
-    )
 
 
 def unpack_header(payload: bytes, kind: int, name: str) -> tuple[int, float]:

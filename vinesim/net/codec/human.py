@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import struct
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +19,16 @@ from vinesim.net.codec.header import (
     HEADER,
     MAX_COORDINATE,
     MessageError,
-    MessageKind,
     kind_of,
     pack_header,
     unpack_header,
 )
+from vinesim.net.codec.json_values import COUNT, NUMBER, POSE, TEXT, list_of, object_of, pose_value
 from vinesim.net.codec.rotation import TURN_LSB, quaternion, rotation_vector
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
+
+HUMAN = 6
+"""Kind of the message."""
 
 POSITION_LSB = 2e-4
 """Quantisation step of a position relative to the root [m]; clipped at 6.5 m."""
@@ -57,8 +61,36 @@ def encode_pose(update: RobotUpdate | HumanUpdate) -> bytes:
 
 def decode_pose(payload: bytes, actor: str) -> RobotUpdate | HumanUpdate:
     """Decode the pose of ``actor``, a name that is taken from the key, never from the payload."""
-    human = kind_of(payload) == MessageKind.HUMAN
+    human = kind_of(payload) == HUMAN
     return decode_human(payload, actor) if human else robot.decode_robot(payload, actor)
+
+
+POSE_FIELDS = {
+    "frame_id": TEXT,
+    "pose": POSE,
+    "velocity": list_of(NUMBER, "of its base: m/s, rad/s, world axes"),
+    "joint_position": list_of(NUMBER, "rad or m"),
+    "joint_velocity": list_of(NUMBER, "rad/s or m/s"),
+    "points": object_of("points", "of a person", **dict.fromkeys(POINT_NAMES, POSE)),
+    "intention": TEXT,
+    "lights": object_of("lights", "of a robot, sRGB 0 to 255", pattern=TEXT, color=list_of(COUNT)),
+}
+"""JSON schema of what :func:`describe_pose` returns."""
+
+
+def describe_pose(payload: bytes, _: str) -> dict[str, Any]:
+    """The pose of a robot or of a person for JSON."""
+    update = decode_pose(payload, "")
+    here = {"frame_id": "map", "pose": pose_value(update.base_q)}
+    if isinstance(update, HumanUpdate):
+        points = {name: pose_value(at) for name, at in zip(POINT_NAMES, update.pose.points, strict=True)}
+        return here | {"points": points, "intention": update.intention}
+    return here | {
+        "velocity": update.base_qd.tolist(),
+        "joint_position": update.position.tolist(),
+        "joint_velocity": update.velocity.tolist(),
+        "lights": {"pattern": update.lights.pattern.name.lower(), "color": list(update.lights.color)},
+    }
 
 
 def encode_human(update: HumanUpdate) -> bytes:
@@ -87,7 +119,7 @@ def encode_human(update: HumanUpdate) -> bytes:
         )
     flags = sum(bool(getattr(update.pose, name)) << bit for bit, name in enumerate(_FLAGS))
     bends = (round(FINGER_SCALE * min(max(bend, 0.0), 1.0)) for bend in fingers)
-    return pack_header(MessageKind.HUMAN, _POINTS, update.time) + _HUMAN.pack(
+    return pack_header(HUMAN, _POINTS, update.time) + _HUMAN.pack(
         *root.tolist(),
         *places,
         *turns,
@@ -101,7 +133,7 @@ def encode_human(update: HumanUpdate) -> bytes:
 
 def decode_human(payload: bytes, actor: str) -> HumanUpdate:
     """Decode a person's pose; :class:`MessageError` if that is impossible."""
-    count, time = unpack_header(payload, MessageKind.HUMAN, "human pose")
+    count, time = unpack_header(payload, HUMAN, "human pose")
     if count != _POINTS or len(payload) != HEADER.size + _HUMAN.size:
         raise MessageError(
             f"human pose of {count} points ({_POINTS}) in {len(payload)} B ({HEADER.size + _HUMAN.size})"

@@ -9,8 +9,13 @@ from __future__ import annotations
 import msgspec
 
 from vinesim.net.codec.control import pack, unpack
-from vinesim.net.codec.header import MessageError, MessageKind
+from vinesim.net.codec.header import MessageError
 from vinesim.scene.triangles import MAX_BYTES, is_digest
+
+MESH_PART = 19
+MESH_REQUEST = 20
+MESH_WANTED = 21
+"""Kinds of the messages."""
 
 MAX_PART = 64_000
 """Largest part of a mesh in one message [B]."""
@@ -44,12 +49,12 @@ class MeshWanted(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
 
 def encode_part(part: MeshPart) -> bytes:
     """Encode a part."""
-    return pack(MessageKind.MESH_PART, part)
+    return pack(MESH_PART, part)
 
 
 def decode_part(payload: bytes) -> MeshPart:
     """Decode a part that lies within a mesh of an allowed size; :class:`MessageError`."""
-    part = unpack(payload, MessageKind.MESH_PART, "part of a mesh", _part_decoder)
+    part = unpack(payload, MESH_PART, "part of a mesh", _part_decoder)
     if not is_digest(part.digest):
         raise MessageError(f"part of a mesh with the digest {part.digest[:60]!r}")
     if not 0 <= part.size <= MAX_BYTES or not 0 <= part.offset <= part.size - len(part.data):
@@ -61,12 +66,12 @@ def decode_part(payload: bytes) -> MeshPart:
 
 def encode_request(offset: int) -> bytes:
     """Encode a request for the part that begins at ``offset`` [B]."""
-    return pack(MessageKind.MESH_REQUEST, MeshRequest(offset))
+    return pack(MESH_REQUEST, MeshRequest(offset))
 
 
 def decode_request(payload: bytes) -> int:
     """The offset [B] of a request; :class:`MessageError`."""
-    offset = unpack(payload, MessageKind.MESH_REQUEST, "request for a mesh", _request_decoder).offset
+    offset = unpack(payload, MESH_REQUEST, "request for a mesh", _request_decoder).offset
     if not 0 <= offset <= MAX_BYTES:
         raise MessageError(f"request for a mesh from {offset} B on")
     return offset
@@ -74,12 +79,12 @@ def decode_request(payload: bytes) -> int:
 
 def encode_wanted(wanted: MeshWanted) -> bytes:
     """Encode the reply to an offer."""
-    return pack(MessageKind.MESH_WANTED, wanted)
+    return pack(MESH_WANTED, wanted)
 
 
 def decode_wanted(payload: bytes) -> MeshWanted:
     """Decode the reply to an offer; :class:`MessageError`."""
-    wanted = unpack(payload, MessageKind.MESH_WANTED, "reply to an offered mesh", _wanted_decoder)
+    wanted = unpack(payload, MESH_WANTED, "reply to an offered mesh", _wanted_decoder)
     if not 0 <= wanted.offset <= MAX_BYTES:
         raise MessageError(f"reply that asks for a mesh from {wanted.offset} B on")
     return wanted

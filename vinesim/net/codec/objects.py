@@ -7,15 +7,20 @@ degrees). Linear and angular velocity: i8 with an exponent of two for each.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
-from vinesim.net.codec.header import HEADER, MAX_DATAGRAM, MessageError, MessageKind, pack_header, unpack_header
+from vinesim.net.codec.header import HEADER, MAX_DATAGRAM, MessageError, pack_header, unpack_header
+from vinesim.net.codec.json_values import NUMBER, POSE, THING, YES, list_of, named, object_of, pose_value
 from vinesim.net.codec.rotation import pack_quaternions, unpack_quaternions
 from vinesim.net.codec.trees import MAX_TREES, TOUCHED
 from vinesim.net.replication.interest import CELL_SIZE, Cell
 from vinesim.scene.ids import OBJECT_STRIDE, ObjectKind
 from vinesim.scene.values import ObjectUpdate
+
+OBJECTS = 5
+"""Kind of the message."""
 
 POSITION_LSB = 1e-4
 """Quantisation step of a position in its cell [m]; beyond 3.2 m from :data:`CELL_ORIGIN_OFFSET` it is clipped."""
@@ -97,7 +102,7 @@ def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], Obje
     records["scale"] = exponent[:, 0] + 16.0 * exponent[:, 1]
     count = (MAX_DATAGRAM - HEADER.size) // _OBJECT.itemsize
     parts = [records[first : first + count] for first in range(0, len(records), count)]
-    payloads = [pack_header(MessageKind.OBJECTS, len(part), objects.time) + part.tobytes() for part in parts]
+    payloads = [pack_header(OBJECTS, len(part), objects.time) + part.tobytes() for part in parts]
     return payloads, _read_objects(objects.time, records, cell)
 
 
@@ -106,7 +111,7 @@ def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
 
     Whether the scene has such objects is for the caller to check (:func:`check_object_id`).
     """
-    count, time = unpack_header(payload, MessageKind.OBJECTS, "objects")
+    count, time = unpack_header(payload, OBJECTS, "objects")
     if not 1 <= count <= MAX_TREES or len(payload) != HEADER.size + count * _OBJECT.itemsize:
         raise MessageError(f"{count} objects announced (1 to {MAX_TREES}) in {len(payload)} B")
     records = np.frombuffer(payload, _OBJECT, count, HEADER.size)
@@ -129,6 +134,33 @@ def _read_objects(time: float, records: np.ndarray, cell: Cell) -> ObjectStates:
     velocity = np.concatenate([records["velocity"], records["spin"]], -1) * unit
     ids = records["object"].astype(np.int64)
     return ObjectStates(time, ids, records["ownership"], records["authority"], records["flags"], pose, velocity)
+
+
+OBJECTS_FIELDS = {
+    "things": list_of(
+        object_of("thing", "a box or a loose bunch", touched=YES, pose=POSE, velocity=list_of(NUMBER), **THING)
+    )
+}
+"""JSON schema of what :func:`describe_objects` returns."""
+
+
+def describe_objects(payload: bytes, key: str) -> dict[str, Any]:
+    """Objects for JSON; ValueError if the key names no cell."""
+    _, x, y, _ = key.split("/")
+    objects = decode_objects(payload, (int(x), int(y)))
+    return {
+        "things": [
+            {
+                **named(update.object),
+                "ownership": update.ownership,
+                "authority": update.authority,
+                "touched": bool(flags & TOUCHED),
+                "pose": pose_value(update.pose),
+                "velocity": update.velocity.tolist(),
+            }
+            for update, flags in zip(objects.updates(""), objects.flags.tolist(), strict=True)
+        ],
+    }
 
 
 def _cell_origin(cell: Cell) -> np.ndarray:

@@ -12,9 +12,12 @@ import struct
 
 import numpy as np
 
-from vinesim.net.codec.header import HEADER, MessageError, MessageKind, pack_header, unpack_header
+from vinesim.net.codec.header import HEADER, MessageError, pack_header, unpack_header
 from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quaternion
 from vinesim.scene.values import LightPattern, Lights, RobotUpdate
+
+ROBOT = 1
+"""Kind of the message."""
 
 JOINT_RATE_LSB = 1e-5
 """Quantisation step of the scale of joint velocities [rad/s, m/s]; with i1 values joints reach 83 rad/s."""
@@ -81,7 +84,7 @@ def encode_robot(update: RobotUpdate) -> bytes:
     turn = _to_lsb([x * factor, y * factor, z * factor], TURN_LSB)
     return b"".join(
         (
-            pack_header(MessageKind.ROBOT, count, update.time),
+            pack_header(ROBOT, count, update.time),
             _BASE.pack(*pose[:3], *turn, *_to_lsb(twist, BASE_VELOCITY_LSB), scale, *lights),
             steps.astype("<i2").tobytes(),
             rates.astype("i1").tobytes(),
@@ -92,7 +95,7 @@ def encode_robot(update: RobotUpdate) -> bytes:
 
 def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
     """Decode the pose of ``actor``, a name that is taken from the key, never from the payload."""
-    count, time = unpack_header(payload, MessageKind.ROBOT, "actor pose")
+    count, time = unpack_header(payload, ROBOT, "actor pose")
     joints = HEADER.size + _BASE.size
     rest = len(payload) - joints - 3 * count
     if count > MAX_JOINTS or rest < 0:

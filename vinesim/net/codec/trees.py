@@ -9,6 +9,7 @@ wants to have the same bits as all copies applies what :func:`quantise_tree` or 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 
@@ -18,13 +19,16 @@ from vinesim.net.codec.header import (
     MAX_COORDINATE,
     MAX_DATAGRAM,
     MessageError,
-    MessageKind,
     pack_header,
     unpack_header,
 )
+from vinesim.net.codec.json_values import CLAIM, COUNT, YES, list_of, object_of
 from vinesim.net.codec.robot import BASE_VELOCITY_LSB, JOINT_RATE_LSB
 from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quaternion, rotation_vector
 from vinesim.scene.values import TreeUpdate
+
+TREES = 2
+"""Kind of the message."""
 
 TOUCHED = 1
 RESTING = 2
@@ -190,7 +194,7 @@ def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
             end_root += cuts[end]
             end += 1
         payloads.append(
-            pack_header(MessageKind.TREES, end - start, trees.time)
+            pack_header(TREES, end - start, trees.time)
             + head_bytes[start * _TREE.itemsize : end * _TREE.itemsize]
             + body_bytes[body * _BODY.itemsize : last * _BODY.itemsize]
             + root_bytes[root * _ROOT.itemsize : end_root * _ROOT.itemsize]
@@ -213,7 +217,7 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeSta
 
     Raises :class:`MessageError` for anything that :func:`encode_trees` cannot have written.
     """
-    count, time = unpack_header(payload, MessageKind.TREES, "trees")
+    count, time = unpack_header(payload, TREES, "trees")
     at = HEADER.size + count * _TREE.itemsize
     if not 1 <= count <= MAX_TREES or len(payload) < at:
         raise MessageError(f"{count} trees announced (1 to {MAX_TREES}) in {len(payload)} B")
@@ -260,3 +264,29 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeSta
     if (np.diff(root)[np.diff(np.repeat(tree, cuts)) == 0] <= 0).any():
         raise MessageError("detached bodies of a tree in an order that does not increase")
     return TreeStates(*known, cuts, root, root_x, roots["velocity"] * BASE_VELOCITY_LSB)
+
+
+TREES_FIELDS = {
+    "trees": list_of(object_of("tree", "one record", tree=COUNT, bodies=COUNT, touched=YES, resting=YES, **CLAIM))
+}
+"""JSON schema of what :func:`describe_trees` returns."""
+
+
+def describe_trees(payload: bytes, _: str) -> dict[str, Any]:
+    """Trees for JSON, without their joints."""
+    trees = decode_trees(payload)
+    columns = (trees.tree, trees.ownership, trees.authority, trees.flags, trees.bodies)
+    rows = zip(*(column.tolist() for column in columns), strict=True)
+    return {
+        "trees": [
+            {
+                "tree": tree,
+                "ownership": ownership,
+                "authority": authority,
+                "bodies": bodies,
+                "touched": bool(flags & TOUCHED),
+                "resting": bool(flags & RESTING),
+            }
+            for tree, ownership, authority, flags, bodies in rows
+        ],
+    }

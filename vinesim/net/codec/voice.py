@@ -5,7 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from vinesim.audio.frame import Codec, find_fault
-from vinesim.net.codec.header import HEADER, MessageError, MessageKind, pack_header, unpack_header
+from vinesim.net.codec.header import HEADER, MessageError, pack_header, unpack_header
+
+VOICE = 9
+"""Kind of the message."""
 
 
 class VoiceFrame(NamedTuple):
@@ -23,13 +26,13 @@ def encode_voice(frame: VoiceFrame) -> bytes:
     """Encode a frame: 15 bytes and the sound. Raises :class:`MessageError` for what :func:`find_fault` finds."""
     if fault := find_fault(frame.codec, frame.data):
         raise MessageError(fault)
-    header = pack_header(MessageKind.VOICE, frame.number % 65536, frame.time)
+    header = pack_header(VOICE, frame.number % 65536, frame.time)
     return b"".join((header, bytes((frame.codec,)), frame.data))
 
 
 def decode_voice(payload: bytes) -> VoiceFrame:
     """Decode a frame; whether the sound itself can be decoded shows when it is played."""
-    number, time = unpack_header(payload, MessageKind.VOICE, "frame of sound")
+    number, time = unpack_header(payload, VOICE, "frame of sound")
     if len(payload) <= HEADER.size:
         raise MessageError(f"frame of sound of {len(payload)} B without a codec")
     codec = payload[HEADER.size]

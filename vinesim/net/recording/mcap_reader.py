@@ -13,8 +13,8 @@ from mcap.exceptions import EndOfFile, InvalidMagic
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 
-from vinesim.net.codec import messages
-from vinesim.net.keys import sender_of
+from vinesim.net.codec.header import PROTOCOL
+from vinesim.net.codec.messages import sender_of
 
 METADATA_NAME = "vinesim"
 """Name of the MCAP metadata record with the metadata of the world; the last one holds."""
@@ -102,9 +102,9 @@ def read_recording(path: pathlib.Path) -> Recording:
         ) from error
     if "protocol" not in metadata:
         raise InvalidRecording(f"{path} holds no recording of vinesim: {damage or 'another program wrote it'}")
-    if metadata["protocol"] != str(messages.PROTOCOL):
+    if metadata["protocol"] != str(PROTOCOL):
         raise InvalidRecording(
-            f"{path} speaks protocol version {metadata['protocol']}, this program version {messages.PROTOCOL}: "
+            f"{path} speaks protocol version {metadata['protocol']}, this program version {PROTOCOL}: "
             f"replay it with release {metadata.get('release', '?')} of vinesim, which recorded it"
         )
     recorded.sort(key=lambda message: message.time)

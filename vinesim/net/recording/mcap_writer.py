@@ -1,8 +1,8 @@
 """Writes recordings: every network message of a world, in an MCAP file that any MCAP reader opens.
 
-One channel for each key. A message is a JSON object (:mod:`~vinesim.net.recording.message_json`) that holds the decoded
-content and, in ``raw``, the bytes that crossed the network, for replays. Log time is the network time at which the
-recorder received it [ns], publish time the one in its header.
+One channel for each key. A message is a JSON object (:func:`~vinesim.net.codec.messages.describe_message`) that holds
+the decoded content and, in ``raw``, the bytes that crossed the network, for replays. Log time is the network time at
+which the recorder received it [ns], publish time the one in its header.
 """
 
 from __future__ import annotations
@@ -23,11 +23,9 @@ from mcap.writer import Writer
 
 from vinesim.core.errors import WriteError
 from vinesim.core.version import __version__
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError
+from vinesim.net.codec.header import PROTOCOL, MessageError
+from vinesim.net.codec.messages import describe_message, schema_of, time_of
 from vinesim.net.recording.mcap_reader import METADATA_NAME
-from vinesim.net.recording.mcap_schemas import schema_of
-from vinesim.net.recording.message_json import describe_message
 
 FLUSH_PERIOD = 0.5
 """Time after which recorded messages are on the disk [s]: a recorder that is killed loses no more."""
@@ -83,7 +81,7 @@ class RecordingWriter:
     def __init__(self, path: pathlib.Path, metadata: dict[str, str] | None = None) -> None:
         """Create the file; :class:`RecordingStopped` if that fails. ``metadata``: see :meth:`add_metadata`."""
         self.path = path
-        self.metadata = {"release": __version__, "protocol": str(messages.PROTOCOL)} | (metadata or {})
+        self.metadata = {"release": __version__, "protocol": str(PROTOCOL)} | (metadata or {})
         """What is known of the recorded world: scene, seed, digest, release, protocol."""
         self.count = 0
         """Messages taken."""
@@ -167,7 +165,7 @@ class RecordingWriter:
         if channel is None:
             channel = self._channels[key] = self._writer.register_channel(key, "json", self._schema_id(key))
         try:
-            sampled_at = messages.time_of(payload)
+            sampled_at = time_of(payload)
         except MessageError:
             sampled_at = None
         published = at if sampled_at is None or not 0.0 <= sampled_at < 1e10 else round(sampled_at * 1e9)

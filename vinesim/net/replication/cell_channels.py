@@ -1,21 +1,30 @@
-"""Subscriptions and publishers of one actor in the interest cells around it and around the objects that it owns.
-
-Keys: ``c/<x>/<y>/<actor>`` for states of boxes and bunches that move (best effort), ``own/<x>/<y>/<actor>`` for claims
-and states at rest (reliable). States of trees have channels of their own
-(:mod:`vinesim.net.replication.tree_channels`).
-"""
+"""Subscriptions and publishers of one actor in the cells around it and around the objects that it owns."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from vinesim.net.replication import interest
-from vinesim.net.replication.interest import Cell
+from vinesim.net.replication.interest import TREE_LAYERS, Cell
 from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_64, Bus, Publisher, Subscription
+
+OPEN_MARGIN = 0.3
+CLOSE_MARGIN = 0.8
+"""[m] A cell is opened this far beyond the distance of its layer, and closed that far: others know the own position
+late, and one who walks along an edge does not open and close in turn."""
+
+STEP = 0.1
+"""[m] The cells are chosen anew after so much motion."""
 
 
 class CellChannels:
-    """The channels that are open now, and the position that they follow."""
+    """The channels of boxes, bunches and events that are open now, and the position that they follow.
+
+    Keys: ``c/<x>/<y>/<actor>`` for states of boxes and bunches that move (best effort), ``own/<x>/<y>/<actor>`` for
+    claims and states at rest (reliable).
+    """
 
     def __init__(self, bus: Bus, interest_radius: float) -> None:
         """``interest_radius`` [m]: distance within which others see what moves (:func:`interest.check_radius`)."""
@@ -64,3 +73,54 @@ class CellChannels:
             return np.zeros(len(positions), bool)
         offset = positions[:, :2] - self.position[:2]
         return np.einsum("ij,ij->i", offset, offset) <= (self.interest_radius + interest.HYSTERESIS) ** 2
+
+
+class TreeChannels:
+    """The channels of states of moving trees that are open now, layer by layer.
+
+    Keys: ``tree/<x>/<y>/<actor>`` for all within the interest radius, ``near/<x>/<y>/<actor>`` for what only those near
+    the tree need besides (:data:`vinesim.net.replication.interest.TREE_LAYERS`). An actor subscribes to the cells
+    within the distance of a layer, not to a window: a tree that is farther away is not received.
+    """
+
+    def __init__(self, bus: Bus, interest_radius: float) -> None:
+        """``interest_radius`` [m]: distance of the first layer, and the largest of all."""
+        self._bus = bus
+        self.distances = tuple(min(layer.distance, interest_radius) for layer in TREE_LAYERS)
+        """Of each layer [m]."""
+        self.subscriptions: tuple[dict[Cell, Subscription], ...] = tuple({} for _ in TREE_LAYERS)
+        self.publishers: tuple[dict[Cell, Publisher], ...] = tuple({} for _ in TREE_LAYERS)
+        self._position: np.ndarray | None = None
+        self._owned: set[Cell] = set()
+
+    def update(self, position: np.ndarray, owned: set[Cell]) -> None:
+        """Follow the own ``position`` [3] m and the cells of trees that are ``owned``.
+
+        Publishers are open where the actor can touch a tree, before it does, and where it owns one.
+        """
+        moved = self._position is None or _distance(position, self._position) > STEP
+        if not moved and owned == self._owned:
+            return
+        self._position = position.copy()
+        self._owned = set(owned)
+        reach = self.distances[-1]
+        touchable = interest.tree_cells_within(position, reach + OPEN_MARGIN) | owned
+        kept_touchable = interest.tree_cells_within(position, reach + CLOSE_MARGIN) | owned
+        for layer, subscriptions, publishers, distance in zip(
+            TREE_LAYERS, self.subscriptions, self.publishers, self.distances, strict=True
+        ):
+            opened = interest.tree_cells_within(position, distance + OPEN_MARGIN)
+            kept = interest.tree_cells_within(position, distance + CLOSE_MARGIN)
+            for cell in sorted(subscriptions.keys() - kept):
+                subscriptions.pop(cell).close()
+            for cell in sorted(opened - subscriptions.keys()):
+                subscriptions[cell] = self._bus.subscribe(f"{layer.family}/{cell[0]}/{cell[1]}/*", KEEP_LAST_64)
+            for cell in sorted(publishers.keys() - kept_touchable):
+                publishers.pop(cell).close()
+            for cell in sorted(touchable - publishers.keys()):
+                publishers[cell] = self._bus.publisher(f"{layer.family}/{cell[0]}/{cell[1]}/{self._bus.name}")
+
+
+def _distance(a: np.ndarray, b: np.ndarray) -> float:
+    """On the ground, of two positions [3] m."""
+    return math.hypot(a[0] - b[0], a[1] - b[1])

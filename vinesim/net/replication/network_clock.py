@@ -14,7 +14,7 @@ import logging
 import math
 from collections.abc import Callable
 
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import decode_time, encode_time
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication.clock_sync import PING_WINDOW, STEP_THRESHOLD, ClockEstimate, Ping
 from vinesim.net.transport.bus import Bus
@@ -113,12 +113,12 @@ class NetworkClock:
         if self._now - self._pinged >= PING_PERIOD[self._ping_count >= 2 * PING_WINDOW]:
             self._pinged = self._now
             self._ping_count = self._ping_count + 1
-            self._bus.query(f"clock/{self._bus.name}", messages.encode_time(self._now, report=self.report()))
+            self._bus.query(f"clock/{self._bus.name}", encode_time(self._now, report=self.report()))
 
     def receive(self, payload: bytes, age: float) -> None:
         """Take a reply that arrived ``age`` [s] of real time ago; :class:`MessageError` if it cannot be decoded."""
         assert self._now is not None
-        reply = messages.decode_time(payload)
+        reply = decode_time(payload)
         received = self._now - age
         if reply.asked > received:
             return

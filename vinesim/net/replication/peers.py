@@ -15,10 +15,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import Hello, decode_hello, encode_hello
+from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion
 from vinesim.net.codec.human import encode_pose
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.counters import Counters
+from vinesim.net.codec.messages import Counters
 from vinesim.net.replication import interest
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.replication.network_clock import NetworkClock
@@ -56,7 +56,7 @@ class PeerRegistry:
         self.known: dict[str, RemotePose] = {}
         self.seen_names: set[str] = set()
         """Peers that were ever admitted: their last retained records may arrive after they have left."""
-        greeting = messages.encode_hello(hello)
+        greeting = encode_hello(hello)
         bus.join(greeting)
         bus.declare_queryable(f"hello/{hello.name}", lambda _: greeting)
         self._initial_names = bus.alive() - {hello.name}
@@ -153,11 +153,9 @@ class PeerRegistry:
     def _admit(self, name: str, payload: bytes) -> Iterator[Hello]:
         """Admit a peer unless it has another scene or protocol version."""
         try:
-            hello = messages.decode_hello(payload)
-        except messages.WrongVersion as error:
-            self._reject(
-                name, f"speaks protocol version {error.theirs}, {self.hello.name!r} version {messages.PROTOCOL}"
-            )
+            hello = decode_hello(payload)
+        except WrongVersion as error:
+            self._reject(name, f"speaks protocol version {error.theirs}, {self.hello.name!r} version {PROTOCOL}")
             return
         if hello.name != name:
             raise MessageError(f"{name!r} introduces itself as {hello.name!r}")

@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.human import decode_pose
-from vinesim.net.codec.messages import (
+from vinesim.net.codec.control import (
+    CLAIMS,
+    RETAINED,
     Hello,
-    MessageError,
-    MessageKind,
-    ObjectStates,
     RetainedRecord,
-    TreeStates,
-    is_valid_name,
+    decode_claims,
+    decode_records,
+    encode_claims,
 )
-from vinesim.net.replication import interest
+from vinesim.net.codec.header import MessageError, is_valid_name, kind_of
+from vinesim.net.codec.human import decode_pose
+from vinesim.net.codec.messages import FAMILIES, MESSAGES, sender_of
+from vinesim.net.codec.objects import OBJECTS, ObjectStates, check_object_id, decode_objects
+from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, decode_trees
 from vinesim.net.replication.authority import NO_OWNER, Claim
-from vinesim.net.replication.early_messages import EarlyMessages
-from vinesim.net.replication.hand_forces import MAX_POSE_AGE, LinkCentre
 from vinesim.net.replication.interest import Cell
-from vinesim.net.replication.model_check import check_record, check_tree_states
 from vinesim.net.replication.replication_state import SPECTATOR, ReplicationState, put_counted
 from vinesim.net.transport.bus import Reply
-from vinesim.scene.values import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.ids import is_tree, parse_object_name
+from vinesim.scene.model import Model
+from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
+MAX_EARLY_MESSAGES = 100
+"""Messages of one sender."""
 
-def _no_link(_: str) -> None:
-    """The actor is no robot."""
+MAX_EARLY_BYTES = 1 << 20
+"""Payload bytes of one sender [B]: the largest message."""
+
+MAX_EARLY_SENDERS = 64
+"""Senders with messages."""
+
+MAX_EARLY_TOTAL = 4 << 20
+"""Payload bytes of all senders [B]."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -42,10 +53,9 @@ class Inbox:
     """Every robot of a peer, in every step: extrapolated by at most 150 ms, corrections blended over 100 ms."""
     people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
     """The same for people."""
-    wrenches: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Sum of the wrenches [6] of peers on each own link: :class:`vinesim.net.codec.wrenches.WrenchMessage`."""
-    couplings: dict[str, tuple[Coupling, ...]] = dataclasses.field(default_factory=dict)
-    """Couplings of peers to trees that they or this actor own, by actor."""
+    messages: dict[int, Any] = dataclasses.field(default_factory=dict)
+    """What holds now of what peers have told this actor, by kind:
+    :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees with a new state: the last state of each, extrapolated by at most 150 ms."""
     objects: list[ObjectUpdate] = dataclasses.field(default_factory=list)
@@ -56,9 +66,6 @@ class Inbox:
     """Objects that have lost their remote owner: they are at rest, or the owner has left."""
 
 
-_TREE_FAMILIES = tuple(layer.family for layer in interest.TREE_LAYERS)
-
-
 @dataclasses.dataclass(slots=True)
 class _Step:
     """One call of :meth:`Receiver.receive`."""
@@ -67,10 +74,58 @@ class _Step:
     """Own clock [s]."""
     time: float
     """Network time [s]."""
-    link_centre: LinkCentre = _no_link
     inbox: Inbox = dataclasses.field(default_factory=Inbox)
     new_trees: dict[int, tuple[TreeStates, str]] = dataclasses.field(default_factory=dict)
     """The newest accepted batch and its owner, by tree."""
+
+
+class EarlyMessages:
+    """Messages (key, payload) of senders that have not been admitted yet: they wait, for records are published only
+    once.
+
+    Their number and size are bounded, and live senders displace those that are not live.
+    """
+
+    def __init__(self) -> None:
+        self._messages: dict[str, list[tuple[str, bytes]]] = {}
+        self._sizes: dict[str, int] = {}
+
+    def __len__(self) -> int:
+        """Number of senders."""
+        return len(self._messages)
+
+    @property
+    def size(self) -> int:
+        """Payload bytes of all messages [B]."""
+        return sum(self._sizes.values())
+
+    def put(self, sender: str, key: str, payload: bytes, is_live: Callable[[str], bool]) -> int:
+        """Keep a message if there is room; the number of messages that were discarded: this one or others.
+
+        ``is_live(sender)``: whether a sender may be admitted soon.
+        """
+        discarded = 0
+        if self._has_no_room(sender, len(payload)) and is_live(sender):
+            for other in [other for other in self._messages if other != sender and not is_live(other)]:
+                discarded += len(self.take(other))
+        if self._has_no_room(sender, len(payload)):
+            return discarded + 1
+        self._messages.setdefault(sender, []).append((key, payload))
+        self._sizes[sender] = self._sizes.get(sender, 0) + len(payload)
+        return discarded
+
+    def take(self, sender: str) -> list[tuple[str, bytes]]:
+        """Remove and return the messages of a sender, in order of arrival."""
+        self._sizes.pop(sender, None)
+        return self._messages.pop(sender, [])
+
+    def _has_no_room(self, sender: str, size: int) -> bool:
+        return (
+            len(self._messages.get(sender, ())) >= MAX_EARLY_MESSAGES
+            or self._sizes.get(sender, 0) + size > MAX_EARLY_BYTES
+            or (sender not in self._messages and len(self._messages) >= MAX_EARLY_SENDERS)
+            or self.size + size > MAX_EARLY_TOTAL
+        )
 
 
 class Receiver:
@@ -81,24 +136,21 @@ class Receiver:
         self.early = EarlyMessages()
         """Messages with retained records whose author has not been admitted yet."""
 
-    def receive(self, now: float, offset: float, link_centre: LinkCentre | None = None) -> Inbox:
+    def receive(self, now: float, offset: float) -> Inbox:
         """Everything since the last call; ``offset`` [s]: network time minus own time ``now`` [s].
-
-        ``link_centre``: of the own robot's links; None: nothing can be pushed.
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
         state = self._state
-        step = _Step(now, now + offset, link_centre or _no_link)
+        step = _Step(now, now + offset)
         inbox = step.inbox
         peers = state.peers
         time = step.time
         inbox.left = peers.poll_liveliness(now)
         for name in inbox.left:
             state.ownership.remove_actor(name, time, state.successor_of)
-            state.wrench_sync.remove_peer(name)
-            state.coupling_sync.remove_peer(name)
-            state.voices.remove_peer(name)
+            for sync in state.syncs.values():
+                sync.remove_peer(name)
         inbox.joined, replies = peers.process_replies()
         for reply in replies:
             self._receive_snapshot(reply, step)
@@ -117,8 +169,7 @@ class Receiver:
         poses = [peer.sample(time, now) for peer in peers.known.values() if peer.update is not None]
         inbox.robots = {update.actor: update for update in poses if isinstance(update, RobotUpdate)}
         inbox.people = {update.actor: update for update in poses if isinstance(update, HumanUpdate)}
-        inbox.wrenches = state.wrench_sync.net_wrenches(now)
-        inbox.couplings = state.coupling_sync.couplings(now)
+        inbox.messages = {kind: sync.current(now) for kind, sync in state.syncs.items()}
         for object_id in state.ownership.corrections(time):
             if not state.is_spectator:
                 self._publish_correction(object_id)
@@ -127,61 +178,47 @@ class Receiver:
     def _dispatch(self, key: str, payload: bytes, step: _Step) -> None:
         """Decode and apply one message. Its sender is read from the key, never from the payload."""
         state = self._state
-        counters = self._state.counters
-        family, _, rest = key.partition("/")
-        chunks = rest.split("/")
-        sender = chunks[0] if family in ("a", "voice") else chunks[-1]
-        traffic = {
-            "a": counters.actor,
-            "c": counters.environment,
-            "fact": counters.retained,
-            "force": counters.force,
-            "voice": counters.voice,
-            **dict.fromkeys(_TREE_FAMILIES, counters.environment),
-        }
-        traffic.get(family, counters.event).count_in(payload)
+        counters = state.counters
+        family, *chunks = key.split("/")
+        sender = sender_of(key)
+        counters.of(family).count_in(payload)
         peer = state.peers.known.get(sender)
         if peer is None and not (family == "fact" and state.peers.was_admitted(sender)):
             if sender not in state.peers.local_actors:
                 counters.dropped += self._keep_early(sender, key, payload) if family == "fact" else 1
             return
         try:
-            if family not in ("a", "voice") and peer is not None and peer.hello.kind == SPECTATOR:
+            if peer is not None and peer.hello.kind == SPECTATOR and not FAMILIES[family].by_spectators:
                 raise MessageError(f"a spectator publishes only its pose and its voice, not {key!r}")
+            kind = kind_of(payload)
+            if kind not in MESSAGES or family not in MESSAGES[kind].families:
+                raise MessageError(f"message of kind {kind} under {key!r}, where there is none of this kind")
             if family == "a":
                 assert peer is not None
                 counters.dropped += not peer.receive(decode_pose(payload, sender), step.time)
-            elif family == "voice":
+            elif kind in state.syncs:
                 assert peer is not None
-                state.voices.receive(payload, peer, step.now, step.time)
-            elif family == "force":
-                assert peer is not None
-                pose = peer.update if peer.update and step.time - peer.update.time <= MAX_POSE_AGE else None
-                if messages.kind_of(payload) == MessageKind.COUPLINGS:
-                    state.coupling_sync.receive(payload, peer.hello, pose, step.now, state.ownership.owner)
-                else:
-                    state.wrench_sync.receive(payload, peer.hello, pose, step.now, step.link_centre)
+                state.syncs[kind].receive(payload, peer, step.now, step.time)
             else:
-                self._receive_in_cell(family, (int(chunks[0]), int(chunks[1])), payload, sender, step)
+                self._receive_in_cell(kind, (int(chunks[0]), int(chunks[1])), payload, sender, step)
         except MessageError as error:
             state.peers.count_malformed(sender, error)
 
-    def _receive_in_cell(self, family: str, cell: Cell, payload: bytes, sender: str, step: _Step) -> None:
+    def _receive_in_cell(self, kind: int, cell: Cell, payload: bytes, sender: str, step: _Step) -> None:
         """Apply a message about objects in a cell."""
         state = self._state
-        kind = messages.kind_of(payload)
-        if family == "fact":
-            for record in messages.decode_records(payload, state.object_counts):
+        if kind == RETAINED:
+            for record in decode_records(payload, state.object_counts):
                 if record.author != sender:
                     raise MessageError(f"record by {record.author!r} published by {sender!r}")
                 self._receive_record(cell, record, sender, step, is_remote=sender not in state.peers.local_actors)
-        elif kind == MessageKind.CLAIMS:
-            for object_id, claim, touching in messages.decode_claims(payload, state.object_counts):
+        elif kind == CLAIMS:
+            for object_id, claim, touching in decode_claims(payload, state.object_counts):
                 state.ownership.receive_claim(object_id, claim, touching, sender, step.time)
-        elif kind == MessageKind.OBJECTS:
-            self._receive_objects(messages.decode_objects(payload, cell), cell, sender, step)
+        elif kind == OBJECTS:
+            self._receive_objects(decode_objects(payload, cell), cell, sender, step)
         else:
-            self._receive_trees(messages.decode_trees(payload, state.model.tree_size), sender, step)
+            self._receive_trees(decode_trees(payload, state.model.tree_size), sender, step)
 
     def _keep_early(self, sender: str, key: str, payload: bytes) -> int:
         """Keep records of an actor that may be admitted soon until then, for they are published only once; the number
@@ -198,8 +235,8 @@ class Receiver:
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
         columns = (trees.tree, trees.ownership, trees.authority, trees.flags)
         for row, (tree, ownership, sequence, flags) in enumerate(zip(*(c.tolist() for c in columns), strict=True)):
-            claim = Claim(ownership, sequence, NO_OWNER if flags & messages.RESTING else sender)
-            touching = bool(flags & messages.TOUCHED)
+            claim = Claim(ownership, sequence, NO_OWNER if flags & RESTING else sender)
+            touching = bool(flags & TOUCHED)
             is_accepted = state.ownership.receive_state(tree, claim, touching, trees.time, step.time)
             if is_accepted and is_near[row]:
                 step.new_trees[tree] = (trees, sender)
@@ -211,11 +248,11 @@ class Receiver:
         state = self._state
         updates = objects.updates(sender)
         for update in updates:
-            messages.check_object_id(update.object, state.object_counts)
+            check_object_id(update.object, state.object_counts)
         is_near = state.cells.is_within_radius(objects.pose[:, :3])
         for row, (update, flags) in enumerate(zip(updates, objects.flags.tolist(), strict=True)):
             claim = Claim(update.ownership, update.authority, sender)
-            touching = bool(flags & messages.TOUCHED)
+            touching = bool(flags & TOUCHED)
             is_accepted = state.ownership.receive_state(update.object, claim, touching, objects.time, step.time)
             if is_accepted and is_near[row]:
                 state.object_stream.receive(update, cell)
@@ -250,7 +287,7 @@ class Receiver:
             return
         try:
             cell = int(chunks[0]), int(chunks[1])
-            records = messages.decode_records(reply.payload, state.object_counts)
+            records = decode_records(reply.payload, state.object_counts)
         except (MessageError, ValueError) as error:
             state.peers.count_malformed("the server", MessageError(str(error)))
             return
@@ -264,5 +301,41 @@ class Receiver:
         entry = state.ownership[object_id]
         publisher = state.cells.event_publisher(state.cell_of(object_id))
         if publisher is not None:
-            payload = messages.encode_claims([(object_id, entry.claim, entry.touching)])
+            payload = encode_claims([(object_id, entry.claim, entry.touching)])
             put_counted(publisher, payload, state.counters.event)
+
+
+# ------------------------------------------------------------ what cannot be true of the model
+
+
+def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) -> None:
+    """Raise :class:`MessageError` unless the record can be true of the model; ``counts``: objects of each kind."""
+    if is_tree(record.object):
+        _check_tree_record(record, model)
+    elif record.cut or record.trees:
+        raise MessageError(f"record of object {record.object} with cuts or the state of a tree; it is none")
+    parent = parse_object_name(record.parent)
+    if parent is not None:
+        check_object_id(parent, counts)
+        if parent == record.object:
+            raise MessageError(f"record of object {record.object} that rests on itself")
+
+
+def _check_tree_record(record: RetainedRecord, model: Model) -> None:
+    tree = record.object
+    first = int(model.tree_first[tree])
+    core = int(model.tree_core[tree])
+    wrong = next((body for body in record.cut if not first <= body < first + core), None)
+    if wrong is not None:
+        raise MessageError(f"record of tree {tree} cut at body {wrong}; it has wood from {first} to {first + core - 1}")
+    if record.trees:
+        states = decode_trees(record.trees, model.tree_size)
+        if states.tree.tolist() != [tree]:
+            raise MessageError(f"record of tree {tree} with the state of {states.tree.tolist()}")
+        check_tree_states(states, model)
+
+
+def check_tree_states(states: TreeStates, model: Model) -> None:
+    """Raise :class:`MessageError` unless all bodies that were cut off are wood; berry clusters fall with a bunch."""
+    if len(states.root) and (states.root >= np.repeat(model.tree_core[states.tree], states.roots)).any():
+        raise MessageError("a berry cluster that was cut off its bunch")

@@ -6,7 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from vinesim.net.codec.messages import Hello, MessageError
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.header import MessageError
 from vinesim.net.replication import dead_reckoning
 from vinesim.net.replication.jitter_buffer import JitterBuffer
 from vinesim.net.transport.bus import Subscription

@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from vinesim.net.codec.messages import Hello
-from vinesim.net.counters import Counters, Traffic
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.messages import Counters, Traffic
 from vinesim.net.replication import authority, interest
-from vinesim.net.replication.cell_channels import CellChannels
-from vinesim.net.replication.couplings import CouplingSync
-from vinesim.net.replication.hand_forces import WrenchSync
+from vinesim.net.replication.cell_channels import CellChannels, TreeChannels
+from vinesim.net.replication.direct_messages import LinkCentre, MessageSync, make_syncs
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.ownership import Ownership
 from vinesim.net.replication.peers import PeerRegistry
 from vinesim.net.replication.retained_sync import RetainedSync
 from vinesim.net.replication.streams import ObjectStream, TreeStream, object_counts
-from vinesim.net.replication.tree_channels import TreeChannels
 from vinesim.net.replication.voices import VoiceSync
 from vinesim.net.transport.bus import Bus, Publisher
 from vinesim.scene.ids import is_tree
@@ -29,7 +27,15 @@ class ReplicationState:
     """The replicated state as one actor knows it."""
 
     def __init__(
-        self, bus: Bus, hello: Hello, model: Model, interest_radius: float, jitter_buffer: float, hand_force: float
+        self,
+        bus: Bus,
+        hello: Hello,
+        model: Model,
+        *,
+        interest_radius: float,
+        jitter_buffer: float,
+        hand_force: float,
+        link_centre: LinkCentre,
     ) -> None:
         self.bus = bus
         self.hello = hello
@@ -38,10 +44,20 @@ class ReplicationState:
         self.tree_channels = TreeChannels(bus, interest_radius)
         self.counters = Counters()
         self.peers = PeerRegistry(bus, hello, self.counters, jitter_buffer)
-        self.wrench_sync = WrenchSync(bus, hello.name, self.counters, hand_force)
-        self.coupling_sync = CouplingSync(bus, hello.name, model, self.counters)
-        self.voices = VoiceSync(bus, hello, self.counters)
         self.ownership = Ownership(hello.name, self.peers.known)
+        self.voices = VoiceSync(bus, hello, self.counters)
+        direct = make_syncs(
+            bus,
+            hello.name,
+            model,
+            self.counters,
+            owner=self.ownership.owner,
+            peers=self.peers.known,
+            hand_force=hand_force,
+            link_centre=link_centre,
+        )
+        self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (*direct, self.voices)}
+        """What actors tell each other directly, by kind of message."""
         self.siblings: tuple[ReplicationState, ...] = ()
         """Of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)
@@ -83,8 +99,8 @@ class ReplicationState:
             peer.shift_time(step)
         self.ownership.shift_time(step)
         self.object_stream.shift_time(step)
-        self.wrench_sync.shift_time(step)
-        self.coupling_sync.shift_time(step)
+        for sync in self.syncs.values():
+            sync.shift_time(step)
 
     def count_listeners(self, positions: np.ndarray, distance: float | None = None) -> np.ndarray:
         """Number of peers within ``distance`` [m], by default the interest radius, of each position [k, 3] m: [k]."""

@@ -5,26 +5,24 @@ The decisions are pure functions in other modules: who owns an object (:mod:`~vi
 is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
 (:mod:`~vinesim.net.replication.dead_reckoning`).
 
-Keys: ``a/<actor>`` poses, ``tree/<x>/<y>/<actor>`` and ``near/<x>/<y>/<actor>`` states of trees that move in a cell,
-``c/<x>/<y>/<actor>`` those of boxes and bunches, ``own/<x>/<y>/<actor>`` claims and
-states at rest, ``fact/<x>/<y>/<actor>`` retained records, ``force/<robot>/<person>`` wrenches, ``voice/<actor>``
-frames of sound, and the queries
-``snap/<x>/<y>`` (records of a cell), ``hello/<actor>`` and ``clock/<actor>``.
+Keys: :data:`vinesim.net.codec.messages.FAMILIES`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
-from vinesim.net.codec.messages import Hello, RetainedRecord
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello, RetainedRecord
+from vinesim.net.codec.messages import MESSAGES, Counters
 from vinesim.net.pace import PaceReport
 from vinesim.net.replication import interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.clock_sync import STEP_THRESHOLD
-from vinesim.net.replication.hand_forces import HAND_FORCE, LinkCentre
+from vinesim.net.replication.direct_messages import HAND_FORCE, LinkCentre
 from vinesim.net.replication.receiver import Inbox, Receiver
 from vinesim.net.replication.replication_state import ReplicationState
 from vinesim.net.replication.sender import LocalStep, Sender
@@ -32,7 +30,7 @@ from vinesim.net.replication.streams import NO_ROOTS, DetachedRoots, StateReader
 from vinesim.net.replication.voices import VoiceSync
 from vinesim.net.transport.bus import Bus
 from vinesim.scene.model import Model
-from vinesim.scene.values import Coupling, HumanUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values import HumanUpdate, RobotUpdate, TreeUpdate
 
 
 class Replicator:
@@ -53,11 +51,13 @@ class Replicator:
         interest_radius: float = interest.INTEREST_RADIUS,
         jitter_buffer: float = 0.0,
         hand_force: float = HAND_FORCE,
+        link_centre: LinkCentre = lambda _: None,
     ) -> None:
         """``interest_radius`` [m]: peers nearer than this to an object receive its states; at most 5 m.
 
         ``jitter_buffer`` [s]: delay with which poses of peers are shown (:mod:`vinesim.net.replication.jitter_buffer`).
-        ``hand_force`` [N]: limit of each hand of a peer that pushes this robot.
+        ``hand_force`` [N]: limit of each hand of a peer that pushes this robot. ``link_centre(link)``: centre of mass
+        [3] m of a link of this robot, None for a link that it has not; without it people of other clients push nothing.
         Raises ValueError if the hello has another name than the bus.
         """
         if hello.name != bus.name:
@@ -65,7 +65,15 @@ class Replicator:
         self.bus = bus
         self.hello = hello
         self.model = model
-        self._state = ReplicationState(bus, hello, model, interest_radius, jitter_buffer, hand_force)
+        self._state = ReplicationState(
+            bus,
+            hello,
+            model,
+            interest_radius=interest_radius,
+            jitter_buffer=jitter_buffer,
+            hand_force=hand_force,
+            link_centre=link_centre,
+        )
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self.step_time: Callable[[], float] | None = None
@@ -177,17 +185,15 @@ class Replicator:
         """Shortest of the last pings to the server and back [s]; None without a reply."""
         return self._state.peers.clock.round_trip
 
-    def receive(self, now: float, link_centre: LinkCentre | None = None) -> Inbox:
+    def receive(self, now: float) -> Inbox:
         """Everything that arrived since the last call.
 
-        ``link_centre(link)``: centre of mass [3] m of a link of this robot, None for a link that it has not. Without
-        it, people of other clients push nothing.
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
         self._state.peers.clock.advance(now)
         self._follow_clock()
         now = self.received_at = self._own_time(now)
-        return self._receiver.receive(now, self.offset, link_centre)
+        return self._receiver.receive(now, self.offset)
 
     def send(
         self,
@@ -202,9 +208,8 @@ class Replicator:
         detached_roots: Callable[[int], DetachedRoots] = lambda _: NO_ROOTS,
         pose_on_support: Callable[[int], tuple[str, np.ndarray]] | None = None,
         is_changed: Callable[[int], bool] = lambda _: False,
-        wrenches: dict[str, dict[str, np.ndarray]] | None = None,
         has_body: Callable[[int], bool] = lambda _: True,
-        couplings: Iterable[Coupling] = (),
+        messages: Mapping[int, Any] = MappingProxyType({}),
         carried_on: Iterable[int] = (),
     ) -> list[TreeUpdate]:
         """Publish one step; return the states of trees at rest that left, as all copies hold them.
@@ -219,8 +224,8 @@ class Replicator:
         ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest.
         ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
-        ``wrenches``: wrench [6] of this actor's hands on other clients' robots in this step, by robot and link.
-        ``couplings``: of this actor's contacts with trees; sent if other actors touch them, too.
+        ``messages``: what this actor tells others in this step, by kind:
+        :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`.
         ``carried_on``: objects at rest on this actor that it has carried on so far that their records are published
         again, with the place where they are now.
         """
@@ -230,10 +235,9 @@ class Replicator:
         time = self._last_sent = max(now + self.offset, self._last_sent + 1e-6)
         state.cells.position = np.asarray(pose.base_q[:3], float)
         state.peers.publish_pose(pose, now, time)
-        for payload in state.wrench_sync.publish(wrenches or {}, now, time):
-            state.counters.force.count_out(payload)
-        for payload in state.coupling_sync.publish(self._by_partner(couplings, now), now, time):
-            state.counters.force.count_out(payload)
+        for kind, sync in state.syncs.items():
+            for payload in sync.publish(messages.get(kind), now, time):
+                state.counters.of(MESSAGES[kind].families[0]).count_out(payload)
         touched, moving, grabbed, detached, carried_on = (
             {int(object_id) for object_id in ids} for ids in (touched, moving, grabbed, detached, carried_on)
         )
@@ -259,18 +263,6 @@ class Replicator:
         if self.step_time is None or not self.has_clock:
             return self._state.peers.clock.own(now)
         return self.step_time() - self.offset
-
-    def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
-        """Couplings by the peer that gets them: the owner of the tree, or who touches the own tree, too."""
-        found: dict[str, list[Coupling]] = {}
-        for coupling in couplings:
-            tree = int(self.model.body_tree[coupling.body])
-            owner = self.owner(tree)
-            partners = self._state.coupling_sync.partners(tree, now) if owner == self.hello.name else [owner]
-            for name in partners:
-                if name is not None and name in self._state.peers.known:
-                    found.setdefault(name, []).append(coupling)
-        return found
 
     def _follow_clock(self) -> None:
         """Shift all times of peers and objects when the network clock was set, as by a server that was restarted.

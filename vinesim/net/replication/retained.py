@@ -13,7 +13,7 @@ from collections.abc import Iterator
 
 import msgspec
 
-from vinesim.net.codec.messages import RetainedRecord
+from vinesim.net.codec.control import RetainedRecord
 from vinesim.net.replication import authority
 from vinesim.net.replication.interest import Cell
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import RetainedRecord, encode_records
+from vinesim.net.codec.header import MAX_DATAGRAM
+from vinesim.net.codec.messages import Counters
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL, Bus, Publisher, Subscription
@@ -112,13 +112,13 @@ class RetainedSync:
                 publisher = self._publishers[cell] = self._publisher(cell)
             if waiting and publisher.matching:
                 batch = []
-                free_bytes = messages.MAX_DATAGRAM
+                free_bytes = MAX_DATAGRAM
                 for object_id in sorted(waiting):
                     free_bytes -= TYPICAL_RECORD_SIZE + len(waiting[object_id].trees)
                     if free_bytes < 0 and batch:
                         break
                     batch.append(object_id)
-                payload = messages.encode_records([waiting[object_id] for object_id in batch])
+                payload = encode_records([waiting[object_id] for object_id in batch])
                 if publisher.put(payload):
                     self.counters.retained.count_out(payload)
                     for object_id in batch:

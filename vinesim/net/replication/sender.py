@@ -13,8 +13,9 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import RetainedRecord, TreeStates
+from vinesim.net.codec.control import RetainedRecord, encode_claims
+from vinesim.net.codec.header import LARGEST_COORDINATE
+from vinesim.net.codec.trees import RESTING, TOUCHED, TreeStates, encode_trees
 from vinesim.net.replication import authority, dead_reckoning
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.interest import TREE_LAYERS, Cell
@@ -236,7 +237,7 @@ class Sender:
         """Publish the claims among those of ``objects`` that no peer can know yet."""
         new = [(object_id, entry.claim, entry.touching) for object_id, entry in objects if not entry.announced]
         if new and events is not None:
-            put_counted(events, messages.encode_claims(new), self._state.counters.event)
+            put_counted(events, encode_claims(new), self._state.counters.event)
 
     # ------------------------------------------------------------ rest and retained records
 
@@ -269,7 +270,7 @@ class Sender:
             if not entry.announced:
                 state.ownership.rollback(tree)
             return None
-        payload, update = self._encode_tree(tree, claim, step, messages.RESTING)
+        payload, update = self._encode_tree(tree, claim, step, RESTING)
         if is_changed:
             record = RetainedRecord(
                 tree, claim.ownership, claim.authority, state.hello.name, _IDENTITY_POSE, "", (), payload
@@ -311,7 +312,7 @@ class Sender:
         record = RetainedRecord(object_id, claim.ownership, claim.authority, state.hello.name, moving=True)
         state.ownership[object_id].announced = True
         if is_tree(object_id):
-            payload, _ = self._encode_tree(object_id, claim, step, messages.TOUCHED)
+            payload, _ = self._encode_tree(object_id, claim, step, TOUCHED)
             record = msgspec.structs.replace(record, trees=payload)
             self._publish_tree_record(state.tree_stream.cell[object_id], record, step)
             return
@@ -330,7 +331,7 @@ class Sender:
         """State of a tree as a message, and as receivers decode it; at rest its rates are zero."""
         q, qd = step.read(tree)
         numbers, x, xd = step.detached_roots(tree)
-        rate_factor = 0.0 if flags & messages.RESTING else 1.0
+        rate_factor = 0.0 if flags & RESTING else 1.0
         columns = ClaimColumns([claim], [flags])
         batch = TreeStates(
             step.time,
@@ -340,7 +341,7 @@ class Sender:
             np.asarray(q, float),
             rate_factor * np.asarray(qd, float),
         )
-        (payload,), decoded = messages.encode_trees(with_roots(batch, [(numbers, x, rate_factor * xd)]))
+        (payload,), decoded = encode_trees(with_roots(batch, [(numbers, x, rate_factor * xd)]))
         (update,) = decoded.updates(self._state.hello.name)
         return payload, update
 
@@ -348,11 +349,11 @@ class Sender:
 def _columns(objects: list[tuple[int, ObjectRecord]]) -> ClaimColumns:
     """Claims and flags of some objects."""
     entries = [entry for _, entry in objects]
-    return ClaimColumns([entry.claim for entry in entries], [messages.TOUCHED * entry.touching for entry in entries])
+    return ClaimColumns([entry.claim for entry in entries], [TOUCHED * entry.touching for entry in entries])
 
 
 def _within_range(pose: np.ndarray) -> tuple[float, float, float, float, float, float, float]:
     """A pose [7] as a record has it."""
-    x, y, z = np.clip(pose[:3], -messages.LARGEST_COORDINATE, messages.LARGEST_COORDINATE).tolist()
+    x, y, z = np.clip(pose[:3], -LARGEST_COORDINATE, LARGEST_COORDINATE).tolist()
     qx, qy, qz, qw = pose[3:].tolist()
     return x, y, z, qx, qy, qz, qw

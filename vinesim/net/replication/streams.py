@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import ObjectStates, TreeStates
+from vinesim.net.codec.objects import ObjectStates, encode_objects
+from vinesim.net.codec.trees import RESTING, TreeStates, encode_trees
 from vinesim.net.replication import dead_reckoning, interest
 from vinesim.net.replication.authority import Claim
 from vinesim.net.replication.interest import Cell
@@ -110,7 +110,7 @@ class TreeStream:
         if len(rows) < len(self._active):
             part = np.concatenate([np.arange(self._starts[r], self._starts[r] + self._sizes[r]) for r in rows])
         batch = TreeStates(time, np.array(here), *published.columns(), self._sizes[rows], self._q[part], self._qd[part])
-        payloads, received = messages.encode_trees(with_roots(batch, [self._roots[row] for row in rows]))
+        payloads, received = encode_trees(with_roots(batch, [self._roots[row] for row in rows]))
         bodies = self._order[part]
         self._published_q[layer:, bodies] = received.joint_q
         self._published_rate[layer:, bodies] = dead_reckoning.quaternion_rate(received.joint_q, received.joint_qd)
@@ -126,7 +126,7 @@ class TreeStream:
             rate = dead_reckoning.quaternion_rate(trees.joint_q, trees.joint_qd)
             age = float(dead_reckoning.clamp_age(time - trees.time))
             here = dataclasses.replace(trees, time=now)
-            if age > 0.0 and not (trees.flags & messages.RESTING).any():
+            if age > 0.0 and not (trees.flags & RESTING).any():
                 here = dataclasses.replace(
                     here,
                     joint_q=dead_reckoning.extrapolate(trees.joint_q, rate, dead_reckoning.faded_age(age)),
@@ -194,7 +194,7 @@ class ObjectStream:
         """Messages about some rows of the objects that were last judged; they become the last published state."""
         ids = np.array([self._active[row] for row in rows])
         batch = ObjectStates(time, ids, *published.columns(), self._pose[rows], self._velocity[rows])
-        payloads, received = messages.encode_objects(batch, cell)
+        payloads, received = encode_objects(batch, cell)
         for object_id, pose, velocity in zip(ids.tolist(), received.pose, received.velocity, strict=True):
             self._published[object_id] = pose, velocity
         return payloads

@@ -15,9 +15,11 @@ import numpy as np
 
 from vinesim.audio.frame import FRAME, Codec
 from vinesim.audio.hearing import REACH, may_hear
-from vinesim.net.codec.messages import Hello, MessageError
-from vinesim.net.codec.voice import VoiceFrame, decode_voice, encode_voice
-from vinesim.net.counters import Counters
+from vinesim.net.codec.control import Hello
+from vinesim.net.codec.header import MessageError
+from vinesim.net.codec.messages import Counters
+from vinesim.net.codec.voice import VOICE, VoiceFrame, decode_voice, encode_voice
+from vinesim.net.replication.direct_messages import MessageSync
 from vinesim.net.replication.interest import LAYER_HYSTERESIS
 from vinesim.net.replication.remote_pose import RemotePose
 from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
@@ -71,8 +73,10 @@ class _Source:
         return True
 
 
-class VoiceSync:
+class VoiceSync(MessageSync):
     """Voices to and from one actor."""
+
+    kind = VOICE
 
     def __init__(self, bus: Bus, hello: Hello, counters: Counters) -> None:
         self._bus = bus

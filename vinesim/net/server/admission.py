@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import PROTOCOL, Hello, MessageError, Welcome, WrongVersion
+from vinesim.net.codec.control import Hello, Welcome, decode_hello
+from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion
 
 PROVISIONAL_TIMEOUT = 5.0
 """Time for which the place of an admitted actor is reserved until its liveliness token is seen [s]."""
@@ -123,7 +123,7 @@ class AdmissionControl:
                 del self._admitted[actor]
                 self._forget(actor[0])
         try:
-            hello = messages.decode_hello(greeting)
+            hello = decode_hello(greeting)
             reason = self._find_objection(world, name, session, hello)
         except WrongVersion as error:
             reason = (

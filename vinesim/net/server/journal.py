@@ -18,8 +18,8 @@ from typing import BinaryIO, Self
 
 import msgspec
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError, RetainedRecord
+from vinesim.net.codec.control import RetainedRecord, decode_records, encode_records
+from vinesim.net.codec.header import PROTOCOL, MessageError
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.server.admission import SceneId
@@ -46,7 +46,7 @@ class _Header(msgspec.Struct, frozen=True):
     world: str
     scene: str
     digest: str
-    protocol: int = messages.PROTOCOL
+    protocol: int = PROTOCOL
 
 
 class Journal:
@@ -89,13 +89,13 @@ class Journal:
             for record, end in _records(content, len(start)):
                 if head is None:
                     head = _head_decoder.decode(record)
-                    if head.protocol != messages.PROTOCOL:
+                    if head.protocol != PROTOCOL:
                         raise JournalError(
                             f"{path}: facts of protocol version {head.protocol}, this release speaks "
-                            f"{messages.PROTOCOL}: use the release that wrote them, or give another --state-dir"
+                            f"{PROTOCOL}: use the release that wrote them, or give another --state-dir"
                         )
                 else:
-                    for retained in messages.decode_records(record[_CELL.size :]):
+                    for retained in decode_records(record[_CELL.size :]):
                         state.merge(_CELL.unpack_from(record), retained)
                 valid_end = end
         except (msgspec.DecodeError, MessageError, struct.error) as error:
@@ -119,7 +119,7 @@ class Journal:
         """Append a record that :attr:`state` has merged. Survives the end of this process at once."""
         assert self._file is not None
         try:
-            self._file.write(_packed(_CELL.pack(*cell) + messages.encode_records([retained])))
+            self._file.write(_packed(_CELL.pack(*cell) + encode_records([retained])))
             self._file.flush()
         except OSError as error:
             raise _cannot_write(self.path, error) from error
@@ -138,7 +138,7 @@ class Journal:
     def rewrite(self) -> None:
         """Write the state to a new file and replace the old one."""
         head = _encoder.encode(_Header(self.world, *self.scene_id))
-        records = [_CELL.pack(*cell) + messages.encode_records([retained]) for cell, retained in self.state]
+        records = [_CELL.pack(*cell) + encode_records([retained]) for cell, retained in self.state]
         try:
             _write(self.path, MAGIC + bytes((VERSION,)) + b"".join(map(_packed, [head, *records])))
             if self._file is not None:

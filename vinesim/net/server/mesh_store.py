@@ -12,7 +12,7 @@ import dataclasses
 import logging
 import threading
 
-from vinesim.net.codec.messages import MAX_PART, MeshPart, MeshWanted
+from vinesim.net.codec.meshes import MAX_PART, MeshPart, MeshWanted
 from vinesim.scene.triangles import MAX_BYTES, TrianglesError, decode_triangles, digest_of
 
 log = logging.getLogger(__name__)

@@ -15,8 +15,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError, RetainedRecord
+from vinesim.net.codec.control import MAX_RECORDS, RetainedRecord, decode_records, encode_records
+from vinesim.net.codec.header import MAX_MESSAGE, MessageError
 from vinesim.net.replication.interest import Cell
 from vinesim.net.replication.retained import RetainedState
 from vinesim.net.server.admission import SceneId
@@ -165,7 +165,7 @@ class RetainedStore:
     def submit(self, key: str, payload: bytes) -> None:
         """Queue records that arrived under ``<world>/fact/<cx>/<cy>/<actor>``; returns at once."""
         self.counters.received += 1
-        if len(payload) > messages.MAX_MESSAGE:
+        if len(payload) > MAX_MESSAGE:
             payload = b""  # counted as malformed by the thread
         if len(self._queue) >= MAX_QUEUED or self._queued_bytes.value + len(payload) > MAX_QUEUED_BYTES:
             self.counters.rejected += 1
@@ -291,7 +291,7 @@ class RetainedStore:
             self._warn_once(world, actor, "publishes more records than its quota allows; what exceeds is dropped")
             return ""
         try:
-            records = messages.decode_records(payload)
+            records = decode_records(payload)
             if foreign_authors := [record.author for record in records if record.author != actor]:
                 raise MessageError(f"record by {foreign_authors[0]!r} published by {actor!r}")
         except MessageError as error:
@@ -354,8 +354,8 @@ class RetainedStore:
 
 def _split_messages(records: list[RetainedRecord]) -> list[bytes]:
     """Encode records into messages of at most :data:`MAX_REPLY`."""
-    message = messages.encode_records(records)
-    if len(records) <= 1 or (len(message) <= MAX_REPLY and len(records) <= messages.MAX_RECORDS):
+    message = encode_records(records)
+    if len(records) <= 1 or (len(message) <= MAX_REPLY and len(records) <= MAX_RECORDS):
         return [message]
     half = len(records) // 2
     return _split_messages(records[:half]) + _split_messages(records[half:])

@@ -19,8 +19,9 @@ import zenoh
 from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.core.errors import UsageError
 from vinesim.net import pace
-from vinesim.net.codec import messages
-from vinesim.net.codec.messages import MessageError, is_valid_name
+from vinesim.net.codec.control import decode_time, encode_time, encode_welcome
+from vinesim.net.codec.header import MAX_MESSAGE, MessageError, is_valid_name
+from vinesim.net.codec.meshes import decode_part, decode_request, encode_part, encode_wanted
 from vinesim.net.pace import MIN_FACTOR, WorldClock
 from vinesim.net.replication.interest import Cell
 from vinesim.net.server.admission import AdmissionControl, SceneId
@@ -366,7 +367,7 @@ class Server:
             self.foreign += 1
             self._warn_once(key, "records of a session that did not join with this name, or as a spectator: dropped")
             return
-        payload = sample.payload.to_bytes() if len(sample.payload) <= messages.MAX_MESSAGE else b""
+        payload = sample.payload.to_bytes() if len(sample.payload) <= MAX_MESSAGE else b""
         self.store.submit(key, payload)
 
     def _on_clock_query(self, query: zenoh.Query) -> None:
@@ -376,7 +377,7 @@ class Server:
             try:
                 if "*" in key or not is_valid_name(name):
                     raise MessageError("the question names no world, or not the actor that asks")
-                question = messages.decode_time(_query_payload(query))
+                question = decode_time(_query_payload(query))
             except MessageError as error:
                 self._count_malformed(key, error)
                 return
@@ -389,9 +390,7 @@ class Server:
                 world_time = clock.time(now)
                 factor = clock.factor
                 cause = clock.cause
-            query.reply(
-                str(query.key_expr), messages.encode_time(question.asked, world_time, factor, real=now, cause=cause)
-            )
+            query.reply(str(query.key_expr), encode_time(question.asked, world_time, factor, real=now, cause=cause))
 
     def _on_join_query(self, query: zenoh.Query) -> None:
         with query:
@@ -408,7 +407,7 @@ class Server:
                     self.store.open(world, self._admission.scene_of(world))
             if welcome.refused:
                 log.warning("refused %s/%s: %s", world, name, welcome.refused)
-            query.reply(str(query.key_expr), messages.encode_welcome(welcome))
+            query.reply(str(query.key_expr), encode_welcome(welcome))
 
     def _on_snapshot_query(self, query: zenoh.Query) -> None:
         with query:
@@ -444,11 +443,11 @@ class Server:
                 with self._lock:
                     if not self._admission.is_admitted(world, name):
                         raise MessageError("only an actor that has joined offers meshes")
-                wanted = self.meshes.offer((world, name), messages.decode_part(_query_payload(query)))
+                wanted = self.meshes.offer((world, name), decode_part(_query_payload(query)))
             except MessageError as error:
                 self._count_malformed(key, error)
                 return
-            query.reply(str(query.key_expr), messages.encode_wanted(wanted))
+            query.reply(str(query.key_expr), encode_wanted(wanted))
 
     def _on_mesh_query(self, query: zenoh.Query) -> None:
         with query:
@@ -457,11 +456,11 @@ class Server:
             try:
                 if not is_digest(digest) or "*" in key:
                     raise MessageError("the question names no mesh")
-                part = self.meshes.part(digest, messages.decode_request(_query_payload(query)))
+                part = self.meshes.part(digest, decode_request(_query_payload(query)))
             except MessageError as error:
                 self._count_malformed(key, error)
                 return
-            query.reply(str(query.key_expr), messages.encode_part(part))
+            query.reply(str(query.key_expr), encode_part(part))
 
     def _count_malformed(self, key: str, error: MessageError) -> None:
         """Count an invalid query; log the first of each key."""
@@ -504,4 +503,4 @@ def _strip_root(key: zenoh.KeyExpr) -> str:
 
 def _query_payload(query: zenoh.Query) -> bytes:
     payload = query.payload
-    return payload.to_bytes() if payload is not None and len(payload) <= messages.MAX_MESSAGE else b""
+    return payload.to_bytes() if payload is not None and len(payload) <= MAX_MESSAGE else b""

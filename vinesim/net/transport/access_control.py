@@ -13,6 +13,7 @@ import pathlib
 from collections.abc import Mapping
 from typing import Any
 
+from vinesim.net.codec.messages import FAMILIES
 from vinesim.net.transport.bus import BusError
 
 SERVER = "server"
@@ -34,9 +35,6 @@ class Role(enum.StrEnum):
 class CertificateError(BusError):
     """A certificate or key is missing or unusable; the text names it."""
 
-
-FAMILIES = ("c", "tree", "near", "own", "fact")
-"""First chunks of keys ``FAMILY/<cx>/<cy>/<actor>``."""
 
 _EVERYTHING = [
     "put",
@@ -151,10 +149,12 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         ]
         if role == Role.ROBOT:
             own.append(rule(f"{name} offers its meshes", "ingress", ["query"], f"{root}/offer/{name}"))
-        written = (f"{root}/a/{name}", *(f"{root}/a/{name}/{layer}" for layer in ("far", "mid", "near")))
-        written += (f"{root}/voice/{name}", f"{root}/voice/{name}/pcm")
-        if role != Role.SPECTATOR:
-            written += (f"{root}/force/*/{name}", *(f"{root}/{family}/*/*/{name}" for family in FAMILIES))
+        written = [
+            f"{root}/{key.format(actor=name)}"
+            for family in FAMILIES.values()
+            if family.is_published and (family.by_spectators or role != Role.SPECTATOR)
+            for key in family.keys
+        ]
         own.append(rule(f"{name} writes", "ingress", ["put", "delete"], *written))
         policies.append({"rules": receiving + own, "subjects": [name]})
     everything = [rule(f"servers {flow}", flow, _EVERYTHING, "**") for flow in ("ingress", "egress")]

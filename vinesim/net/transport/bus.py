@@ -105,7 +105,8 @@ class Bus(Protocol):
         ...
 
     def join(self, greeting: bytes) -> None:
-        """Ask the server for admission with an encoded :class:`messages.Hello`, once, before anything else is sent.
+        """Ask the server for admission with an encoded :class:`~vinesim.net.codec.control.Hello`, once, before anything
+        else is sent.
 
         Raises :class:`JoinRejected`. Without a server the actors check each other
         (:mod:`vinesim.net.replication.peers`).

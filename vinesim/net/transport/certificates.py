@@ -16,7 +16,7 @@ import socket
 from collections.abc import Sequence
 
 from vinesim.core.errors import UsageError
-from vinesim.net.codec.messages import is_valid_name
+from vinesim.net.codec.header import is_valid_name
 from vinesim.net.transport.access_control import (
     CA_NAME,
     SERVER,

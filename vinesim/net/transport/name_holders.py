@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import threading
 
-from vinesim.net.keys import sender_of
+from vinesim.net.codec.messages import FAMILIES, sender_of
 
 MAX_FORMER_SESSIONS = 8
 """Sessions of one name that have left and are still remembered."""
 
-BOUND_FAMILIES = frozenset(("a", "c", "tree", "near", "own", "fact", "force", "voice", "hello"))
+BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello"}
 """First chunks of the keys that belong to one actor."""
 
 

@@ -13,7 +13,8 @@ from collections.abc import Callable
 import zenoh
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
-from vinesim.net.codec import messages
+from vinesim.net.codec.control import Welcome, decode_welcome
+from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion
 from vinesim.net.transport.bus import JoinRejected
 from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, has_match
 
@@ -142,7 +143,7 @@ class ServerAdmission:
         if self.rejection:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
 
-    def _query(self, hello: bytes) -> list[messages.Welcome]:
+    def _query(self, hello: bytes) -> list[Welcome]:
         """Replies of all servers, first the one that counts; an unreadable reply counts as a rejection."""
         replies = self._session.get(
             self._key, payload=hello, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
@@ -161,13 +162,13 @@ class ServerAdmission:
             self.spectators_speak_to = welcomes[0].spectators_speak_to
         return welcomes
 
-    def _decode(self, answer: bytes) -> messages.Welcome:
+    def _decode(self, answer: bytes) -> Welcome:
         try:
-            return messages.decode_welcome(answer)
-        except messages.WrongVersion as error:
-            return messages.Welcome(
+            return decode_welcome(answer)
+        except WrongVersion as error:
+            return Welcome(
                 f"the server at {self._endpoint} speaks protocol version {error.theirs}, {self._name!r} version "
-                f"{messages.PROTOCOL}: use the same release of vinesim"
+                f"{PROTOCOL}: use the same release of vinesim"
             )
-        except messages.MessageError as error:
-            return messages.Welcome(f"the reply of the server at {self._endpoint} cannot be decoded: {error}")
+        except MessageError as error:
+            return Welcome(f"the reply of the server at {self._endpoint} cannot be decoded: {error}")

@@ -24,7 +24,7 @@ import zenoh
 
 from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.core.errors import UsageError
-from vinesim.net.codec import messages
+from vinesim.net.codec.header import MAX_MESSAGE, is_valid_name
 from vinesim.net.transport.access_control import tls_config
 from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
 from vinesim.net.transport.endpoints import Endpoint, client_links
@@ -95,7 +95,7 @@ class ZenohBus:
         invalid.
         """
         for what, text in (("actor name", name), ("world", world)):
-            if not messages.is_valid_name(text):
+            if not is_valid_name(text):
                 raise UsageError(f"{what} {text!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
         links = client_links(connect, secured=certificates is not None)
         self._credentials = {} if certificates is None else tls_config(certificates, name)
@@ -349,7 +349,7 @@ class ZenohBus:
             source = sample.source_info
             key = str(sample.key_expr)[skip:]
             self.bytes_in += size
-            if size > messages.MAX_MESSAGE:
+            if size > MAX_MESSAGE:
                 self._oversized += 1
             elif not self._is_foreign(key, source.source_id if source is not None else None):
                 self._store.put(depth, key, sample.payload.to_bytes())
@@ -368,7 +368,7 @@ class ZenohBus:
         skip = len(self._prefix)
 
         def on_reply(reply: zenoh.Reply) -> None:
-            if reply.ok is not None and len(reply.ok.payload) <= messages.MAX_MESSAGE:
+            if reply.ok is not None and len(reply.ok.payload) <= MAX_MESSAGE:
                 arrived = time.monotonic()
                 reply_key = str(reply.ok.key_expr)[skip:]
                 if bound_name(reply_key):
@@ -414,7 +414,7 @@ class ZenohBus:
         except zenoh.ZError as error:
             self.count_failure(error)
             return []
-        return [payload.to_bytes() for payload in found if len(payload) <= messages.MAX_MESSAGE]
+        return [payload.to_bytes() for payload in found if len(payload) <= MAX_MESSAGE]
 
     @property
     def spectators_speak_to(self) -> SpectatorsSpeakTo:

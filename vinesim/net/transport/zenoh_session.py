@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import zenoh
 
-from vinesim.net.codec import messages
+from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.transport.bus import BusError
 from vinesim.net.transport.endpoints import Endpoint
 
@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 LEASE = 2000
 """A peer that is silent for this long is taken to have left [ms]."""
 
-MAX_RECEIVE = 4 * messages.MAX_MESSAGE
+MAX_RECEIVE = 4 * MAX_MESSAGE
 """Fragmented messages beyond this size are not even reassembled, here or in the router [B]."""
 
 CONNECT_TIMEOUT = 2.0

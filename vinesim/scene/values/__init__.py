@@ -6,7 +6,7 @@ A value that leaves the physics thread owns its arrays: they are never written a
 
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec
 from vinesim.scene.values.measurement import Measurement
-from vinesim.scene.values.network import Coupling, HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
+from vinesim.scene.values.network import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 from vinesim.scene.values.rigid import Mesh, RigidBox, RigidVisual, Shape
 from vinesim.scene.values.robot import (
     FORWARD_KINDS,
@@ -53,7 +53,6 @@ __all__ = [
     "Contact",
     "ControllerKind",
     "ControllerSpec",
-    "Coupling",
     "Detachment",
     "Drive",
     "ElasticSample",

@@ -86,18 +86,3 @@ class ObjectUpdate:
     """[7] in the world"""
     velocity: np.ndarray
     """[6] m/s and rad/s, of its origin, world axes."""
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class Coupling:
-    """Force of an actor on one body of a tree that another client owns, as a spring of fixed stiffness.
-
-    Where both clients hold the body at the same place the spring pulls with just the force of the contact.
-    """
-
-    body: int
-    """Plant body in the model."""
-    point: np.ndarray
-    """[3] m where the force acts, in the body's frame."""
-    anchor: np.ndarray
-    """[3] m where the spring pulls that point, world."""
