@@ -63,8 +63,7 @@ QUANTITIES = {
     "friction": Quantity("1", lambda p: p.friction),
     "stiffness": Quantity("N/m", lambda p: p.contact_stiffness),
 }
-"""Tables of the file by name. Contacts have those of them that :class:`vinesim.kernels.contact.friction_law.Surface` has as
-fields."""
+"""Tables of the file; :class:`vinesim.kernels.contact.friction_law.Surface` says which of them contacts have."""
 
 _ContactFile = msgspec.defstruct(
     "_ContactFile", [(name, dict[str, Number], {}) for name in QUANTITIES], frozen=True, forbid_unknown_fields=True

@@ -65,9 +65,7 @@ def gather_row(
     }
 """
 )
-def combine_rows(
-    system: wp.array(dtype=wp.float64), at: int, pitch: int, factor: wp.mat22d
-):
+def combine_rows(system: wp.array(dtype=wp.float64), at: int, pitch: int, factor: wp.mat22d):
     """Replace the row that begins at ``at`` and the next by combinations of both, ``factor`` times them."""
     ...
 

@@ -11,14 +11,14 @@ import warp as wp
 
 from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
+from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.jacobians import write_rows
-from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
+from vinesim.kernels.contact.row_solver import solve_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
     Contacts,
     Geoms,
-    MaterialPairs,
     Parameters,
     PlantBodies,
     RigidBodies,
@@ -93,7 +93,7 @@ def predict_impacted_trees(
 def write_tree_rows(
     # model
     parameters: Parameters,
-    pairs: MaterialPairs,
+    pairs: wp.array2d(dtype=Surface),
     capsules: Capsules,
     geoms: Geoms,
     # in
@@ -243,8 +243,7 @@ def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out
         target_out.free[row] = source.free[row]
         target_out.impulse[row] = source.impulse[row]
         target_out.velocity[row] = source.velocity[row]
-        target_out.friction[row // 3] = source.friction[row // 3]
-        target_out.compliance[row // 3] = source.compliance[row // 3]
+        target_out.surface[row // 3] = source.surface[row // 3]
     synchronize_lanes(lanes)
 
 
@@ -266,7 +265,7 @@ def solve_trees(
 ):
     """``lanes`` threads per tree solve for its impulses.
 
-    On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_few_rows`,
+    On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_rows`,
     in full warps; nothing happens with the others. On a CPU two sweeps are done here, and trees that need more are listed.
     """
     tree = wp.tid() // lanes
@@ -276,19 +275,9 @@ def solve_trees(
         count = tree_contacts_out.count[tree]
     system = view_system(system_out, tree, trees, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-    sweeps = solve_few_rows(
-        count,
-        max_sweeps,
-        FIRST_SWEEPS,
-        newton_end,
-        tolerance,
-        system.matrix,
-        system.free,
-        system.friction,
-        system.compliance,
-        system.impulse,
-        system.velocity,
-    )
+    sweeps = int(-1)
+    if lanes > 1:
+        sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
     busy = bool(False)
     if lanes == 1 and count > 0:
         search = view_search(search_out, tree, trees, width + 1)
@@ -332,19 +321,9 @@ def solve_busy_trees(
         count = tree_contacts_out.count[tree]
         system = view_system(system_out, tree, trees, width)
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-        sweeps = solve_many_rows(
-            count,
-            max_sweeps,
-            FIRST_SWEEPS,
-            newton_end,
-            tolerance,
-            system.matrix,
-            system.free,
-            system.friction,
-            system.compliance,
-            system.impulse,
-            system.velocity,
-        )
+        sweeps = int(-1)
+        if lanes > 1:
+            sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
         if sweeps < 0:
             sweeps = tree_contacts_out.sweeps[tree]
             copy_system(lane, lanes, 3 * count, system, dense)
