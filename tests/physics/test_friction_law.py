@@ -57,7 +57,7 @@ def solve_as_in_a_batch(matrix: np.ndarray, free: np.ndarray, surface: np.ndarra
 def test_batches_and_islands_find_the_same_impulses() -> None:
     """Canes fall on bars: contacts that stick, slide and open, each tree an island of its own.
 
-    A solver stops where a sweep changes nothing by more than 1e-10 of the largest impulse; both agree within 1e-8 of it.
+    A solver ends where a sweep changes nothing by more than 1e-10 of the largest impulse; they agree within 1e-8 of it.
     """
     model = canes(3)
     parameters = PhysicsParameters(sleep=False, solver_sweeps=int(MOST_SWEEPS), solver_tolerance=TOLERANCE)

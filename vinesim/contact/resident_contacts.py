@@ -248,15 +248,20 @@ class ResidentContacts:
         contacts = self._tree_contacts
         width = 3 * self.slots
         entries = -(-trees // GROUP) * GROUP
+        numbers = (p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance)
         few = self.slots
-        first = 1
         lanes = 1
-        block = 1
+        solve = tree_islands.begin_trees
+        of_most = trees
+        first_lanes: tuple[int, ...] = ()
+        search: tuple[Any, ...] = (self._search,)
         if not self._device.is_cpu:
             few = FIRST_LANES // 3
-            first = FIRST_LANES
             lanes = WARP_SIZE
-            block = FULL_BLOCK
+            solve = tree_islands.solve_small_trees
+            of_most = -(-trees * FIRST_LANES // FULL_BLOCK) * FULL_BLOCK
+            first_lanes = (FIRST_LANES,)
+            search = ()
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
@@ -358,27 +363,11 @@ class ResidentContacts:
             ),
         ]
         solves = [
-            bound(
-                tree_islands.solve_trees,
-                -(-trees * first // block) * block,
-                p.solver_sweeps,
-                p.solver_newton_steps,
-                p.solver_newton_contacts,
-                p.solver_tolerance,
-                trees,
-                width,
-                first,
-                contacts,
-                self._system,
-                self._search,
-            ),
+            bound(solve, of_most, *numbers, trees, width, *first_lanes, contacts, self._system, *search),
             bound(
                 tree_islands.solve_busy_trees,
                 self._groups * lanes,
-                p.solver_sweeps,
-                p.solver_newton_steps,
-                p.solver_newton_contacts,
-                p.solver_tolerance,
+                *numbers,
                 trees,
                 width,
                 lanes,

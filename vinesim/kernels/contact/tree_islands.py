@@ -247,8 +247,38 @@ def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out
     synchronize_lanes(lanes)
 
 
+@wp.kernel
+def begin_trees(
+    # model
+    max_sweeps: int,
+    max_newton_steps: int,
+    max_newton_contacts: int,
+    tolerance: wp.float64,
+    # in
+    trees: int,
+    width: int,
+    # out
+    tree_contacts_out: TreeContacts,
+    system_out: TreeSystem,
+    search_out: TreeSearch,
+):
+    """One thread of a CPU per tree: two sweeps for its impulses; trees that need more are listed."""
+    tree = wp.tid()
+    count = tree_contacts_out.count[tree]
+    if count > 0:
+        system = view_system(system_out, tree, trees, width)
+        search = view_search(search_out, tree, trees, width + 1)
+        newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
+        update_velocities(0, 1, 3 * count, system)
+        limit = wp.min(FIRST_SWEEPS, max_sweeps)
+        sweeps, busy = solve_tree(0, 0, 1, count, limit, newton_end, tolerance, system, search)
+        tree_contacts_out.sweeps[tree] = sweeps
+        if busy and sweeps < max_sweeps:
+            tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
+
+
 @wp.kernel(cuda_max_registers=128)
-def solve_trees(
+def solve_small_trees(
     # model
     max_sweeps: int,
     max_newton_steps: int,
@@ -261,13 +291,9 @@ def solve_trees(
     # out
     tree_contacts_out: TreeContacts,
     system_out: TreeSystem,
-    search_out: TreeSearch,
 ):
-    """``lanes`` threads per tree solve for its impulses.
-
-    On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_rows`,
-    in full warps; nothing happens with the others. On a CPU two sweeps are done here, and trees that need more are listed.
-    """
+    """``lanes`` threads of a GPU per tree solve for its impulses, in full warps; nothing happens with trees of more rows, see
+    :func:`vinesim.kernels.contact.row_solver.solve_rows`."""
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
     count = int(0)
@@ -275,19 +301,9 @@ def solve_trees(
         count = tree_contacts_out.count[tree]
     system = view_system(system_out, tree, trees, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-    sweeps = int(-1)
-    if lanes > 1:
-        sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
-    busy = bool(False)
-    if lanes == 1 and count > 0:
-        search = view_search(search_out, tree, trees, width + 1)
-        update_velocities(lane, lanes, 3 * count, system)
-        limit = wp.min(FIRST_SWEEPS, max_sweeps)
-        sweeps, busy = solve_tree(0, lane, lanes, count, limit, newton_end, tolerance, system, search)
+    sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
     if lane == 0 and count > 0 and sweeps >= 0:
         tree_contacts_out.sweeps[tree] = sweeps
-        if busy and sweeps < max_sweeps:
-            tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
 
 
 @wp.kernel
