@@ -261,8 +261,8 @@ def solve_rows(
     """Solve for the impulses of ``count`` contacts of a tree from its ``lanes`` threads, of which this is number ``lane``;
     returns the number of sweeps, or -1 where there are more rows than threads: then nothing has happened.
 
-    What the loop assigns under a condition, Warp keeps from one turn to the next: in registers, of which there are few.
-    So it chooses values instead of branching, and computes in functions.
+    What the loop assigns under a condition stays in registers from one turn to the next: generated code declares all
+    variables before the loop. So the loop chooses values instead of branching, and computes in functions.
     """
     size = wp.where(3 * count <= wp.min(lanes, MOST_ROWS), 3 * count, 0)
     most = most_of_warp(size)  # all trees of a warp go through the same steps

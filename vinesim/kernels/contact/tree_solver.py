@@ -2,7 +2,7 @@
 
 :mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, and finds its
 way through lists of them. The contacts of a tree alone are one matrix, and nothing else moves: then a row is a sum. On a
-GPU :mod:`vinesim.kernels.contact.row_solver` does the same in registers, and what is here solves the trees that have too
+GPU :mod:`vinesim.kernels.contact.row_solver` does the same with a thread a row, and what is here solves the trees that have too
 many contacts for that, a warp each, whose threads share the rows and all take the same decisions from the same numbers. On
 a CPU one thread has all rows. The matrix is in single precision, as the impulse response is that it comes from; all else is
 in double precision.
