@@ -539,7 +539,9 @@ def test_contacts_satisfy_signorini_coulomb_and_action_is_reaction(seed):
         impulse = solver.impulses.rows.impulse[: 3 * n].reshape(n, 3)
         assert (impulse[:, 0] >= 0.0).all()
         friction = np.linalg.norm(impulse[:, 1:], axis=1)
-        assert (friction <= solver.impulses.contacts.friction[:n] * impulse[:, 0] * (1.0 + 1e-9) + 1e-15).all()
+        assert (
+            friction <= solver.impulses.contacts.surface["friction"][:n] * impulse[:, 0] * (1.0 + 1e-9) + 1e-15
+        ).all()
         # on plants, summed over bodies; on others, per contact
         outside = [c for c in physics.contacts if c.actor != "plants"]
         np.testing.assert_allclose(

@@ -173,7 +173,7 @@ def test_a_bar_stands_as_deep_in_a_cane_as_the_stiffness_of_their_materials_says
             table[Material.BARK, Material.UNKNOWN] = table[Material.UNKNOWN, Material.BARK] = stiffness
         return table
 
-    monkeypatch.setattr("vinesim.contact.collision_arrays.pair_table", listed)
+    monkeypatch.setattr("vinesim.scene.materials.pair_table", listed)
     physics = Physics(assemble([cane((0.0, 0.0, 1.0), pieces=8, beta=0.05)]))
     physics.add_robot(bar((0.4375, -0.045, 0.95), stiffness=5000.0, damping=300.0))  # at the middle of a piece
     physics.rigid.command("bar", np.array([0.02]))

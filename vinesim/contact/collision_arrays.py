@@ -11,14 +11,15 @@ import warp as wp
 
 from vinesim.contact.plant_capsules import PlantCapsules
 from vinesim.core import frames
-from vinesim.core.warp_arrays import SharedArrays, share
+from vinesim.core.warp_arrays import SharedArrays, share, zeros
 from vinesim.kernels.contact import broadphase, structs
+from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
 from vinesim.rigid.collision_geoms import RigidGeoms, concatenate, persistent_names
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.rigid.static_world import FIRST_FIXED_GEOM
-from vinesim.scene.materials import pair_table
+from vinesim.scene.materials import pair_tables
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.wires.elastic_supports import WIRE_DAMPING_TIME
@@ -36,17 +37,16 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
     return made
 
 
-def material_pairs(p: PhysicsParameters) -> SharedArrays:
-    """Friction, stiffness and damping of contacts by their two materials, as the kernels see them."""
-    stiffness = pair_table("stiffness", p.contact_stiffness)
-    damping = p.contact_damping_time * stiffness
-    return SharedArrays(
-        structs.MaterialPairs,
-        friction=pair_table("friction", p.friction),
-        stiffness=stiffness,
-        damping=damping,
-        compliance=1.0 / (p.dt * (stiffness * p.dt + damping)),
-    )
+def material_pairs(p: PhysicsParameters) -> np.ndarray:
+    """What contacts have of their two materials: records of :class:`Surface` [material, material]."""
+    tables = pair_tables(p)
+    stiffness = tables["stiffness"]
+    tables["damping"] = p.contact_damping_time * stiffness
+    tables["compliance"] = 1.0 / (p.dt * (stiffness * p.dt + tables["damping"]))
+    pairs = zeros(Surface, stiffness.shape)
+    for name in Surface.vars:
+        pairs[name] = tables[name]
+    return pairs
 
 
 class PlantArrays:

@@ -15,8 +15,9 @@ from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, material_
 from vinesim.contact.detection import ContactDetection
 from vinesim.contact.row_response import RowResponse
 from vinesim.core import frames
-from vinesim.core.warp_arrays import SharedArrays, entry, share
+from vinesim.core.warp_arrays import SharedArrays, entry, share, zeros
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
+from vinesim.kernels.contact.friction_law import Steps, Surface
 from vinesim.kernels.contact.island_system import IslandSystem
 from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.kernels.shared_launch import ONCE
@@ -93,10 +94,8 @@ class ImpulseSolver:
             "impulse": np.zeros(3 * n),
         }
         self._place_arrays = {
-            "friction": np.zeros(n),
-            "compliance": np.zeros(n),
-            "own": np.zeros((n, 3, 3)),
-            "mass": np.zeros((n, 2)),
+            "surface": zeros(Surface, (n,)),
+            "steps": zeros(Steps, (n,)),
             "pressed": np.zeros(n, np.int32),
         }
         for name in ("free", "impulse", "impulse_first", "impulse_before", "direction"):
@@ -287,8 +286,9 @@ class ImpulseSolver:
         dt = self.parameters.dt
         if wires is not None and len(at):
             force = self.rows.impulse[3 * at] / dt
-            share = contacts.stiffness[at] * dt + contacts.damping[at]
-            wires.add_presses(force, -(force / share + self.rows.bias[3 * at]))
+            surface = contacts.surface[at]
+            damping = surface["stiffness"] * dt + surface["damping"]
+            wires.add_presses(force, -(force / damping + self.rows.bias[3 * at]))
 
     def _respond_constrained(self, jacobian: np.ndarray) -> np.ndarray:
         """Take over the response of rigid bodies that MuJoCo's constraints bind, and return it [row, dof]."""
@@ -380,7 +380,7 @@ class ImpulseSolver:
         )
         write_contact_rows = bind_shared(
             jacobians.write_contact_rows,
-            [parameters, self._pairs.struct, capsules, geoms],
+            [parameters, share(self._pairs, Surface), capsules, geoms],
             [bodies, rigid_bodies, rigid.factors.struct, candidates, warm_start],
             [share(self._rigid_spans, wp.vec2i), contacts, rows],
         )

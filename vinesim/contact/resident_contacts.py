@@ -18,7 +18,7 @@ from vinesim.contact.plant_capsules import plant_capsules
 from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
 from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
-from vinesim.kernels.contact.row_solver import FEW_ROWS
+from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
 from vinesim.kernels.contact.tree_views import GROUP
 from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
@@ -179,7 +179,7 @@ class ResidentContacts:
         self._static_blocks.low, self._static_blocks.high = (
             wp.array(np.array(corner, np.float32), dtype=wp.vec3, device=device) for corner in zip(*boxes, strict=True)
         )
-        self._pairs = self._on_device(structs.MaterialPairs, material_pairs(self.parameters).struct)
+        self._pairs = wp.array(material_pairs(self.parameters), dtype=Surface, device=device)
 
     def _by_slot(self, dtype: Any, columns: int) -> wp.array:
         """A table [tree, column] of zeros in which the trees of one column lie side by side."""
@@ -204,8 +204,7 @@ class ResidentContacts:
         self.rows = self._allocated(structs.Rows, of_rows, {"plant_jacobian": 12})
         self._system = self._allocated(TreeSystem, {"free": trees * rows, "velocity": trees * rows}, {})
         self._system.matrix = self._zeros(float, trees * rows, rows)
-        self._system.friction = self.contacts.friction
-        self._system.compliance = self.contacts.compliance
+        self._system.surface = self.contacts.surface
         self._system.impulse = self.rows.impulse
         searched = trees * rows if self._device.is_cpu else 1  # a GPU searches in registers
         self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, searched), {"factor": rows + 1})
@@ -249,15 +248,20 @@ class ResidentContacts:
         contacts = self._tree_contacts
         width = 3 * self.slots
         entries = -(-trees // GROUP) * GROUP
+        numbers = (p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance)
         few = self.slots
-        first = 1
         lanes = 1
-        block = 1
+        solve = tree_islands.begin_trees
+        of_most = trees
+        first_lanes: tuple[int, ...] = ()
+        search: tuple[Any, ...] = (self._search,)
         if not self._device.is_cpu:
-            few = int(FEW_ROWS) // 3
-            first = FIRST_LANES
+            few = FIRST_LANES // 3
             lanes = WARP_SIZE
-            block = FULL_BLOCK
+            solve = tree_islands.solve_small_trees
+            of_most = -(-trees * FIRST_LANES // FULL_BLOCK) * FULL_BLOCK
+            first_lanes = (FIRST_LANES,)
+            search = ()
 
         def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
             block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
@@ -359,27 +363,11 @@ class ResidentContacts:
             ),
         ]
         solves = [
-            bound(
-                tree_islands.solve_trees,
-                -(-trees * first // block) * block,
-                p.solver_sweeps,
-                p.solver_newton_steps,
-                p.solver_newton_contacts,
-                p.solver_tolerance,
-                trees,
-                width,
-                first,
-                contacts,
-                self._system,
-                self._search,
-            ),
+            bound(solve, of_most, *numbers, trees, width, *first_lanes, contacts, self._system, *search),
             bound(
                 tree_islands.solve_busy_trees,
                 self._groups * lanes,
-                p.solver_sweeps,
-                p.solver_newton_steps,
-                p.solver_newton_contacts,
-                p.solver_tolerance,
+                *numbers,
                 trees,
                 width,
                 lanes,

@@ -51,6 +51,9 @@ def entry(data: np.ndarray, place: int = 0) -> ctypes.c_int32:
 
 
 def zeros(dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """NumPy zeros for a Warp array of ``shape``: vectors and matrices add their own dimensions."""
+    """NumPy zeros for a Warp array of ``shape``: vectors and matrices add their own dimensions, structs are records."""
     inner = tuple(getattr(dtype, "_shape_", ()))
-    return np.zeros(shape + inner, wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype)))
+    of_one = (
+        dtype.numpy_dtype() if hasattr(dtype, "vars") else wp.dtype_to_numpy(getattr(dtype, "_wp_scalar_type_", dtype))
+    )
+    return np.zeros(shape + inner, of_one)

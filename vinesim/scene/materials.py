@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import enum
 import functools
+from collections.abc import Callable
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from vinesim.core.data_files import find_data_file
 from vinesim.core.toml_loader import DataError, load_toml
 from vinesim.scene.ids import Organ
+from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_parameters import Number
 
 
@@ -47,14 +50,25 @@ OF_ORGAN = {
 """Materials of plants, trellis and crates; a pole is of no known material."""
 
 
-class _ContactFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Numbers by pair, written ``bark-steel``, in either order."""
+class Quantity(NamedTuple):
+    """A number of each pair of materials."""
 
-    friction: dict[str, Number] = {}
-    stiffness: dict[str, Number] = {}
+    unit: str
+    """In which the file gives it."""
+    default: Callable[[PhysicsParameters], float]
+    """Of pairs that the file does not list."""
 
 
-_UNITS = {"friction": "1", "stiffness": "N/m"}
+QUANTITIES = {
+    "friction": Quantity("1", lambda p: p.friction),
+    "stiffness": Quantity("N/m", lambda p: p.contact_stiffness),
+}
+"""Tables of the file; :class:`vinesim.kernels.contact.friction_law.Surface` says which of them contacts have."""
+
+_ContactFile = msgspec.defstruct(
+    "_ContactFile", [(name, dict[str, Number], {}) for name in QUANTITIES], frozen=True, forbid_unknown_fields=True
+)
+"""Numbers by pair, written ``bark-steel``, in either order."""
 
 
 def materials_of_organs(organs: np.ndarray) -> np.ndarray:
@@ -66,7 +80,7 @@ def materials_of_organs(organs: np.ndarray) -> np.ndarray:
 
 
 def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarray:
-    """``friction`` [1] or ``stiffness`` [N/m] of each two materials, symmetric [material, material].
+    """One of :data:`QUANTITIES` of each two materials, symmetric [material, material].
 
     ``default``: of pairs that the file does not list. ``name``: of a file in ``data/materials``, or a path. Raises
     :class:`DataError` for a pair or a unit that it cannot be.
@@ -77,10 +91,14 @@ def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarr
     return table
 
 
+def pair_tables(parameters: PhysicsParameters) -> dict[str, np.ndarray]:
+    """All :data:`QUANTITIES` of each two materials."""
+    return {name: pair_table(name, quantity.default(parameters)) for name, quantity in QUANTITIES.items()}
+
+
 def pair_numbers(name: str = "contact") -> dict[str, dict[str, Number]]:
     """All numbers of the file with their sources, by quantity and pair as written."""
-    file = load_toml(find_data_file("materials", name, ".toml"), _ContactFile)
-    return {"friction": file.friction, "stiffness": file.stiffness}
+    return msgspec.structs.asdict(load_toml(find_data_file("materials", name, ".toml"), _ContactFile))
 
 
 @functools.cache
@@ -93,8 +111,8 @@ def _listed(quantity: str, name: str) -> dict[tuple[int, int], float]:
         words = text.split("-")
         if len(words) != 2 or not known.keys() >= set(words):
             raise DataError(f"{place} is no pair of materials; give two of {', '.join(known)} with a hyphen between")
-        if number.unit != _UNITS[quantity]:
-            raise DataError(f"{place}.unit is {number.unit!r}; give the value in {_UNITS[quantity]!r}")
+        if number.unit != QUANTITIES[quantity].unit:
+            raise DataError(f"{place}.unit is {number.unit!r}; give the value in {QUANTITIES[quantity].unit!r}")
         if not number.value > 0.0:
             raise DataError(f"{place}.value is {number.value}; give a number above 0")
         first, second = sorted(known[word] for word in words)

@@ -3,5 +3,5 @@
 The stages in their order, a module each: ``broadphase``, ``narrowphase_rigid`` and ``narrowphase_plants``, ``islands``,
 ``jacobians``, ``row_response``, ``delassus``, ``projected_gauss_seidel`` with the steps of ``newton`` on an
 ``island_system``, ``forces``. ``structs`` groups their arrays, ``distance`` and ``body_motion`` hold the geometry. Modules
-named ``tree_`` do the same for batches of trees on a GPU.
+named ``tree_`` and ``row_solver`` do the same for batches of trees. All solvers call ``friction_law``.
 """

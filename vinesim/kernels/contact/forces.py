@@ -39,10 +39,11 @@ def store_contact(
     impulse = wp.vec3d(impulses[n], impulses[n + 1], impulses[n + 2])
     contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
     # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
-    force_u = impulse[1] / parameters.dt + contacts_out.damping[c] * slip_u
-    force_v = impulse[2] / parameters.dt + contacts_out.damping[c] * slip_v
-    anchor = -force_u / contacts_out.stiffness[c] * t1
-    anchor = anchor - force_v / contacts_out.stiffness[c] * t2
+    surface = contacts_out.surface[c]
+    force_u = impulse[1] / parameters.dt + surface.damping * slip_u
+    force_v = impulse[2] / parameters.dt + surface.damping * slip_v
+    anchor = -force_u / surface.stiffness * t1
+    anchor = anchor - force_v / surface.stiffness * t2
     friction = impulse[1] * t1 + impulse[2] * t2
     if impulse[0] <= wp.float64(0.0):  # an open one starts from nothing, but is listed: it is looked for, too
         anchor = wp.vec3d()

@@ -11,6 +11,7 @@ do not depend on how wide the vectors of a CPU are.
 
 import warp as wp
 
+from vinesim.kernels.contact.friction_law import Steps, Surface, steps_of
 from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Rows
 
 wp.set_module_options({"enable_backward": False})
@@ -23,14 +24,10 @@ EIGHT = "typedef double Eight __attribute__((vector_size(64), aligned(8)));"
 class IslandSystem:
     """What the solver of an island works with, by place in the list of islands, or by row of its padded blocks."""
 
-    friction: wp.array(dtype=wp.float64)
-    """[place] 1"""
-    compliance: wp.array(dtype=wp.float64)
-    """[place] 1/kg"""
-    own: wp.array(dtype=wp.mat33d)
-    """[place] 1/kg, velocities along the rows of a contact by impulses along them; plants, rigid bodies and compliance."""
-    mass: wp.array(dtype=wp.vec2d)
-    """[place] kg, by which a velocity along the normal, or along a tangent, becomes an impulse of Gauss-Seidel."""
+    surface: wp.array(dtype=Surface)
+    """[place]"""
+    steps: wp.array(dtype=Steps)
+    """[place]"""
     free: wp.array(dtype=wp.float64)
     """[row] m/s without impulses, bias included."""
     impulse: wp.array(dtype=wp.float64)
@@ -183,7 +180,7 @@ def contact_residual(
 ):
     """The same with velocity without impulses, bias and compliance: what is 0 along rows that press or stick."""
     row = contact_row(place, block, islands)
-    value = three(row, system.free) + system.compliance[place] * three(row, system.impulse)
+    value = three(row, system.free) + system.surface[place].compliance * three(row, system.impulse)
     return value + contact_velocity(place, block, island, islands, matrix, system)
 
 
@@ -230,23 +227,17 @@ def gather_contact(
     row = islands.row_start[block] + k
     pitch = block_pitch(block, islands)
     entry = islands.matrix_start[block] + k * pitch + k
+    surface = contacts.surface[c]
     own = wp.mat33d()
     for axis in range(3):
         for other in range(3):
             own[axis, other] = rows.delassus[entry + axis * pitch + other]
-        own[axis, axis] = own[axis, axis] + contacts.compliance[c]
+        own[axis, axis] = own[axis, axis] + surface.compliance
     at = rigid_entry(place, island, islands)
     for i in range(island_dofs(island, islands)):
         own = own + wp.outer(system_out.jacobian[at + i], system_out.response[at + i])
-    # with the larger eigenvalue of the tangential block a step of friction stays inside of the cone's convergence
-    mean = wp.float64(0.5) * (own[1, 1] + own[2, 2])
-    spread = wp.float64(0.5) * (own[1, 1] - own[2, 2])
-    one = wp.float64(1.0)
-    eigenvalue = mean + wp.sqrt(spread * spread + own[1, 2] * own[1, 2])
-    system_out.own[place] = own
-    system_out.mass[place] = wp.vec2d(one / own[0, 0], one / eigenvalue)
-    system_out.friction[place] = contacts.friction[c]
-    system_out.compliance[place] = contacts.compliance[c]
+    system_out.surface[place] = surface
+    system_out.steps[place] = steps_of(own)
     set_three(row, three(3 * c, rows.velocity_free) + three(3 * c, rows.bias), system_out.free)
     set_three(row, three(3 * c, rows.impulse), system_out.impulse)
 

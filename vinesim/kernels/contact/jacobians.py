@@ -8,12 +8,12 @@ began.
 import warp as wp
 
 from vinesim.kernels.contact.body_motion import to_double, velocity_at
+from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
     Contacts,
     Geoms,
-    MaterialPairs,
     Parameters,
     PlantBodies,
     RigidBodies,
@@ -68,23 +68,13 @@ def write_rigid_rows(
 
 
 @wp.func
-def write_material_numbers(c: int, material: int, other: int, pairs: MaterialPairs, contacts_out: Contacts):
-    """Write the numbers of a contact that follow from the two materials."""
-    contacts_out.friction[c] = pairs.friction[material, other]
-    contacts_out.stiffness[c] = pairs.stiffness[material, other]
-    contacts_out.damping[c] = pairs.damping[material, other]
-    contacts_out.compliance[c] = pairs.compliance[material, other]
-
-
-@wp.func
-def write_wire_numbers(c: int, parameters: Parameters, contacts_out: Contacts):
-    """Put the spring of a wire behind that of the contact."""
+def with_wire(surface: Surface, wire_stiffness: wp.float64, parameters: Parameters):
+    """The surface of a contact with the spring of a wire [N/m] behind its own."""
     one = wp.float64(1.0)
-    stiffness = one / (one / contacts_out.stiffness[c] + one / contacts_out.wire_stiffness[c])
-    damping = parameters.wire_damping_time * stiffness
-    contacts_out.stiffness[c] = stiffness
-    contacts_out.damping[c] = damping
-    contacts_out.compliance[c] = one / (parameters.dt * (stiffness * parameters.dt + damping))
+    surface.stiffness = one / (one / surface.stiffness + one / wire_stiffness)
+    surface.damping = parameters.wire_damping_time * surface.stiffness
+    surface.compliance = one / (parameters.dt * (surface.stiffness * parameters.dt + surface.damping))
+    return surface
 
 
 @wp.func
@@ -99,8 +89,8 @@ def write_bias(
     feature = contacts.feature[c]
     other = contacts.other[c]
     axes = contacts.axes[c]
-    stiffness = contacts.stiffness[c]
-    share = stiffness * parameters.dt + contacts.damping[c]
+    stiffness = contacts.surface[c].stiffness
+    share = stiffness * parameters.dt + contacts.surface[c].damping
     if end_gap > wp.float64(0.0):
         rows_out.bias[3 * c] = end_gap / parameters.dt
     else:
@@ -131,7 +121,7 @@ def write_rows(
     tree_row: int,
     slot: int,
     parameters: Parameters,
-    pairs: MaterialPairs,
+    pairs: wp.array2d(dtype=Surface),
     capsules: Capsules,
     geoms: Geoms,
     bodies: PlantBodies,
@@ -159,15 +149,16 @@ def write_rows(
     last_dof = int(-1)
     arm = lever
     if g >= 0:
-        write_material_numbers(c, material, geoms.material[g], pairs, contacts_out)
+        surface = pairs[material, geoms.material[g]]
         if geoms.friction[g] > wp.float64(0.0):
-            contacts_out.friction[c] = geoms.friction[g]
+            surface.friction = geoms.friction[g]
         if contacts_out.wire_stiffness[c] > wp.float64(0.0):
-            write_wire_numbers(c, parameters, contacts_out)
+            surface = with_wire(surface, contacts_out.wire_stiffness[c], parameters)
+        contacts_out.surface[c] = surface
         last_dof = geoms.dof[g]
         arm = x - rigid.subtree_com[geoms.root[g]]
     else:
-        write_material_numbers(c, material, capsules.material[-1 - g], pairs, contacts_out)
+        contacts_out.surface[c] = pairs[material, capsules.material[-1 - g]]
         other_lever = x - to_double(wp.transform_get_translation(bodies.q[other]))
         velocity = velocity - velocity_at(bodies.q[other], bodies.qd_free[other], x)
 
@@ -193,7 +184,7 @@ def write_rows(
 def write_contact_rows(
     # model
     parameters: Parameters,
-    pairs: MaterialPairs,
+    pairs: wp.array2d(dtype=Surface),
     capsules: Capsules,
     geoms: Geoms,
     # in

@@ -8,6 +8,7 @@ bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
 
 import warp as wp
 
+from vinesim.kernels.contact.friction_law import linearise_sliding, presses, project_into_cone, slides
 from vinesim.kernels.contact.island_system import (
     EIGHT,
     IslandSystem,
@@ -25,9 +26,6 @@ from vinesim.kernels.contact.islands import padded
 from vinesim.kernels.contact.structs import Islands
 
 wp.set_module_options({"enable_backward": False})
-
-SLIDING_SHARE = wp.constant(wp.float64(0.999999))
-"""[1] A contact slides if its friction is at least this share of the largest one."""
 
 
 @wp.func_native("""
@@ -59,17 +57,16 @@ def gather_row(
     + """
     double* const u = system.data + at;
     double* const v = u + pitch;
+    const double uu = factor.data[0][0], uv = factor.data[0][1], vu = factor.data[1][0], vv = factor.data[1][1];
     for (int i = 0; i < pitch; i += 8) {
         const Eight along_u = *(const Eight*)(u + i), along_v = *(const Eight*)(v + i);
         *(Eight*)(u + i) = along_u * uu + along_v * uv;
-        *(Eight*)(v + i) = along_u * uv + along_v * vv;
+        *(Eight*)(v + i) = along_u * vu + along_v * vv;
     }
 """
 )
-def combine_rows(
-    system: wp.array(dtype=wp.float64), at: int, pitch: int, uu: wp.float64, uv: wp.float64, vv: wp.float64
-):
-    """Replace the row that begins at ``at`` and the next by combinations of both."""
+def combine_rows(system: wp.array(dtype=wp.float64), at: int, pitch: int, factor: wp.mat22d):
+    """Replace the row that begins at ``at`` and the next by combinations of both, ``factor`` times them."""
     ...
 
 
@@ -88,35 +85,23 @@ def linearise_friction(
 ):
     """Make the friction rows of a sliding contact, which begin at ``at``, of those of a sticking one.
 
-    Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the residual velocity along
-    the tangents and e their eigenvalue. Linearised about the present f, with d = f / |f|, P = 1 - d d^T and
-    s = mu x_n / |f|:  x_t - s P (x_t - r_t / e) - mu d x_n = 0 (Alart and Curnier, A mixed formulation for frictional
-    contact problems prone to Newton like solution methods, 1991). ``number``: of the contact among those that press;
-    ``right``: entries of right-hand sides.
+    x_t - K (x_t - step r_t) - g x_n = 0, see :func:`vinesim.kernels.contact.friction_law.linearise_sliding`. ``number``:
+    of the contact among those that press; ``right``: entries of right-hand sides.
     """
     one = wp.float64(1.0)
-    row = contact_row(place, block, islands)
-    mass = system_out.mass[place][1]
-    friction = system_out.friction[place]
+    x = three(contact_row(place, block, islands), system_out.impulse)
+    steps = system_out.steps[place]
     residual = contact_residual(place, block, island, islands, matrix, system_out)
-    fu = system_out.impulse[row + 1] - residual[1] * mass
-    fv = system_out.impulse[row + 2] - residual[2] * mass
-    scale = one / wp.max(wp.sqrt(fu * fu + fv * fv), wp.float64(1.0e-30))
-    share = wp.min(friction * system_out.impulse[row] * scale, one)
-    du = fu * scale
-    dv = fv * scale
-    uu = share * (one - du * du)
-    uv = -share * du * dv
-    vv = share * (one - dv * dv)
-    combine_rows(system_out.matrix, at, pitch, uu * mass, uv * mass, vv * mass)
+    K, g = linearise_sliding(x, residual, steps, system_out.surface[place])
+    combine_rows(system_out.matrix, at, pitch, K * steps.tangential)
     n = at + right + 3 * number
-    system_out.matrix[n] = system_out.matrix[n] - friction * du
-    system_out.matrix[n + 1] = system_out.matrix[n + 1] + one - uu
-    system_out.matrix[n + 2] = system_out.matrix[n + 2] - uv
+    system_out.matrix[n] = system_out.matrix[n] - g[0]
+    system_out.matrix[n + 1] = system_out.matrix[n + 1] + one - K[0, 0]
+    system_out.matrix[n + 2] = system_out.matrix[n + 2] - K[0, 1]
     n = n + pitch
-    system_out.matrix[n] = system_out.matrix[n] - friction * dv
-    system_out.matrix[n + 1] = system_out.matrix[n + 1] - uv
-    system_out.matrix[n + 2] = system_out.matrix[n + 2] + one - vv
+    system_out.matrix[n] = system_out.matrix[n] - g[1]
+    system_out.matrix[n + 1] = system_out.matrix[n + 1] - K[1, 0]
+    system_out.matrix[n + 2] = system_out.matrix[n + 2] + one - K[1, 1]
 
 
 @wp.func
@@ -125,7 +110,7 @@ def list_pressed(block: int, islands: Islands, system_out: IslandSystem):
     start = islands.block_start[block]
     count = int(0)
     for k in range(islands.block_start[block + 1] - start):
-        if system_out.impulse[islands.row_start[block] + 3 * k] > wp.float64(0.0):
+        if presses(three(islands.row_start[block] + 3 * k, system_out.impulse)):
             system_out.pressed[start + count] = k
             count = count + 1
     return count
@@ -169,14 +154,13 @@ def write_block(
                 pitch - right,
             )
             diagonal = entry + right + 3 * p + axis
-            system_out.matrix[diagonal] = system_out.matrix[diagonal] + system_out.compliance[place]
+            system_out.matrix[diagonal] = system_out.matrix[diagonal] + system_out.surface[place].compliance
             system_out.matrix[entry] = -system_out.free[row + axis]
             for i in range(dofs):
                 system_out.matrix[entry + 1 + i] = -system_out.jacobian[rigid + i][axis]
             for i in range(1 + dofs, right):
                 system_out.matrix[entry + i] = wp.float64(0.0)
-        x = three(row, system_out.impulse)
-        if wp.sqrt(x[1] * x[1] + x[2] * x[2]) >= system_out.friction[place] * x[0] * SLIDING_SHARE:
+        if slides(three(row, system_out.impulse), system_out.surface[place]):
             linearise_friction(place, block, island, p, at + pitch, right, pitch, islands, matrix, system_out)
 
 
@@ -317,18 +301,6 @@ def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
 
 
 @wp.func
-def project_into_cone(x: wp.vec3d, friction: wp.float64):
-    """An impulse put back into its friction cone, where the guess about its contact was wrong."""
-    zero = wp.float64(0.0)
-    normal = wp.max(x[0], zero)
-    tangential = wp.sqrt(x[1] * x[1] + x[2] * x[2])
-    share = wp.float64(1.0)
-    if tangential > friction * normal:
-        share = friction * normal / tangential
-    return wp.vec3d(normal, share * x[1], share * x[2])
-
-
-@wp.func
 def newton_step(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
     """Impulses that fit the present states of all contacts of one island, put back into their friction cones."""
     first = islands.first_dof[island]
@@ -348,5 +320,5 @@ def newton_step(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64
             for i in range(dofs):
                 x = x + system_out.solution[at + 1 + i] * system_out.rigid_matrix[first + i, 0]
             row = contact_row(place, block, islands)
-            set_three(row, project_into_cone(x, system_out.friction[place]), system_out.impulse)
+            set_three(row, project_into_cone(x, system_out.surface[place]), system_out.impulse)
     update_rigid_velocity(island, islands, system_out)

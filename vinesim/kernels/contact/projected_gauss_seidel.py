@@ -1,13 +1,13 @@
-"""Projected Gauss-Seidel on the impulses of the contacts: Coulomb cones, contact by contact, with Newton steps between.
+"""Projected Gauss-Seidel on the impulses of the contacts of islands, contact by contact, with Newton steps between.
 
-The conditions: v = A x + v_free + bias + compliance x along each row; normal impulses x_n >= 0 with v_n >= 0 and
-x_n v_n = 0; friction |x_t| <= mu x_n against the sliding. In double precision.
+The conditions are those of :mod:`vinesim.kernels.contact.friction_law`.
 """
 
 import warp as wp
 
 from vinesim.kernels.compiler_flags import INLINE_ALL
 from vinesim.kernels.contact.conjugate_gradient import follow_conjugate_direction
+from vinesim.kernels.contact.friction_law import MIN_IMPULSE_SCALE, relaxed, size_of_change
 from vinesim.kernels.contact.island_system import (
     IslandSystem,
     contact_residual,
@@ -26,9 +26,6 @@ from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
-MIN_IMPULSE_SCALE = wp.constant(wp.float64(1.0e-5))
-"""[N s] The largest impulse counts as at least this when convergence is judged. TUNED: 1 mN over 10 ms."""
-
 NEWTON_PERIOD = wp.constant(10)
 """Sweeps between two further Newton steps of an island that the first ones did not settle. TUNED"""
 
@@ -37,29 +34,15 @@ NEWTON_PERIOD = wp.constant(10)
 def relax_contact(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem
 ):
-    """One Gauss-Seidel step of a contact, normal and then friction; returns the largest change of an impulse [N s]."""
+    """One Gauss-Seidel step of a contact; returns how far its impulse has changed [N s]."""
     zero = wp.float64(0.0)
     row = contact_row(place, block, islands)
     before = three(row, system_out.impulse)
     residual = contact_residual(place, block, island, islands, matrix, system_out)
-    mass = system_out.mass[place]
-    normal = wp.max(zero, before[0] - residual[0] * mass[0])
-    pressed = normal - before[0]
-    fu = zero
-    fv = zero
-    if normal != zero or before[1] != zero or before[2] != zero:
-        own = system_out.own[place]
-        fu = before[1] - (residual[1] + own[1, 0] * pressed) * mass[1]
-        fv = before[2] - (residual[2] + own[2, 0] * pressed) * mass[1]
-        tangential = wp.sqrt(fu * fu + fv * fv)
-        limit = system_out.friction[place] * normal
-        if tangential > limit:
-            share = limit / wp.max(tangential, wp.float64(1.0e-30))
-            fu = fu * share
-            fv = fv * share
-    change = wp.vec3d(pressed, fu - before[1], fv - before[2])
+    after = relaxed(before, residual, system_out.steps[place], system_out.surface[place])
+    change = after - before
     if change[0] != zero or change[1] != zero or change[2] != zero:
-        set_three(row, wp.vec3d(normal, fu, fv), system_out.impulse)
+        set_three(row, after, system_out.impulse)
         push_rigid_bodies(
             change,
             system_out.response,
@@ -68,7 +51,7 @@ def relax_contact(
             islands.first_dof[island],
             island_dofs(island, islands),
         )
-    return wp.max(wp.abs(change[0]), wp.abs(change[1]) + wp.abs(change[2]))
+    return size_of_change(change)
 
 
 @wp.func

@@ -1,239 +1,320 @@
-"""The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU: a thread for each row, which stays in its registers.
+"""The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU: a thread for each row, and shuffles between them.
 
 The matrices of trees are small, and their solve is a chain of steps that wait for each other: through memory, even shared
 memory, each of them takes many times what it takes through registers and shuffles. The steps, their order and their
 conditions are those of ``tree_solver``; a Newton step keeps the rows of contacts that do not press as those of an identity.
+
+Native code exchanges numbers between the threads of a warp and solves linear systems in registers; it knows nothing of
+contacts. All threads of a warp must call every function that contains native code.
 """
 
 import warp as wp
 
-from vinesim.kernels.contact.newton import SLIDING_SHARE
-from vinesim.kernels.contact.projected_gauss_seidel import MIN_IMPULSE_SCALE
+from vinesim.kernels.contact.friction_law import (
+    MIN_IMPULSE_SCALE,
+    Steps,
+    Surface,
+    presses,
+    project_into_cone,
+    relaxed,
+    size_of_change,
+    slides,
+)
+from vinesim.kernels.contact.tree_solver import FIRST_SWEEPS, TreeSystem, sliding_row, steps_of_contact
 
 wp.set_module_options({"enable_backward": False})
 
-_SOLVER = """
-#if defined(__CUDA_ARCH__)
-constexpr int ROWS = %(rows)d, LANES = %(lanes)d;
-constexpr unsigned ALL = 0xffffffffu;
-const int lane = threadIdx.x %% LANES, c = lane / 3, part = lane %% 3;
-const int size = 3 * count <= ROWS ? 3 * count : 0;
-const int most = __reduce_max_sync(ALL, size);  // all trees of a warp go through the same steps
-if (most == 0) return count > 0 ? -1 : 0;
-const bool is_row = lane < size;
+MOST_ROWS = wp.constant(30)
+"""Rows of a tree that the threads of a warp solve; fewer threads solve as many rows as they are."""
 
-auto from = [&](double value, int source) { return __shfl_sync(ALL, value, source, LANES); };
-auto of_group = [&](bool value) {  // a bit for each lane of the tree
-    return __ballot_sync(ALL, value) >> (threadIdx.x %% 32 - lane) & (0xffffffffu >> (32 - LANES));
-};
-auto entry = [](auto& a, int i) -> double& { return *(double*)((char*)a.data + (size_t)i * a.strides[0]); };
-auto coupling = [&](int i, int j) {
-    return *(float*)((char*)matrix.data + (size_t)i * matrix.strides[0] + (size_t)j * matrix.strides[1]);
-};
-float a[ROWS];
-const char* column = (const char*)matrix.data + (is_row ? lane * (size_t)matrix.strides[1] : 0);
+
+def _on_gpu(code: str, elsewhere: str = "0") -> str:
+    """Native code for a GPU; a CPU compiles what takes its place, but never calls it."""
+    about = f"constexpr int ROWS = {int(MOST_ROWS)};\nconstexpr unsigned ALL = 0xffffffffu;"
+    return f"#if defined(__CUDA_ARCH__)\n{about}\n{code}\n#else\nreturn {elsewhere};\n#endif\n"
+
+
+@wp.func_native(_on_gpu("return __shfl_sync(ALL, value, source, lanes);"))
+def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
+    """The value of the thread ``source`` among the ``lanes`` of the same tree."""
+    ...
+
+
+@wp.func_native(
+    _on_gpu("return __ballot_sync(ALL, value) >> (threadIdx.x % 32 - lane) & (0xffffffffu >> (32 - lanes));")
+)
+def lanes_where(value: bool, lane: int, lanes: int) -> wp.uint32:
+    """A bit for each thread of the tree: whether its value is true."""
+    ...
+
+
+@wp.func_native(_on_gpu("return __any_sync(ALL, value);", "false"))
+def any_of_warp(value: bool) -> bool:
+    """Whether the value of any thread of the warp is true."""
+    ...
+
+
+@wp.func_native(_on_gpu("return __reduce_max_sync(ALL, value);"))
+def most_of_warp(value: int) -> int:
+    """The largest value of the threads of the warp; the compiler knows that it is the same for all."""
+    ...
+
+
+@wp.func_native(
+    _on_gpu("""
+for (int other = lanes / 2; other > 0; other /= 2) value += __shfl_xor_sync(ALL, value, other, lanes);
+return value;
+""")
+)
+def sum_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
+    """The sum of the values of the threads of the tree."""
+    ...
+
+
+@wp.func_native(
+    _on_gpu("""
+for (int other = lanes / 2; other > 0; other /= 2) value = fmax(value, __shfl_xor_sync(ALL, value, other, lanes));
+return value;
+""")
+)
+def largest_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
+    """The largest value of the threads of the tree."""
+    ...
+
+
+@wp.func
+def of_contact(c: int, value: wp.float64, lanes: int):
+    """The values of the three rows of a contact."""
+    return wp.vec3d(
+        from_lane(value, 3 * c, lanes), from_lane(value, 3 * c + 1, lanes), from_lane(value, 3 * c + 2, lanes)
+    )
+
+
+@wp.func
+def component(part: int, of: wp.vec3d):
+    """An entry of a vector, without an index that would move it to memory."""
+    return wp.where(part == 0, of[0], wp.where(part == 1, of[1], of[2]))
+
+
+@wp.func
+def coupling(j: int, lane: int, size: int, matrix: wp.array2d(dtype=float)):
+    """Entry [1/kg] of the row of a thread, of a symmetric matrix of ``size`` rows; 0 outside of it."""
+    if j < size and lane < size:
+        return wp.float64(matrix[j, lane])
+    return wp.float64(0.0)
+
+
+@wp.func
+def row_velocity(
+    x: wp.float64, outside: wp.float64, lane: int, lanes: int, size: int, most: int, matrix: wp.array2d(dtype=float)
+):
+    """``outside`` [m/s] and the velocity along the row of a thread by the impulses of all, ``most`` at most."""
+    v = outside
+    for j in range(most):
+        v = v + coupling(j, lane, size, matrix) * from_lane(x, j, lanes)
+    return v
+
+
+@wp.func_native(
+    _on_gpu("""
+double row[ROWS];
 #pragma unroll
-for (int j = 0; j < ROWS; ++j, column += matrix.strides[0]) a[j] = is_row && j < size ? *(const float*)column : 0.0f;
-double x = 0.0, outside = 0.0, mu = 0.0, soft = 0.0, by_normal = 0.0, by_tangent = 0.0, nu = 0.0, nv = 0.0;
-if (is_row) {
-    x = entry(impulse, lane);
-    outside = entry(free, lane);
-    mu = entry(friction, c);
-    soft = entry(compliance, c);
-    const double uu = coupling(3 * c + 1, 3 * c + 1), vv = coupling(3 * c + 2, 3 * c + 2);
-    const double uv = coupling(3 * c + 1, 3 * c + 2), spread = 0.5 * (uu - vv);
-    by_normal = 1.0 / (coupling(3 * c, 3 * c) + soft);
-    by_tangent = 1.0 / (0.5 * (uu + vv) + soft + sqrt(spread * spread + uv * uv));
-    nu = coupling(3 * c, 3 * c + 1);
-    nv = coupling(3 * c, 3 * c + 2);
+for (int j = 0; j < ROWS; ++j) {
+    row[j] = 0.0;
+    if (columns >> j & 1) {
+        row[j] = own * wp::load(wp::address(matrix, j, lane)) + others * wp::load(wp::address(matrix, j, partner));
+    }
+    if (j / 3 == lane / 3) row[j] += added[j % 3];
 }
-auto velocities = [&]() {
-    double sum = outside;
+double by_pivot = 0.0;
+#pragma unroll
+for (int k = 0; k < ROWS; ++k) {
+    if (k % 3 == 0 && k >= most) break;
+    const double reciprocal = 1.0 / __shfl_sync(ALL, row[k], k, lanes);
+    const double factor = lane == k ? 0.0 : row[k] * reciprocal;
+    if (lane == k) by_pivot = reciprocal;
     #pragma unroll
-    for (int j = 0; j < ROWS; ++j) {
-        if (j %% 3 == 0 && j >= most) break;
-        sum += (double)a[j] * from(x, j);
+    for (int j = k + 1; j < ROWS; ++j) {
+        if (j % 3 == 0 && j >= most) break;
+        row[j] -= factor * __shfl_sync(ALL, row[j], k, lanes);
     }
-    return sum;
-};
-double v = velocities(), first = 0.0, before = 0.0, direction = 0.0, gradient_before = 0.0;
-bool busy = size > 0;
-int done = 0;
-for (int sweeps = 0; sweeps < max_sweeps && __any_sync(ALL, busy); ++sweeps) {
-    const bool restarts = busy && newton_end > 0 && sweeps == newton_end + 1;
-    const bool follows = busy && !restarts && sweeps > newton_end;
-    const bool steps = busy && sweeps > 0 && sweeps <= newton_end;
-    if (sweeps == first_sweeps) first = x;
-    bool moved = restarts;
-    if (restarts) x = first;
-    if (__any_sync(ALL, follows)) {  // the conjugate direction
-        const double change = x - before;
-        double gradient = change * change;
-        #pragma unroll
-        for (int other = LANES / 2; other > 0; other /= 2) gradient += __shfl_xor_sync(ALL, gradient, other, LANES);
-        if (follows) {
-            const double share = gradient_before > 0.0 && gradient <= gradient_before ? gradient / gradient_before : 0.0;
-            const double further = share > 0.0 ? share * direction : 0.0;
-            direction = further + change;
-            gradient_before = gradient;
-            x += further;
-            moved = share > 0.0;
-        }
-    }
-    if (__any_sync(ALL, steps)) {  // a Newton step
-        const double xn = from(x, 3 * c), xu = from(x, 3 * c + 1), xv = from(x, 3 * c + 2);
-        const double vu = from(v, 3 * c + 1), vv = from(v, 3 * c + 2);
-        const int partner = 3 * c + (part == 1 ? 2 : 1);
-        const double outside_partner = from(outside, partner);
-        const bool presses = is_row && xn > 0.0;
-        const unsigned pressing = of_group(presses);
-        double own = presses ? 1.0 : 0.0, others = 0.0, right = presses ? -outside : 0.0;
-        double to_normal = 0.0, to_u = 0.0, to_v = 0.0;
-        const double limit = mu * xn * %(sliding)r;
-        if (presses && part > 0 && xu * xu + xv * xv >= limit * limit) {
-            const double softer = 1.0 - soft * by_tangent;
-            const double fu = softer * xu - by_tangent * vu, fv = softer * xv - by_tangent * vv;
-            const double scale = rsqrt(fmax(fu * fu + fv * fv, 1e-30)), share = fmin(mu * xn * scale, 1.0);
-            const double along_u = part == 1 ? 1.0 : 0.0, along_v = 1.0 - along_u;
-            const double mine = (part == 1 ? fu : fv) * scale;
-            const double cu = share * (along_u - mine * fu * scale), cv = share * (along_v - mine * fv * scale);
-            own = by_tangent * (part == 1 ? cu : cv);
-            others = by_tangent * (part == 1 ? cv : cu);
-            right = -(own * outside + others * outside_partner);
-            to_normal = -mu * mine;
-            to_u = along_u - softer * cu;
-            to_v = along_v - softer * cv;
-        } else {
-            const double diagonal = presses ? soft : 1.0;
-            if (part == 0) to_normal = diagonal;
-            if (part == 1) to_u = diagonal;
-            if (part == 2) to_v = diagonal;
-        }
-        double row[ROWS];
-        #pragma unroll
-        for (int j = 0; j < ROWS; ++j) {
-            const float theirs = __shfl_sync(ALL, a[j], partner, LANES);
-            row[j] = (float)(pressing >> j & 1) * (own * a[j] + others * theirs);
-            if (j / 3 == c) row[j] += j %% 3 == 0 ? to_normal : j %% 3 == 1 ? to_u : to_v;
-        }
-        double by_pivot = 0.0;
-        #pragma unroll
-        for (int k = 0; k < ROWS; ++k) {  // Gauss-Jordan, without pivoting: see solve_newton_system
-            if (k %% 3 == 0 && k >= most) break;
-            const double reciprocal = 1.0 / from(row[k], k);
-            const double factor = lane == k ? 0.0 : row[k] * reciprocal;
-            if (lane == k) by_pivot = reciprocal;
-            #pragma unroll
-            for (int j = k + 1; j < ROWS; ++j) {
-                if (j %% 3 == 0 && j >= most) break;
-                row[j] -= factor * from(row[j], k);
-            }
-            right -= factor * from(right, k);
-        }
-        const double found = presses ? right * by_pivot : x;
-        const double normal = fmax(from(found, 3 * c), 0.0), u = from(found, 3 * c + 1), w = from(found, 3 * c + 2);
-        const double tangential = sqrt(u * u + w * w);
-        const double share = tangential > mu * normal ? mu * normal / tangential : 1.0;
-        if (steps) {
-            x = part == 0 ? normal : share * found;
-            moved = true;
-        }
-    }
-    if (__any_sync(ALL, moved)) {
-        const double anew = velocities();
-        if (moved) v = anew;
-    }
-    before = x;
-    double change = 0.0, largest = %(scale)r;
-    #pragma unroll
-    for (int k = 0; k < ROWS / 3; ++k) {  // a sweep: each lane computes for its own contact, when that one's turn comes
-        if (3 * k >= most) break;
-        const double xn = from(x, 3 * c), xu = from(x, 3 * c + 1), xv = from(x, 3 * c + 2);
-        const double vn = from(v, 3 * c), vu = from(v, 3 * c + 1), vv = from(v, 3 * c + 2);
-        const double normal = fmax(0.0, xn - (vn + soft * xn) * by_normal), by_n = normal - xn;
-        double fu = xu - (vu + soft * xu + by_n * nu) * by_tangent;
-        double fv = xv - (vv + soft * xv + by_n * nv) * by_tangent;
-        const double square = fu * fu + fv * fv, limit = mu * normal;
-        if (square > limit * limit) {
-            const double share = limit * rsqrt(square);
-            fu *= share;
-            fv *= share;
-        }
-        const bool turn = busy && is_row && c == k;
-        const double dn = from(turn ? by_n : 0.0, 3 * k), du = from(turn ? fu - xu : 0.0, 3 * k);
-        const double dv = from(turn ? fv - xv : 0.0, 3 * k);
-        if (turn) {
-            x = part == 0 ? normal : part == 1 ? fu : fv;
-            change = fmax(fabs(dn), fabs(du) + fabs(dv));
-            largest = fmax(largest, normal);
-        }
-        v += (double)a[3 * k] * dn + (double)a[3 * k + 1] * du + (double)a[3 * k + 2] * dv;
-    }
-    #pragma unroll
-    for (int other = LANES / 2; other > 0; other /= 2) {
-        largest = fmax(largest, __shfl_xor_sync(ALL, largest, other, LANES));
-    }
-    const bool goes_on = of_group(change > tolerance * largest) != 0;
-    if (busy) done = sweeps + 1;
-    busy = busy && goes_on;
+    right -= factor * __shfl_sync(ALL, right, k, lanes);
 }
-if (is_row) {
-    entry(impulse, lane) = x;
-    entry(velocity, lane) = v;
-}
-return size > 0 || count == 0 ? done : -1;
-#else
-return -1;
-#endif
-"""
-
-
-def _snippet(rows: int, lanes: int) -> str:
-    numbers = {"sliding": float(SLIDING_SHARE), "scale": float(MIN_IMPULSE_SCALE)}
-    return _SOLVER % ({"rows": rows, "lanes": lanes} | numbers)
-
-
-FEW_ROWS = wp.constant(15)
-"""Rows of a tree that :func:`solve_few_rows` solves."""
-MANY_ROWS = wp.constant(30)
-"""Rows of a tree that :func:`solve_many_rows` solves."""
-
-
-@wp.func_native(_snippet(int(FEW_ROWS), 16))
-def solve_few_rows(
-    count: int,
-    max_sweeps: int,
-    first_sweeps: int,
-    newton_end: int,
-    tolerance: wp.float64,
+return right * by_pivot;
+""")
+)
+def solve_combined(
     matrix: wp.array2d(dtype=float),
-    free: wp.array(dtype=wp.float64),
-    friction: wp.array(dtype=wp.float64),
-    compliance: wp.array(dtype=wp.float64),
-    impulse: wp.array(dtype=wp.float64),
-    velocity: wp.array(dtype=wp.float64),
-) -> int:
-    """Solve for the impulses of ``count`` contacts of a tree with 16 threads of a GPU; returns the number of sweeps, or -1 on
-    a CPU and where there are more than :data:`FEW_ROWS` rows: then nothing has happened.
+    columns: wp.uint32,
+    partner: int,
+    own: wp.float64,
+    others: wp.float64,
+    added: wp.vec3d,
+    right: wp.float64,
+    lane: int,
+    lanes: int,
+    most: int,
+) -> wp.float64:
+    """Solve a linear system of ``most`` rows at most; returns the entry of this thread.
 
-    The fields of :class:`vinesim.kernels.contact.tree_solver.TreeSystem`. All threads of a warp must call it.
+    Its row is ``own`` times the thread's and ``others`` times that of its partner, in the given columns, with what is added
+    in those of its own contact; ``right`` is its right-hand side. Gauss-Jordan elimination without pivoting: see
+    :func:`vinesim.kernels.contact.tree_solver.solve_newton_system`.
     """
     ...
 
 
-@wp.func_native(_snippet(int(MANY_ROWS), 32))
-def solve_many_rows(
+@wp.func
+def newton_impulse(
+    x: wp.float64,
+    v: wp.float64,
+    outside: wp.float64,
+    lane: int,
+    lanes: int,
+    is_row: bool,
+    most: int,
+    steps: Steps,
+    surface: Surface,
+    matrix: wp.array2d(dtype=float),
+):
+    """The impulse along the row of a thread that fits the present states of all contacts, put back into its cone."""
+    zero = wp.float64(0.0)
+    one = wp.float64(1.0)
+    c = lane // 3
+    part = lane % 3
+    impulse = of_contact(c, x, lanes)
+    velocity = of_contact(c, v, lanes)
+    partner = 3 * c + wp.where(part == 1, 2, 1)
+    outside_partner = from_lane(outside, partner, lanes)
+    is_pressed = is_row and presses(impulse)
+    pressing = lanes_where(is_pressed, lane, lanes)
+    columns = wp.where(is_pressed, pressing, wp.uint32(0))
+    own = wp.where(is_pressed, one, zero)
+    others = wp.float64(0.0)
+    diagonal = wp.where(is_pressed, surface.compliance, one)
+    added = wp.vec3d(
+        wp.where(part == 0, diagonal, zero),
+        wp.where(part == 1, diagonal, zero),
+        wp.where(part == 2, diagonal, zero),
+    )
+    if is_pressed and part > 0 and slides(impulse, surface):
+        by_tangents, added = sliding_row(part, impulse, velocity, steps, surface)
+        own = wp.where(part == 1, by_tangents[0], by_tangents[1])
+        others = wp.where(part == 1, by_tangents[1], by_tangents[0])
+    right = -(own * outside + others * outside_partner)
+    found = solve_combined(matrix, columns, partner, own, others, added, right, lane, lanes, most)
+    found = wp.where(is_pressed, found, x)
+    return component(part, project_into_cone(of_contact(c, found, lanes), surface))
+
+
+@wp.func
+def sweep_rows(
+    x: wp.float64,
+    v: wp.float64,
+    lane: int,
+    lanes: int,
+    size: int,
+    busy: bool,
+    most: int,
+    steps: Steps,
+    surface: Surface,
+    matrix: wp.array2d(dtype=float),
+):
+    """One sweep; returns impulse and velocity along the row of a thread, how far the impulse of its contact has changed, and
+    the normal one [N s]. Each thread computes for its own contact, and uses it when that one's turn comes."""
+    c = lane // 3
+    part = lane % 3
+    change = wp.float64(0.0)
+    normal = wp.float64(0.0)
+    for k in range(most // 3):
+        impulse = of_contact(c, x, lanes)
+        residual = of_contact(c, v, lanes) + surface.compliance * impulse
+        after = relaxed(impulse, residual, steps, surface)
+        is_next = busy and lane < size and c == k
+        mine = wp.where(is_next, after - impulse, wp.vec3d())
+        x = wp.where(is_next, component(part, after), x)
+        change = wp.where(is_next, size_of_change(mine), change)
+        normal = wp.where(is_next, after[0], normal)
+        for axis in range(3):
+            v = v + coupling(3 * k + axis, lane, size, matrix) * from_lane(mine[axis], 3 * k, lanes)
+    return x, v, change, normal
+
+
+@wp.func
+def further_along(change: wp.float64, direction: wp.float64, gradient: wp.float64, gradient_before: wp.float64):
+    """How much further the impulse of a thread goes in the conjugate direction after a sweep: see
+    :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`."""
+    goes = gradient_before > wp.float64(0.0) and gradient <= gradient_before
+    return wp.where(goes, gradient / gradient_before * direction, wp.float64(0.0))
+
+
+@wp.func
+def solve_rows(
+    lane: int,
+    lanes: int,
     count: int,
     max_sweeps: int,
-    first_sweeps: int,
     newton_end: int,
     tolerance: wp.float64,
-    matrix: wp.array2d(dtype=float),
-    free: wp.array(dtype=wp.float64),
-    friction: wp.array(dtype=wp.float64),
-    compliance: wp.array(dtype=wp.float64),
-    impulse: wp.array(dtype=wp.float64),
-    velocity: wp.array(dtype=wp.float64),
-) -> int:
-    """The same with the 32 threads of a warp for a tree, and up to :data:`MANY_ROWS` rows."""
-    ...
+    system_out: TreeSystem,
+):
+    """Solve for the impulses of ``count`` contacts of a tree from its ``lanes`` threads, of which this is number ``lane``;
+    returns the number of sweeps, or -1 where there are more rows than threads: then nothing has happened.
+
+    What the loop assigns under a condition stays in registers from one turn to the next: generated code declares all
+    variables before the loop. So the loop chooses values instead of branching, and computes in functions.
+    """
+    size = wp.where(3 * count <= wp.min(lanes, MOST_ROWS), 3 * count, 0)
+    most = most_of_warp(size)  # all trees of a warp go through the same steps
+    if most == 0:
+        return wp.where(count > 0, -1, 0)
+    is_row = lane < size
+    steps = Steps()
+    surface = Surface()
+    x = wp.float64(0.0)
+    outside = wp.float64(0.0)
+    if is_row:
+        steps = steps_of_contact(lane // 3, system_out)
+        surface = system_out.surface[lane // 3]
+        x = system_out.impulse[lane]
+        outside = system_out.free[lane]
+    v = row_velocity(x, outside, lane, lanes, size, most, system_out.matrix)
+    first = wp.float64(0.0)
+    before = wp.float64(0.0)
+    direction = wp.float64(0.0)
+    gradient_before = wp.float64(0.0)
+    busy = bool(size > 0)
+    done = int(0)
+    sweeps = int(0)
+    while sweeps < max_sweeps and any_of_warp(busy):
+        restarts = busy and newton_end > 0 and sweeps == newton_end + 1
+        follows = busy and sweeps > newton_end and not restarts
+        takes_step = busy and sweeps > 0 and sweeps <= newton_end
+        first = wp.where(sweeps == FIRST_SWEEPS, x, first)
+        found = wp.where(restarts, first, x)
+        if any_of_warp(follows):
+            change = x - before
+            gradient = sum_of_lanes(change * change, lanes)
+            further = further_along(change, direction, gradient, gradient_before)
+            direction = wp.where(follows, further + change, direction)
+            gradient_before = wp.where(follows, gradient, gradient_before)
+            found = wp.where(follows, x + further, found)
+        if any_of_warp(takes_step):
+            impulse = newton_impulse(x, v, outside, lane, lanes, is_row, most, steps, surface, system_out.matrix)
+            found = wp.where(takes_step, impulse, found)
+        x = found
+        moves = restarts or follows or takes_step
+        if any_of_warp(moves):
+            velocity = row_velocity(x, outside, lane, lanes, size, most, system_out.matrix)
+            v = wp.where(moves, velocity, v)
+        before = x
+        x, v, change, normal = sweep_rows(x, v, lane, lanes, size, busy, most, steps, surface, system_out.matrix)
+        largest = largest_of_lanes(wp.max(normal, MIN_IMPULSE_SCALE), lanes)
+        sweeps = sweeps + 1
+        done = wp.where(busy, sweeps, done)
+        changing = lanes_where(change > tolerance * largest, lane, lanes)  # by all threads, also of trees that are done
+        busy = busy and changing != wp.uint32(0)
+    if is_row:
+        system_out.impulse[lane] = x
+        system_out.velocity[lane] = v
+    return wp.where(size > 0 or count == 0, done, -1)

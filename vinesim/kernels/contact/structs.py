@@ -7,6 +7,8 @@ number).
 
 import warp as wp
 
+from vinesim.kernels.contact.friction_law import Surface
+
 wp.set_module_options({"enable_backward": False})
 
 # entries of ``counters``
@@ -58,20 +60,6 @@ class Parameters:
     """[m/s] A contact that closes faster is an impact."""
     wire_damping_time: wp.float64
     """[s] damping of a wire over its stiffness."""
-
-
-@wp.struct
-class MaterialPairs:
-    """The same by the two materials in contact [material, material], symmetric."""
-
-    friction: wp.array2d(dtype=wp.float64)
-    """[1] Coulomb coefficient."""
-    stiffness: wp.array2d(dtype=wp.float64)
-    """[N/m] normal, and as the anchor of friction tangential."""
-    damping: wp.array2d(dtype=wp.float64)
-    """[N s/m]"""
-    compliance: wp.array2d(dtype=wp.float64)
-    """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), on the diagonal of the Delassus matrix."""
 
 
 @wp.struct
@@ -364,13 +352,8 @@ class Contacts:
     other_slot: wp.array(dtype=wp.int32)
     """the same of the other plant body, -1 for a geom."""
     gap: wp.array(dtype=wp.float64)
-    friction: wp.array(dtype=wp.float64)
-    stiffness: wp.array(dtype=wp.float64)
-    """[N/m]"""
-    damping: wp.array(dtype=wp.float64)
-    """[N s/m]"""
-    compliance: wp.array(dtype=wp.float64)
-    """[m/(N s^2)] see :class:`MaterialPairs`."""
+    surface: wp.array(dtype=Surface)
+    """what its two materials make of it; with the friction of a geom that has its own, and the spring of a wire."""
     wire_stiffness: wp.array(dtype=wp.float64)
     """[N/m] of the wire that is its other side; 0: of none, or one that does not give."""
     wire_shift: wp.array(dtype=wp.float64)

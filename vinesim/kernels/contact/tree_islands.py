@@ -11,14 +11,14 @@ import warp as wp
 
 from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
+from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.jacobians import write_rows
-from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
+from vinesim.kernels.contact.row_solver import solve_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
     Contacts,
     Geoms,
-    MaterialPairs,
     Parameters,
     PlantBodies,
     RigidBodies,
@@ -93,7 +93,7 @@ def predict_impacted_trees(
 def write_tree_rows(
     # model
     parameters: Parameters,
-    pairs: MaterialPairs,
+    pairs: wp.array2d(dtype=Surface),
     capsules: Capsules,
     geoms: Geoms,
     # in
@@ -243,13 +243,42 @@ def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out
         target_out.free[row] = source.free[row]
         target_out.impulse[row] = source.impulse[row]
         target_out.velocity[row] = source.velocity[row]
-        target_out.friction[row // 3] = source.friction[row // 3]
-        target_out.compliance[row // 3] = source.compliance[row // 3]
+        target_out.surface[row // 3] = source.surface[row // 3]
     synchronize_lanes(lanes)
 
 
+@wp.kernel
+def begin_trees(
+    # model
+    max_sweeps: int,
+    max_newton_steps: int,
+    max_newton_contacts: int,
+    tolerance: wp.float64,
+    # in
+    trees: int,
+    width: int,
+    # out
+    tree_contacts_out: TreeContacts,
+    system_out: TreeSystem,
+    search_out: TreeSearch,
+):
+    """One thread of a CPU per tree: two sweeps for its impulses; trees that need more are listed."""
+    tree = wp.tid()
+    count = tree_contacts_out.count[tree]
+    if count > 0:
+        system = view_system(system_out, tree, trees, width)
+        search = view_search(search_out, tree, trees, width + 1)
+        newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
+        update_velocities(0, 1, 3 * count, system)
+        limit = wp.min(FIRST_SWEEPS, max_sweeps)
+        sweeps, busy = solve_tree(0, 0, 1, count, limit, newton_end, tolerance, system, search)
+        tree_contacts_out.sweeps[tree] = sweeps
+        if busy and sweeps < max_sweeps:
+            tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
+
+
 @wp.kernel(cuda_max_registers=128)
-def solve_trees(
+def solve_small_trees(
     # model
     max_sweeps: int,
     max_newton_steps: int,
@@ -262,13 +291,9 @@ def solve_trees(
     # out
     tree_contacts_out: TreeContacts,
     system_out: TreeSystem,
-    search_out: TreeSearch,
 ):
-    """``lanes`` threads per tree solve for its impulses.
-
-    On a GPU 16 threads solve trees of few contacts at once, see :func:`vinesim.kernels.contact.row_solver.solve_few_rows`,
-    in full warps; nothing happens with the others. On a CPU two sweeps are done here, and trees that need more are listed.
-    """
+    """``lanes`` threads of a GPU per tree solve for its impulses, in full warps; nothing happens with trees of more rows, see
+    :func:`vinesim.kernels.contact.row_solver.solve_rows`."""
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
     count = int(0)
@@ -276,29 +301,9 @@ def solve_trees(
         count = tree_contacts_out.count[tree]
     system = view_system(system_out, tree, trees, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-    sweeps = solve_few_rows(
-        count,
-        max_sweeps,
-        FIRST_SWEEPS,
-        newton_end,
-        tolerance,
-        system.matrix,
-        system.free,
-        system.friction,
-        system.compliance,
-        system.impulse,
-        system.velocity,
-    )
-    busy = bool(False)
-    if lanes == 1 and count > 0:
-        search = view_search(search_out, tree, trees, width + 1)
-        update_velocities(lane, lanes, 3 * count, system)
-        limit = wp.min(FIRST_SWEEPS, max_sweeps)
-        sweeps, busy = solve_tree(0, lane, lanes, count, limit, newton_end, tolerance, system, search)
+    sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
     if lane == 0 and count > 0 and sweeps >= 0:
         tree_contacts_out.sweeps[tree] = sweeps
-        if busy and sweeps < max_sweeps:
-            tree_contacts_out.busy[wp.atomic_add(tree_contacts_out.busy_count, 0, 1)] = tree
 
 
 @wp.kernel
@@ -332,19 +337,9 @@ def solve_busy_trees(
         count = tree_contacts_out.count[tree]
         system = view_system(system_out, tree, trees, width)
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-        sweeps = solve_many_rows(
-            count,
-            max_sweeps,
-            FIRST_SWEEPS,
-            newton_end,
-            tolerance,
-            system.matrix,
-            system.free,
-            system.friction,
-            system.compliance,
-            system.impulse,
-            system.velocity,
-        )
+        sweeps = int(-1)
+        if lanes > 1:
+            sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
         if sweeps < 0:
             sweeps = tree_contacts_out.sweeps[tree]
             copy_system(lane, lanes, 3 * count, system, dense)

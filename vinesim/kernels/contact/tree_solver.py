@@ -2,7 +2,7 @@
 
 :mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, and finds its
 way through lists of them. The contacts of a tree alone are one matrix, and nothing else moves: then a row is a sum. On a
-GPU :mod:`vinesim.kernels.contact.row_solver` does the same in registers, and what is here solves the trees that have too
+GPU :mod:`vinesim.kernels.contact.row_solver` does the same with a thread a row, and what is here solves the trees that have too
 many contacts for that, a warp each, whose threads share the rows and all take the same decisions from the same numbers. On
 a CPU one thread has all rows. The matrix is in single precision, as the impulse response is that it comes from; all else is
 in double precision.
@@ -10,8 +10,19 @@ in double precision.
 
 import warp as wp
 
-from vinesim.kernels.contact.newton import SLIDING_SHARE
-from vinesim.kernels.contact.projected_gauss_seidel import MIN_IMPULSE_SCALE
+from vinesim.kernels.contact.friction_law import (
+    MIN_IMPULSE_SCALE,
+    Steps,
+    Surface,
+    linearise_sliding,
+    presses,
+    project_into_cone,
+    relaxed,
+    size_of_change,
+    slides,
+    steps_of,
+)
+from vinesim.kernels.contact.island_system import set_three, three
 
 wp.set_module_options({"enable_backward": False})
 
@@ -32,10 +43,8 @@ class TreeSystem:
     """[row, row] Delassus matrix, 1/kg."""
     free: wp.array(dtype=wp.float64)
     """[row] m/s without impulses, bias included."""
-    friction: wp.array(dtype=wp.float64)
-    """[contact] Coulomb coefficient."""
-    compliance: wp.array(dtype=wp.float64)
-    """[contact] m/(N s^2)"""
+    surface: wp.array(dtype=Surface)
+    """[contact]"""
     impulse: wp.array(dtype=wp.float64)
     """[row] N s, the guess at first."""
     velocity: wp.array(dtype=wp.float64)
@@ -54,22 +63,6 @@ class TreeSearch:
     """[row] impulses before the last sweep."""
     direction: wp.array(dtype=wp.float64)
     """[row] direction of search."""
-
-
-@wp.func
-def reciprocal(x: wp.float64):
-    """1 / x from single precision by two Newton steps: to rounding, in a fifth of the instructions of a division."""
-    two = wp.float64(2.0)
-    y = wp.float64(1.0 / wp.float32(x))
-    y = y * (two - x * y)
-    return y * (two - x * y)
-
-
-@wp.func
-def reciprocal_root(square: wp.float64):
-    """1 / sqrt(square) in the same way."""
-    y = wp.float64(1.0 / wp.sqrt(wp.max(wp.float32(square), 1.0e-30)))
-    return y * (wp.float64(1.5) - wp.float64(0.5) * square * y * y)
 
 
 @wp.func_native("""
@@ -100,55 +93,39 @@ def update_velocities(lane: int, lanes: int, size: int, system_out: TreeSystem):
 
 
 @wp.func
-def tangential_eigenvalue(c: int, system: TreeSystem):
-    """The larger eigenvalue [1/kg] of the tangential block of a contact, with compliance."""
-    half = wp.float64(0.5)
-    uu = wp.float64(system.matrix[3 * c + 1, 3 * c + 1])
-    vv = wp.float64(system.matrix[3 * c + 2, 3 * c + 2])
-    uv = wp.float64(system.matrix[3 * c + 1, 3 * c + 2])
-    spread = half * (uu - vv)
-    square = spread * spread + uv * uv
-    return half * (uu + vv) + system.compliance[c] + square * reciprocal_root(square)
+def steps_of_contact(c: int, system: TreeSystem):
+    """The steps of Gauss-Seidel of a contact."""
+    own = wp.mat33d()
+    for r in range(3):
+        for k in range(3):
+            own[r, k] = wp.float64(system.matrix[3 * c + r, 3 * c + k])
+        own[r, r] = own[r, r] + system.surface[c].compliance
+    return steps_of(own)
 
 
 @wp.func
 def relax_contact(c: int, lane: int, lanes: int, size: int, system_out: TreeSystem):
-    """One Gauss-Seidel step of a contact, normal and then friction: its normal impulse and the largest change [N s]."""
-    compliance = system_out.compliance[c]
+    """One Gauss-Seidel step of a contact: its normal impulse and how far its impulse has changed [N s]."""
+    zero = wp.float64(0.0)
     n = 3 * c
-    before = wp.vec3d(system_out.impulse[n], system_out.impulse[n + 1], system_out.impulse[n + 2])
-    r = compliance * before + wp.vec3d(system_out.velocity[n], system_out.velocity[n + 1], system_out.velocity[n + 2])
-    normal = wp.max(wp.float64(0.0), before[0] - r[0] * reciprocal(wp.float64(system_out.matrix[n, n]) + compliance))
-    change = normal - before[0]
-    ru = r[1] + change * wp.float64(system_out.matrix[n, n + 1])
-    rv = r[2] + change * wp.float64(system_out.matrix[n, n + 2])
-    # the larger eigenvalue of the tangential block: the step stays inside the cone's convergence
-    step = reciprocal(tangential_eigenvalue(c, system_out))
-    fu = before[1] - ru * step
-    fv = before[2] - rv * step
-    square = fu * fu + fv * fv
-    limit = system_out.friction[c] * normal
-    if square > limit * limit:
-        share = limit * reciprocal_root(square)
-        fu = fu * share
-        fv = fv * share
-    change_u = fu - before[1]
-    change_v = fv - before[2]
+    surface = system_out.surface[c]
+    before = three(n, system_out.impulse)
+    residual = surface.compliance * before + three(n, system_out.velocity)
+    after = relaxed(before, residual, steps_of_contact(c, system_out), surface)
+    change = after - before
     synchronize_lanes(lanes)
-    if change != wp.float64(0.0) or change_u != wp.float64(0.0) or change_v != wp.float64(0.0):
+    if change[0] != zero or change[1] != zero or change[2] != zero:
         if lane == 0:
-            system_out.impulse[n] = normal
-            system_out.impulse[n + 1] = fu
-            system_out.impulse[n + 2] = fv
+            set_three(n, after, system_out.impulse)
         for row in range(lane, size, lanes):
             system_out.velocity[row] = (
                 system_out.velocity[row]
-                + wp.float64(system_out.matrix[n, row]) * change
-                + wp.float64(system_out.matrix[n + 1, row]) * change_u
-                + wp.float64(system_out.matrix[n + 2, row]) * change_v
+                + wp.float64(system_out.matrix[n, row]) * change[0]
+                + wp.float64(system_out.matrix[n + 1, row]) * change[1]
+                + wp.float64(system_out.matrix[n + 2, row]) * change[2]
             )
     synchronize_lanes(lanes)
-    return normal, wp.max(wp.abs(change), wp.abs(change_u) + wp.abs(change_v))
+    return after[0], size_of_change(change)
 
 
 @wp.func
@@ -157,7 +134,7 @@ def list_pressing(count: int, system: TreeSystem):
     listed = wp.int64(0)
     found = int(0)
     for c in range(count):
-        if system.impulse[3 * c] > wp.float64(0.0):
+        if presses(three(3 * c, system.impulse)):
             listed = listed | (wp.int64(c) << wp.int64(4 * found))
             found = found + 1
     return listed, found
@@ -170,41 +147,40 @@ def row_of(listed: wp.int64, i: int):
 
 
 @wp.func
-def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, search_out: TreeSearch):
-    """Write a friction row of a sliding contact.
+def sliding_row(part: int, x: wp.vec3d, velocity: wp.vec3d, steps: Steps, surface: Surface):
+    """A row of Newton's system for the friction of a sliding contact along its tangent ``part``, 1 or 2:
+    x_t - K (x_t - step r_t) - g x_n = 0, see :func:`vinesim.kernels.contact.friction_law.linearise_sliding`.
 
-    Friction is the projection of f = x_t - r_t / e on the disk of radius mu x_n, where r_t is the velocity along the
-    tangents, compliance included, and e their eigenvalue. Linearised about the present f, with d = f / |f|,
-    P = 1 - d d^T and s = mu x_n / |f|:  x_t - s P (x_t - r_t / e) - mu d x_n = 0 (Alart and Curnier, A mixed
-    formulation for frictional contact problems prone to Newton like solution methods, 1991).
+    x [N s] impulses and velocity [m/s], compliance left out, of the contact. Returns by how much the matrix rows and the
+    free velocities of the two tangents are multiplied, and what is then added for the impulses of the contact itself.
     """
-    one = wp.float64(1.0)
-    c = row_of(listed, i) // 3
-    n = 3 * c
-    u = n + 1
-    v = n + 2
-    softness = reciprocal(tangential_eigenvalue(c, system))
-    softer = one - system.compliance[c] * softness
-    fu = softer * system.impulse[u] - softness * system.velocity[u]
-    fv = softer * system.impulse[v] - softness * system.velocity[v]
-    scale = reciprocal_root(fu * fu + fv * fv)
-    friction = system.friction[c]
-    share = wp.min(friction * system.impulse[n] * scale, one)
-    along_u = wp.where(i % 3 == 1, one, wp.float64(0.0))
-    along_v = one - along_u
-    mine = (along_u * fu + along_v * fv) * scale
-    cu = share * (along_u - mine * fu * scale)
-    cv = share * (along_v - mine * fv * scale)
+    K, g = linearise_sliding(x, velocity + surface.compliance * x, steps, surface)
+    along_u = wp.where(part == 1, wp.float64(1.0), wp.float64(0.0))
+    along_v = wp.float64(1.0) - along_u
+    by_u = along_u * K[0, 0] + along_v * K[1, 0]
+    by_v = along_u * K[0, 1] + along_v * K[1, 1]
+    softer = wp.float64(1.0) - surface.compliance * steps.tangential
+    added = wp.vec3d(-(along_u * g[0] + along_v * g[1]), along_u - softer * by_u, along_v - softer * by_v)
+    return wp.vec2d(steps.tangential * by_u, steps.tangential * by_v), added
+
+
+@wp.func
+def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, search_out: TreeSearch):
+    """Write a friction row of a sliding contact: see :func:`sliding_row`."""
+    n = row_of(listed, i - i % 3)
+    c = n // 3
+    by, added = sliding_row(
+        i % 3, three(n, system.impulse), three(n, system.velocity), steps_of_contact(c, system), system.surface[c]
+    )
     for k in range(size):
         column = row_of(listed, k)
-        search_out.factor[i, k] = softness * (
-            cu * wp.float64(system.matrix[column, u]) + cv * wp.float64(system.matrix[column, v])
+        search_out.factor[i, k] = by[0] * wp.float64(system.matrix[column, n + 1]) + by[1] * wp.float64(
+            system.matrix[column, n + 2]
         )
-    k = i - i % 3
-    search_out.factor[i, k] = search_out.factor[i, k] - friction * mine
-    search_out.factor[i, k + 1] = search_out.factor[i, k + 1] + along_u - softer * cu
-    search_out.factor[i, k + 2] = search_out.factor[i, k + 2] + along_v - softer * cv
-    search_out.factor[i, size] = -softness * (cu * system.free[u] + cv * system.free[v])
+    for axis in range(3):
+        k = i - i % 3 + axis
+        search_out.factor[i, k] = search_out.factor[i, k] + added[axis]
+    search_out.factor[i, size] = -(by[0] * system.free[n + 1] + by[1] * system.free[n + 2])
 
 
 @wp.func
@@ -216,15 +192,12 @@ def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, syst
     for i in range(lane, size, lanes):
         row = row_of(listed, i)
         c = row // 3
-        u = system.impulse[3 * c + 1]
-        v = system.impulse[3 * c + 2]
-        limit = system.friction[c] * system.impulse[3 * c] * SLIDING_SHARE
-        if i % 3 > 0 and u * u + v * v >= limit * limit:
+        if i % 3 > 0 and slides(three(3 * c, system.impulse), system.surface[c]):
             write_sliding_row(i, listed, size, system, search_out)
         else:
             for k in range(size):
                 search_out.factor[i, k] = wp.float64(system.matrix[row_of(listed, k), row])
-            search_out.factor[i, i] = search_out.factor[i, i] + system.compliance[c]
+            search_out.factor[i, i] = search_out.factor[i, i] + system.surface[c].compliance
             search_out.factor[i, size] = -system.free[row]
     synchronize_lanes(lanes)
 
@@ -237,7 +210,7 @@ def solve_newton_system(
     across = wp.min(lanes, LANES_ACROSS)
     down = wp.max(lanes / LANES_ACROSS, 1)
     for k in range(size):
-        scale = reciprocal(search_out.factor[k, k])
+        scale = wp.float64(1.0) / search_out.factor[k, k]
         for m in range(k + 1 + lane // across, size, down):
             factor = search_out.factor[m, k] * scale
             if factor != wp.float64(0.0):
@@ -246,7 +219,7 @@ def solve_newton_system(
         synchronize_lanes(lanes)
     for back in range(size):
         k = size - 1 - back
-        value = search_out.factor[k, size] * reciprocal(search_out.factor[k, k])
+        value = search_out.factor[k, size] / search_out.factor[k, k]
         for m in range(lane, k, lanes):
             search_out.factor[m, size] = search_out.factor[m, size] - search_out.factor[m, k] * value
         if lane == 0:
@@ -269,17 +242,8 @@ def take_newton_step(lane: int, lanes: int, count: int, system_out: TreeSystem, 
 def project_into_cones(lane: int, lanes: int, count: int, system_out: TreeSystem):
     """Put the impulses back into their friction cones, where the guess about a contact was wrong."""
     for c in range(lane, count, lanes):
-        n = 3 * c
-        normal = wp.max(system_out.impulse[n], wp.float64(0.0))
-        u = system_out.impulse[n + 1]
-        v = system_out.impulse[n + 2]
-        tangential = wp.sqrt(u * u + v * v)
-        share = wp.float64(1.0)
-        if tangential > system_out.friction[c] * normal:
-            share = system_out.friction[c] * normal / tangential
-        system_out.impulse[n] = normal
-        system_out.impulse[n + 1] = share * u
-        system_out.impulse[n + 2] = share * v
+        x = project_into_cone(three(3 * c, system_out.impulse), system_out.surface[c])
+        set_three(3 * c, x, system_out.impulse)
     synchronize_lanes(lanes)
 
 

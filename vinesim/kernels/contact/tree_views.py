@@ -5,6 +5,7 @@ Entry ``i`` of a tree lies at ``i * trees + tree``: see :mod:`vinesim.kernels.co
 
 import warp as wp
 
+from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.structs import Contacts, Rows, WarmStart
 from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
 
@@ -28,6 +29,10 @@ def view_double(a: wp.array(dtype=wp.float64), tree: int, trees: int) -> wp.arra
 
 
 @wp.func_native(VIEW)
+def view_surface(a: wp.array(dtype=Surface), tree: int, trees: int) -> wp.array(dtype=Surface): ...
+
+
+@wp.func_native(VIEW)
 def view_vec3d(a: wp.array(dtype=wp.vec3d), tree: int, trees: int) -> wp.array(dtype=wp.vec3d): ...
 
 
@@ -47,6 +52,10 @@ def view_matrix(a: wp.array2d(dtype=float), tree: int, trees: int, columns: int)
 
 @wp.func_native("a.data += first; return a;")
 def part_double(a: wp.array(dtype=wp.float64), first: int) -> wp.array(dtype=wp.float64): ...
+
+
+@wp.func_native("a.data += first; return a;")
+def part_surface(a: wp.array(dtype=Surface), first: int) -> wp.array(dtype=Surface): ...
 
 
 @wp.func_native("a.data += first * a.shape.dims[1]; return a;")
@@ -82,10 +91,7 @@ def view_contacts(s: Contacts, tree: int, trees: int):
         view_int(s.other_body, tree, trees),
         s.other_slot,
         view_double(s.gap, tree, trees),
-        view_double(s.friction, tree, trees),
-        view_double(s.stiffness, tree, trees),
-        view_double(s.damping, tree, trees),
-        view_double(s.compliance, tree, trees),
+        view_surface(s.surface, tree, trees),
         view_double(s.wire_stiffness, tree, trees),
         view_double(s.wire_shift, tree, trees),
         view_vec3d(s.point, tree, trees),
@@ -130,8 +136,7 @@ def view_system(s: TreeSystem, tree: int, trees: int, width: int):
     return TreeSystem(
         view_matrix(s.matrix, tree, trees, width),
         view_double(s.free, tree, trees),
-        view_double(s.friction, tree, trees),
-        view_double(s.compliance, tree, trees),
+        view_surface(s.surface, tree, trees),
         view_double(s.impulse, tree, trees),
         view_double(s.velocity, tree, trees),
     )
@@ -154,8 +159,7 @@ def part_of_system(s: TreeSystem, first: int):
     return TreeSystem(
         part_matrix(s.matrix, first),
         part_double(s.free, first),
-        part_double(s.friction, first),
-        part_double(s.compliance, first),
+        part_surface(s.surface, first),
         part_double(s.impulse, first),
         part_double(s.velocity, first),
     )
