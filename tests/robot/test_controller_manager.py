@@ -8,10 +8,10 @@ import pytest
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.controller_manager import ControllerManager, GoalResult
 from vinesim.robot.control.trajectory_controller import Outcome, Trajectory
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import ControllerKind
 

@@ -11,8 +11,8 @@ from vinesim.core import frames
 from vinesim.rigid.free_bunch import FreeBunch
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.world import Physics
 
 

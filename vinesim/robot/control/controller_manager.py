@@ -19,8 +19,8 @@ from vinesim.robot.control.trajectory_controller import (
     TrajectoryController,
     TrajectoryError,
 )
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.values import ControllerKind, ControllerSpec, GripperState
 
 

@@ -10,8 +10,8 @@ from collections.abc import Container, Mapping, Sequence
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
-from vinesim.robot.description.errors import description_error
 from vinesim.robot.description.sidecar import Controller, Sidecar
+from vinesim.robot.description.urdf import description_error
 from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 
 INTERFACE_OF_KIND = {

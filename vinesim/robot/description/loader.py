@@ -24,11 +24,9 @@ from vinesim.core import data_files
 from vinesim.robot.description.controllers import command_interfaces, make_controllers
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
-from vinesim.robot.description.errors import DescriptionError, description_error
 from vinesim.robot.description.inferred_defaults import guess_cameras, guess_groups, guess_lidars
 from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
-from vinesim.robot.description.meshes import replace_unopened_meshes, resolve_meshes
-from vinesim.robot.description.package_resources import find_installed
+from vinesim.robot.description.meshes import find_installed, replace_unopened_meshes, resolve_meshes
 from vinesim.robot.description.repairs import (
     MOUNT,
     add_missing_masses,
@@ -37,14 +35,20 @@ from vinesim.robot.description.repairs import (
     repair_joints,
 )
 from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
-from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
-from vinesim.robot.description.urdf_model import Joint, Robot, parse_robot
-from vinesim.robot.description.urdf_reader import (
+from vinesim.robot.description.urdf import (
     MOVABLE_JOINT_TYPES,
+    DescriptionError,
+    Joint,
+    Robot,
     check_friction,
+    check_joints,
+    check_masses,
     check_numbers,
+    check_tree,
+    description_error,
     fix_wheels,
     merge_disabled_collisions,
+    parse_robot,
     read_xml,
     set_friction,
 )

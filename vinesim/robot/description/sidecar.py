@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from vinesim.robot.description.errors import description_error
+from vinesim.robot.description.urdf import description_error
 from vinesim.scene.values import ControllerKind, SensorMode, SensorPacing
 
 

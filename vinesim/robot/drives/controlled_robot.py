@@ -20,8 +20,7 @@ from vinesim.core import frames
 from vinesim.interaction.detachment import Blade
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives.commands import CommandError, CommandInterface
-from vinesim.robot.drives.joint_servos import JointServos
+from vinesim.robot.drives.joint_servos import CommandError, CommandInterface, JointServos
 from vinesim.robot.drives.proprioception import BodySensors, elastic_sample
 from vinesim.robot.drives.robot_instance import RobotInstance
 from vinesim.scene.values import Contact, LightPattern, Lights, RobotSample, RobotUpdate
