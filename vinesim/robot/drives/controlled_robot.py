@@ -70,8 +70,15 @@ class Robot(RobotInstance):
         """[joint] :class:`CommandInterface` by which each joint was commanded last."""
         return self._servos.interface
 
+    @property
+    def physics(self) -> Physics:
+        """The world whose plants its grippers act on; :class:`CommandError` before :meth:`fit_cutters`."""
+        if self._physics is None:
+            raise CommandError(f"{self.name} has no grippers for plants; call fit_cutters(physics) first")
+        return self._physics
+
     def fit_cutters(self, physics: Physics) -> None:
-        """Give the robot the cutters of its description, to cut plants in ``physics``."""
+        """Let grippers act on plants in ``physics``: give the robot the cutters of its description."""
         self._physics = physics
         for cutter in self.description.cutters:
             blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
