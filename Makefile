@@ -9,7 +9,7 @@ PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadgroup
 LINT = .venv-lint/bin
 BIOME = .venv-lint/node_modules/.bin/biome
 
-.PHONY: demo test test-long check lint docs validation setup clean
+.PHONY: demo test test-long check lint docs wheel validation setup clean
 demo:
 	@PYTHON=$(PYTHON) tools/setup run
 	@.venv/bin/vinesim demo --seconds $(SECONDS) --seed $(SEED) --out $(OUT) $(ARGS)
@@ -37,6 +37,9 @@ setup:
 
 docs: setup # the documentation site, into build/site
 	@NO_MKDOCS_2_WARNING=1 .venv/bin/python -m mkdocs build --strict --quiet
+
+wheel: # what pip installs, into build/wheel
+	@$(PYTHON) -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
 
 validation: setup # figures and pictures of docs/validation.md, by the tests' own code
 	@.venv/bin/python -m tests.laws.plots
