@@ -33,7 +33,7 @@ from vinesim.net.transport.bus import KEEP_ALL
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description as load_robot
-from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model

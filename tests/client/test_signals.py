@@ -18,8 +18,8 @@ from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import standing_pose
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HandGestures, Intention, LightPattern, Lights

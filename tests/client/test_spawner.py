@@ -15,10 +15,10 @@ from vinesim.client.remote.spawner import RemoteSpawner, resolve_description
 from vinesim.core import frames
 from vinesim.net.codec.control import Hello
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.sidecar import encode_sidecar
-from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.description.urdf import DescriptionError
+from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import RobotUpdate
 from vinesim.world import Physics

@@ -14,8 +14,7 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.drives.remote_robot import RemoteRobot
-from vinesim.robot.drives.robot_instance import RobotInstance
+from vinesim.robot.drives.robot_instance import RemoteRobot, RobotInstance
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Drive, RobotSpec, RobotUpdate
 

@@ -13,8 +13,8 @@ from tests.support.contact_scenes import bar, cane
 from vinesim.core import frames
 from vinesim.rigid.mujoco_contacts import PairFriction
 from vinesim.rigid.rigid_world import RigidWorld
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.builder import assemble
 from vinesim.scene.materials import Material, pair_table
 from vinesim.scene.model import Model

@@ -10,8 +10,8 @@ import pytest
 from tests.support.robot_yard import Yard
 from vinesim.rigid.mujoco_contacts import disabled_pairs
 from vinesim.rigid.rigid_world import RigidWorld
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.builder import assemble
 
 BOX = '<collision><origin xyz="{at}"/><geometry><box size="{size}"/></geometry></collision>'

@@ -8,8 +8,8 @@ import pytest
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.admittance_controller import AdmittanceController
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.builder import assemble
 
 

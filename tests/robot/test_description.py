@@ -16,9 +16,8 @@ from lxml import etree
 
 from vinesim.core import data_files, frames
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.description.urdf_model import parse_robot
+from vinesim.robot.description.urdf import DescriptionError, parse_robot
 
 
 @pytest.fixture(scope="module")

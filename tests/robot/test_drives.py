@@ -13,9 +13,9 @@ from vinesim.core import frames
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError, CommandInterface
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.drives.joint_servos import CommandError, CommandInterface
+from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.scene.builder import assemble
 from vinesim.scene.values import Contact, RobotUpdate
 from vinesim.world import Physics

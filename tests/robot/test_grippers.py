@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pathlib
+
 import numpy as np
 import pytest
 
@@ -9,10 +11,16 @@ from tests.support.contact_scenes import bunch_scene
 from tests.support.robot_yard import Yard, hand_of, wrench_of
 from vinesim.core import frames
 from vinesim.rigid.free_bunch import FreeBunch
+from vinesim.robot.control.controller_manager import ControllerManager
+from vinesim.robot.control.gripper_controllers import CONTROLLERS
+from vinesim.robot.control.trajectory_controller import Outcome
 from vinesim.robot.description.description import RobotDescription
+from vinesim.robot.description.grippers import GRIPPER_KINDS
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
+from vinesim.scene.values import FORWARD_KINDS, ControllerKind
 from vinesim.world import Physics
 
 
@@ -111,3 +119,82 @@ def test_a_cutter_detaches_a_bunch_between_its_blades(vinebot: RobotDescription)
     robot.remove()
     assert physics.detachment_monitor.blades == []
     physics.step()
+
+
+# ---------------------------------------------------------------------- what is a gripper
+
+BODY = """<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>"""
+JAW = """<joint name="{name}_joint" type="prismatic"><parent link="base"/><child link="{name}"/><axis xyz="0 1 0"/>
+<limit lower="0" upper="0.05" effort="10" velocity="1"/></joint><link name="{name}">{body}</link>"""
+CLAW = f"""<robot name="small"><link name="base">{BODY}</link>
+{JAW.format(name="upper", body=BODY)}{JAW.format(name="lower", body=BODY)}</robot>"""
+GROUP = '[groups.{}]\njoints = ["upper_joint", "lower_joint"]\n'
+
+
+def load(folder: pathlib.Path, toml: str) -> RobotDescription:
+    """A robot with two joints that slide from one link, and this TOML file."""
+    file = folder / "small.urdf"
+    file.write_text(CLAW)
+    file.with_suffix(".toml").write_text(toml)
+    return load_description(file)
+
+
+def kinds(description: RobotDescription) -> dict[str, tuple[ControllerKind, str]]:
+    """Kind of each controller that does not pass commands on, and of its gripper, by name."""
+    return {spec.name: (spec.kind, spec.gripper) for spec in description.controllers if spec.kind not in FORWARD_KINDS}
+
+
+def test_each_kind_of_gripper_has_a_controller() -> None:
+    assert CONTROLLERS.keys() == GRIPPER_KINDS.keys()
+
+
+def test_groups_called_gripper_or_hand_are_fingers_if_the_file_does_not_list_grippers(tmp_path: pathlib.Path) -> None:
+    fingers = (ControllerKind.GRIPPER, "fingers")
+    assert kinds(load(tmp_path, GROUP.format("gripper_left"))) == {"gripper_left_controller": fingers}
+    assert kinds(load(tmp_path, GROUP.format("my_hand"))) == {"my_hand_controller": fingers}
+    none = load(tmp_path, "grippers = []\n" + GROUP.format("my_hand"))
+    assert kinds(none) == {"my_hand_controller": (ControllerKind.JOINT_TRAJECTORY, "")}
+
+
+def test_a_group_that_looks_like_fingers_gets_a_warning_until_the_file_says_what_it_is(
+    tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    trajectory = (ControllerKind.JOINT_TRAJECTORY, "")
+    claw = load(tmp_path, GROUP.format("claw"))
+    assert kinds(claw) == {"claw_controller": trajectory}
+    (warning,) = [record.getMessage() for record in caplog.records if "no gripper" in record.getMessage()]
+    assert "group 'claw' is no gripper" in warning
+    assert '[[grippers]] kind = "fingers", group = "claw"' in warning
+    caplog.clear()
+    listed = load(tmp_path, GROUP.format("claw") + '[[grippers]]\nkind = "fingers"\ngroup = "claw"\n')
+    assert kinds(listed) == {"claw_controller": (ControllerKind.GRIPPER, "fingers")}
+    assert kinds(load(tmp_path, "grippers = []\n" + GROUP.format("claw"))) == {"claw_controller": trajectory}
+    assert not [record for record in caplog.records if "no gripper" in record.getMessage()]
+
+
+def test_cutters_may_be_listed_among_the_grippers_or_by_themselves(tmp_path: pathlib.Path) -> None:
+    cutter = 'group = "claw"\nframe = "base"\nhalf = [0.02, 0.02, 0.004]\n'
+    alone = load(tmp_path, GROUP.format("claw") + "[[cutters]]\n" + cutter)
+    fingers = '[[grippers]]\nkind = "fingers"\ngroup = "claw"\n'
+    listed = load(tmp_path, GROUP.format("claw") + fingers + '[[grippers]]\nkind = "cutter"\n' + cutter)
+    assert alone.grippers == listed.grippers
+    assert alone.controllers == listed.controllers
+    assert kinds(alone)["claw_cutter_controller"] == (ControllerKind.GRIPPER, "cutter")
+
+
+def test_controllers_of_a_toml_file_name_kinds_of_grippers(tmp_path: pathlib.Path) -> None:
+    named = '[controllers.{}]\nkind = "{}"\ngroup = "claw"\n'
+    toml = "grippers = []\n" + GROUP.format("claw") + named.format("shut", "gripper")
+    assert kinds(load(tmp_path, toml)) == {"shut": (ControllerKind.GRIPPER, "fingers")}
+    with pytest.raises(DescriptionError, match=r"small\.toml: controller 'cut': no cutter at 'claw'; name its group"):
+        load(tmp_path, GROUP.format("claw") + named.format("cut", "cutter"))
+    with pytest.raises(DescriptionError, match=r"controller 'x' has the kind 'magnet'; give one of cutter, fingers, "):
+        load(tmp_path, GROUP.format("claw") + named.format("x", "magnet"))
+
+
+def test_a_cutter_that_is_not_fitted_ends_its_goal(vinebot: RobotDescription) -> None:
+    manager = ControllerManager(Yard(vinebot).robot)
+    manager.start_gripper("cutter_left_controller", 0.0, None, 0.0, b"cut")
+    (result,) = manager.take_results()
+    assert result.outcome is Outcome.INVALID_GOAL
+    assert "no cutter at 'gripper_left'; cutters fitted: none" in result.text

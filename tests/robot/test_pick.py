@@ -14,8 +14,8 @@ from vinesim.client.tasks import planning, start_poses
 from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.robot.tasks.pick import PickBunch, PickPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model

@@ -10,10 +10,10 @@ import pytest
 from vinesim.core import frames
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.robot.tasks.push import Phase, PushBunch
 from vinesim.scene.builder import assemble
 

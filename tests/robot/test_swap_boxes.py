@@ -9,8 +9,8 @@ import pytest
 
 from vinesim.client.tasks import planning, start_poses
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.robot.tasks.swap_boxes import LIFT_HEIGHT, SwapBoxes, SwapPlan
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model

@@ -17,9 +17,9 @@ from tests.support.robot_yard import Yard
 from vinesim.core import frames
 from vinesim.net.codec.robot import decode_robot, encode_robot
 from vinesim.rigid.urdf import shapes_of
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.description.package_resources import find_installed
+from vinesim.robot.description.meshes import find_installed
+from vinesim.robot.description.urdf import DescriptionError
 
 MOMENTS = 'ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"'
 LIMIT = '<limit lower="-1" upper="2" effort="30" velocity="1"/>'

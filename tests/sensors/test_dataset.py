@@ -26,7 +26,7 @@ from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
 from vinesim.core.data_files import DataFileNotFound
 from vinesim.core.errors import UsageError, WriteError
-from vinesim.robot.description.errors import DescriptionError
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import annotations, dataset

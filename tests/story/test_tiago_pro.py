@@ -6,8 +6,8 @@ import pytest
 from tests.support.contact_scenes import cane
 from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.errors import DescriptionError
 from vinesim.robot.description.loader import load_description
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.builder import assemble

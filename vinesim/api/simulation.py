@@ -281,7 +281,7 @@ class Simulation:
         """Add a robot by the name of one in ``data/robots`` or the path of a URDF file.
 
         Args:
-            robot: name or path; :class:`~vinesim.robot.description.errors.DescriptionError` if it cannot be used.
+            robot: name or path; :class:`~vinesim.robot.description.urdf.DescriptionError` if it cannot be used.
             pose: (x, y, yaw) in m and rad, or [7] position and quaternion of the base.
             name: unique name of this robot; ``robot_0``, ``robot_1``, ... unless given.
         """

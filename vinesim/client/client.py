@@ -48,7 +48,7 @@ from vinesim.rigid.urdf import RobotError
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.sidecar import encode_sidecar
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene

@@ -85,7 +85,7 @@ class Rollout:
     Args:
         model: constants; what is not given to :meth:`run` is taken from here. It is not written.
         ticks: how many.
-        watch: bodies [k] whose motion the loss looks at; all that move unless given.
+        watched: bodies [k] whose motion the loss looks at; all that move unless given.
         fine: let the berry clusters of bunches move.
         dt: tick [s].
         phi: see :class:`vinesim.plants.articulation_solver.ArticulationSolver`; likewise ``fast_rate``,

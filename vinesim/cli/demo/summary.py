@@ -123,7 +123,7 @@ def push_summary(
 def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str, Any]) -> dict[str, Any]:
     """Messages of :data:`SMALL_TOPICS` that were lost: on the way, by the listener's count, and before they were sent.
 
-    The latter are of the whole run of the robot whose ``report`` it is. ``share``: of all that should have come.
+    The latter are of the whole run of the robot whose ``report`` it is; the share is of all that should have come.
     """
     dropped = report.get("ros_dropped", {})
     topics = [topic for topic in SMALL_TOPICS if topic in received]

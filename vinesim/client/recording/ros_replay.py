@@ -10,7 +10,7 @@ from vinesim.client.client import Client
 from vinesim.client.processes.ros_process import TRUTH_ORGANS
 from vinesim.client.processes.ros_worker import truth_frame
 from vinesim.core import frames
-from vinesim.robot.drives.remote_robot import RemoteRobot
+from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.ros.world_node import WorldNode
 from vinesim.scene.ids import Organ
 

@@ -11,8 +11,8 @@ from vinesim.client.world_time import WorldTime
 from vinesim.robot.control import controller_manager
 from vinesim.robot.control.controller_manager import ControllerManager
 from vinesim.robot.control.trajectory_controller import Outcome, Tolerance, Trajectory
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.ros.commands.types import (
     BaseVelocity,
     CancelGoal,

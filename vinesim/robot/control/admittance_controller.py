@@ -12,8 +12,8 @@ from __future__ import annotations
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.values import RobotSample
 
 JACOBIAN_DAMPING = 0.05

@@ -24,9 +24,8 @@ from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.launch import bind_launch
 from vinesim.kernels.robot import inverse_kinematics
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.robot.drives.joint_servos import clip
+from vinesim.robot.drives.joint_servos import CommandError, clip
 
 POSITION_GAIN = 5.0
 """[1/s] Feedback gain of position and orientation; well below the servos' bandwidth. GUESSED"""

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from vinesim.robot.control.gripper_controller import CutterController, GripperController
+from vinesim.robot.control.gripper_controllers import CONTROLLERS, GripperController
 from vinesim.robot.control.trajectory_controller import (
     GoalHandle,
     Outcome,
@@ -19,8 +19,8 @@ from vinesim.robot.control.trajectory_controller import (
     TrajectoryController,
     TrajectoryError,
 )
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.values import ControllerKind, ControllerSpec, GripperState
 
 
@@ -33,7 +33,7 @@ class GoalResult:
     text: str = ""
     """Why it failed; empty if it did not."""
     gripper: GripperState | None = None
-    """Of a gripper or cutter."""
+    """Of a gripper."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -42,7 +42,7 @@ class _ActiveGoal:
 
     id: bytes
     trajectory: GoalHandle | None
-    """None for grippers and cutters."""
+    """None for grippers."""
 
 
 class ControllerManager:
@@ -62,7 +62,6 @@ class ControllerManager:
         """[joint] whether that is a trajectory controller."""
         self._trajectories: dict[str, TrajectoryController] = {}
         self._grippers: dict[str, GripperController] = {}
-        self._cutters: dict[str, CutterController] = {}
         self._goals: dict[str, _ActiveGoal] = {}
         """By controller."""
         self._results: list[GoalResult] = []
@@ -101,19 +100,13 @@ class ControllerManager:
             self._take_desired(name)
             self._end(name, Outcome.CANCELED, "an empty trajectory stopped it")
 
-    def start_gripper(self, name: str, opening: float, effort: float | None, time: float, goal: bytes) -> None:
-        """Move a gripper, or close a cutter if that is what the controller has (whatever the ``opening``)."""
-        spec = self.specs.get(name)
-        kind = ControllerKind.CUTTER if spec and spec.kind is ControllerKind.CUTTER else ControllerKind.GRIPPER
-        spec = self._spec(name, kind)
+    def start_gripper(self, name: str, position: float, effort: float | None, time: float, goal: bytes) -> None:
+        """Give a gripper a goal; what ``position`` and ``effort`` mean is said by its :class:`GripperController`."""
+        spec = self._spec(name, ControllerKind.GRIPPER)
         try:
-            if kind is ControllerKind.CUTTER:
-                cutter = self._cutters.setdefault(name, CutterController(self.robot, spec.group))
-                cutter.start(effort)
-            else:
-                if name not in self._grippers:
-                    self._grippers[name] = GripperController(self.robot, spec.group)
-                self._grippers[name].start(opening, effort, time)
+            if name not in self._grippers:
+                self._grippers[name] = CONTROLLERS[spec.gripper](self.robot, spec.group)
+            self._grippers[name].start(position, effort, time)
         except CommandError as error:
             self._results.append(GoalResult(goal, Outcome.INVALID_GOAL, str(error), self._gripper_state(name, time)))
             return
@@ -129,8 +122,7 @@ class ControllerManager:
                     self._trajectories[name].cancel()
                     self._take_desired(name)
                 elif name in self._grippers:
-                    here = self.robot.gripper_opening(self.specs[name].group)
-                    self._grippers[name].start(here, None, time)
+                    self._grippers[name].cancel(time)
                 self._end(name, Outcome.CANCELED, "it was cancelled", time)
 
     def cancel_all(self, time: float) -> None:
@@ -215,9 +207,7 @@ class ControllerManager:
         self.desired[joints], self.desired_velocity[joints] = controller.desired, controller.desired_velocity
 
     def _gripper_state(self, name: str, time: float) -> GripperState | None:
-        if name in self._grippers:
-            return self._grippers[name].state(time)
-        return self._cutters[name].state() if name in self._cutters else None
+        return self._grippers[name].state(time) if name in self._grippers else None
 
     # ------------------------------------------------------------------ claims
 

@@ -20,8 +20,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vinesim.robot.drives.commands import CommandError, CommandInterface
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError, CommandInterface
 
 
 class Outcome(enum.IntEnum):

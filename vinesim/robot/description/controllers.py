@@ -5,13 +5,15 @@ Where the URDF has ``ros2_control`` tags, a controller commands a joint only by 
 
 from __future__ import annotations
 
+import dataclasses
 import pathlib
 from collections.abc import Container, Mapping, Sequence
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
-from vinesim.robot.description.errors import description_error
+from vinesim.robot.description.grippers import GRIPPER_KINDS
 from vinesim.robot.description.sidecar import Controller, Sidecar
+from vinesim.robot.description.urdf import description_error
 from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 
 INTERFACE_OF_KIND = {
@@ -23,6 +25,8 @@ INTERFACE_OF_KIND = {
     ControllerKind.IMPEDANCE: "effort",
 }
 """The command interface of ros2_control that each kind of controller needs of its joints."""
+FINGERS_CONTROLLER = "gripper"
+"""What a TOML file may call the kind of a controller of fingers, besides ``fingers``."""
 MIN_ARM_JOINTS = 4
 """A group with a tool, or with so many joints, is an arm: it gets an impedance controller."""
 
@@ -41,7 +45,7 @@ def make_controllers(
 ) -> tuple[ControllerSpec, ...]:
     """The controllers of a robot with these ``driven`` joints, sorted by name; ``interfaces``: by joint, empty: all.
 
-    :class:`DescriptionError` if one of the ``sidecar`` names a joint, group or cutter that is not there.
+    :class:`DescriptionError` if one of the ``sidecar`` names a joint, group or gripper that is not there.
     """
     if sidecar.controllers is not None:
         specs = [_checked(name, one, sidecar, driven, file) for name, one in sidecar.controllers.items()]
@@ -51,25 +55,18 @@ def make_controllers(
     return tuple(sorted((one for one in limited if one is not None), key=lambda spec: spec.name))
 
 
-def is_gripper(name: str, sidecar: Sidecar) -> bool:
-    """Whether a group is a gripper: it is called one or a hand, or has a cutter."""
-    return "gripper" in name or "hand" in name or any(cutter.group == name for cutter in sidecar.cutters)
-
-
 def _derived(sidecar: Sidecar, driven: Sequence[str]) -> list[ControllerSpec]:
-    specs = []
+    of_name = {gripper.controller: gripper for gripper in sidecar.all_grippers}
+    specs = [_of_gripper(name, gripper.kind, gripper.group, sidecar) for name, gripper in of_name.items()]
+    moved_by_grippers = {gripper.group for gripper in sidecar.all_grippers if gripper.moves_joints}
     arms = []
     for name, group in sidecar.groups.items():
-        if is_gripper(name, sidecar):
-            specs.append(ControllerSpec(f"{name}_controller", ControllerKind.GRIPPER, group.joints, name))
+        if name in moved_by_grippers:
             continue
         specs.append(ControllerSpec(f"{name}_controller", ControllerKind.JOINT_TRAJECTORY, group.joints, name))
         if group.tool or len(group.joints) >= MIN_ARM_JOINTS:
             arms += group.joints
             specs.append(ControllerSpec(f"{name}_impedance_controller", ControllerKind.IMPEDANCE, group.joints, name))
-    for group in dict.fromkeys(cutter.group for cutter in sidecar.cutters):
-        stem = group.replace("gripper", "cutter") if "gripper" in group else f"{group}_cutter"
-        specs.append(ControllerSpec(f"{stem}_controller", ControllerKind.CUTTER, (), group))
     specs += [ControllerSpec(f"{kind}_controller", kind, tuple(driven)) for kind in FORWARD_KINDS]
     if arms:
         specs.append(ControllerSpec("see", ControllerKind.SERIES_ELASTIC, tuple(arms)))
@@ -79,13 +76,17 @@ def _derived(sidecar: Sidecar, driven: Sequence[str]) -> list[ControllerSpec]:
 def _checked(
     name: str, given: Controller, sidecar: Sidecar, driven: Container[str], file: pathlib.Path
 ) -> ControllerSpec:
-    if given.group and given.group not in sidecar.groups:
+    if given.group and given.group not in {*sidecar.groups, *(gripper.group for gripper in sidecar.all_grippers)}:
         raise description_error(file, f"controller {name!r} belongs to {given.group!r}", "name a group")
-    if given.kind is ControllerKind.CUTTER:
-        if all(cutter.group != given.group for cutter in sidecar.cutters):
-            raise description_error(file, f"controller {name!r}: no cutter at {given.group!r}", "name its group")
-        return ControllerSpec(name, given.kind, (), given.group)
-    if given.kind is ControllerKind.GRIPPER and not given.group:
+    gripper = {FINGERS_CONTROLLER: "fingers"}.get(given.kind, given.kind)
+    if gripper not in GRIPPER_KINDS and given.kind not in tuple(ControllerKind):
+        known = ", ".join(sorted({*ControllerKind, *GRIPPER_KINDS}))
+        raise description_error(file, f"controller {name!r} has the kind {given.kind!r}", f"give one of {known}")
+    if gripper in GRIPPER_KINDS and not GRIPPER_KINDS[gripper].moves_joints:
+        if all((one.kind, one.group) != (gripper, given.group) for one in sidecar.all_grippers):
+            raise description_error(file, f"controller {name!r}: no {gripper} at {given.group!r}", "name its group")
+        return _of_gripper(name, gripper, given.group, sidecar)
+    if gripper in GRIPPER_KINDS and not given.group:
         raise description_error(file, f"controller {name!r} of a gripper has no group", "name one")
     joints = given.joints or (sidecar.groups[given.group].joints if given.group else ())
     for joint in joints:
@@ -93,15 +94,23 @@ def _checked(
             raise description_error(file, f"controller {name!r} moves {joint!r}", "name driven joints only")
     if not joints or len(set(joints)) < len(joints):
         raise description_error(file, f"controller {name!r} moves {list(joints)}", "name joints, each once")
-    return ControllerSpec(name, given.kind, joints, given.group)
+    if gripper in GRIPPER_KINDS:
+        return ControllerSpec(name, ControllerKind.GRIPPER, joints, given.group, gripper)
+    return ControllerSpec(name, ControllerKind(given.kind), joints, given.group)
+
+
+def _of_gripper(name: str, kind: str, group: str, sidecar: Sidecar) -> ControllerSpec:
+    """The controller ``name`` of the grippers of a ``kind`` that a ``group`` has."""
+    joints = sidecar.groups[group].joints if GRIPPER_KINDS[kind].moves_joints else ()
+    return ControllerSpec(name, ControllerKind.GRIPPER, joints, group, kind)
 
 
 def _limited(spec: ControllerSpec, interfaces: Mapping[str, set[str]]) -> ControllerSpec | None:
     """The controller with the joints that offer its interface; None if there are none."""
     needed = INTERFACE_OF_KIND.get(spec.kind)
-    if not interfaces or needed is None:
+    if not interfaces or needed is None or not spec.joints:
         return spec
     joints = tuple(joint for joint in spec.joints if needed in interfaces.get(joint, ()))
     if spec.kind is ControllerKind.GRIPPER and joints != spec.joints:
         return None
-    return ControllerSpec(spec.name, spec.kind, joints, spec.group) if joints else None
+    return dataclasses.replace(spec, joints=joints) if joints else None

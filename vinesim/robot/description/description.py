@@ -9,8 +9,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from vinesim.core import frames
+from vinesim.robot.description.grippers import AnyGripper, Cutter
 from vinesim.robot.description.kinematics import MovingJoints
-from vinesim.robot.description.sidecar import BaseLimits, CameraMount, Cutter, JointGroup, SensorMount
+from vinesim.robot.description.sidecar import BaseLimits, CameraMount, JointGroup, SensorMount
 from vinesim.scene.values import ControllerSpec, Drive, RobotSpec, SensorPacing
 
 
@@ -42,7 +43,7 @@ class RobotDescription:
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
     sensor_pacing: SensorPacing
-    cutters: tuple[Cutter, ...]
+    grippers: tuple[AnyGripper, ...]
     controllers: tuple[ControllerSpec, ...]
     """What ROS may command, by which interface; sorted by name."""
     base_limits: BaseLimits
@@ -59,6 +60,11 @@ class RobotDescription:
     def joints(self) -> tuple[str, ...]:
         """Names of the driven joints, in the order of joint arrays everywhere."""
         return tuple(drive.joint for drive in self.drives)
+
+    @property
+    def cutters(self) -> tuple[Cutter, ...]:
+        """Those of the grippers that cut."""
+        return tuple(gripper for gripper in self.grippers if isinstance(gripper, Cutter))
 
     def joint_indices(self, group: str) -> np.ndarray:
         """Indices of a group's joints in joint arrays; KeyError if there is no such group."""

@@ -9,10 +9,9 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.kinematics import joint_limits
 from vinesim.robot.description.repairs import some_names
 from vinesim.robot.description.sidecar import JointGroup
-from vinesim.robot.description.urdf_model import Joint, Robot
+from vinesim.robot.description.urdf import Joint, Robot, joint_limits
 from vinesim.scene.values import Drive
 
 ACCELERATION_TIME = 0.02

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.robot.description.urdf_model import Joint, Robot
-from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
+from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -42,32 +40,6 @@ class MovingJoints:
         poses[:, :3] = self.origin[:, :3] + self.translation * q[:, None]
         poses[:, 3:] = self.origin[:, 3:] * np.cos(half) + self.rotation * np.sin(half)
         return poses
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class JointLimits:
-    """Limits of one joint, infinite in position if it is continuous."""
-
-    lower: float
-    """[rad or m]"""
-    upper: float
-    """[rad or m]"""
-    effort: float
-    """[N m or N]"""
-    velocity: float
-    """[rad/s or m/s]"""
-
-
-def joint_limits(joint: Joint) -> JointLimits:
-    """Limits of a driven joint; ValueError if one that it needs is missing."""
-    limit = joint.limit
-    if limit is None or limit.effort is None or limit.velocity is None:
-        raise ValueError(f"joint {joint.name!r} has no limits of effort and velocity")
-    if joint.type == "continuous":
-        return JointLimits(-math.inf, math.inf, limit.effort, limit.velocity)
-    if limit.lower is None or limit.upper is None:
-        raise ValueError(f"joint {joint.name!r} has no limits of position")
-    return JointLimits(limit.lower, limit.upper, limit.effort, limit.velocity)
 
 
 def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:

@@ -24,11 +24,10 @@ from vinesim.core import data_files
 from vinesim.robot.description.controllers import command_interfaces, make_controllers
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
-from vinesim.robot.description.errors import DescriptionError, description_error
+from vinesim.robot.description.grippers import guess_fingers, warn_of_unlisted_fingers
 from vinesim.robot.description.inferred_defaults import guess_cameras, guess_groups, guess_lidars
 from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
-from vinesim.robot.description.meshes import replace_unopened_meshes, resolve_meshes
-from vinesim.robot.description.package_resources import find_installed
+from vinesim.robot.description.meshes import find_installed, replace_unopened_meshes, resolve_meshes
 from vinesim.robot.description.repairs import (
     MOUNT,
     add_missing_masses,
@@ -37,14 +36,20 @@ from vinesim.robot.description.repairs import (
     repair_joints,
 )
 from vinesim.robot.description.sidecar import Sidecar, check_sidecar, read_sidecar
-from vinesim.robot.description.urdf_checks import check_joints, check_masses, check_tree
-from vinesim.robot.description.urdf_model import Joint, Robot, parse_robot
-from vinesim.robot.description.urdf_reader import (
+from vinesim.robot.description.urdf import (
     MOVABLE_JOINT_TYPES,
+    DescriptionError,
+    Joint,
+    Robot,
     check_friction,
+    check_joints,
+    check_masses,
     check_numbers,
+    check_tree,
+    description_error,
     fix_wheels,
     merge_disabled_collisions,
+    parse_robot,
     read_xml,
     set_friction,
 )
@@ -104,7 +109,7 @@ def load_description(
     check_masses(parsed, file, notes)
     add_missing_masses(root, parsed, base, order, assumed)
     urdf = etree.tostring(root, encoding="unicode")
-    description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed)
+    description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed, is_remote=is_remote)
     description = dataclasses.replace(description, meshes=meshes, is_remote=is_remote)
     for note in notes:
         log.info("%s: %s", file.name, note)
@@ -135,6 +140,8 @@ def _assemble(
     sidecar: Sidecar,
     notes: list[str],
     assumed: list[str],
+    *,
+    is_remote: bool,
 ) -> RobotDescription:
     """The description of a checked ``robot``; ``base``: its root link, ``order``: its joints outwards."""
     driven = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None]
@@ -142,6 +149,12 @@ def _assemble(
     anchors = link_anchors(base, order)
     if not sidecar.groups:
         sidecar = msgspec.structs.replace(sidecar, groups=guess_groups(names, anchors))
+    if sidecar.grippers is None:
+        fingers = guess_fingers(sidecar.groups, sidecar.cutters)
+        if not is_remote:  # the list is not sent to other clients
+            driven_by_group = {name: group.joints for name, group in sidecar.groups.items()}
+            warn_of_unlisted_fingers(driven_by_group, fingers, robot.joints, assumed)
+        sidecar = msgspec.structs.replace(sidecar, grippers=fingers)
     check_sidecar(sidecar, set(names), anchors, file.with_suffix(".toml"))
     fixed = [joint for joint in robot.joints if joint.type == "fixed"]
     description = RobotDescription(
@@ -161,7 +174,7 @@ def _assemble(
         sensor_pacing=SensorPacing(sidecar.sensors.mode, sidecar.sensors.least_rate),
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,
-        cutters=sidecar.cutters,
+        grippers=sidecar.all_grippers,
         controllers=make_controllers(sidecar, names, command_interfaces(urdf), file.with_suffix(".toml")),
         base_limits=msgspec.structs.replace(sidecar.base, linear=0.0, angular=0.0, effort=BOLTED_EFFORT)
         if base == MOUNT

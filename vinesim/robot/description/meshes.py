@@ -8,16 +8,16 @@ names: it makes boxes of these bounds where it has no triangles of that digest.
 from __future__ import annotations
 
 import functools
+import importlib.util
 import pathlib
+import sys
 from collections.abc import Mapping
 from typing import NamedTuple, cast
 
 import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
-from vinesim.robot.description.errors import description_error
-from vinesim.robot.description.package_resources import find_installed
-from vinesim.robot.description.urdf_model import parse_origin
+from vinesim.robot.description.urdf import description_error, parse_origin
 from vinesim.scene import triangles
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
@@ -230,3 +230,13 @@ def _replace_by_box(shape: etree._Element, mesh: etree._Element, bounds: np.ndar
     geometry.remove(mesh)
     size = np.maximum(np.abs(upper - lower), MIN_BOX_EDGE)
     etree.SubElement(geometry, "box", size=" ".join(f"{value:.9g}" for value in size))
+
+
+def find_installed(path: str) -> pathlib.Path | None:
+    """A file that a wheel of cmeel (example-robot-data and others) installed below ``share``; None if missing."""
+    roots = [pathlib.Path(sys.prefix) / "share"]
+    cmeel = importlib.util.find_spec("cmeel")
+    if cmeel is not None and cmeel.origin:
+        roots.append(pathlib.Path(cmeel.origin).parent.parent / "cmeel.prefix" / "share")
+    roots += [pathlib.Path(entry) / "cmeel.prefix" / "share" for entry in sys.path if entry]
+    return next((root / path for root in roots if (root / path).is_file()), None)

@@ -13,8 +13,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.kinematics import link_anchors
-from vinesim.robot.description.urdf_model import Joint, Robot, parse_inertial
-from vinesim.robot.description.urdf_reader import MOVABLE_JOINT_TYPES
+from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, parse_inertial
 
 MOUNT = "world_mount"
 """Name that the root link ``world`` gets: a robot with a root of this name is bolted down."""

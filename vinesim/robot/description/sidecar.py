@@ -1,4 +1,4 @@
-"""The TOML file beside a URDF: base limits, joint groups with gains, sensors, cutters, controllers.
+"""The TOML file beside a URDF: base limits, joint groups with gains, sensors, grippers, controllers.
 
 The attributes are the keys of the file, except ``armature``, ``series_stiffness`` and ``series_damping`` of a group,
 which the file calls ``rotor``, ``elastic`` and ``elastic_damping``.
@@ -13,8 +13,9 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from vinesim.robot.description.errors import description_error
-from vinesim.scene.values import ControllerKind, SensorMode, SensorPacing
+from vinesim.robot.description.grippers import AnyGripper, Cutter
+from vinesim.robot.description.urdf import description_error
+from vinesim.scene.values import SensorMode, SensorPacing
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -98,29 +99,15 @@ class SensorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """[Hz]"""
 
 
-class Cutter(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The space between two blades: x along the blades, y from one to the other, z across their plane."""
-
-    group: str
-    """The gripper it belongs to."""
-    frame: str
-    """The link that carries it."""
-    half: tuple[float, float, float]
-    """Half edges of the space [m]; the second is how far to either side wood is caught."""
-    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Its centre in ``frame`` [m]."""
-    force: float | None = None
-    """Largest force with which it cuts [N]; without it, it cuts whatever is in its mouth."""
-
-
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A controller, as ROS sees it; see :class:`vinesim.scene.values.ControllerKind`."""
+    """A controller, as ROS sees it."""
 
-    kind: ControllerKind
+    kind: str
+    """A :class:`~vinesim.scene.values.ControllerKind`, or a kind of gripper."""
     joints: tuple[str, ...] = ()
     """Those of ``group`` unless given."""
     group: str = ""
-    """A joint group; a gripper or cutter needs one."""
+    """A joint group; a gripper needs one."""
 
 
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -133,7 +120,10 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sensors: SensorTable = SensorTable()
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
+    grippers: tuple[AnyGripper, ...] | None = None
+    """None: fingers are guessed from the names of groups, :func:`vinesim.robot.description.grippers.guess_fingers`."""
     cutters: tuple[Cutter, ...] = ()
+    """Further ``grippers``, all cutters, so that ``kind`` may be left out."""
     friction: dict[str, float] = {}
     """Coulomb coefficient [1] by link, of all that touches the link; instead of the URDF's ``mu1``."""
     controllers: dict[str, Controller] | None = None
@@ -141,6 +131,11 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     srdf: str = ""
     """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
     file of the URDF's name that ends with ``.srdf``, if there is one."""
+
+    @property
+    def all_grippers(self) -> tuple[AnyGripper, ...]:
+        """Those of ``grippers`` and ``cutters``."""
+        return (*(self.grippers or ()), *self.cutters)
 
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:
@@ -163,7 +158,7 @@ MAX_REMOTE_NUMBER = 1e7
 def encode_sidecar(base: BaseLimits, groups: dict[str, JointGroup]) -> str:
     """What copies of a robot need on other clients, as JSON: limits of the base, joint groups with their gains.
 
-    Sensors and cutters act where the robot is simulated, and are not part of it.
+    Sensors and grippers act where the robot is simulated, and are not part of it.
     """
     return msgspec.json.encode(Sidecar(base=base, groups=groups)).decode()
 
@@ -193,7 +188,8 @@ def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str
     """Raise :class:`DescriptionError` unless all names are ``driven`` joints or ``links`` and all values are fit."""
     for name, group in sidecar.groups.items():
         _check_group(name, group, driven, links, file)
-    _check_cutters(sidecar, links, file)
+    for gripper in sidecar.all_grippers:
+        gripper.check(sidecar.groups, links, file)
     if not all(0.0 <= slip < 1.0 for slip in sidecar.base.slip):
         raise description_error(file, f"slip of {sidecar.base.slip}", "give shares from 0 to below 1")
     mounts: Iterable[SensorMount] = (
@@ -237,19 +233,3 @@ def _check_group(
         raise description_error(file, f"group {name!r} has a spring below zero", "give 0 or more")
     if group.tool and group.tool not in links:
         raise description_error(file, f"group {name!r} has the tool {group.tool!r}", "name a link of the URDF")
-
-
-def _check_cutters(sidecar: Sidecar, links: Container[str], file: pathlib.Path) -> None:
-    for cutter in sidecar.cutters:
-        if cutter.group not in sidecar.groups:
-            raise description_error(file, f"a cutter belongs to {cutter.group!r}", "name a group")
-        if cutter.frame not in links:
-            raise description_error(
-                file, f"the cutter of {cutter.group!r} sits in {cutter.frame!r}", "name a link of the URDF"
-            )
-        if cutter.force is not None and not cutter.force > 0.0:
-            raise description_error(file, f"the cutter of {cutter.group!r} has {cutter.force} N", "give more than 0")
-        if min(cutter.half) <= 0.0:
-            raise description_error(
-                file, f"the cutter of {cutter.group!r} has a mouth of {cutter.half}", "give half edges above 0"
-            )

@@ -20,8 +20,7 @@ from vinesim.core import frames
 from vinesim.interaction.detachment import Blade
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.drives.commands import CommandError, CommandInterface
-from vinesim.robot.drives.joint_servos import JointServos
+from vinesim.robot.drives.joint_servos import CommandError, CommandInterface, JointServos
 from vinesim.robot.drives.proprioception import BodySensors, elastic_sample
 from vinesim.robot.drives.robot_instance import RobotInstance
 from vinesim.scene.values import Contact, LightPattern, Lights, RobotSample, RobotUpdate
@@ -71,8 +70,15 @@ class Robot(RobotInstance):
         """[joint] :class:`CommandInterface` by which each joint was commanded last."""
         return self._servos.interface
 
+    @property
+    def physics(self) -> Physics:
+        """The world whose plants its grippers act on; :class:`CommandError` before :meth:`fit_cutters`."""
+        if self._physics is None:
+            raise CommandError(f"{self.name} has no grippers for plants; call fit_cutters(physics) first")
+        return self._physics
+
     def fit_cutters(self, physics: Physics) -> None:
-        """Give the robot the cutters of its description, to cut plants in ``physics``."""
+        """Let grippers act on plants in ``physics``: give the robot the cutters of its description."""
         self._physics = physics
         for cutter in self.description.cutters:
             blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))

@@ -10,6 +10,7 @@ fast: it turns to where the spring gives what position, velocity, effort or impe
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -19,7 +20,6 @@ from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.launch import bind_launch
 from vinesim.kernels.rigid import joint_servos
 from vinesim.rigid.rigid_world import RigidWorld
-from vinesim.robot.drives.commands import CommandInterface
 from vinesim.scene.values import Drive
 
 ACCELERATION_EFFORT_SHARE = 0.7
@@ -28,6 +28,26 @@ RIGID_DEFLECTION = 0.05
 """[rad or m] Deflection at full effort of a drive for which neither spring nor servo stiffness is given. GUESSED"""
 MIN_DIVISOR = 1e-9
 """Stiffness, inertia and velocity [SI units] are taken to be at least this where they divide."""
+
+
+class CommandInterface(enum.IntEnum):
+    """What a joint is commanded by: the command interfaces of ros2_control, and the motor of a series elastic drive.
+
+    Source: CANOPIES D6.4, sections 5.2 (position, velocity, effort) and 3.1 (series elastic elements).
+    """
+
+    POSITION = 0
+    """[rad or m]"""
+    VELOCITY = 1
+    """[rad/s or m/s]"""
+    EFFORT = 2
+    """[N m or N]"""
+    MOTOR_POSITION = 3
+    """[rad or m] of the motor behind its spring, seen from the joint."""
+
+
+class CommandError(ValueError):
+    """A command that the robot cannot take; the message names the robot, the joint or group, and the remedy."""
 
 
 def series_stiffness(drives: Sequence[Drive]) -> np.ndarray:

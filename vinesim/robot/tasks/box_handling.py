@@ -12,8 +12,8 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.robot.control.waypoint_follower import WaypointFollower
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.world import Physics
 

@@ -23,8 +23,8 @@ from vinesim.core import frames
 from vinesim.rigid.static_world import CRATE_WALL
 from vinesim.robot.control.cartesian_controller import CartesianController, axes_of_pose
 from vinesim.robot.control.waypoint_follower import WaypointFollower
-from vinesim.robot.drives.commands import CommandError
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.world import Physics
 

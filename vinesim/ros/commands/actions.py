@@ -1,4 +1,4 @@
-"""Action servers of trajectory controllers, grippers and cutters: control_msgs, as ros2_controllers serve them.
+"""Action servers of trajectory controllers and grippers: control_msgs, as ros2_controllers serve them.
 
 A goal is checked here and executed by the client; its handle waits without a thread or task of its own until the
 client tells how it ended. A newer goal of a controller ends the one before it, which is aborted.
@@ -72,7 +72,7 @@ class ControllerActions:
             if spec.kind is ControllerKind.JOINT_TRAJECTORY:
                 take = partial(convert.trajectory_goal, controller=spec.name, known=spec.joints)
                 self._serve(node, FollowJointTrajectory, f"{spec.name}/follow_joint_trajectory", take)
-            elif spec.kind in (ControllerKind.GRIPPER, ControllerKind.CUTTER):
+            elif spec.kind is ControllerKind.GRIPPER:
                 take = partial(convert.gripper_goal, controller=spec.name)
                 self._serve(node, GripperCommand, f"{spec.name}/gripper_cmd", take)
 

@@ -90,14 +90,13 @@ class JointTrajectory:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GripperGoal:
-    """A goal of a gripper or cutter (control_msgs/action/GripperCommand)."""
+    """A goal of a gripper (control_msgs/action/GripperCommand); what it means is said by the kind of gripper."""
 
     controller: str
     goal: bytes
     position: float
-    """Opening between the fingers [m or rad]; of no meaning for a cutter, which closes once."""
     max_effort: float | None
-    """[N or N m] a finger, or of the blades; None: all there is."""
+    """None: all there is."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

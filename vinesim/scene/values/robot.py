@@ -66,11 +66,10 @@ class RobotSpec:
 
 
 class ControllerKind(enum.StrEnum):
-    """What a controller of a robot does with its joints, in the words of ros2_controllers where they have one."""
+    """What a controller of a robot does, in the words of ros2_controllers where they have one."""
 
     JOINT_TRAJECTORY = "joint_trajectory"
     GRIPPER = "gripper"
-    CUTTER = "cutter"
     FORWARD_POSITION = "forward_position"
     FORWARD_VELOCITY = "forward_velocity"
     FORWARD_EFFORT = "forward_effort"
@@ -89,9 +88,11 @@ class ControllerSpec:
     name: str
     kind: ControllerKind
     joints: tuple[str, ...]
-    """In the order of its commands; none for a cutter."""
+    """In the order of its commands; none for a gripper that has no joints, such as a cutter."""
     group: str = ""
-    """The joint group of a gripper or cutter."""
+    """The joint group, if it is one of a gripper."""
+    gripper: str = ""
+    """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -122,14 +123,15 @@ class JointReference:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GripperState:
-    """How far a gripper's or cutter's goal is, or how it ended (control_msgs/GripperCommand)."""
+    """How far a gripper's goal is, or how it ended (control_msgs/GripperCommand).
+
+    What the values mean is said by the controller of each kind, in :mod:`vinesim.robot.control.gripper_controllers`.
+    """
 
     position: float
-    """Opening [m or rad]."""
     effort: float
-    """Largest of the fingers' efforts [N or N m]; of a cutter what it had to overcome [N]."""
     stalled: bool = False
-    """It stopped before its goal: something is between its fingers, or too strong for its blades."""
+    """It stopped before its goal."""
     reached_goal: bool = False
 
     @property

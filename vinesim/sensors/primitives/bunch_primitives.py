@@ -63,9 +63,11 @@ def bunch_batches(
     group: np.ndarray,
     ripeness: Ripeness | None = None,
 ) -> list[Batch]:
-    """Berries, rachises and pedicels of some bunches ``which`` [k], each in its segments (:func:`bunch_bodies`).
+    """Berries, rachises and pedicels of some bunches, each in its segments (:func:`bunch_bodies`).
 
     Args:
+        model: constants of the vineyard.
+        which: numbers of the bunches [k].
         poses: [k][segment, 7] of the segments on what carries them; their carriers' own frames unless given.
         carrier: [k][segment] rows of the poses that move the segments. A bunch without clusters has one segment.
         group: [k] groups that must not mix in a cluster of primitives.

@@ -6,7 +6,8 @@ const NEAREST = 0.05; // m from the eyes
 /** A metre further off counts as much as so many radians beside the ray. */
 const FARNESS = 0.01;
 /** Hands go into a bunch by this share of its radius, and into a rigid body by this depth [m]. */
-const INTO_BUNCH = 0.3, INTO_RIGID = 0.02;
+const INTO_BUNCH = 0.3,
+  INTO_RIGID = 0.02;
 
 /**
  * What a ray from the `eye` in the direction `ray` (both Vector3, of the world) points at, or misses by less than
@@ -21,7 +22,8 @@ export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }
     const distance = point.distanceTo(eye);
     if (missed > spread || depth < NEAREST || distance > farthest) return;
     const cost = missed + FARNESS * depth + (distance > reach ? 1e3 : 0);
-    if (best === null || cost < best.cost) best = { cost, carrier, name: world.nameOf(carrier), at: world.within(carrier, point), distance, what };
+    if (best === null || cost < best.cost)
+      best = { cost, carrier, name: world.nameOf(carrier), at: world.within(carrier, point), distance, what };
   };
   const offerAxis = (carrier, length, radius, accept) => {
     const start = world.place(carrier);
@@ -30,13 +32,16 @@ export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }
     const { along, depth, gap } = nearest(eye, ray, start, axis, length);
     accept(Math.max(gap - radius, 0) / depth, depth, start.addScaledVector(axis, along));
   };
-  wood.forEach((carrier, k) => offerAxis(carrier, wood_length[k], 0, (missed, depth, point) =>
-    offer(missed, depth, carrier, point, "cane")));
+  wood.forEach((carrier, k) => {
+    offerAxis(carrier, wood_length[k], 0, (missed, depth, point) => offer(missed, depth, carrier, point, "cane"));
+  });
   bunch_body.forEach((carrier, k) => {
     if (world.picked.has(k)) return;
     offerAxis(carrier, bunch_length[k], bunch_radius[k], (missed, depth, point) => {
-      if (!withShears) return offer(missed, depth, carrier, point.addScaledVector(ray, (INTO_BUNCH - 1) * bunch_radius[k]), "bunch");
-      const stalk = bunch_stalk[k], middle = new THREE.Vector3(0.5 * stalk_length[k], 0, 0);
+      if (!withShears)
+        return offer(missed, depth, carrier, point.addScaledVector(ray, (INTO_BUNCH - 1) * bunch_radius[k]), "bunch");
+      const stalk = bunch_stalk[k],
+        middle = new THREE.Vector3(0.5 * stalk_length[k], 0, 0);
       return offer(missed, depth, stalk, middle.applyQuaternion(world.turn(stalk)).add(world.place(stalk)), "bunch");
     });
   });
@@ -44,7 +49,8 @@ export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }
     for (const [carrier, box] of world.bounds) {
       const [owner] = world.nameOf(carrier).split("/");
       if (owner === world.header.person) continue;
-      const from = world.within(carrier, eye), way = ray.clone().applyQuaternion(world.turn(carrier).conjugate());
+      const from = world.within(carrier, eye),
+        way = ray.clone().applyQuaternion(world.turn(carrier).conjugate());
       const hit = new THREE.Ray(from, way).intersectBox(box, new THREE.Vector3());
       if (hit === null) continue;
       const depth = hit.distanceTo(from);
@@ -56,8 +62,12 @@ export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }
 
 /** Nearest points of a ray and of a piece [m] of an axis: how far along the piece, how deep along the ray, the gap between. */
 function nearest(eye, ray, start, axis, length) {
-  const apart = eye.clone().sub(start), b = ray.dot(axis), d = ray.dot(apart), e = axis.dot(apart);
+  const apart = eye.clone().sub(start),
+    b = ray.dot(axis),
+    d = ray.dot(apart),
+    e = axis.dot(apart);
   const along = Math.min(Math.max((e - b * d) / Math.max(1 - b * b, 1e-9), 0), length);
-  const way = start.clone().addScaledVector(axis, along).sub(eye), depth = way.dot(ray);
+  const way = start.clone().addScaledVector(axis, along).sub(eye),
+    depth = way.dot(ray);
   return { along, depth: Math.max(depth, 1e-3), gap: way.addScaledVector(ray, -depth).length() };
 }

@@ -1,14 +1,26 @@
 // Messages of named arrays: see vinesim/web/array_message.py for their layout.
 
-const KINDS = { u1: Uint8Array, i1: Int8Array, u2: Uint16Array, i2: Int16Array, u4: Uint32Array, i4: Int32Array,
-  f4: Float32Array, f8: Float64Array };
+const KINDS = {
+  u1: Uint8Array,
+  i1: Int8Array,
+  u2: Uint16Array,
+  i2: Int16Array,
+  u4: Uint32Array,
+  i4: Int32Array,
+  f4: Float32Array,
+  f8: Float64Array,
+};
 
 /** Header of a message; its `arrays` are typed arrays over the message's own memory. */
 export function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
   for (const [name, [kind, shape, offset]] of Object.entries(header.arrays)) {
-    header.arrays[name] = new KINDS[kind](buffer, 4 + length + offset, shape.reduce((product, n) => product * n, 1));
+    header.arrays[name] = new KINDS[kind](
+      buffer,
+      4 + length + offset,
+      shape.reduce((product, n) => product * n, 1),
+    );
   }
   return header;
 }

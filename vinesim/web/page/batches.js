@@ -16,28 +16,46 @@ export class Batches {
     this.seen = new RowList();
     this.unseen = new RowList();
     this.uniforms = { listed: { value: listTexture(new Uint32Array(LIST_WIDTH)) }, copies: { value: this.copies } };
-    const vertices = points.length / 3, each = (make) => Array.from({ length: this.copies }, (_, k) => make(k)).flat();
+    const vertices = points.length / 3,
+      each = (make) => Array.from({ length: this.copies }, (_, k) => make(k)).flat();
     const copy = new THREE.BufferAttribute(Uint32Array.from(each((k) => Array(vertices).fill(k))), 1);
     copy.gpuType = THREE.IntType;
-    const attributes = { position: new THREE.Float32BufferAttribute(each(() => points), 3), copy };
-    this.geometry = geometryOf(attributes, each((k) => faces.map((vertex) => vertex + k * vertices)));
+    const attributes = {
+      position: new THREE.Float32BufferAttribute(
+        each(() => points),
+        3,
+      ),
+      copy,
+    };
+    this.geometry = geometryOf(
+      attributes,
+      each((k) => faces.map((vertex) => vertex + k * vertices)),
+    );
     this.shadowGeometry = geometryOf(attributes, this.geometry.index);
   }
 
-  clear() { this.seen.count = this.unseen.count = 0; }
+  clear() {
+    this.seen.count = this.unseen.count = 0;
+  }
 
   /** Triangles that are drawn for the eyes. */
-  get triangles() { return this.instances(this.seen.count) * this.geometry.index.count / 3; }
+  get triangles() {
+    return (this.instances(this.seen.count) * this.geometry.index.count) / 3;
+  }
 
-  instances(count) { return Math.ceil(count / this.copies); }
+  instances(count) {
+    return Math.ceil(count / this.copies);
+  }
 
   /** Draw what was added to `seen` for the eyes and the sun from now on, what was added to `unseen` for the sun. */
   update() {
-    const { listed } = this.uniforms, { seen, unseen } = this, count = seen.count + unseen.count;
+    const { listed } = this.uniforms,
+      { seen, unseen } = this,
+      count = seen.count + unseen.count;
     const room = this.instances(count) * this.copies;
     if (listed.value.image.data.length < room) {
       listed.value.dispose();
-      listed.value = listTexture(new Uint32Array(Math.ceil(2 * room / LIST_WIDTH) * LIST_WIDTH));
+      listed.value = listTexture(new Uint32Array(Math.ceil((2 * room) / LIST_WIDTH) * LIST_WIDTH));
     }
     const rows = listed.value.image.data;
     rows.set(seen.rows.subarray(0, seen.count));
@@ -78,7 +96,13 @@ function geometryOf(attributes, index) {
 }
 
 function listTexture(list) {
-  const texture = new THREE.DataTexture(list, LIST_WIDTH, list.length / LIST_WIDTH, THREE.RedIntegerFormat, THREE.UnsignedIntType);
+  const texture = new THREE.DataTexture(
+    list,
+    LIST_WIDTH,
+    list.length / LIST_WIDTH,
+    THREE.RedIntegerFormat,
+    THREE.UnsignedIntType,
+  );
   texture.internalFormat = "R32UI";
   texture.minFilter = texture.magFilter = THREE.NearestFilter;
   return texture;

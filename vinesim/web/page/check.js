@@ -1,5 +1,5 @@
 // Runs before the page's modules, in browsers of any age: a sentence for what is missing, instead of a blank page.
-(function () {
+(() => {
   var started = false;
 
   function say(text) {
@@ -11,7 +11,9 @@
   }
 
   function check() {
-    var script = document.createElement("script"), canvas = document.createElement("canvas"), context;
+    var script = document.createElement("script"),
+      canvas = document.createElement("canvas"),
+      context;
     if (!("noModule" in script) || typeof Promise.prototype.finally !== "function")
       return "This browser is too old for the vineyard: open this address in Chrome, Edge, Firefox or Safari of 2022 or later.";
     if (window.WebGL2RenderingContext) context = canvas.getContext("webgl2");
@@ -23,13 +25,23 @@
   }
 
   /** Called by main.js when the vineyard is there; from then on it reports failures itself. */
-  window.pageStarted = function () { started = true; };
-  window.addEventListener("error", function (event) {
-    if (started) return;
-    say(event.message
-      ? "This browser cannot run the page (" + event.message + "): use Chrome, Edge, Firefox or Safari of 2022 or later."
-      : "A part of the page did not load: is the client still running? Then load the page again.");
-  }, true);
+  window.pageStarted = () => {
+    started = true;
+  };
+  window.addEventListener(
+    "error",
+    (event) => {
+      if (started) return;
+      say(
+        event.message
+          ? "This browser cannot run the page (" +
+              event.message +
+              "): use Chrome, Edge, Firefox or Safari of 2022 or later."
+          : "A part of the page did not load: is the client still running? Then load the page again.",
+      );
+    },
+    true,
+  );
   window.pageMisses = check();
   if (window.pageMisses) say(window.pageMisses);
 })();

@@ -8,7 +8,8 @@ const AROUND = directions(122);
 
 /** Points [3] of the primitives of each carrier that lie farthest in the directions `AROUND`, in its frame. */
 export function outermost({ shape, first, size, kind, carrier }) {
-  const hulls = new Map(), u = new THREE.Vector3();
+  const hulls = new Map(),
+    u = new THREE.Vector3();
   first.forEach((start, k) => {
     const of = carrier[start];
     if (!hulls.has(of)) hulls.set(of, new Hull());
@@ -16,7 +17,8 @@ export function outermost({ shape, first, size, kind, carrier }) {
     for (let row = start; row < start + size[k]; ++row)
       for (let direction = 0; direction < AROUND.length; direction += 3)
         if (kind[k] === TRIANGLE)
-          for (let at = 16 * row; at < 16 * row + 12; at += 4) hull.add(direction, shape[at], shape[at + 1], shape[at + 2]);
+          for (let at = 16 * row; at < 16 * row + 12; at += 4)
+            hull.add(direction, shape[at], shape[at + 1], shape[at + 2]);
         else hull.add(direction, ...support(shape, 16 * row, kind[k], u.fromArray(AROUND, direction)));
   });
   return new Map([...hulls].map(([of, { points }]) => [of, points]));
@@ -25,7 +27,8 @@ export function outermost({ shape, first, size, kind, carrier }) {
 /** How far `points` reach in a direction. */
 export function farthest(points, { x, y, z }) {
   let along = -Infinity;
-  for (let at = 0; at < points.length; at += 3) along = Math.max(along, x * points[at] + y * points[at + 1] + z * points[at + 2]);
+  for (let at = 0; at < points.length; at += 3)
+    along = Math.max(along, x * points[at] + y * points[at + 1] + z * points[at + 2]);
   return along;
 }
 
@@ -52,13 +55,15 @@ class Hull {
 
 /** Point of a primitive that is no triangle, farthest in the direction `u`. */
 function support(shape, at, kind, u) {
-  const [a, b, c] = [0, 4, 8].map((from) => new THREE.Vector3().fromArray(shape, at + from)), radius = shape[at + 3];
+  const [a, b, c] = [0, 4, 8].map((from) => new THREE.Vector3().fromArray(shape, at + from)),
+    radius = shape[at + 3];
   if (kind === SPHEROID) {
     const w = u.clone().addScaledVector(b, u.dot(b) * (shape[at + 7] ** 2 - 1));
     return a.addScaledVector(w, radius / Math.sqrt(u.dot(w)));
   }
   if (kind === BOX || kind === ELLIPSOID) {
-    const turn = new THREE.Quaternion().fromArray(shape, at + 4), half = new THREE.Vector3(radius, c.x, c.y);
+    const turn = new THREE.Quaternion().fromArray(shape, at + 4),
+      half = new THREE.Vector3(radius, c.x, c.y);
     const local = u.clone().applyQuaternion(turn.clone().conjugate());
     if (kind === BOX) local.set(...local.toArray().map(Math.sign));
     else local.divideScalar(local.multiply(half).length());
@@ -70,8 +75,14 @@ function support(shape, at, kind, u) {
 /** Both directions of each axis, then `count` others spread evenly. */
 function directions(count) {
   const axes = [1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1];
-  return Float64Array.from(axes.concat(Array.from({ length: count }, (_, k) => {
-    const z = 1 - (2 * k + 1) / count, turned = k * Math.PI * (3 - Math.sqrt(5)), flat = Math.sqrt(1 - z * z);
-    return [flat * Math.cos(turned), flat * Math.sin(turned), z];
-  }).flat()));
+  return Float64Array.from(
+    axes.concat(
+      Array.from({ length: count }, (_, k) => {
+        const z = 1 - (2 * k + 1) / count,
+          turned = k * Math.PI * (3 - Math.sqrt(5)),
+          flat = Math.sqrt(1 - z * z);
+        return [flat * Math.cos(turned), flat * Math.sin(turned), z];
+      }).flat(),
+    ),
+  );
 }

@@ -1,16 +1,31 @@
 // Eyes that fly: keys, mouse, touch and gamepad. Angles about the world's z (yaw) and to the side (pitch).
 
-const KEYS = { KeyW: [0, 1], ArrowUp: [0, 1], KeyS: [0, -1], ArrowDown: [0, -1], KeyA: [1, 1], ArrowLeft: [1, 1],
-  KeyD: [1, -1], ArrowRight: [1, -1], KeyE: [2, 1], KeyQ: [2, -1] };
+const KEYS = {
+  KeyW: [0, 1],
+  ArrowUp: [0, 1],
+  KeyS: [0, -1],
+  ArrowDown: [0, -1],
+  KeyA: [1, 1],
+  ArrowLeft: [1, 1],
+  KeyD: [1, -1],
+  ArrowRight: [1, -1],
+  KeyE: [2, 1],
+  KeyQ: [2, -1],
+};
 /** A stick that is less than this share off its middle rests. */
 const REST = 0.15;
 /** Numbers of buttons of a gamepad with the standard mapping. */
-const LEFT_TRIGGER = 6, RIGHT_TRIGGER = 7;
+const LEFT_TRIGGER = 6,
+  RIGHT_TRIGGER = 7;
 /** Angles beside the line straight behind what is followed, the best ones first [rad]; height of what is looked at [m]. */
-const SIDES = [0.6, -0.6, 0.4, -0.4, 0.2, -0.2], AIM = 1.1;
+const SIDES = [0.6, -0.6, 0.4, -0.4, 0.2, -0.2],
+  AIM = 1.1;
 /** One of them is kept until it has moved so far [m] or turned by twice the angle with this sine. */
-const FAR = 1, HALF_TURN = 0.25, NOTHING = { at: [NaN, NaN], turned: 0, side: SIDES[0] };
-const TURN = 1.8, NOD = 1.4; // rad/s of a stick that is pushed all the way
+const FAR = 1,
+  HALF_TURN = 0.25,
+  NOTHING = { at: [NaN, NaN], turned: 0, side: SIDES[0] };
+const TURN = 1.8,
+  NOD = 1.4; // rad/s of a stick that is pushed all the way
 
 export class FlyingEyes {
   constructor(element, pose) {
@@ -22,7 +37,9 @@ export class FlyingEyes {
     this.followed = NOTHING;
     this.held = new Set();
     this.fingers = new Map();
-    addEventListener("keydown", (event) => { if (event.code in KEYS) this.held.add(event.code); });
+    addEventListener("keydown", (event) => {
+      if (event.code in KEYS) this.held.add(event.code);
+    });
     addEventListener("keyup", (event) => this.held.delete(event.code));
     addEventListener("blur", () => this.held.clear());
     element.addEventListener("pointerdown", (event) => {
@@ -33,24 +50,31 @@ export class FlyingEyes {
     element.addEventListener("pointerup", up);
     element.addEventListener("pointercancel", up);
     element.addEventListener("pointermove", (event) => this.drag(event));
-    element.addEventListener("wheel", (event) => {
-      this.speed = Math.min(Math.max(this.speed * Math.exp(-event.deltaY / 600), 0.1), 30);
-      event.preventDefault();
-    }, { passive: false });
+    element.addEventListener(
+      "wheel",
+      (event) => {
+        this.speed = Math.min(Math.max(this.speed * Math.exp(-event.deltaY / 600), 0.1), 30);
+        event.preventDefault();
+      },
+      { passive: false },
+    );
   }
 
   /** One finger looks, two fingers fly. */
   drag(event) {
     const last = this.fingers.get(event.pointerId);
     if (!last) return;
-    const dx = event.clientX - last[0], dy = event.clientY - last[1];
+    const dx = event.clientX - last[0],
+      dy = event.clientY - last[1];
     this.fingers.set(event.pointerId, [event.clientX, event.clientY]);
     if (this.fingers.size > 1) this.push(-0.004 * dy * this.speed, 0.004 * dx * this.speed);
     else this.look(0.0035 * dx, 0.0035 * dy);
   }
 
   /** Two fingers ask to move [m]. */
-  push(ahead, left) { this.move(ahead, left, 0); }
+  push(ahead, left) {
+    this.move(ahead, left, 0);
+  }
 
   look(yaw, pitch) {
     this.yaw += yaw;
@@ -59,7 +83,9 @@ export class FlyingEyes {
 
   /** Move [m] along where the eyes look, to their left, and up. */
   move(ahead, left, up) {
-    const c = Math.cos(this.yaw), s = Math.sin(this.yaw), level = Math.cos(this.pitch);
+    const c = Math.cos(this.yaw),
+      s = Math.sin(this.yaw),
+      level = Math.cos(this.pitch);
     this.place[0] += ahead * c * level - left * s;
     this.place[1] += ahead * s * level + left * c;
     this.place[2] = Math.min(Math.max(this.place[2] + ahead * Math.sin(this.pitch) + up, 0.1), 200);
@@ -72,7 +98,9 @@ export class FlyingEyes {
     for (const pad of navigator.getGamepads?.() ?? []) {
       if (!pad?.connected) continue; // some browsers keep one that is gone, with its last axes
       const { ahead, left, up, turn, nod } = wishOf(pad);
-      [ahead, left, up].forEach((value, axis) => { way[axis] += value; });
+      [ahead, left, up].forEach((value, axis) => {
+        way[axis] += value;
+      });
       this.look(turn * TURN * seconds, nod * NOD * seconds);
     }
     if (!way.some((value) => value !== 0)) return false;
@@ -85,12 +113,17 @@ export class FlyingEyes {
    * point)`. It is chosen anew when the point has moved far, or turned.
    */
   follow(point, heading, between, distance = 3.2) {
-    const behind = (side) =>
-      [point[0] - distance * Math.cos(heading + side), point[1] - distance * Math.sin(heading + side), 1.6];
+    const behind = (side) => [
+      point[0] - distance * Math.cos(heading + side),
+      point[1] - distance * Math.sin(heading + side),
+      1.6,
+    ];
     const { at, turned } = this.followed;
-    const way = Math.hypot(point[0] - at[0], point[1] - at[1]), turn = Math.abs(Math.sin((heading - turned) / 2));
+    const way = Math.hypot(point[0] - at[0], point[1] - at[1]),
+      turn = Math.abs(Math.sin((heading - turned) / 2));
     if (!(way < FAR) || turn > HALF_TURN) {
-      const target = [point[0], point[1], AIM], counts = SIDES.map((angle) => between(behind(angle), target));
+      const target = [point[0], point[1], AIM],
+        counts = SIDES.map((angle) => between(behind(angle), target));
       this.followed = { at: [...point], turned: heading, side: SIDES[counts.indexOf(Math.min(...counts))] };
     }
     const goal = behind(this.followed.side);
@@ -113,12 +146,19 @@ export class FlyingEyes {
  * of the standard mapping only; of other pads the first two count, for a trigger at rest may be an axis at -1.
  */
 function wishOf({ axes, buttons, mapping }) {
-  const isStandard = mapping === "standard", axis = (k) => isStandard || k < 2 ? beyondRest(axes[k] ?? 0) : 0;
-  const trigger = (k) => isStandard ? beyondRest(buttons[k]?.value ?? 0) : 0;
-  return { ahead: -axis(1), left: -axis(0), up: trigger(RIGHT_TRIGGER) - trigger(LEFT_TRIGGER), turn: -axis(2), nod: -axis(3) };
+  const isStandard = mapping === "standard",
+    axis = (k) => (isStandard || k < 2 ? beyondRest(axes[k] ?? 0) : 0);
+  const trigger = (k) => (isStandard ? beyondRest(buttons[k]?.value ?? 0) : 0);
+  return {
+    ahead: -axis(1),
+    left: -axis(0),
+    up: trigger(RIGHT_TRIGGER) - trigger(LEFT_TRIGGER),
+    turn: -axis(2),
+    nod: -axis(3),
+  };
 }
 
 /** The share of its way that a stick or trigger is beyond its rest: slow at first, not with a jerk. */
 function beyondRest(value) {
-  return Math.sign(value) * Math.max(Math.abs(value) - REST, 0) / (1 - REST);
+  return (Math.sign(value) * Math.max(Math.abs(value) - REST, 0)) / (1 - REST);
 }

@@ -2,13 +2,16 @@
 
 /** Cone or cylinder with n sides; with ends or as an open tube. */
 function tube(sides, closed, flat) {
-  const points = [], faces = [];
+  const points = [],
+    faces = [];
   const ring = (z) => {
     const first = points.length / 3;
-    for (let k = 0; k < sides; ++k) points.push(Math.cos(k / sides * 2 * Math.PI), Math.sin(k / sides * 2 * Math.PI), z);
+    for (let k = 0; k < sides; ++k)
+      points.push(Math.cos((k / sides) * 2 * Math.PI), Math.sin((k / sides) * 2 * Math.PI), z);
     return first;
   };
-  const low = ring(0), high = ring(1);
+  const low = ring(0),
+    high = ring(1);
   for (let k = 0; k < sides; ++k) {
     const next = (k + 1) % sides;
     faces.push(low + k, low + next, high + next, low + k, high + next, high + k);
@@ -27,21 +30,45 @@ function tube(sides, closed, flat) {
 
 /** Sphere of triangles: an octahedron whose edges were halved so many times. */
 function sphere(halvings) {
-  let points = [[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]];
-  let faces = [[0, 2, 4], [2, 1, 4], [1, 3, 4], [3, 0, 4], [2, 0, 5], [1, 2, 5], [3, 1, 5], [0, 3, 5]];
+  const points = [
+    [1, 0, 0],
+    [-1, 0, 0],
+    [0, 1, 0],
+    [0, -1, 0],
+    [0, 0, 1],
+    [0, 0, -1],
+  ];
+  let faces = [
+    [0, 2, 4],
+    [2, 1, 4],
+    [1, 3, 4],
+    [3, 0, 4],
+    [2, 0, 5],
+    [1, 2, 5],
+    [3, 1, 5],
+    [0, 3, 5],
+  ];
   for (let round = 0; round < halvings; ++round) {
     const known = new Map();
     const middle = (i, j) => {
       const key = Math.min(i, j) * 1e6 + Math.max(i, j);
       if (!known.has(key)) {
-        const sum = points[i].map((x, axis) => x + points[j][axis]), length = Math.hypot(...sum);
+        const sum = points[i].map((x, axis) => x + points[j][axis]),
+          length = Math.hypot(...sum);
         known.set(key, points.push(sum.map((x) => x / length)) - 1);
       }
       return known.get(key);
     };
     faces = faces.flatMap(([a, b, c]) => {
-      const ab = middle(a, b), bc = middle(b, c), ca = middle(c, a);
-      return [[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]];
+      const ab = middle(a, b),
+        bc = middle(b, c),
+        ca = middle(c, a);
+      return [
+        [a, ab, ca],
+        [ab, b, bc],
+        [ca, bc, c],
+        [ab, bc, ca],
+      ];
     });
   }
   return { points: points.flat(), faces: faces.flat() };
@@ -55,9 +82,10 @@ function tetrahedron() {
 
 /** Blade of so many strips on each side of the midrib and along it. */
 function blade(across, along) {
-  const points = [], faces = [], columns = 2 * across + 1;
-  for (let j = 0; j <= along; ++j)
-    for (let i = 0; i < columns; ++i) points.push(i / across - 1, j / along, 0);
+  const points = [],
+    faces = [],
+    columns = 2 * across + 1;
+  for (let j = 0; j <= along; ++j) for (let i = 0; i < columns; ++i) points.push(i / across - 1, j / along, 0);
   for (let j = 0; j < along; ++j)
     for (let i = 0; i < columns - 1; ++i) {
       const k = j * columns + i;
@@ -68,11 +96,17 @@ function blade(across, along) {
 
 /** Cube whose normals are told by doubled coordinates. */
 function cube() {
-  const points = [], faces = [];
+  const points = [],
+    faces = [];
   for (let axis = 0; axis < 3; ++axis)
     for (const side of [-1, 1]) {
       const first = points.length / 3;
-      for (const [u, v] of [[-1, -1], [1, -1], [1, 1], [-1, 1]]) {
+      for (const [u, v] of [
+        [-1, -1],
+        [1, -1],
+        [1, 1],
+        [-1, 1],
+      ]) {
         const corner = [0, 0, 0];
         corner[axis] = 2 * side;
         corner[(axis + 1) % 3] = u * side;
@@ -86,10 +120,13 @@ function cube() {
 
 /** How far the flattest face of a mesh is inside the sphere of radius 1 that it stands for. */
 const insideBall = ({ points, faces }) => {
-  const at = (k) => points.slice(3 * k, 3 * k + 3), minus = (p, q) => p.map((x, axis) => x - q[axis]);
+  const at = (k) => points.slice(3 * k, 3 * k + 3),
+    minus = (p, q) => p.map((x, axis) => x - q[axis]);
   let least = 1;
   for (let k = 0; k < faces.length; k += 3) {
-    const [a, b, c] = [0, 1, 2].map((corner) => at(faces[k + corner])), u = minus(b, a), v = minus(c, a);
+    const [a, b, c] = [0, 1, 2].map((corner) => at(faces[k + corner])),
+      u = minus(b, a),
+      v = minus(c, a);
     const normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]];
     least = Math.min(least, Math.abs(normal.reduce((sum, x, axis) => sum + x * a[axis], 0)) / Math.hypot(...normal));
   }
@@ -97,7 +134,8 @@ const insideBall = ({ points, faces }) => {
 };
 /** The same of a cylinder. */
 const insideTube = (sides) => 1 - Math.cos(Math.PI / sides);
-const BALLS = [sphere(3), sphere(2), sphere(1)], SIDES = [16, 10, 6];
+const BALLS = [sphere(3), sphere(2), sphere(1)],
+  SIDES = [16, 10, 6];
 
 /**
  * By kind, in the order of its numbers (primitives.py); each from fine to coarse. `inside`: of bodies that are round, how

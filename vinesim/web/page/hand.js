@@ -4,7 +4,8 @@ import * as THREE from "./vendor/three.module.js";
 
 /** From the eyes at most, and how fast hands move and turn [m, m/s, rad/s]. */
 export const ARM = 0.75;
-const REACH = 0.9, TURN = 3;
+const REACH = 0.9,
+  TURN = 3;
 const NEAREST = 0.25; // m from the eyes
 /** A hand comes to what was tapped from so far before it at most [m]: one that came from below would lift it. */
 const APPROACH = 0.2;
@@ -15,10 +16,12 @@ const HANGING = [0.3, -0.2, -0.7];
  * share of how steep that line is. An empty hand comes along it; blades come from the right and from below, or the hand
  * would hide what they cut. GUESSED, by pictures.
  */
-const EMPTY = { left: 0, up: 0, roll: 0, steep: 1 }, WITH_SHEARS = { left: 0.9, up: 0.35, roll: -0.8, steep: 0.5 };
+const EMPTY = { left: 0, up: 0, roll: 0, steep: 1 },
+  WITH_SHEARS = { left: 0.9, up: 0.35, roll: -0.8, steep: 0.5 };
 /** Between palm and fingers [m], in the palm's frame. */
 const GRASP = [0.06, 0, 0];
-const FIST = [1, 1, 1, 1, 1], OPEN = [0, 0, 0, 0, 0];
+const FIST = [1, 1, 1, 1, 1],
+  OPEN = [0, 0, 0, 0, 0];
 /** A finger that moves less than this [px] between touching and leaving the screen has tapped. */
 const STILL = 10;
 
@@ -42,8 +45,14 @@ export class Hand {
     this.listenToTaps(element, tap);
     this.listenToKeys(Object.values(gestures));
     this.buttons = Object.fromEntries(["reach", "hold"].map((name) => [name, document.getElementById(name)]));
-    this.buttons.reach.addEventListener("click", () => { this.toggleReach(); this.buttons.reach.blur(); });
-    this.buttons.hold.addEventListener("click", () => { this.toggleHold(); this.buttons.hold.blur(); });
+    this.buttons.reach.addEventListener("click", () => {
+      this.toggleReach();
+      this.buttons.reach.blur();
+    });
+    this.buttons.hold.addEventListener("click", () => {
+      this.toggleHold();
+      this.buttons.hold.blur();
+    });
   }
 
   listenToMouse(element) {
@@ -73,7 +82,10 @@ export class Hand {
       const from = down.get(event.pointerId);
       if (from && Math.hypot(event.clientX - from[0], event.clientY - from[1]) > STILL) isTap = false;
     });
-    element.addEventListener("pointercancel", (event) => { down.delete(event.pointerId); isTap = false; });
+    element.addEventListener("pointercancel", (event) => {
+      down.delete(event.pointerId);
+      isTap = false;
+    });
     element.addEventListener("pointerup", (event) => {
       down.delete(event.pointerId);
       if (isTap && event.button === 0) tap(cursorOf(event));
@@ -104,7 +116,9 @@ export class Hand {
   }
 
   /** Reach for a point in the frame of what carries it, and follow that until the hand closes. */
-  reachFor(target) { Object.assign(this, { target, kept: null, reaching: true }); }
+  reachFor(target) {
+    Object.assign(this, { target, kept: null, reaching: true });
+  }
 
   /** A state tells that the shears have closed. */
   cut() {
@@ -132,7 +146,8 @@ export class Hand {
   /** Move a `place` back `ahead`, the less the nearer the hand is to the line along which it comes there. */
   stopBefore(place, ahead) {
     if (!this.offset) return;
-    const way = place.clone().sub(this.offset), beside = way.addScaledVector(ahead, -way.dot(ahead)).length();
+    const way = place.clone().sub(this.offset),
+      beside = way.addScaledVector(ahead, -way.dot(ahead)).length();
     place.addScaledVector(ahead, -Math.min(APPROACH, 2 * beside));
   }
 
@@ -141,16 +156,24 @@ export class Hand {
    * `pose` [7] of the head, `yaw` of it; `ray` Vector3: direction of the cursor from the eyes.
    */
   tracked(pose, yaw, ray, world, seconds) {
-    const eye = new THREE.Vector3(...pose.slice(0, 3)), head = new THREE.Quaternion(...pose.slice(3));
-    const goal = { left: 0, up: 0, roll: 0 }, place = new THREE.Vector3();
+    const eye = new THREE.Vector3(...pose.slice(0, 3)),
+      head = new THREE.Quaternion(...pose.slice(3));
+    const goal = { left: 0, up: 0, roll: 0 },
+      place = new THREE.Vector3();
     if (this.reaching) {
-      const aim = this.aim(eye, head, ray, world), hold = this.withShears ? WITH_SHEARS : EMPTY;
+      const aim = this.aim(eye, head, ray, world),
+        hold = this.withShears ? WITH_SHEARS : EMPTY;
       goal.left = wrapped(Math.atan2(aim.y, aim.x) - yaw + hold.left);
       goal.up = hold.up + hold.steep * Math.atan2(aim.z, Math.hypot(aim.x, aim.y));
       goal.roll = hold.roll;
       const turn = turnOf(goal, yaw);
-      place.set(...(this.withShears ? this.mouth : GRASP)).applyQuaternion(turn).negate().add(aim);
-      if (this.target !== null && !this.closed) this.stopBefore(place, new THREE.Vector3(1, 0, 0).applyQuaternion(turn));
+      place
+        .set(...(this.withShears ? this.mouth : GRASP))
+        .applyQuaternion(turn)
+        .negate()
+        .add(aim);
+      if (this.target !== null && !this.closed)
+        this.stopBefore(place, new THREE.Vector3(1, 0, 0).applyQuaternion(turn));
     } else place.set(...HANGING).applyAxisAngle(new THREE.Vector3(0, 0, 1), yaw);
     for (const [name, angle] of Object.entries(goal)) {
       const way = name === "left" ? wrapped(angle - this.angles.left) : angle - this.angles[name];
@@ -158,9 +181,12 @@ export class Hand {
     }
     this.offset ??= place.clone();
     const way = place.sub(this.offset);
-    this.offset.addScaledVector(way, Math.min(1, REACH * seconds / Math.max(way.length(), 1e-6)));
-    return { pose: [...this.offset.clone().add(eye), ...turnOf(this.angles, yaw)], closed: this.closed,
-      fingers: this.fingers ?? (this.closed ? FIST : OPEN) };
+    this.offset.addScaledVector(way, Math.min(1, (REACH * seconds) / Math.max(way.length(), 1e-6)));
+    return {
+      pose: [...this.offset.clone().add(eye), ...turnOf(this.angles, yaw)],
+      closed: this.closed,
+      fingers: this.fingers ?? (this.closed ? FIST : OPEN),
+    };
   }
 }
 
@@ -173,4 +199,4 @@ function turnOf({ left, up, roll }, yaw) {
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
 /** Where in the picture: -1 to 1, right and up. */
-const cursorOf = (event) => [2 * event.clientX / innerWidth - 1, 1 - 2 * event.clientY / innerHeight];
+const cursorOf = (event) => [(2 * event.clientX) / innerWidth - 1, 1 - (2 * event.clientY) / innerHeight];

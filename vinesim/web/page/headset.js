@@ -3,7 +3,9 @@
 import * as THREE from "./vendor/three.module.js";
 import { Detail, PIXELS } from "./rate.js";
 
-const WALK = 1.4, TURN = Math.PI / 6, DEAD = 0.25; // m/s, rad, share of a stick's way
+const WALK = 1.4,
+  TURN = Math.PI / 6,
+  DEAD = 0.25; // m/s, rad, share of a stick's way
 const HALF = Math.SQRT1_2;
 /** From the browser's axes (y up) to the world's (z up). */
 const UPRIGHT = new THREE.Quaternion(HALF, 0, 0, HALF);
@@ -13,11 +15,14 @@ const FORWARD = new THREE.Quaternion(-0.5, 0.5, 0.5, 0.5);
 const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky-finger"];
 /** Angles [rad] between the first and the last bone of a finger that is bent all the way; the thumb has one joint less. */
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
-const AIM = 0.7, FARTHEST = 8, FLATTEST = 0.1; // share of a stick's way; m; how steep a ray to the floor is at least
+const AIM = 0.7,
+  FARTHEST = 8,
+  FLATTEST = 0.1; // share of a stick's way; m; how steep a ray to the floor is at least
 const CLICK = [0.3, 30]; // amplitude and ms of the pulse for a choice
 const RATE = 72; // Hz, of a display that does not tell
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
-const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
+const PINCH = 0.025,
+  CLOSED = 0.5; // m between the tips, mean bend of the fingers
 /** A palm is at the hip so far below the eyes and so far beside them [m]. GUESSED. */
 const HIP = { above: 0.45, below: 0.9, beside: 0.3 };
 
@@ -33,8 +38,10 @@ export class Headset {
     this.choose = choose;
     this.wrist = new THREE.Group(); // goes with the left hand
     this.pulled = false;
-    this.mark = new THREE.Mesh(new THREE.RingGeometry(0.18, 0.22, 32).rotateX(-Math.PI / 2), // where a jump leads
-      new THREE.MeshBasicMaterial({ color: 0x30c060, depthTest: false, transparent: true, toneMapped: false }));
+    this.mark = new THREE.Mesh(
+      new THREE.RingGeometry(0.18, 0.22, 32).rotateX(-Math.PI / 2), // where a jump leads
+      new THREE.MeshBasicMaterial({ color: 0x30c060, depthTest: false, transparent: true, toneMapped: false }),
+    );
     this.mark.visible = false;
     this.pressed = [false, false];
     this.renderer = renderer;
@@ -43,7 +50,9 @@ export class Headset {
     this.viewer = new THREE.Matrix4(); // between the eyes, on the rig
     this.scale = new Detail(PIXELS);
     renderer.xr.enabled = true;
-    renderer.xr.addEventListener("sessionend", () => { this.mark.visible = false; });
+    renderer.xr.addEventListener("sessionend", () => {
+      this.mark.visible = false;
+    });
     renderer.xr.setReferenceSpaceType("local-floor");
     rig.add(camera);
     this.rays = [0, 1].map((k) => rig.add(renderer.xr.getController(k)) && renderer.xr.getController(k));
@@ -56,16 +65,22 @@ export class Headset {
         this.sources[k] = event.data;
         if (event.data.handedness === "left") ray.add(this.wrist);
       });
-      ray.addEventListener("disconnected", () => { this.sources[k] = null; });
+      ray.addEventListener("disconnected", () => {
+        this.sources[k] = null;
+      });
     });
   }
 
-  get isWorn() { return this.renderer.xr.isPresenting; }
+  get isWorn() {
+    return this.renderer.xr.isPresenting;
+  }
 
   /** Ask the browser for the headset; called by a click. */
   async enter(place, yaw) {
-    const session = await navigator.xr.requestSession("immersive-vr",
-      { requiredFeatures: ["local-floor"], optionalFeatures: ["hand-tracking"] });
+    const session = await navigator.xr.requestSession("immersive-vr", {
+      requiredFeatures: ["local-floor"],
+      optionalFeatures: ["hand-tracking"],
+    });
     this.rig.position.set(place[0], 0, -place[1]);
     this.rig.rotation.y = yaw - Math.PI / 2;
     await this.renderer.xr.setSession(session);
@@ -84,7 +99,9 @@ export class Headset {
       for (const view of viewer.views) view.requestViewportScale?.(this.scale.value); // of the next picture
     }
     this.tracked = this.sources.map((source) => this.trackHand(frame, source?.hand));
-    this.tracked.forEach((seen, k) => { if (seen !== null) this.takeFromHip(seen, k); });
+    this.tracked.forEach((seen, k) => {
+      if (seen !== null) this.takeFromHip(seen, k);
+    });
     this.sources.forEach((source, k) => {
       const pressed = source?.gamepad?.buttons?.[STICK]?.pressed ?? false;
       if (pressed && !this.pressed[k]) this.press(source.handedness);
@@ -132,16 +149,24 @@ export class Headset {
     if (!frame?.getJointPose || !hand) return null;
     const space = this.renderer.xr.getReferenceSpace();
     const joint = (name) => hand.get(name) && frame.getJointPose(hand.get(name), space)?.transform;
-    const place = (name) => { const at = joint(name)?.position; return at && new THREE.Vector3(at.x, at.y, at.z); };
-    const knuckle = place("middle-finger-phalanx-proximal"), palm = joint("middle-finger-metacarpal");
+    const place = (name) => {
+      const at = joint(name)?.position;
+      return at && new THREE.Vector3(at.x, at.y, at.z);
+    };
+    const knuckle = place("middle-finger-phalanx-proximal"),
+      palm = joint("middle-finger-metacarpal");
     if (!knuckle || !palm) return null;
     const fingers = FINGERS.map((finger, k) => {
-      const bones = k === 0 ? ["metacarpal", "phalanx-proximal", "phalanx-distal", "tip"]
-        : ["metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"];
+      const bones =
+        k === 0
+          ? ["metacarpal", "phalanx-proximal", "phalanx-distal", "tip"]
+          : ["metacarpal", "phalanx-proximal", "phalanx-intermediate", "phalanx-distal", "tip"];
       const points = bones.map((bone) => place(`${finger}-${bone}`));
       if (points.includes(undefined)) return 0;
       const ways = points.slice(1).map((point, i) => point.clone().sub(points[i]).normalize());
-      const bend = ways.slice(1).reduce((sum, way, i) => sum + Math.acos(Math.min(Math.max(way.dot(ways[i]), -1), 1)), 0);
+      const bend = ways
+        .slice(1)
+        .reduce((sum, way, i) => sum + Math.acos(Math.min(Math.max(way.dot(ways[i]), -1), 1)), 0);
       return Math.min(bend / FULL_BEND[k], 1);
     });
     const gap = place("thumb-tip")?.distanceTo(place("index-finger-tip") ?? knuckle) ?? 1;
@@ -153,7 +178,8 @@ export class Headset {
 
   /** A hand without a controller that closes at the hip presses; until it opens again it holds nothing. */
   takeFromHip(seen, k) {
-    const way = new THREE.Vector3().setFromMatrixPosition(seen.matrix)
+    const way = new THREE.Vector3()
+      .setFromMatrixPosition(seen.matrix)
       .sub(new THREE.Vector3().setFromMatrixPosition(this.viewer));
     const isAtHip = -way.y > HIP.above && -way.y < HIP.below && Math.hypot(way.x, way.z) < HIP.beside;
     const closes = seen.closed && !this.closed[k];
@@ -173,7 +199,10 @@ export class Headset {
   /** Turn the floor about the head. */
   turn(angle) {
     const head = new THREE.Vector3().setFromMatrixPosition(this.viewer).applyMatrix4(this.rig.matrixWorld);
-    this.rig.position.sub(head).applyAxisAngle(new THREE.Vector3(0, 1, 0), angle).add(head);
+    this.rig.position
+      .sub(head)
+      .applyAxisAngle(new THREE.Vector3(0, 1, 0), angle)
+      .add(head);
     this.rig.rotation.y += angle;
   }
 
@@ -195,11 +224,16 @@ export class Headset {
         return;
       }
       if (source.hand) return; // not seen now: it hangs down
-      const buttons = source.gamepad?.buttons ?? [], trigger = buttons[0]?.value ?? 0, grip = buttons[1]?.value ?? 0;
+      const buttons = source.gamepad?.buttons ?? [],
+        trigger = buttons[0]?.value ?? 0,
+        grip = buttons[1]?.value ?? 0;
       const own = buttons[4]?.pressed ? this.poses.a : buttons[5]?.pressed ? this.poses.b : undefined;
       const thumb = buttons.slice(3).some((button) => button.touched) || grip > 0.8 ? 1 : 0;
-      hands[source.handedness] = { pose: worldPose(this.rays[k].matrixWorld), closed: grip > 0.5 || trigger > 0.5,
-        fingers: own ?? [thumb, trigger, grip, grip, grip] };
+      hands[source.handedness] = {
+        pose: worldPose(this.rays[k].matrixWorld),
+        closed: grip > 0.5 || trigger > 0.5,
+        fingers: own ?? [thumb, trigger, grip, grip, grip],
+      };
     });
     return hands;
   }
@@ -215,7 +249,9 @@ export class Headset {
 
 /** Pose [7] in the world of something that looks along -z with y up in the browser's axes. */
 function worldPose(matrix) {
-  const place = new THREE.Vector3(), turn = new THREE.Quaternion(), scale = new THREE.Vector3();
+  const place = new THREE.Vector3(),
+    turn = new THREE.Quaternion(),
+    scale = new THREE.Vector3();
   matrix.decompose(place, turn, scale);
   turn.premultiply(UPRIGHT).multiply(FORWARD);
   return [place.x, -place.z, place.y, turn.x, turn.y, turn.z, turn.w];

@@ -14,18 +14,24 @@ export class LateHands {
 
   /** A state was applied: hands as simulated, and the controllers that they followed. */
   take({ arrays }) {
-    const { world } = this, { hand_proxy: proxy, hand_controller: controller } = arrays;
+    const { world } = this,
+      { hand_proxy: proxy, hand_controller: controller } = arrays;
     if (!proxy) return;
     this.parts = [];
     world.names.forEach((name, k) => {
       const found = name.startsWith(`${world.header.person}/`) && PART.exec(name);
       if (!found) return;
-      const carrier = world.bodies + 1 + k, data = world.poses.image.data;
-      this.parts.push([SIDES.indexOf(found[1]), carrier, matrix([...data.subarray(8 * carrier, 8 * carrier + 3),
-        ...data.subarray(8 * carrier + 4, 8 * carrier + 8)])]);
+      const carrier = world.bodies + 1 + k,
+        data = world.poses.image.data;
+      this.parts.push([
+        SIDES.indexOf(found[1]),
+        carrier,
+        matrix([...data.subarray(8 * carrier, 8 * carrier + 3), ...data.subarray(8 * carrier + 4, 8 * carrier + 8)]),
+      ]);
     });
     this.held = SIDES.map((_, k) => {
-      const hand = matrix(proxy.subarray(7 * k, 7 * k + 7)), held = matrix(controller.subarray(7 * k, 7 * k + 7));
+      const hand = matrix(proxy.subarray(7 * k, 7 * k + 7)),
+        held = matrix(controller.subarray(7 * k, 7 * k + 7));
       return { back: hand.clone().invert(), offset: held.invert().multiply(hand) };
     });
   }
@@ -41,7 +47,9 @@ export class LateHands {
   draw(person) {
     if (this.held === null) return;
     const moved = SIDES.map((_, k) => this.palm(person, k)?.multiply(this.held[k].back) ?? null);
-    const place = new THREE.Vector3(), turn = new THREE.Quaternion(), scale = new THREE.Vector3();
+    const place = new THREE.Vector3(),
+      turn = new THREE.Quaternion(),
+      scale = new THREE.Vector3();
     const data = this.world.poses.image.data;
     for (const [side, carrier, pose] of this.parts) {
       if (moved[side] === null) continue;
@@ -54,5 +62,9 @@ export class LateHands {
 }
 
 function matrix([x, y, z, ...turn]) {
-  return new THREE.Matrix4().compose(new THREE.Vector3(x, y, z), new THREE.Quaternion(...turn), new THREE.Vector3(1, 1, 1));
+  return new THREE.Matrix4().compose(
+    new THREE.Vector3(x, y, z),
+    new THREE.Quaternion(...turn),
+    new THREE.Vector3(1, 1, 1),
+  );
 }

@@ -19,36 +19,60 @@ import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
-const SHADOW_PERIOD = 250, SHADOW_PICTURES = 4; // the shadow map is drawn again after this time [ms] and this number of pictures
+/** The shadow map is drawn again after this time [ms] and this number of pictures. */
+const SHADOW_PERIOD = 250;
+const SHADOW_PICTURES = 4;
 const LONGEST = 0.1; // s: longest time by which the keys move the viewpoint in one picture
 const FINGER = 22; // px: a tap within this distance of a thing selects it
-/** Turn of the view after which the list of visible plants is made again [rad]. In a headset: half the diagonal field of
- * view, the same turn, and the angle of one pixel of the finest displays [rad]. */
-const TURN = 0.35, IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
+/** Turn of the view after which the list of visible plants is made again [rad]. */
+const TURN = 0.35;
+/** In a headset: half the diagonal field of view, the same turn, and the angle of one pixel of the finest displays [rad]. */
+const IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
 /** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on: so many
  * triangles, as a share of a phone's, and so many pixels. One without a graphics card does from the start. */
-const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.3, FEW_PIXELS = 250_000;
+const SLOW = 5,
+  FIRST_PICTURES = 12,
+  FEW = 0.3,
+  FEW_PIXELS = 250_000;
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 /** Pictures a second on a screen, at which as much is drawn as they allow [Hz]. */
 const RATE = 60;
 const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser.";
-const NOBODY = "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
+const NOBODY =
+  "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
 
 /** A number in the address, null if it has none: triangles, pictures a second (rate), shadows. */
-const asked = (name) => { const given = new URLSearchParams(location.search).get(name); return given === null ? null : Number(given); };
+const asked = (name) => {
+  const given = new URLSearchParams(location.search).get(name);
+  return given === null ? null : Number(given);
+};
 
 /** What the page has done, for those who look at it from outside. */
-const page = (window.vinesim = { states: 0, drawn: 0, tick: -1, frames: 0, calls: 0, triangles: 0, haptics: {}, failure: null });
+const page = {
+  states: 0,
+  drawn: 0,
+  tick: -1,
+  frames: 0,
+  calls: 0,
+  triangles: 0,
+  haptics: {},
+  failure: null,
+};
+window.vinesim = page;
 
 class Viewer {
   constructor(world, start) {
     this.world = world;
     this.detail = asked("triangles") === null && asked("rate") === null ? new Detail(TRIANGLES) : null; // null: fixed
     this.isSlow = this.detail !== null && SOFTWARE.test(graphicsCard());
-    this.renderer = new THREE.WebGLRenderer({ canvas: element("view"), antialias: !this.isSlow, powerPreference: "high-performance" });
+    this.renderer = new THREE.WebGLRenderer({
+      canvas: element("view"),
+      antialias: !this.isSlow,
+      powerPreference: "high-performance",
+    });
     this.renderer.info.autoReset = false;
     this.scene = new THREE.Scene();
     this.scene.add(world.group);
@@ -56,12 +80,20 @@ class Viewer {
     this.isPerson = world.header.person !== null;
     this.eyes = new (this.isPerson ? WalkingEyes : FlyingEyes)(this.renderer.domElement, start);
     const { mouth, gestures } = world.header;
-    this.hand = this.isPerson ? new Hand(this.renderer.domElement, gestures, mouth, (cursor) => this.reach(cursor)) : null;
+    this.hand = this.isPerson
+      ? new Hand(this.renderer.domElement, gestures, mouth, (cursor) => this.reach(cursor))
+      : null;
     this.rig = new THREE.Group();
     this.scene.add(this.rig);
     this.shears = new Shears(mouth, world.group);
-    this.headset = new Headset(this.renderer, this.rig, this.camera, world.header.buttons,
-      (side) => this.shears.toggle(side), () => this.indicate(this.wrist.after(this.intention)));
+    this.headset = new Headset(
+      this.renderer,
+      this.rig,
+      this.camera,
+      world.header.buttons,
+      (side) => this.shears.toggle(side),
+      () => this.indicate(this.wrist.after(this.intention)),
+    );
     this.scene.add(this.headset.mark);
     this.wrist = new Wrist(this.headset.wrist, world.header.intentions);
     this.offerHeadset();
@@ -73,11 +105,20 @@ class Viewer {
     this.intention = "";
     this.offerIntentions(world.header.intentions);
     element("follow").hidden = this.isPerson;
-    for (const [name, code] of [["follow", "KeyF"], ["label", "KeyN"]])
-      element(name).addEventListener("click", () => { this.press(code); element(name).blur(); });
+    for (const [name, code] of [
+      ["follow", "KeyF"],
+      ["label", "KeyN"],
+    ])
+      element(name).addEventListener("click", () => {
+        this.press(code);
+        element(name).blur();
+      });
     const isRoomy = innerWidth > 640 && innerHeight > 560; // as in the style sheet
     for (const panel of document.querySelectorAll("details")) panel.open = isRoomy;
-    for (const help of document.querySelectorAll("#bottom .help")) help.addEventListener("click", () => { help.hidden = true; });
+    for (const help of document.querySelectorAll("#bottom .help"))
+      help.addEventListener("click", () => {
+        help.hidden = true;
+      });
     const { replay } = world.header;
     this.timeline = replay === null ? null : new Timeline(replay, (wish) => this.ask(wish));
     this.newest = null;
@@ -95,7 +136,9 @@ class Viewer {
     if (this.isSlow) this.drawLess();
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
-    addEventListener("keydown", (event) => { if (!event.repeat) this.press(event.code); });
+    addEventListener("keydown", (event) => {
+      if (!event.repeat) this.press(event.code);
+    });
     this.resize();
     this.connect();
     this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
@@ -130,9 +173,10 @@ class Viewer {
   async offerHeadset() {
     const button = element("enter");
     if (!isSecureContext)
-      say("Headset and microphone need https: start the client with --page-lan, and open the address that it prints.",
-        { stays: true });
-    button.hidden = !await navigator.xr?.isSessionSupported("immersive-vr");
+      say("Headset and microphone need https: start the client with --page-lan, and open the address that it prints.", {
+        stays: true,
+      });
+    button.hidden = !(await navigator.xr?.isSessionSupported("immersive-vr"));
     button.addEventListener("click", () => this.headset.enter(this.eyes.place, this.eyes.yaw).catch(fail));
     for (const change of ["sessionstart", "sessionend"])
       this.renderer.xr.addEventListener(change, () => {
@@ -143,7 +187,10 @@ class Viewer {
   connect() {
     this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/state`);
     this.socket.binaryType = "arraybuffer";
-    this.socket.onmessage = (event) => { ++page.states; this.take(decode(event.data)); };
+    this.socket.onmessage = (event) => {
+      ++page.states;
+      this.take(decode(event.data));
+    };
     this.socket.onclose = () => setTimeout(() => this.reconnect(), RETRY);
   }
 
@@ -159,7 +206,8 @@ class Viewer {
       this.shapes = null;
       this.connect();
     } catch (failure) {
-      if (failure.status === 403) fail("This address is no longer valid: open the one that the client has printed now.");
+      if (failure.status === 403)
+        fail("This address is no longer valid: open the one that the client has printed now.");
       setTimeout(() => this.reconnect(), RETRY);
     }
   }
@@ -206,7 +254,7 @@ class Viewer {
     this.overlays.press(code);
     if (code === "KeyF" && !this.isPerson) {
       const actors = this.actors();
-      this.followed = actors.length ? (this.followed + 2) % (actors.length + 1) - 1 : -1;
+      this.followed = actors.length ? ((this.followed + 2) % (actors.length + 1)) - 1 : -1;
       if (!actors.length) say(NOBODY);
     }
     if (code === "KeyT") this.shears.toggle("right");
@@ -228,7 +276,8 @@ class Viewer {
   }
 
   draw(frame) {
-    const now = performance.now(), passed = (now - this.lastFrame) / 1000;
+    const now = performance.now(),
+      passed = (now - this.lastFrame) / 1000;
     if (passed < this.shortest && !this.headset.isWorn) return;
     const seconds = this.isPerson ? this.pace.spend(passed) : Math.min(passed, LONGEST);
     const wasHidden = isUnusual(passed, this.frame);
@@ -241,8 +290,9 @@ class Viewer {
     element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
     if (this.followed >= 0 && this.followed < actors.length) {
       const { carrier } = actors[this.followed];
-      this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier),
-        (eye, point) => this.world.countBetween(eye, point));
+      this.eyes.follow(this.world.place(carrier).toArray(), this.world.heading(carrier), (eye, point) =>
+        this.world.countBetween(eye, point),
+      );
     }
     if (this.headset.isWorn) {
       this.headset.update(frame, seconds, passed);
@@ -252,12 +302,19 @@ class Viewer {
     const eye = new THREE.Vector3(...pose.slice(0, 3));
     page.voice.listen(pose);
     if (this.world.isLeft(eye)) this.loadPlants(eye);
-    this.world.list(eye, ahead(pose), this.headset.isWorn ? IN_HEADSET : { field: this.diagonal, turn: TURN, pixel: this.pixel });
+    this.world.list(
+      eye,
+      ahead(pose),
+      this.headset.isWorn ? IN_HEADSET : { field: this.diagonal, turn: TURN, pixel: this.pixel },
+    );
     this.overlays.draw(actors, this.camera);
     if (this.isPerson) {
       this.person = this.track(pose, seconds);
       this.lateHands.draw(this.person);
-      this.shears.draw([0, 1].map((k) => this.lateHands.palm(this.person, k)), facing(pose));
+      this.shears.draw(
+        [0, 1].map((k) => this.lateHands.palm(this.person, k)),
+        facing(pose),
+      );
     }
     this.renderer.info.reset();
     if (now - this.shadowAt > Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
@@ -266,8 +323,11 @@ class Viewer {
       this.renderer.info.reset();
     }
     this.renderer.render(this.scene, this.camera);
-    Object.assign(page, { frames: page.frames + 1, calls: this.renderer.info.render.calls,
-      triangles: this.renderer.info.render.triangles });
+    Object.assign(page, {
+      frames: page.frames + 1,
+      calls: this.renderer.info.render.calls,
+      triangles: this.renderer.info.render.triangles,
+    });
     this.label(actors);
     const silence = (now - this.heardAt) / 1000;
     if (this.socket.readyState === WebSocket.OPEN && silence > SILENCE && !this.timeline?.status.paused)
@@ -347,9 +407,13 @@ class Viewer {
   /** Reach for what was tapped; what is too far away is said. */
   reach(cursor) {
     if (this.headset.isWorn) return;
-    const spread = FINGER / (innerHeight / 2) * Math.tan(this.camera.fov / 2 * Math.PI / 180);
-    const found = pointAt(this.world, new THREE.Vector3(...this.eyes.place), this.ray(cursor),
-      { spread, reach: ARM, farthest: FARTHEST, withShears: this.shears.taken.right });
+    const spread = (FINGER / (innerHeight / 2)) * Math.tan(((this.camera.fov / 2) * Math.PI) / 180);
+    const found = pointAt(this.world, new THREE.Vector3(...this.eyes.place), this.ray(cursor), {
+      spread,
+      reach: ARM,
+      farthest: FARTHEST,
+      withShears: this.shears.taken.right,
+    });
     if (found === null) return;
     if (found.distance <= ARM) this.hand.reachFor(found);
     else say(`This ${found.what} is ${found.distance.toFixed(1)} m away, an arm reaches ${ARM} m: walk nearer.`);
@@ -357,11 +421,13 @@ class Viewer {
 
   /** Half of what the camera sees, corner to corner [rad]. */
   get diagonal() {
-    return Math.atan(Math.tan(this.camera.fov / 2 * Math.PI / 180) * Math.hypot(1, this.camera.aspect));
+    return Math.atan(Math.tan(((this.camera.fov / 2) * Math.PI) / 180) * Math.hypot(1, this.camera.aspect));
   }
 
   /** Angle of a pixel in the middle of the picture [rad]. */
-  get pixel() { return 2 * Math.tan(this.camera.fov / 2 * Math.PI / 180) / this.renderer.domElement.height; }
+  get pixel() {
+    return (2 * Math.tan(((this.camera.fov / 2) * Math.PI) / 180)) / this.renderer.domElement.height;
+  }
 
   /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
   look(pose) {
@@ -375,13 +441,17 @@ class Viewer {
 
   /** Names above the other actors. */
   label(actors) {
-    const names = element("names"), there = new Set(), eye = new THREE.Vector3(...this.eyes.place);
+    const names = element("names"),
+      there = new Set(),
+      eye = new THREE.Vector3(...this.eyes.place);
     const lowest = element("top").getBoundingClientRect().bottom;
     if (!names.hidden)
       for (const { name, carrier } of actors) {
         if (name === this.world.header.person) continue;
-        const head = this.world.names.indexOf(`${name}/head`), parts = head < 0 ? this.parts(name) : [this.world.bodies + 1 + head];
-        const point = this.world.place(head < 0 ? carrier : parts[0]), top = this.world.top(parts);
+        const head = this.world.names.indexOf(`${name}/head`),
+          parts = head < 0 ? this.parts(name) : [this.world.bodies + 1 + head];
+        const point = this.world.place(head < 0 ? carrier : parts[0]),
+          top = this.world.top(parts);
         const distance = point.distanceTo(eye);
         const below = this.project(point);
         if (below.z > 1 || Math.abs(below.x) > 1 || Math.abs(below.y) > 1.2 || !Number.isFinite(top)) continue;
@@ -391,17 +461,23 @@ class Viewer {
           this.labels.set(name, names.appendChild(document.createElement("div")));
           this.labels.get(name).textContent = name;
         }
-        const label = this.labels.get(name), size = NAME.far + (NAME.near - NAME.far) * Math.min(1, NAME.from / distance);
+        const label = this.labels.get(name),
+          size = NAME.far + (NAME.near - NAME.far) * Math.min(1, NAME.from / distance);
         label.style.fontSize = `${size.toFixed(1)}px`;
-        const x = (above.x + 1) / 2 * innerWidth, y = Math.max((1 - above.y) / 2 * innerHeight, lowest + 2 * size);
+        const x = ((above.x + 1) / 2) * innerWidth,
+          y = Math.max(((1 - above.y) / 2) * innerHeight, lowest + 2 * size);
         label.style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
       }
-    for (const [name, label] of this.labels) if (!there.has(name)) { label.remove(); this.labels.delete(name); }
+    for (const [name, label] of this.labels)
+      if (!there.has(name)) {
+        label.remove();
+        this.labels.delete(name);
+      }
   }
 
   /** Carriers of an actor. */
   parts(actor) {
-    return this.world.names.flatMap((name, k) => name.startsWith(`${actor}/`) ? [this.world.bodies + 1 + k] : []);
+    return this.world.names.flatMap((name, k) => (name.startsWith(`${actor}/`) ? [this.world.bodies + 1 + k] : []));
   }
 
   /** A point (Vector3, world) in the picture: -1 to 1 right and up, beyond 1 in z: behind the eyes. */
@@ -430,7 +506,8 @@ function facing(pose) {
 
 /** What draws in this browser; empty if it does not say. */
 function graphicsCard() {
-  const gl = document.createElement("canvas").getContext("webgl2"), names = gl?.getExtension("WEBGL_debug_renderer_info");
+  const gl = document.createElement("canvas").getContext("webgl2"),
+    names = gl?.getExtension("WEBGL_debug_renderer_info");
   const card = gl?.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER) ?? "";
   gl?.getExtension("WEBGL_lose_context")?.loseContext();
   return card;
@@ -443,7 +520,9 @@ function fail(failure) {
 }
 
 addEventListener("unhandledrejection", (event) => fail(event.reason));
-addEventListener("error", (event) => { if (event.message) fail(event.message); });
+addEventListener("error", (event) => {
+  if (event.message) fail(event.message);
+});
 
 if (window.pageMisses) throw new Error(window.pageMisses);
 page.voice = new Voice();

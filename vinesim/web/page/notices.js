@@ -5,7 +5,9 @@ const FIRST = 5; // pictures in which a browser compiles shaders, however long t
 const TIMES = 5;
 
 /** Whether a time between two pictures is much longer than the usual one: an absence, also on slow machines. */
-export function isUnusual(passed, usual) { return passed > TIMES * usual; }
+export function isUnusual(passed, usual) {
+  return passed > TIMES * usual;
+}
 
 /** Show a sentence for a while, or until it is clicked; one that is shown already comes once more. */
 export function say(text, { stays = false } = {}) {
@@ -31,12 +33,15 @@ export class Absence {
   }
 
   /** The next jump of time was asked for. */
-  expect() { this.known = null; }
+  expect() {
+    this.known = null;
+  }
 
   /** A picture was drawn at a time of the world [s]; `picked` bunches and names of `actors`, null: not known yet, the
    * next picture tells. */
   drawn(time, picked, actors) {
-    const { known } = this, passed = known === null ? 0 : time - known.time;
+    const { known } = this,
+      passed = known === null ? 0 : time - known.time;
     const isAbsence = passed < 0 || (++this.pictures > FIRST && passed > this.long && isUnusual(passed, this.usual));
     if (isAbsence && this.before === null) this.before = { ...known };
     if (!isAbsence) this.usual += 0.2 * (passed - this.usual);
@@ -46,7 +51,9 @@ export class Absence {
     }
     this.known = { time, picked: new Set(picked), actors };
     if (this.before === null) return;
-    const { before } = this, was = new Set(before.actors), is = new Set(actors);
+    const { before } = this,
+      was = new Set(before.actors),
+      is = new Set(actors);
     this.before = null;
     const found = [];
     const count = [...picked].filter((bunch) => !before.picked.has(bunch)).length;

@@ -2,8 +2,14 @@
 
 import * as THREE from "./vendor/three.module.js";
 
-const KINDS = { KeyC: ["forces", "contact forces"], KeyI: ["interest", "areas of interest"], KeyO: ["owners", "owners"] };
-const METRES_PER_NEWTON = 0.02, SHORTEST = 0.04, CORNERS = 64;
+const KINDS = {
+  KeyC: ["forces", "contact forces"],
+  KeyI: ["interest", "areas of interest"],
+  KeyO: ["owners", "owners"],
+};
+const METRES_PER_NEWTON = 0.02,
+  SHORTEST = 0.04,
+  CORNERS = 64;
 
 export class Overlays {
   /** `group`: the world's axes. */
@@ -17,15 +23,21 @@ export class Overlays {
     this.labels = new Map();
     this.buttons = {};
     for (const [code, [name, text]] of Object.entries(KINDS)) {
-      const button = this.buttons[name] = this.panel.appendChild(document.createElement("button"));
+      const button = this.panel.appendChild(document.createElement("button"));
+      this.buttons[name] = button;
       button.innerHTML = `<kbd class="keys">${code.slice(3)}</kbd> ${text}`;
       button.setAttribute("aria-pressed", "false");
-      button.addEventListener("click", () => { this.toggle(name); button.blur(); });
+      button.addEventListener("click", () => {
+        this.toggle(name);
+        button.blur();
+      });
     }
     this.state = null;
   }
 
-  press(code) { if (code in KINDS) this.toggle(KINDS[code][0]); }
+  press(code) {
+    if (code in KINDS) this.toggle(KINDS[code][0]);
+  }
 
   toggle(name) {
     if (!this.shown.delete(name)) this.shown.add(name);
@@ -33,9 +45,13 @@ export class Overlays {
   }
 
   /** Whether the client is to send more than poses. */
-  get areShown() { return this.shown.size > 0; }
+  get areShown() {
+    return this.shown.size > 0;
+  }
 
-  take(state) { if (state.owners) this.state = state; }
+  take(state) {
+    if (state.owners) this.state = state;
+  }
 
   /** Draw the newest; `actors` with their carriers. */
   draw(actors, camera) {
@@ -43,14 +59,24 @@ export class Overlays {
     this.forces.visible = this.shown.has("forces") && state !== null;
     this.interest.visible = this.shown.has("interest");
     if (this.forces.visible) fill(this.forces, arrows(state.arrays.contact_place, state.arrays.contact_force));
-    if (this.interest.visible) fill(this.interest, circles(actors.map(({ carrier }) => this.world.place(carrier)),
-      this.world.header.interest));
+    if (this.interest.visible)
+      fill(
+        this.interest,
+        circles(
+          actors.map(({ carrier }) => this.world.place(carrier)),
+          this.world.header.interest,
+        ),
+      );
     this.label(this.shown.has("owners") && state !== null ? state.owners : {}, camera);
   }
 
   label(owners, camera) {
     const names = document.getElementById("names");
-    for (const [name, label] of this.labels) if (!(name in owners)) { label.remove(); this.labels.delete(name); }
+    for (const [name, label] of this.labels)
+      if (!(name in owners)) {
+        label.remove();
+        this.labels.delete(name);
+      }
     for (const [name, owner] of Object.entries(owners)) {
       const point = this.place(name);
       if (point === null) continue;
@@ -60,14 +86,16 @@ export class Overlays {
       label.className = "owner";
       label.textContent = `${name}: ${owner}`;
       label.hidden = point.z > 1;
-      const x = (point.x + 1) / 2 * innerWidth, y = (1 - point.y) / 2 * innerHeight;
+      const x = ((point.x + 1) / 2) * innerWidth,
+        y = ((1 - point.y) / 2) * innerHeight;
       label.style.transform = `translate(${x}px, ${y}px) translate(-50%, -100%)`;
     }
   }
 
   /** Where a tree, box or bunch is [3]; null: not here. */
   place(name) {
-    const [kind, index] = name.split("/"), { world } = this;
+    const [kind, index] = name.split("/"),
+      { world } = this;
     if (kind === "tree") return world.place(world.header.arrays.tree_first[index]).add(new THREE.Vector3(0, 0, 0.4));
     const row = world.names.indexOf(name);
     return row < 0 ? null : world.place(world.bodies + 1 + row).add(new THREE.Vector3(0, 0, 0.3));
@@ -75,8 +103,10 @@ export class Overlays {
 }
 
 function lines(color) {
-  const mesh = new THREE.LineSegments(new THREE.BufferGeometry(),
-    new THREE.LineBasicMaterial({ color, depthTest: false, transparent: true }));
+  const mesh = new THREE.LineSegments(
+    new THREE.BufferGeometry(),
+    new THREE.LineBasicMaterial({ color, depthTest: false, transparent: true }),
+  );
   mesh.frustumCulled = false;
   mesh.renderOrder = 2;
   mesh.visible = false;
@@ -105,7 +135,8 @@ function arrows(place, force) {
     const length = way.length();
     if (length < 1e-3) continue;
     way.multiplyScalar(Math.max(METRES_PER_NEWTON, SHORTEST / length));
-    const to = from.clone().add(way), back = way.clone().multiplyScalar(-0.25);
+    const to = from.clone().add(way),
+      back = way.clone().multiplyScalar(-0.25);
     const side = new THREE.Vector3(way.y, -way.x, 0);
     if (side.length() < 1e-6) side.set(1, 0, 0);
     side.setLength(0.1 * way.length());
@@ -119,7 +150,7 @@ function circles(centres, radius) {
   const points = [];
   for (const { x, y } of centres)
     for (let k = 0; k < 2 * CORNERS; ++k) {
-      const angle = Math.ceil(k / 2) / CORNERS * 2 * Math.PI;
+      const angle = (Math.ceil(k / 2) / CORNERS) * 2 * Math.PI;
       points.push(x + radius * Math.cos(angle), y + radius * Math.sin(angle), 0.05);
     }
   return points;

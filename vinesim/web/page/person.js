@@ -2,7 +2,8 @@
 
 import { FlyingEyes } from "./fly.js";
 
-const WALK = 1.4, CROUCH = 0.55; // m/s, m
+const WALK = 1.4,
+  CROUCH = 0.55; // m/s, m
 const LONGEST_WISH = 1; // m that fingers ask for in advance
 
 /**
@@ -43,12 +44,14 @@ export class WalkingEyes extends FlyingEyes {
 
   /** Fingers may be faster than a person. */
   push(ahead, left) {
-    const wish = [this.wish[0] + ahead, this.wish[1] + left], length = Math.hypot(...wish);
+    const wish = [this.wish[0] + ahead, this.wish[1] + left],
+      length = Math.hypot(...wish);
     this.wish = wish.map((value) => value * Math.min(1, LONGEST_WISH / Math.max(length, 1e-9)));
   }
 
   move(ahead, left) {
-    const c = Math.cos(this.yaw), s = Math.sin(this.yaw);
+    const c = Math.cos(this.yaw),
+      s = Math.sin(this.yaw);
     this.place[0] += ahead * c - left * s;
     this.place[1] += ahead * s + left * c;
   }
@@ -58,7 +61,7 @@ export class WalkingEyes extends FlyingEyes {
     this.crouch += Math.min(Math.max(goal - this.crouch, -1.5 * seconds), 1.5 * seconds);
     this.place[2] = this.height - this.crouch;
     this.speed = WALK;
-    const share = Math.min(1, WALK * seconds / Math.max(Math.hypot(...this.wish), 1e-9));
+    const share = Math.min(1, (WALK * seconds) / Math.max(Math.hypot(...this.wish), 1e-9));
     const [ahead, left] = this.wish;
     this.wish = [(1 - share) * ahead, (1 - share) * left];
     this.move(share * ahead, share * left);

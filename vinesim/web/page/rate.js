@@ -43,7 +43,9 @@ export class Detail {
   add(seconds, rate) {
     this.late += seconds > LATE / rate;
     if (++this.seen < WINDOW) return false;
-    const before = this.value, [least, most] = this.limits, [less, more] = this.steps;
+    const before = this.value,
+      [least, most] = this.limits,
+      [less, more] = this.steps;
     if (this.late > MOST_LATE * WINDOW) {
       if (this.isTrial) this.patience = Math.min(2 * this.patience, this.longest);
       this.value = Math.max(least, this.value * less);

@@ -74,7 +74,10 @@ void main() {
 /** Vertex shaders by the name of the kind. */
 export const VERTEX = {
   // position: x y on the unit circle, z: -1 first pole, 0 and 1 rings, 2 last pole
-  cone: COMMON + START + /* glsl */ `
+  cone:
+    COMMON +
+    START +
+    /* glsl */ `
   vec3 axis = b.xyz - a.xyz;
   float len = max(length(axis), 1e-9);
   axis /= len;
@@ -85,9 +88,13 @@ export const VERTEX = {
   p = mix(a.xyz, b.xyz, s) + n * r;
   vLocal = vec3(position.xy * r, shape(2).x + s * len);
   if (shape(2).w > 0.0) vSky = mix(vSky, shape(2).z, s); // light runs on from one piece of wood to the next
-` + FINISH,
+` +
+    FINISH,
   // position: x y on the unit circle, z: 0 and 1 sides, -1 and 2 ends (flat), or their centres
-  cylinder: COMMON + START + /* glsl */ `
+  cylinder:
+    COMMON +
+    START +
+    /* glsl */ `
   vec3 axis = normalize(b.xyz - a.xyz);
   vec3 side = across(axis), up = cross(axis, side);
   float s = clamp(position.z, 0.0, 1.0);
@@ -96,37 +103,57 @@ export const VERTEX = {
   n = end ? axis * (s * 2.0 - 1.0) : normalize(radial);
   p = mix(a.xyz, b.xyz, s) + radial * a.w;
   vLocal = vec3(position.xy * a.w, s * length(b.xyz - a.xyz));
-` + FINISH,
-  spheroid: COMMON + START + /* glsl */ `
+` +
+    FINISH,
+  spheroid:
+    COMMON +
+    START +
+    /* glsl */ `
   float along = dot(position, b.xyz);
   p = a.xyz + a.w * (position + b.xyz * along * (b.w - 1.0));
   n = normalize(position - b.xyz * along * (1.0 - 1.0 / b.w));
   vDetail = shape(3);
   vLocal = vec3(shape(2).xy, along);
-` + FINISH,
-  ellipsoid: COMMON + START + /* glsl */ `
+` +
+    FINISH,
+  ellipsoid:
+    COMMON +
+    START +
+    /* glsl */ `
   vec3 half3 = vec3(a.w, shape(2).xy);
   vLocal = position * half3;
   p = a.xyz + turn(b, vLocal);
   n = turn(b, normalize(position / half3));
-` + FINISH,
+` +
+    FINISH,
   // position: a corner of the cube, normal from the axis whose coordinate is doubled
-  box: COMMON + START + /* glsl */ `
+  box:
+    COMMON +
+    START +
+    /* glsl */ `
   vec3 half3 = vec3(a.w, shape(2).xy);
   vec3 face = step(1.5, abs(position)) * sign(position);
   vLocal = clamp(position, -1.0, 1.0) * half3;
   p = a.xyz + turn(b, vLocal);
   n = turn(b, face);
-` + FINISH,
+` +
+    FINISH,
   // position: x is the number of the corner
-  triangle: COMMON + START + /* glsl */ `
+  triangle:
+    COMMON +
+    START +
+    /* glsl */ `
   vec4 corner = shape(int(position.x));
   p = vLocal = corner.xyz;
   vSurface.w = 0u;
   n = unpackNormal(corner.w);
-` + FINISH,
+` +
+    FINISH,
   // position: x from -1 to 1 across, y from 0 to 1 along
-  leaf: COMMON + START + /* glsl */ `
+  leaf:
+    COMMON +
+    START +
+    /* glsl */ `
   vec4 c = shape(2), d = shape(3);
   int outline = int(b.w) * 4;
   float u = position.x * leafExtent[outline], v = mix(leafExtent[outline + 1], leafExtent[outline + 2], position.y);
@@ -137,7 +164,8 @@ export const VERTEX = {
   vLocal = vec3(u, v, b.w);
   vSurface.w = floatBitsToUint(c.w);
   vDetail = vec4(b.xyz, d.w); // midrib and age
-` + FINISH,
+` +
+    FINISH,
 };
 
 const VARYINGS = /* glsl */ `
@@ -160,31 +188,46 @@ const CUT = /* glsl */ `
 /** Fragment shader of a kind. */
 export function fragment(kind) {
   const isLeaf = kind === "leaf";
-  return LIGHT + MATERIALS + (isLeaf ? LEAVES : BERRIES + SOLIDS) + VARYINGS + `const bool LEAF = ${isLeaf};` + /* glsl */ `
+  return (
+    LIGHT +
+    MATERIALS +
+    (isLeaf ? LEAVES : BERRIES + SOLIDS) +
+    VARYINGS +
+    `const bool LEAF = ${isLeaf};` +
+    /* glsl */ `
 void main() {
-` + CUT + /* glsl */ `
+` +
+    CUT +
+    /* glsl */ `
   uint packed = vSurface.x, material = vSurface.y;
   vec3 tint = pow(vec3(packed & 255u, (packed >> 8) & 255u, (packed >> 16) & 255u) / 255.0, vec3(2.2));
   vec3 n = normalize(vNormal), d = normalize(vPlace - eye);
   float away = dot(n, d) + 0.15;
   if (!LEAF && away > 0.0) n = normalize(n - d * away); // at rims of coarse meshes normals point away from the eye
   float seed = uintBitsToFloat(vSurface.w);
-` + (isLeaf ? /* glsl */ `
+` +
+    (isLeaf
+      ? /* glsl */ `
   Surface s = blade(n, tint, vSky, vLocal, seed, vDetail, material, d);
   vec3 light = leaving(s, n, vPlace, true, false);
-` : kind === "spheroid" ? /* glsl */ `
+`
+      : kind === "spheroid"
+        ? /* glsl */ `
   bool isBerry = material == BERRY;
   Surface s;
   if (isBerry) s = berry(n, tint, vSky, vLocal, vDetail);
   else s = solid(n, tint, vSky, material, vLocal, seed, vPlace.z);
   vec3 light = leaving(s, n, vPlace, false, isBerry);
-` : /* glsl */ `
+`
+        : /* glsl */ `
   Surface s = solid(n, tint, vSky, material, vLocal, seed, vPlace.z);
   vec3 light = leaving(s, n, vPlace, false, false);
-`) + /* glsl */ `
+`) +
+    /* glsl */ `
   pixel = vec4(display(light), 1.0);
 }
-`;
+`
+  );
 }
 
 /** Fragment shader for what the sun sees: only depth. */
@@ -212,7 +255,10 @@ void main() {
   gl_Position = projectionMatrix * modelViewMatrix * vec4(position, 1.0);
 }`;
 
-export const GROUND_FRAGMENT = LIGHT + GROUND + /* glsl */ `
+export const GROUND_FRAGMENT =
+  LIGHT +
+  GROUND +
+  /* glsl */ `
 in vec3 vPlace;
 out vec4 pixel;
 void main() {
@@ -232,7 +278,10 @@ void main() {
   gl_Position.z = gl_Position.w;
 }`;
 
-export const SKY_FRAGMENT = LIGHT + SKY + /* glsl */ `
+export const SKY_FRAGMENT =
+  LIGHT +
+  SKY +
+  /* glsl */ `
 in vec3 vPlace;
 out vec4 pixel;
 void main() {

@@ -7,7 +7,9 @@ import { say } from "./notices.js";
 const SIDES = ["left", "right"];
 const MARK = { inner: 0.017, outer: 0.021, dot: 0.005 }; // radii of a ring around the cut, and of a dot in it [m]
 /** With nothing between the blades, with what they would cut, with wood that is too strong. */
-const NOTHING = 0xffffff, CUTS = 0x3dff6e, TOO_STRONG = 0xff4d3d;
+const NOTHING = 0xffffff,
+  CUTS = 0x3dff6e,
+  TOO_STRONG = 0xff4d3d;
 
 export class Shears {
   /** `mouth` [3]: where they cut, in the palm's frame [m]; null: the page has no person who can take them. */
@@ -19,8 +21,15 @@ export class Shears {
     this.told = []; // sentences so far
     document.getElementById("tools").hidden = mouth === null;
     this.button = document.getElementById("shears");
-    this.button.addEventListener("click", () => { this.toggle("right"); this.button.blur(); });
-    this.marks = SIDES.map(() => { const mark = makeMark(); group.add(mark); return mark; });
+    this.button.addEventListener("click", () => {
+      this.toggle("right");
+      this.button.blur();
+    });
+    this.marks = SIDES.map(() => {
+      const mark = makeMark();
+      group.add(mark);
+      return mark;
+    });
   }
 
   /** Take the shears into a hand, or put them away. */
@@ -31,7 +40,9 @@ export class Shears {
   }
 
   /** Whether the left and the right hand have them, for the page's message. */
-  get inHands() { return SIDES.map((side) => this.taken[side]); }
+  get inHands() {
+    return SIDES.map((side) => this.taken[side]);
+  }
 
   /** A state has come: say what the shears have cut each time that they have closed since the last one; whether they
    * have. */
@@ -54,7 +65,8 @@ export class Shears {
       if (!mark.visible) return;
       mark.position.set(...this.mouth).applyMatrix4(palms[k]);
       mark.quaternion.copy(turn);
-      const found = this.between[k], [ring, dot] = mark.children;
+      const found = this.between[k],
+        [ring, dot] = mark.children;
       dot.visible = found !== "";
       ring.material.color.set(found === "" ? NOTHING : found === "strong wood" ? TOO_STRONG : CUTS);
       dot.material.color.copy(ring.material.color);
@@ -66,7 +78,10 @@ export class Shears {
 function makeMark() {
   const mark = new THREE.Group();
   for (const shape of [new THREE.RingGeometry(MARK.inner, MARK.outer, 40), new THREE.CircleGeometry(MARK.dot, 20)]) {
-    const part = new THREE.Mesh(shape, new THREE.MeshBasicMaterial({ depthTest: false, transparent: true, toneMapped: false }));
+    const part = new THREE.Mesh(
+      shape,
+      new THREE.MeshBasicMaterial({ depthTest: false, transparent: true, toneMapped: false }),
+    );
     part.renderOrder = 3;
     part.frustumCulled = false;
     mark.add(part);

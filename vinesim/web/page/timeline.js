@@ -15,9 +15,18 @@ export class Timeline {
     this.isHeld = false; // the slider
     for (const speed of new Set([...SPEEDS, status.speed].sort((a, b) => a - b)))
       this.speed.append(new Option(`${speed} x`, speed));
-    this.button.addEventListener("click", () => { this.tell({ paused: !this.status.paused }); this.button.blur(); });
-    this.speed.addEventListener("change", () => { this.tell({ speed: Number(this.speed.value) }); this.speed.blur(); });
-    this.slider.addEventListener("input", () => { this.isHeld = true; this.write(Number(this.slider.value)); });
+    this.button.addEventListener("click", () => {
+      this.tell({ paused: !this.status.paused });
+      this.button.blur();
+    });
+    this.speed.addEventListener("change", () => {
+      this.tell({ speed: Number(this.speed.value) });
+      this.speed.blur();
+    });
+    this.slider.addEventListener("input", () => {
+      this.isHeld = true;
+      this.write(Number(this.slider.value));
+    });
     this.slider.addEventListener("change", () => {
       this.isHeld = false;
       this.tell({ seek: Number(this.slider.value) });
@@ -45,5 +54,7 @@ export class Timeline {
     return jumped;
   }
 
-  write(position) { this.text.textContent = `${position.toFixed(1)} / ${this.status.length.toFixed(1)} s`; }
+  write(position) {
+    this.text.textContent = `${position.toFixed(1)} / ${this.status.length.toFixed(1)} s`;
+  }
 }

@@ -1,20 +1,28 @@
 // Hears and speaks: a socket of its own, Opus by WebCodecs or PCM16, each speaker where it is, the tones of lights.
 
-const RATE = 48000, FRAME = 960, PCM_FACTOR = 3; // Hz, samples, to 16 kHz
-const OPUS = 1, PCM16 = 2, EXTRA = 128; // codecs as on the socket
-const BITRATE = 24000, RETRY = 1000, SILENCE = 10000; // bit/s, ms, ms without a frame until a speaker is forgotten
+const RATE = 48000,
+  FRAME = 960,
+  PCM_FACTOR = 3; // Hz, samples, to 16 kHz
+const OPUS = 1,
+  PCM16 = 2,
+  EXTRA = 128; // codecs as on the socket
+const BITRATE = 24000,
+  RETRY = 1000,
+  SILENCE = 10000; // bit/s, ms, ms without a frame until a speaker is forgotten
 const TAPS = 48;
 
 /** Low pass for every third sample. */
 const LOW_PASS = Float32Array.from({ length: TAPS }, (_, k) => {
-  const t = 0.9 * (k - (TAPS - 1) / 2) / PCM_FACTOR;
-  const window = 0.54 - 0.46 * Math.cos(2 * Math.PI * k / (TAPS - 1));
-  return 0.9 / PCM_FACTOR * (t === 0 ? 1 : Math.sin(Math.PI * t) / (Math.PI * t)) * window;
+  const t = (0.9 * (k - (TAPS - 1) / 2)) / PCM_FACTOR;
+  const window = 0.54 - 0.46 * Math.cos((2 * Math.PI * k) / (TAPS - 1));
+  return (0.9 / PCM_FACTOR) * (t === 0 ? 1 : Math.sin(Math.PI * t) / (Math.PI * t)) * window;
 });
 
 /** PCM16 of 16 kHz of the frames of one microphone. */
 class Downsampler {
-  constructor() { this.before = new Float32Array(TAPS - 1); }
+  constructor() {
+    this.before = new Float32Array(TAPS - 1);
+  }
 
   take(samples) {
     const all = new Float32Array(this.before.length + samples.length);
@@ -35,8 +43,9 @@ class Downsampler {
 function upsample(pcm, last) {
   const samples = new Float32Array(pcm.length * PCM_FACTOR);
   for (let i = 0; i < pcm.length; ++i) {
-    const from = i ? pcm[i - 1] / 32768 : last, to = pcm[i] / 32768;
-    for (let k = 0; k < PCM_FACTOR; ++k) samples[PCM_FACTOR * i + k] = from + (to - from) * (k + 1) / PCM_FACTOR;
+    const from = i ? pcm[i - 1] / 32768 : last,
+      to = pcm[i] / 32768;
+    for (let k = 0; k < PCM_FACTOR; ++k) samples[PCM_FACTOR * i + k] = from + ((to - from) * (k + 1)) / PCM_FACTOR;
   }
   return samples;
 }
@@ -45,8 +54,13 @@ function upsample(pcm, last) {
 class Source {
   constructor(context, law) {
     [this.reference, this.reach, this.fade] = law;
-    this.panner = new PannerNode(context, { panningModel: "equalpower", distanceModel: "inverse",
-      refDistance: this.reference, rolloffFactor: 1, maxDistance: 1e6 });
+    this.panner = new PannerNode(context, {
+      panningModel: "equalpower",
+      distanceModel: "inverse",
+      refDistance: this.reference,
+      rolloffFactor: 1,
+      maxDistance: 1e6,
+    });
     this.end = new GainNode(context, { gain: 0 });
     this.panner.connect(this.end).connect(context.destination);
     this.place = [0, 0, 0];
@@ -63,7 +77,9 @@ class Source {
     this.end.gain.value = Math.min(1, Math.max(0, (this.reach - distance) / this.fade));
   }
 
-  close() { this.end.disconnect(); }
+  close() {
+    this.end.disconnect();
+  }
 }
 
 /** The voice of one speaker: decodes its frames and plays them where it is. */
@@ -73,7 +89,9 @@ class Speaker extends Source {
     this.player = new AudioWorkletNode(context, "player", { numberOfInputs: 0, outputChannelCount: [1] });
     this.player.connect(this.panner);
     this.counts = { stalls: 0, cut: 0 };
-    this.player.port.onmessage = ({ data }) => { this.counts = data; };
+    this.player.port.onmessage = ({ data }) => {
+      this.counts = data;
+    };
     this.last = 0;
     this.received = this.lost = 0;
     this.heardAt = performance.now();
@@ -93,18 +111,23 @@ class Speaker extends Source {
 
   decode(bytes) {
     if (!this.decoder || this.decoder.state === "closed") {
-      this.decoder = new AudioDecoder({ error: () => {}, output: (data) => {
-        const samples = new Float32Array(data.numberOfFrames);
-        data.copyTo(samples, { planeIndex: 0, format: "f32-planar" });
-        data.close();
-        this.play(samples);
-      } });
+      this.decoder = new AudioDecoder({
+        error: () => {},
+        output: (data) => {
+          const samples = new Float32Array(data.numberOfFrames);
+          data.copyTo(samples, { planeIndex: 0, format: "f32-planar" });
+          data.close();
+          this.play(samples);
+        },
+      });
       this.decoder.configure({ codec: "opus", sampleRate: RATE, numberOfChannels: 1 });
     }
     this.decoder.decode(new EncodedAudioChunk({ type: "key", timestamp: 20000 * this.received, data: bytes }));
   }
 
-  play(samples) { this.player.port.postMessage(samples, [samples.buffer]); }
+  play(samples) {
+    this.player.port.postMessage(samples, [samples.buffer]);
+  }
 
   close() {
     super.close();
@@ -128,7 +151,10 @@ class Tone extends Source {
     this.level.gain.setTargetAtTime(frequency ? level : 0, this.level.context.currentTime, 0.003);
   }
 
-  close() { super.close(); this.oscillator.stop(); }
+  close() {
+    super.close();
+    this.oscillator.stop();
+  }
 }
 
 export class Voice {
@@ -142,24 +168,40 @@ export class Voice {
     const panel = document.getElementById("sound");
     [this.hearing, this.speaking] = panel.querySelectorAll("button");
     this.text = panel.querySelector("span");
-    this.hearing.addEventListener("click", () => { this.toggleHearing(); this.hearing.blur(); });
-    this.speaking.addEventListener("click", () => { this.toggleSpeaking(); this.speaking.blur(); });
-    addEventListener("keydown", (event) => { if (event.code === "KeyM" && !event.repeat) this.toggleSpeaking(); });
+    this.hearing.addEventListener("click", () => {
+      this.toggleHearing();
+      this.hearing.blur();
+    });
+    this.speaking.addEventListener("click", () => {
+      this.toggleSpeaking();
+      this.speaking.blur();
+    });
+    addEventListener("keydown", (event) => {
+      if (event.code === "KeyM" && !event.repeat) this.toggleSpeaking();
+    });
   }
 
-  press(button, isOn) { button.setAttribute("aria-pressed", String(isOn)); }
+  press(button, isOn) {
+    button.setAttribute("aria-pressed", String(isOn));
+  }
 
-  say(text) { this.text.textContent = text; }
+  say(text) {
+    this.text.textContent = text;
+  }
 
   async toggleHearing() {
     if (!this.context) return this.hear();
-    if (this.context.state === "running") await this.context.suspend(); else await this.context.resume();
+    if (this.context.state === "running") await this.context.suspend();
+    else await this.context.resume();
     this.press(this.hearing, this.context.state === "running");
   }
 
   /** Begin to hear; the browser allows it after a click or a key. True: it works. */
   async hear() {
-    if (this.context) { await this.context.resume(); return true; }
+    if (this.context) {
+      await this.context.resume();
+      return true;
+    }
     if (!isSecureContext || !window.AudioWorkletNode) {
       this.say("sound needs https or this machine itself: start the client with --page-lan and open its address");
       return false;
@@ -179,7 +221,7 @@ export class Voice {
     this.socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/voice`);
     this.socket.binaryType = "arraybuffer";
     this.socket.onopen = () => this.socket.send(JSON.stringify({ opus: this.opus }));
-    this.socket.onmessage = ({ data }) => typeof data === "string" ? this.obey(JSON.parse(data)) : this.take(data);
+    this.socket.onmessage = ({ data }) => (typeof data === "string" ? this.obey(JSON.parse(data)) : this.take(data));
     this.socket.onclose = () => setTimeout(() => this.connect(), RETRY);
   }
 
@@ -187,7 +229,11 @@ export class Voice {
   obey(status) {
     this.status = status;
     if (this.microphone) this.say(status.objection);
-    for (const [name, tone] of this.tones) if (!(name in status.tones)) { tone.close(); this.tones.delete(name); }
+    for (const [name, tone] of this.tones)
+      if (!(name in status.tones)) {
+        tone.close();
+        this.tones.delete(name);
+      }
     for (const [name, [frequency, level, ...place]] of Object.entries(status.tones)) {
       if (!this.tones.has(name)) this.tones.set(name, new Tone(this.context, status.law));
       this.tones.get(name).put(place);
@@ -197,7 +243,8 @@ export class Voice {
 
   /** A frame of a speaker. */
   take(message) {
-    const view = new DataView(message), length = view.getUint8(1);
+    const view = new DataView(message),
+      length = view.getUint8(1);
     const place = [4, 8, 12].map((at) => view.getFloat32(at, true));
     const name = new TextDecoder().decode(new Uint8Array(message, 16, length));
     if (!this.speakers.has(name)) this.speakers.set(name, new Speaker(this.context, this.status.law));
@@ -210,7 +257,8 @@ export class Voice {
   /** Once a frame: the ears are at a pose [7], x forward and z up. */
   listen(pose) {
     if (!this.context) return;
-    const listener = this.context.listener, [x, y, z, w] = pose.slice(3);
+    const listener = this.context.listener,
+      [x, y, z, w] = pose.slice(3);
     const ahead = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)];
     const up = [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)];
     ["X", "Y", "Z"].forEach((axis, k) => {
@@ -220,52 +268,84 @@ export class Voice {
     });
     const now = performance.now();
     for (const [name, speaker] of this.speakers)
-      if (now - speaker.heardAt > SILENCE) { speaker.close(); this.speakers.delete(name); }
+      if (now - speaker.heardAt > SILENCE) {
+        speaker.close();
+        this.speakers.delete(name);
+      }
     for (const source of [...this.speakers.values(), ...this.tones.values()]) source.update(pose.slice(0, 3));
   }
 
   async toggleSpeaking() {
     if (this.microphone) {
-      this.microphone.stream.getTracks().forEach((track) => track.stop());
+      this.microphone.stream.getTracks().forEach((track) => {
+        track.stop();
+      });
       this.microphone.source.disconnect();
       this.microphone = null;
       this.press(this.speaking, false);
       this.say("");
       return;
     }
-    if (!await this.hear()) return;
-    try { await this.open(); } catch (failure) { this.say(explain(failure)); return; }
+    if (!(await this.hear())) return;
+    try {
+      await this.open();
+    } catch (failure) {
+      this.say(explain(failure));
+      return;
+    }
     this.press(this.speaking, true);
     this.say(this.status.objection);
   }
 
   async open() {
-    const stream = await navigator.mediaDevices.getUserMedia({ audio: {
-      channelCount: 1, echoCancellation: true, noiseSuppression: true, autoGainControl: true } });
+    const stream = await navigator.mediaDevices.getUserMedia({
+      audio: {
+        channelCount: 1,
+        echoCancellation: true,
+        noiseSuppression: true,
+        autoGainControl: true,
+      },
+    });
     const source = new MediaStreamAudioSourceNode(this.context, { mediaStream: stream });
     const capture = new AudioWorkletNode(this.context, "capture", { numberOfOutputs: 0 });
     source.connect(capture);
     const downsampler = new Downsampler();
     let number = 0;
     if (this.opus && !this.encoder) {
-      this.encoder = new AudioEncoder({ error: () => { this.opus = false; }, output: (chunk) => {
-        const data = new Uint8Array(chunk.byteLength);
-        chunk.copyTo(data);
-        this.send(OPUS, data);
-      } });
+      this.encoder = new AudioEncoder({
+        error: () => {
+          this.opus = false;
+        },
+        output: (chunk) => {
+          const data = new Uint8Array(chunk.byteLength);
+          chunk.copyTo(data);
+          this.send(OPUS, data);
+        },
+      });
       this.encoder.configure(encoderConfig());
     }
     capture.port.onmessage = ({ data }) => {
-      const { send } = this.status, wantsMain = send.includes("main"), wantsPcm = send.includes("pcm");
+      const { send } = this.status,
+        wantsMain = send.includes("main"),
+        wantsPcm = send.includes("pcm");
       if (wantsMain && this.opus) {
-        const sound = new AudioData({ format: "f32-planar", sampleRate: RATE, numberOfFrames: FRAME,
-          numberOfChannels: 1, timestamp: 20000 * number++, data });
+        const sound = new AudioData({
+          format: "f32-planar",
+          sampleRate: RATE,
+          numberOfFrames: FRAME,
+          numberOfChannels: 1,
+          timestamp: 20000 * number++,
+          data,
+        });
         this.encoder.encode(sound);
         sound.close();
       }
       if (wantsPcm || (wantsMain && !this.opus)) this.send(PCM16 + (this.opus ? EXTRA : 0), downsampler.take(data));
     };
-    stream.getTracks()[0].onended = () => { if (this.microphone) this.toggleSpeaking(); this.say("the microphone is gone"); };
+    stream.getTracks()[0].onended = () => {
+      if (this.microphone) this.toggleSpeaking();
+      this.say("the microphone is gone");
+    };
     this.microphone = { stream, source };
   }
 
@@ -279,15 +359,24 @@ export class Voice {
   }
 }
 
-const encoderConfig = () => ({ codec: "opus", sampleRate: RATE, numberOfChannels: 1, bitrate: BITRATE,
-  opus: { frameDuration: 20000, usedtx: true } });
+const encoderConfig = () => ({
+  codec: "opus",
+  sampleRate: RATE,
+  numberOfChannels: 1,
+  bitrate: BITRATE,
+  opus: { frameDuration: 20000, usedtx: true },
+});
 
 async function hasOpus() {
   try {
-    const able = await Promise.all([AudioEncoder.isConfigSupported(encoderConfig()),
-      AudioDecoder.isConfigSupported({ codec: "opus", sampleRate: RATE, numberOfChannels: 1 })]);
+    const able = await Promise.all([
+      AudioEncoder.isConfigSupported(encoderConfig()),
+      AudioDecoder.isConfigSupported({ codec: "opus", sampleRate: RATE, numberOfChannels: 1 }),
+    ]);
     return able.every((one) => one.supported);
-  } catch { return false; }
+  } catch {
+    return false;
+  }
 }
 
 /** A sentence for whoever wanted to speak. */

@@ -2,7 +2,8 @@
 
 const FRAME = 960; // samples of 20 ms at 48 kHz
 /** Delay of a voice behind the beginning of its first frame, at first and at most: a frame, and a reserve. */
-const START = 1.5 * FRAME, LARGEST = 12 * FRAME; // samples
+const START = 1.5 * FRAME,
+  LARGEST = 12 * FRAME; // samples
 const RESERVE = FRAME / 2; // samples by which frames may come too early
 const EASE = 8; // of what was too early, the share 1/so much is waited for no more
 const SPARE = 4 * FRAME; // samples that may wait beyond these
@@ -113,7 +114,10 @@ class Player extends AudioWorkletProcessor {
       if (this.plays && this.frames.length) {
         this.last = this.frames[0][this.at++];
         this.waiting -= 1;
-        if (this.at === this.frames[0].length) { this.frames.shift(); this.at = 0; }
+        if (this.at === this.frames[0].length) {
+          this.frames.shift();
+          this.at = 0;
+        }
         this.level = Math.min(1, this.level + 1 / RAMP);
       } else {
         if (this.plays) this.end();

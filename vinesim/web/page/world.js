@@ -6,22 +6,27 @@ import { boxAround, farthest, outermost } from "./extent.js";
 import { ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
 import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
 
-const SHAPE_SHIFT = 10, SURFACE_SHIFT = 9, POSE_SHIFT = 9;
+const SHAPE_SHIFT = 10,
+  SURFACE_SHIFT = 9,
+  POSE_SHIFT = 9;
 /** Distances [m] from which the next coarser level is drawn, in units of a cluster's thickness. */
 const LEVEL_DISTANCE = [60, 190, 400];
 const COARSEST = 1000;
 /** Where the budget is short, what is far goes rather than that what is near gets edges: levels are coarser by this at
  * most, and by more with budgets below that of a phone, with which bunches go last. */
-const NEAR_COARSER = 1.5, MOST_SHORT = 5;
+const NEAR_COARSER = 1.5,
+  MOST_SHORT = 5;
 /** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
 const RIGID_COARSER = [3, 8];
 /** Round parts of rigid bodies are drawn so coarsely that this is wrong at most, in pixels. */
 const ROUNDNESS = 0.5;
 /** A cluster hides what is behind this share of its ball; at the end of a line of sight, where an actor works, plants
  * must be. */
-const HALF_FULL = 0.5, MOST_BETWEEN = 0.8;
+const HALF_FULL = 0.5,
+  MOST_BETWEEN = 0.8;
 /** The list is made anew when a rigid body comes nearer, or goes, by this factor; not if it stays nearer than so many m. */
-const COMES_NEARER = 1.3, NEAR = 1.5;
+const COMES_NEARER = 1.3,
+  NEAR = 1.5;
 /** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
 const VANISHING = 2600;
 /** Of leaves and grass less: where some must be missing, bunches and posts are missed more. */
@@ -34,7 +39,10 @@ const STRAY = 0.2;
 export const TRIANGLE_BUDGET = 300_000;
 /** The lists of what is drawn are made anew when the eye has moved so far [m]. */
 const STRIDE = 0.25;
-const SUN_SIZE = 2048, SUN_REACH = 9, SUN_NEAR = 1, SUN_FAR = 60;
+const SUN_SIZE = 2048,
+  SUN_REACH = 9,
+  SUN_NEAR = 1,
+  SUN_FAR = 60;
 /** Of how far berries are loaded around a place, the share after which the plants around another one are. */
 const LEFT = 0.5;
 /** Rigid primitives for which there is room from the start. */
@@ -51,7 +59,14 @@ export class World {
     this.rows = this.plants + RIGID_ROOM;
     this.carriers = this.bodies + 1 + 1024;
     this.shapes = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.rows * 4, SHAPE_SHIFT);
-    this.surfaces = dataTexture(THREE.RGBAIntegerFormat, THREE.UnsignedIntType, Uint32Array, 4, this.rows, SURFACE_SHIFT);
+    this.surfaces = dataTexture(
+      THREE.RGBAIntegerFormat,
+      THREE.UnsignedIntType,
+      Uint32Array,
+      4,
+      this.rows,
+      SURFACE_SHIFT,
+    );
     this.poses = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.carriers * 2, POSE_SHIFT);
     for (let k = 0; k < this.carriers; ++k) this.poses.image.data[8 * k + 7] = 1;
     this.strayed = new Set(); // bodies of plants
@@ -85,7 +100,9 @@ export class World {
   }
 
   /** Whether eyes have come so far that the plants around them should be loaded. */
-  isLeft(eye) { return this.reach !== null && eye.distanceTo(this.around) > LEFT * this.reach; }
+  isLeft(eye) {
+    return this.reach !== null && eye.distanceTo(this.around) > LEFT * this.reach;
+  }
 
   /** All plants to their poses [7] at rest. */
   rest(poses) {
@@ -101,7 +118,8 @@ export class World {
   /** Rows of primitives into the textures, from a row on. */
   write(arrays, row) {
     this.shapes.image.data.set(arrays.shape, row * 16);
-    const surface = this.surfaces.image.data, colour = new Uint32Array(arrays.surface.slice().buffer);
+    const surface = this.surfaces.image.data,
+      colour = new Uint32Array(arrays.surface.slice().buffer);
     for (let k = 0; k < arrays.material.length; ++k) {
       surface[4 * (row + k)] = colour[k];
       surface[4 * (row + k) + 1] = arrays.material[k];
@@ -117,56 +135,98 @@ export class World {
       const at = (corner, axis) => hull[2 * corner + axis];
       extent.set([Math.max(Math.abs(at(1, 0)), Math.abs(at(5, 0))), at(3, 1), at(7, 1), 0], 4 * k);
     }
-    const outlines = new THREE.DataArrayTexture(Uint8Array.from(arrays.outline, (x) => x + 128), 256, 256, 6);
+    const outlines = new THREE.DataArrayTexture(
+      Uint8Array.from(arrays.outline, (x) => x + 128),
+      256,
+      256,
+      6,
+    );
     outlines.format = THREE.RedFormat;
     outlines.minFilter = outlines.magFilter = THREE.LinearFilter;
     outlines.needsUpdate = true;
     this.sunTarget = new THREE.WebGLRenderTarget(SUN_SIZE, SUN_SIZE, {
       depthTexture: new THREE.DepthTexture(SUN_SIZE, SUN_SIZE, THREE.UnsignedIntType),
-      minFilter: THREE.NearestFilter, magFilter: THREE.NearestFilter });
+      minFilter: THREE.NearestFilter,
+      magFilter: THREE.NearestFilter,
+    });
     this.sunCamera = new THREE.OrthographicCamera(-SUN_REACH, SUN_REACH, SUN_REACH, -SUN_REACH, SUN_NEAR, SUN_FAR);
     const noises = smoothTable(new THREE.DataTexture(arrays.noise, 256, 256, THREE.RGBAFormat));
     noises.wrapS = noises.wrapT = THREE.RepeatWrapping;
     const leaves = smoothTable(new THREE.DataArrayTexture(arrays.leaf, 128, 128, 6));
     const common = {
-      eye: { value: this.eye }, sun: { value: new THREE.Vector3(...header.sun) }, outlines: { value: outlines },
-      noises: { value: noises }, ...lightOf(header.light),
-      sunDepth: { value: this.sunTarget.depthTexture }, sunMatrix: { value: new THREE.Matrix4() },
-      sunTexel: { value: 2 * SUN_REACH / SUN_SIZE }, sunDeep: { value: SUN_FAR - SUN_NEAR },
+      eye: { value: this.eye },
+      sun: { value: new THREE.Vector3(...header.sun) },
+      outlines: { value: outlines },
+      noises: { value: noises },
+      ...lightOf(header.light),
+      sunDepth: { value: this.sunTarget.depthTexture },
+      sunMatrix: { value: new THREE.Matrix4() },
+      sunTexel: { value: (2 * SUN_REACH) / SUN_SIZE },
+      sunDeep: { value: SUN_FAR - SUN_NEAR },
     };
     this.common = common;
-    const uniforms = { ...common, poses: { value: this.poses }, shapes: { value: this.shapes },
-      surfaces: { value: this.surfaces }, leafExtent: { value: extent }, leaves: { value: leaves } };
+    const uniforms = {
+      ...common,
+      poses: { value: this.poses },
+      shapes: { value: this.shapes },
+      surfaces: { value: this.surfaces },
+      leafExtent: { value: extent },
+      leaves: { value: leaves },
+    };
     this.shadowGroup = new THREE.Group();
     this.shadowGroup.rotation.x = -Math.PI / 2;
-    this.draws = MESHES.map(({ name, levels }) => levels.map((level) => {
-      const batches = new Batches(level), own = { ...uniforms, ...batches.uniforms };
-      const make = (fragmentShader, side) => new THREE.RawShaderMaterial({
-        glslVersion: THREE.GLSL3, vertexShader: VERTEX[name], fragmentShader, uniforms: own, side });
-      const seen = make(fragment(name), name === "leaf" ? THREE.DoubleSide : THREE.FrontSide);
-      const cast = make(depthOnly(name), THREE.DoubleSide);
-      for (const [group, geometry, material] of [
-        [this.group, batches.geometry, seen], [this.shadowGroup, batches.shadowGeometry, cast]]) {
-        const mesh = new THREE.Mesh(geometry, material);
-        mesh.frustumCulled = false;
-        group.add(mesh);
-      }
-      return batches;
-    }));
+    this.draws = MESHES.map(({ name, levels }) =>
+      levels.map((level) => {
+        const batches = new Batches(level),
+          own = { ...uniforms, ...batches.uniforms };
+        const make = (fragmentShader, side) =>
+          new THREE.RawShaderMaterial({
+            glslVersion: THREE.GLSL3,
+            vertexShader: VERTEX[name],
+            fragmentShader,
+            uniforms: own,
+            side,
+          });
+        const seen = make(fragment(name), name === "leaf" ? THREE.DoubleSide : THREE.FrontSide);
+        const cast = make(depthOnly(name), THREE.DoubleSide);
+        for (const [group, geometry, material] of [
+          [this.group, batches.geometry, seen],
+          [this.shadowGroup, batches.shadowGeometry, cast],
+        ]) {
+          const mesh = new THREE.Mesh(geometry, material);
+          mesh.frustumCulled = false;
+          group.add(mesh);
+        }
+        return batches;
+      }),
+    );
     this.group.add(this.makeGround(arrays, common), makeSky(common));
   }
 
   makeGround(arrays, common) {
     const [x, y, cell] = this.header.ground;
-    const columns = this.header.ground_columns, share = (s) => 255 * Math.min(Math.max(s, 0), 1);
-    const sky = new THREE.DataTexture(Uint8Array.from(arrays.ground_sky, share), columns,
-      arrays.ground_sky.length / columns, THREE.RedFormat);
+    const columns = this.header.ground_columns,
+      share = (s) => 255 * Math.min(Math.max(s, 0), 1);
+    const sky = new THREE.DataTexture(
+      Uint8Array.from(arrays.ground_sky, share),
+      columns,
+      arrays.ground_sky.length / columns,
+      THREE.RedFormat,
+    );
     sky.unpackAlignment = 1;
     sky.minFilter = sky.magFilter = THREE.LinearFilter;
     sky.needsUpdate = true;
-    const material = new THREE.RawShaderMaterial({ glslVersion: THREE.GLSL3, vertexShader: GROUND_VERTEX,
-      fragmentShader: GROUND_FRAGMENT, uniforms: { ...common, groundSky: { value: sky },
-        ground: { value: new THREE.Vector3(x, y, cell) }, rows: { value: new THREE.Vector2(...this.header.rows) } } });
+    const material = new THREE.RawShaderMaterial({
+      glslVersion: THREE.GLSL3,
+      vertexShader: GROUND_VERTEX,
+      fragmentShader: GROUND_FRAGMENT,
+      uniforms: {
+        ...common,
+        groundSky: { value: sky },
+        ground: { value: new THREE.Vector3(x, y, cell) },
+        rows: { value: new THREE.Vector2(...this.header.rows) },
+      },
+    });
     const mesh = new THREE.Mesh(new THREE.PlaneGeometry(600, 600, 1, 1), material);
     mesh.frustumCulled = false;
     return mesh;
@@ -174,7 +234,8 @@ export class World {
 
   /** Shapes of robots, people, boxes and picked bunches. */
   setRigid(header) {
-    const { arrays } = header, count = arrays.material.length;
+    const { arrays } = header,
+      count = arrays.material.length;
     if (this.plants + count > this.rows) throw new Error(`${count} rigid primitives; there is room for ${RIGID_ROOM}`);
     this.write(arrays, this.plants);
     this.rigidClusters = clusters(arrays);
@@ -184,7 +245,9 @@ export class World {
     this.bounds = new Map([...this.outermost].map(([carrier, points]) => [carrier, boxAround(points)]));
     const own = partsBeforeEyes(this.header);
     this.hidden = new Set();
-    this.names.forEach((name, k) => { if (own.has(name)) this.hidden.add(this.bodies + 1 + k); });
+    this.names.forEach((name, k) => {
+      if (own.has(name)) this.hidden.add(this.bodies + 1 + k);
+    });
     this.rigidVersion = header.version;
     this.surfaces.clearUpdateRanges(); // all of it
     this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
@@ -198,7 +261,11 @@ export class World {
     for (let k = 0; k < body.length; ++k) {
       this.pose(body[k], place, turn, k);
       const at = 7 * body[k];
-      const away = Math.hypot(place[3 * k] - rest[at], place[3 * k + 1] - rest[at + 1], place[3 * k + 2] - rest[at + 2]);
+      const away = Math.hypot(
+        place[3 * k] - rest[at],
+        place[3 * k + 1] - rest[at + 1],
+        place[3 * k + 2] - rest[at + 2],
+      );
       const isAway = away > STRAY;
       if (isAway === this.strayed.has(body[k])) continue;
       if (isAway) this.strayed.add(body[k]);
@@ -225,7 +292,8 @@ export class World {
 
   /** Colours of indicator lights; only rows that have changed go to the graphics card. */
   light({ lamp, lamp_surface, lamp_material }) {
-    const surface = this.surfaces.image.data, colour = new Uint32Array(lamp_surface.slice().buffer);
+    const surface = this.surfaces.image.data,
+      colour = new Uint32Array(lamp_surface.slice().buffer);
     for (let k = 0; k < lamp.length; ++k) {
       const at = 4 * (this.plants + lamp[k]);
       if (surface[at] === colour[k] && surface[at + 1] === lamp_material[k]) continue;
@@ -248,7 +316,9 @@ export class World {
   }
 
   /** Name of a rigid body, whose carrier changes when others come and go; "": a plant's. */
-  nameOf(carrier) { return this.names[carrier - this.bodies - 1] ?? ""; }
+  nameOf(carrier) {
+    return this.names[carrier - this.bodies - 1] ?? "";
+  }
 
   /** Quaternion of a carrier. */
   turn(carrier) {
@@ -267,10 +337,14 @@ export class World {
 
   /** Height of the highest point of some carriers [m]. */
   top(carriers) {
-    return Math.max(...carriers.filter((carrier) => this.outermost.has(carrier)).map((carrier) => {
-      const up = new THREE.Vector3(0, 0, 1).applyQuaternion(this.turn(carrier).conjugate());
-      return this.place(carrier).z + farthest(this.outermost.get(carrier), up);
-    }));
+    return Math.max(
+      ...carriers
+        .filter((carrier) => this.outermost.has(carrier))
+        .map((carrier) => {
+          const up = new THREE.Vector3(0, 0, 1).applyQuaternion(this.turn(carrier).conjugate());
+          return this.place(carrier).z + farthest(this.outermost.get(carrier), up);
+        }),
+    );
   }
 
   /** Heading of a carrier about the vertical [rad]. */
@@ -293,7 +367,8 @@ export class World {
    */
   list(eye, ahead, { field, turn, pixel }) {
     this.eye.copy(eye);
-    const isNear = this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn;
+    const isNear =
+      this.listedAt !== null && this.listedAt.distanceTo(eye) < STRIDE && this.listedAhead.angleTo(ahead) < turn;
     if (isNear && this.listedField === field && this.pixel === pixel) return;
     this.listedAt = eye.clone();
     this.listedField = field;
@@ -312,17 +387,21 @@ export class World {
     for (const level of this.draws.flat()) level.update();
   }
 
-  countTriangles() { return this.draws.flat().reduce((sum, level) => sum + level.triangles, 0); }
+  countTriangles() {
+    return this.draws.flat().reduce((sum, level) => sum + level.triangles, 0);
+  }
 
   chooseRigid() {
-    const { first, size, kind, carrier, widest } = this.rigidClusters, coarser = RIGID_COARSER.filter((most) => this.coarser > most).length;
+    const { first, size, kind, carrier, widest } = this.rigidClusters,
+      coarser = RIGID_COARSER.filter((most) => this.coarser > most).length;
     for (let k = 0; k < first.length; ++k) {
       if (this.hidden.has(carrier[k])) continue;
-      const levels = this.draws[kind[k]], { inside } = MESHES[kind[k]];
+      const levels = this.draws[kind[k]],
+        { inside } = MESHES[kind[k]];
       let level = Math.min(coarser, levels.length - 1);
       if (inside) {
         this.listedAway.set(carrier[k], this.away(carrier[k]));
-        const seen = widest[k] * COMES_NEARER / this.listedAway.get(carrier[k]) / this.pixel;
+        const seen = (widest[k] * COMES_NEARER) / this.listedAway.get(carrier[k]) / this.pixel;
         level = Math.max(0, inside.filter((share) => share * seen < ROUNDNESS).length - 1);
       }
       levels[level].seen.add(this.plants + first[k], size[k]);
@@ -331,11 +410,14 @@ export class World {
 
   /** How many clusters of plants are on the line from an eye [3] to a point [3] in the world, or around the eye. */
   countBetween(eye, point) {
-    const { first, ball } = this.plantClusters, way = point.map((value, axis) => value - eye[axis]);
+    const { first, ball } = this.plantClusters,
+      way = point.map((value, axis) => value - eye[axis]);
     const square = way[0] ** 2 + way[1] ** 2 + way[2] ** 2;
     let count = 0;
     for (let k = 0; k < first.length; ++k) {
-      const x = ball[4 * k] - eye[0], y = ball[4 * k + 1] - eye[1], z = ball[4 * k + 2] - eye[2];
+      const x = ball[4 * k] - eye[0],
+        y = ball[4 * k + 1] - eye[1],
+        z = ball[4 * k + 2] - eye[2];
       const along = Math.min(Math.max((x * way[0] + y * way[1] + z * way[2]) / square, 0), MOST_BETWEEN);
       const away = Math.hypot(x - along * way[0], y - along * way[1], z - along * way[2]);
       count += away < HALF_FULL * ball[4 * k + 3];
@@ -345,27 +427,39 @@ export class World {
 
   /** From the eye to the surface of a rigid body at least [m]. */
   away(carrier) {
-    const { min, max } = this.bounds.get(carrier), { x, y, z } = this.eye, data = this.poses.image.data, at = 8 * carrier;
+    const { min, max } = this.bounds.get(carrier),
+      { x, y, z } = this.eye,
+      data = this.poses.image.data,
+      at = 8 * carrier;
     const away = Math.hypot(data[at] - x, data[at + 1] - y, data[at + 2] - z);
     return Math.max(away - Math.max(min.length(), max.length()), NEAR);
   }
 
   choosePlants(angle) {
-    const { first, size, kind, bunch, ball, thickness, carrier } = this.plantClusters, { x, y, z } = this.eye;
-    const ahead = this.listedAhead, short = Math.min(Math.max(TRIANGLE_BUDGET / this.budget, 1), MOST_SHORT);
+    const { first, size, kind, bunch, ball, thickness, carrier } = this.plantClusters,
+      { x, y, z } = this.eye;
+    const ahead = this.listedAhead,
+      short = Math.min(Math.max(TRIANGLE_BUDGET / this.budget, 1), MOST_SHORT);
     const vanishing = { [LEAF]: VANISHING_LEAVES, [SPHEROID]: VANISHING * short };
     for (let k = 0; k < first.length; ++k) {
       if (bunch[k] >= 0 && this.picked.has(bunch[k])) continue;
-      const dx = ball[4 * k] - x, dy = ball[4 * k + 1] - y, dz = ball[4 * k + 2] - z, radius = ball[4 * k + 3];
-      const away = Math.hypot(dx, dy, dz), sizes = Math.max(away - radius, 0.05) / thickness[k];
+      const dx = ball[4 * k] - x,
+        dy = ball[4 * k + 1] - y,
+        dz = ball[4 * k + 2] - z,
+        radius = ball[4 * k + 3];
+      const away = Math.hypot(dx, dy, dz),
+        sizes = Math.max(away - radius, 0.05) / thickness[k];
       if (sizes * this.coarser > (vanishing[kind[k]] ?? VANISHING)) continue;
-      const ratio = sizes * Math.min(this.coarser, NEAR_COARSER * short), levels = this.draws[kind[k]];
+      const ratio = sizes * Math.min(this.coarser, NEAR_COARSER * short),
+        levels = this.draws[kind[k]];
       let level = 0;
       while (level < levels.length - 1 && ratio > LEVEL_DISTANCE[level] * (kind[k] === LEAF ? 0.35 : 1)) ++level;
       const around = (radius + STRIDE) / away;
       const cosine = (dx * ahead.x + dy * ahead.y + dz * ahead.z) / away; // beyond 1 by rounding
-      const isSeen = around >= 1 || this.strayed.has(carrier[k])
-        || Math.acos(Math.max(-1, Math.min(1, cosine))) < angle + Math.asin(around);
+      const isSeen =
+        around >= 1 ||
+        this.strayed.has(carrier[k]) ||
+        Math.acos(Math.max(-1, Math.min(1, cosine))) < angle + Math.asin(around);
       if (isSeen) levels[level].seen.add(first[k], size[k]);
       else if (away - radius < SUN_REACH * Math.SQRT2) levels[level].unseen.add(first[k], size[k]);
     }
@@ -373,9 +467,10 @@ export class World {
 
   /** What the sun sees around the eye, into the depth texture that the shaders read. */
   renderShadow(renderer) {
-    const sun = this.common.sun.value, camera = this.sunCamera;
+    const sun = this.common.sun.value,
+      camera = this.sunCamera;
     if (sun.z < 0.03) return;
-    const step = 2 * SUN_REACH / SUN_SIZE * 64; // whole texels, so that edges of shadows do not crawl
+    const step = ((2 * SUN_REACH) / SUN_SIZE) * 64; // whole texels, so that edges of shadows do not crawl
     const centre = new THREE.Vector3(Math.round(this.eye.x / step) * step, Math.round(this.eye.y / step) * step, 1);
     camera.position.copy(centre).addScaledVector(sun, 30).applyMatrix4(this.shadowGroup.matrixWorld);
     camera.up.set(0, 1, 0);
@@ -389,7 +484,9 @@ export class World {
     renderer.render(this.shadowGroup, camera);
     renderer.setRenderTarget(null);
     renderer.xr.enabled = vr;
-    this.common.sunMatrix.value.copy(camera.projectionMatrix).multiply(camera.matrixWorldInverse)
+    this.common.sunMatrix.value
+      .copy(camera.projectionMatrix)
+      .multiply(camera.matrixWorldInverse)
       .multiply(this.shadowGroup.matrixWorld);
   }
 }
@@ -402,7 +499,8 @@ function partsBeforeEyes({ person }) {
 /** Uniforms of the light that cameras see. */
 function lightOf({ balance, exposure, dim, ...colours }) {
   const uniforms = { gain: { value: new THREE.Vector3(...balance).multiplyScalar(exposure) }, skyDim: { value: dim } };
-  for (const [name, colour] of Object.entries(colours)) uniforms[`${name}Colour`] = { value: new THREE.Vector3(...colour) };
+  for (const [name, colour] of Object.entries(colours))
+    uniforms[`${name}Colour`] = { value: new THREE.Vector3(...colour) };
   return uniforms;
 }
 
@@ -415,8 +513,15 @@ function smoothTable(texture) {
 }
 
 function makeSky(common) {
-  const material = new THREE.RawShaderMaterial({ glslVersion: THREE.GLSL3, vertexShader: SKY_VERTEX,
-    fragmentShader: SKY_FRAGMENT, uniforms: common, side: THREE.BackSide, depthWrite: false, depthFunc: THREE.LessEqualDepth });
+  const material = new THREE.RawShaderMaterial({
+    glslVersion: THREE.GLSL3,
+    vertexShader: SKY_VERTEX,
+    fragmentShader: SKY_FRAGMENT,
+    uniforms: common,
+    side: THREE.BackSide,
+    depthWrite: false,
+    depthFunc: THREE.LessEqualDepth,
+  });
   const mesh = new THREE.Mesh(new THREE.SphereGeometry(1, 24, 12), material);
   mesh.frustumCulled = false;
   mesh.renderOrder = 1;
@@ -424,7 +529,8 @@ function makeSky(common) {
 }
 
 function dataTexture(format, type, Kind, channels, texels, shift) {
-  const width = 1 << shift, height = Math.max(Math.ceil(texels / width), 1);
+  const width = 1 << shift,
+    height = Math.max(Math.ceil(texels / width), 1);
   const texture = new THREE.DataTexture(new Kind(width * height * channels), width, height, format, type);
   if (format === THREE.RGBAIntegerFormat) texture.internalFormat = "RGBA32UI";
   texture.minFilter = texture.magFilter = THREE.NearestFilter;
@@ -433,15 +539,24 @@ function dataTexture(format, type, Kind, channels, texels, shift) {
 
 /** Runs of primitives, with the mean thickness of their parts and the largest radius [m]. */
 function clusters(arrays) {
-  const { first, size, kind, bunch, ball, shape } = arrays, count = first.length;
-  const thickness = new Float32Array(count), widest = new Float32Array(count);
+  const { first, size, kind, bunch, ball, shape } = arrays,
+    count = first.length;
+  const thickness = new Float32Array(count),
+    widest = new Float32Array(count);
   for (let k = 0; k < count; ++k) {
     let sum = 0;
     for (let at = 16 * first[k]; at < 16 * (first[k] + size[k]); at += 16) {
       sum += Math.abs(shape[at + 3]);
-      widest[k] = Math.max(widest[k], shape[at + 3], kind[k] === ELLIPSOID ? Math.max(shape[at + 8], shape[at + 9]) : 0);
+      widest[k] = Math.max(
+        widest[k],
+        shape[at + 3],
+        kind[k] === ELLIPSOID ? Math.max(shape[at + 8], shape[at + 9]) : 0,
+      );
     }
-    thickness[k] = kind[k] === TRIANGLE ? 1 : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
+    thickness[k] =
+      kind[k] === TRIANGLE
+        ? 1
+        : Math.max(sum / size[k], 1e-4) * (kind[k] === LEAF ? 0.6 : kind[k] === SPHEROID ? 0.8 : 1);
   }
   const carrier = Array.from(first, (row) => arrays.carrier[row]);
   return { first, size, kind, bunch, ball, thickness, widest, carrier };

@@ -2,7 +2,9 @@
 
 import * as THREE from "./vendor/three.module.js";
 
-const WIDTH = 0.16, PIXELS = 512, LINE = 38; // m; px wide and of a line
+const WIDTH = 0.16,
+  PIXELS = 512,
+  LINE = 38; // m; px wide and of a line
 const LETTERS = 28; // of a line
 const NOTHING = "nothing";
 
@@ -15,9 +17,11 @@ export class Wrist {
     this.canvas.width = PIXELS;
     this.canvas.height = LINE * (this.intentions.length + 5);
     this.texture = new THREE.CanvasTexture(this.canvas);
-    const height = WIDTH * this.canvas.height / PIXELS;
-    this.panel = new THREE.Mesh(new THREE.PlaneGeometry(WIDTH, height),
-      new THREE.MeshBasicMaterial({ map: this.texture, transparent: true, toneMapped: false }));
+    const height = (WIDTH * this.canvas.height) / PIXELS;
+    this.panel = new THREE.Mesh(
+      new THREE.PlaneGeometry(WIDTH, height),
+      new THREE.MeshBasicMaterial({ map: this.texture, transparent: true, toneMapped: false }),
+    );
     this.panel.position.set(0, 0.03 + height / 2, 0);
     carrier.rotation.x = -0.6; // towards the eyes
     carrier.add(this.panel);
@@ -25,7 +29,9 @@ export class Wrist {
   }
 
   /** The intention that comes after another one in the list; nothing comes after the last. */
-  after(intention) { return this.intentions[(this.intentions.indexOf(intention) + 1) % this.intentions.length]; }
+  after(intention) {
+    return this.intentions[(this.intentions.indexOf(intention) + 1) % this.intentions.length];
+  }
 
   /** Show what is `chosen` and what was `said`; without either there is nothing to see. */
   show(chosen, said) {

@@ -1,0 +1,114 @@
+"""What grippers of each kind do with a goal of ``control_msgs/GripperCommand``, and how it ends.
+
+The kinds are declared in :mod:`vinesim.robot.description.grippers`; :data:`CONTROLLERS` has one controller for each.
+"""
+
+from __future__ import annotations
+
+import abc
+
+import numpy as np
+
+from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.scene.values import GripperState
+
+GOAL_TOLERANCE = 2e-3
+"""[m or rad] A gripper this near to its goal has reached it."""
+STALL_SPEED = 1e-3
+"""[m/s or rad/s] A gripper that moves slower is stalled; the default of ``gripper_action_controller``."""
+STALL_DURATION = 0.3
+"""[s] for which it must be so slow. GUESSED: a tenth of the time that it takes to close."""
+
+
+class GripperController(abc.ABC):
+    """The grippers of one kind at one group of a robot; they have one goal at a time."""
+
+    def __init__(self, robot: Robot, group: str) -> None:
+        """Raises :class:`CommandError` if the robot has none of the kind there."""
+        self.robot = robot
+        self.group = group
+
+    @abc.abstractmethod
+    def start(self, position: float, effort: float | None, time: float) -> None:
+        """Take a goal at ``time`` [s]; ``effort`` None: all there is. :class:`CommandError` if it is unfit."""
+
+    @abc.abstractmethod
+    def state(self, time: float) -> GripperState:
+        """How far the goal is at ``time`` [s]; called in every step of it."""
+
+    @abc.abstractmethod
+    def cancel(self, time: float) -> None:
+        """Stop in a goal that is not done, at ``time`` [s]."""
+
+
+class FingersController(GripperController):
+    """Moves fingers to an opening; to hold what they hold, they keep pressing when the goal has ended.
+
+    Goal: the opening [m or rad], and the largest effort of each finger [N or N m]; see :meth:`Robot.command_gripper`.
+    Result: the opening, and the largest effort of a finger; stalled if something is between the fingers.
+    """
+
+    def __init__(self, robot: Robot, group: str) -> None:
+        super().__init__(robot, group)
+        self._fingers = robot.description.joint_indices(group)
+        self._goal = robot.gripper_opening(group)
+        self._slow_since: float | None = None
+
+    def start(self, position: float, effort: float | None, time: float) -> None:
+        """See :class:`GripperController`."""
+        self.robot.command_gripper(self.group, position, effort)
+        self._goal = position
+        self._slow_since = None
+
+    def state(self, time: float) -> GripperState:
+        """See :class:`GripperController`."""
+        robot = self.robot
+        _, velocity, effort, _ = robot.rigid.joint_measurements(robot.name)
+        opening = robot.gripper_opening(self.group)
+        strongest = float(np.abs(effort[self._fingers]).max())
+        if abs(opening - self._goal) <= GOAL_TOLERANCE:
+            return GripperState(opening, strongest, reached_goal=True)
+        if np.abs(velocity[self._fingers]).max() > STALL_SPEED:
+            self._slow_since = None
+        elif self._slow_since is None:
+            self._slow_since = time
+        stalled = self._slow_since is not None and time - self._slow_since >= STALL_DURATION
+        return GripperState(opening, strongest, stalled=stalled)
+
+    def cancel(self, time: float) -> None:
+        """Hold the fingers where they are."""
+        self.start(self.robot.gripper_opening(self.group), None, time)
+
+
+class CutterController(GripperController):
+    """Closes a cutter once, whatever position the goal has.
+
+    Goal: the largest force of the blades [N]; see :meth:`Robot.command_cutter`.
+    Result: position 0 once closed, and the force [N] that the blades had to overcome, 0 if nothing was between them;
+    stalled if that was more than they had, and nothing was cut.
+    """
+
+    def __init__(self, robot: Robot, group: str) -> None:
+        super().__init__(robot, group)
+        self._closures = tuple(blade.closures for blade in robot.cutter_blades(group))
+
+    def start(self, position: float, effort: float | None, time: float) -> None:
+        """See :class:`GripperController`."""
+        self.robot.command_cutter(self.group, effort)
+        self._closures = tuple(blade.closures for blade in self.robot.cutter_blades(self.group))
+
+    def state(self, time: float) -> GripperState:
+        """See :class:`GripperController`."""
+        blades = self.robot.cutter_blades(self.group)
+        if any(blade.closures == before for blade, before in zip(blades, self._closures, strict=True)):
+            return GripperState(1.0, 0.0)
+        effort = max(min(blade.resistance, blade.force) for blade in blades)
+        too_weak = any(blade.resistance > blade.force for blade in blades)
+        return GripperState(0.0, effort, stalled=too_weak, reached_goal=not too_weak)
+
+    def cancel(self, time: float) -> None:
+        """Nothing: the blades close within one step."""
+
+
+CONTROLLERS: dict[str, type[GripperController]] = {"fingers": FingersController, "cutter": CutterController}
+"""By kind of gripper."""
