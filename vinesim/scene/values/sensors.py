@@ -1,10 +1,12 @@
-"""What cameras and lidars measure."""
+"""The sensors that a robot can carry: what each kind measures, how it is mounted, and the table of the kinds."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
+from typing import ClassVar, Literal, Protocol
 
+import msgspec
 import numpy as np
 
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
@@ -14,6 +16,65 @@ MIN_BERRY_PIXELS = 4
 
 Box = tuple[int, int, int, int]
 """First column, first row, last column, last row (inclusive)."""
+MIN_CAMERA_SIZE = 16
+MAX_CAMERA_SIZE = 4096
+"""Bounds of the width and height of a camera's picture [px]."""
+
+
+class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sensor of a robot, as a table of its TOML file says: its name in topics, the link it sits in, its data file."""
+
+    name: str
+    frame: str
+    type: str = ""
+
+
+class RenderedMount(SensorMount, frozen=True, forbid_unknown_fields=True):
+    """A sensor that is rendered: one of :data:`SENSOR_KINDS`."""
+
+    kind: ClassVar[str]
+    """Name of its kind."""
+    rate: float | None = None
+    """Frames a second [Hz]; the sensor's own unless given."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """What is wrong with its values, and the remedy; None if they are fit."""
+        if self.rate is not None and not 0.01 <= self.rate <= 1000.0:
+            return f"the rate {self.rate}", "give 0.01 to 1000 Hz"
+        return None
+
+
+class PictureMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
+    """A sensor that delivers pictures."""
+
+    size: tuple[int, int] | None = None
+    """Width and height [px] with the same angle of view; the sensor's own unless given."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """See :meth:`RenderedMount.fault`."""
+        if self.size is not None and not all(MIN_CAMERA_SIZE <= n <= MAX_CAMERA_SIZE for n in self.size):
+            bounds = f"give width and height from {MIN_CAMERA_SIZE} to {MAX_CAMERA_SIZE} px"
+            return f"the size {list(self.size)}", bounds
+        return super().fault()
+
+
+class SensorFrame(Protocol):
+    """What a sensor delivers at once; a frozen dataclass, so that its time can be replaced."""
+
+    @property
+    def time(self) -> float:
+        """[s]"""
+        ...
+
+    @property
+    def name(self) -> str:
+        """The sensor's name."""
+        ...
+
+    @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """The arrays that two runs in lockstep must have equal to the bit."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -54,7 +115,7 @@ class SensorPacing:
 
 
 class CameraOutput(enum.Flag):
-    """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for."""
+    """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for. Others render if any is."""
 
     RGB = enum.auto()
     DEPTH = enum.auto()
@@ -156,6 +217,11 @@ class CameraFrame:
     """Of every bunch of which at least one pixel is seen, by index."""
 
     @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """See :attr:`SensorFrame.measured`."""
+        return self.rgb, self.depth, self.labels
+
+    @property
     def outputs(self) -> CameraOutput:
         """The parts that were made."""
         made = CameraOutput.NONE if self.bunches is None else CameraOutput.BUNCHES
@@ -229,6 +295,66 @@ class LidarScan:
     """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
 
     @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """See :attr:`SensorFrame.measured`."""
+        return self.xyz, self.intensity, self.labels
+
+    @property
     def organs(self) -> np.ndarray:
         """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
         return self.labels // LABEL_STRIDE
+
+
+class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
+    """An RGB-D camera, and in which quality it is rendered live."""
+
+    kind: ClassVar[str] = "camera"
+    quality: Literal["fast", "full", "still"] = "fast"
+
+
+class LidarMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
+    """A spinning lidar."""
+
+    kind: ClassVar[str] = "lidar"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SensorKind:
+    """A kind of sensor, as all layers know it. The layers above are named, not imported: each imports its own part."""
+
+    table: str
+    """Its array of tables in the TOML file of a robot."""
+    mount: type[RenderedMount]
+    """One such table."""
+    maker: str
+    """Module of vinesim.sensors whose ``MAKER`` is the :class:`vinesim.sensors.sensor.SensorMaker`."""
+    publisher: str
+    """Module of vinesim.ros.publishers whose ``PUBLISHER`` is the :class:`vinesim.ros.sensor_node.SensorPublisher`."""
+    whole: CameraOutput
+    """What is rendered of it where every frame counts: in lockstep."""
+    topics: tuple[str, ...]
+    """Topics below its name that a user watches all the time; the first alone shows that it works."""
+    costly_topics: tuple[str, ...] = ()
+    """Topics below its name that a user looks at now and then."""
+
+
+SENSOR_KINDS: dict[str, SensorKind] = {
+    CameraMount.kind: SensorKind(
+        table="cameras",
+        mount=CameraMount,
+        maker="vinesim.sensors.camera.camera",
+        publisher="vinesim.ros.publishers.camera",
+        whole=CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS,
+        topics=("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info"),
+        costly_topics=("depth/points", "labels"),
+    ),
+    LidarMount.kind: SensorKind(
+        table="lidars",
+        mount=LidarMount,
+        maker="vinesim.sensors.lidar.lidar",
+        publisher="vinesim.ros.publishers.lidar",
+        whole=CameraOutput.DEPTH,
+        topics=("points",),
+    ),
+}
+"""All kinds by name. A robot's sensors are in this order, those of one kind in the order of its file."""
