@@ -28,8 +28,10 @@ class SensorPublisher(Protocol):
     packages: ClassVar[tuple[str, ...]]
     """Message packages that must be importable and may not come with ROS."""
 
-    def __init__(self, advertise: Advertise, name: str, number: int, parameters: Parameters) -> None:
-        """``number``: counts the sensors of its kind from 0."""
+    def __init__(
+        self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
+    ) -> None:
+        """``number`` counts the sensors of its kind from 0; ``channels`` are its images, if its data file decides."""
         ...
 
     @property
@@ -60,13 +62,16 @@ class SensorNode(Node):
         *,
         namespace: str = "",
         sensors: Mapping[str, str],
+        channels: Mapping[str, Sequence[str]] | None = None,
         rates: Mapping[str, float] | None = None,
         params_file: pathlib.Path | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """``rates``: those of sensors [Hz], with which their parameters start; others have none. ``params_file``,
-        ``parameters``: see :class:`Node`."""
+        """``channels``: images of a sensor, where its data file decides which there are. ``rates``: those of sensors
+        [Hz], with which their parameters start; others have none. ``params_file``, ``parameters``: see :class:`Node`.
+        """
         self._kinds = sensors
+        self._channels = channels or {}
         needed = {package: None for kind in sensors.values() for package in publisher(kind).packages}
         if needed:
             message_packages.ensure_importable(needed)
@@ -82,7 +87,9 @@ class SensorNode(Node):
         self._publishers: dict[str, SensorPublisher] = {}
         count = dict.fromkeys(self._kinds.values(), 0)
         for sensor, kind in self._kinds.items():
-            self._publishers[sensor] = publisher(kind)(self._advertise, sensor, count[kind], parameters)
+            self._publishers[sensor] = publisher(kind)(
+                self._advertise, sensor, parameters, number=count[kind], channels=self._channels.get(sensor, ())
+            )
             count[kind] += 1
         for sensor, rate in self._rates.items():
             parameters.declare(

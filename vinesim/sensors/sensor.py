@@ -105,6 +105,8 @@ class SensorMaker:
     """The sensor of a mount of this kind."""
     load_kernels: Callable[[], None]
     """Compiles its kernels for the CPU, or reads them from the cache, before the first frame is due."""
+    channels: Callable[[str], tuple[str, ...]] = lambda _: ()
+    """Names of the images of a sensor where its data file decides which there are."""
     export: Callable[[Any], Export] | None = None
     """What a data set keeps of its frames; None: nothing."""
 

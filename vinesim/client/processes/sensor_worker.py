@@ -217,6 +217,7 @@ class SensorWorker:
 
     def _open_node(self, stack: contextlib.ExitStack) -> SensorNode:
         from vinesim.ros.sensor_node import SensorNode
+        from vinesim.sensors.sensor import maker
 
         config = self.config
         return stack.enter_context(
@@ -224,6 +225,7 @@ class SensorWorker:
                 f"{ros_name(config.name)}_sensors",
                 namespace=config.namespace,
                 sensors={mount.name: mount.kind for mount in config.description.sensors},
+                channels={mount.name: maker(mount.kind).channels(mount.type) for mount in config.description.sensors},
                 rates=self._rates(),
                 params_file=config.params_file,
                 parameters=config.parameters,

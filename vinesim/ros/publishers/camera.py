@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -29,7 +29,9 @@ class CameraPublisher:
 
     packages: ClassVar = ("vision_msgs",)
 
-    def __init__(self, advertise: Advertise, name: str, _number: int, parameters: Parameters) -> None:
+    def __init__(
+        self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
+    ) -> None:
         # vision_msgs can be imported once the node has seen to it
         from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 

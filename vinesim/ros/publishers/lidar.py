@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import ClassVar
 
@@ -22,7 +22,9 @@ class LidarPublisher:
     packages: ClassVar = ()
     truth: ClassVar = ()
 
-    def __init__(self, advertise: Advertise, name: str, number: int, parameters: Parameters) -> None:
+    def __init__(
+        self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
+    ) -> None:
         self._parameters = parameters
         self._exact = f"{name}.exact_ranges"
         parameters.declare(

@@ -305,6 +305,60 @@ class LidarScan:
         return self.labels // LABEL_STRIDE
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Band:
+    """One band of a multispectral camera. Its response is a Gaussian."""
+
+    name: str
+    centre: float
+    """[nm]"""
+    width: float
+    """Between the wavelengths at which the response is half of its greatest [nm]."""
+    irradiance: float
+    """Of a level surface in the open, sun and sky [W/(m2 nm)]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class MultispectralFrame:
+    """One picture in several bands, which all show the same at the same pixel."""
+
+    time: float
+    name: str
+    info: CameraInfo
+    pose: np.ndarray
+    """[7] optical frame in the world when the picture was taken."""
+    bands: tuple[Band, ...]
+    """By wavelength."""
+    reflectance: np.ndarray
+    """[band, height, width] float32: light over that of a level white panel in the open. In shadow it is less than what
+    the surface reflects, on a leaf that faces a low sun it is more."""
+    labels: np.ndarray
+    """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
+
+    @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """See :attr:`SensorFrame.measured`."""
+        return (self.reflectance,)
+
+    @property
+    def radiance(self) -> np.ndarray:
+        """[band, height, width] float32 W/(m2 sr nm)."""
+        irradiance = np.array([band.irradiance for band in self.bands], np.float32)
+        return self.reflectance * (irradiance / np.float32(np.pi))[:, None, None]
+
+    def band(self, name: str) -> np.ndarray:
+        """Reflectance [height, width] in a band; :class:`KeyError` if there is none of that name."""
+        return self.reflectance[{band.name: k for k, band in enumerate(self.bands)}[name]]
+
+    @property
+    def ndvi(self) -> np.ndarray:
+        """[height, width] float32: (nir - red) / (nir + red), 0 where both are dark (Rouse et al. 1974)."""
+        red = self.band("red")
+        nir = self.band("nir")
+        total = nir + red
+        return np.divide(nir - red, total, out=np.zeros_like(total), where=total > 0.0)
+
+
 class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
     """An RGB-D camera, and in which quality it is rendered live."""
 
@@ -316,6 +370,12 @@ class LidarMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
     """A spinning lidar."""
 
     kind: ClassVar[str] = "lidar"
+
+
+class MultispectralMount(PictureMount, frozen=True, forbid_unknown_fields=True):
+    """A multispectral camera."""
+
+    kind: ClassVar[str] = "multispectral"
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -355,6 +415,14 @@ SENSOR_KINDS: dict[str, SensorKind] = {
         publisher="vinesim.ros.publishers.lidar",
         whole=CameraOutput.DEPTH,
         topics=("points",),
+    ),
+    MultispectralMount.kind: SensorKind(
+        table="multispectral_cameras",
+        mount=MultispectralMount,
+        maker="vinesim.sensors.camera.multispectral",
+        publisher="vinesim.ros.publishers.multispectral",
+        whole=CameraOutput.RGB,
+        topics=("ndvi/image_raw", "ndvi/camera_info"),
     ),
 }
 """All kinds by name. A robot's sensors are in this order, those of one kind in the order of its file."""
