@@ -11,7 +11,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.kernels.raster import transform_primitives
-from vinesim.scene.values import SENSOR_KINDS, CameraOutput, SensorFrame, Snapshot
+from vinesim.scene.values import SENSOR_KINDS, CameraOutput, RenderedMount, SensorFrame, Snapshot
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, SunPath
 from vinesim.sensors.primitives.scene_primitives import Primitives
 
@@ -114,6 +114,16 @@ class SensorMaker:
 def maker(kind: str) -> SensorMaker:
     """What makes sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     return importlib.import_module(SENSOR_KINDS[kind].maker).MAKER
+
+
+def export_frame(
+    mount: RenderedMount, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, setting: SensorSetting
+) -> Export:
+    """What a data set keeps of one frame of a sensor, made for it, from ``pose`` [7]; its kind must have an export."""
+    kind = maker(mount.kind)
+    assert kind.export is not None
+    whole = SENSOR_KINDS[mount.kind].whole
+    return kind.export(kind.make(mount, setting).frame(primitives, snapshot, np.array(pose, float), whole))
 
 
 def load_kernels(*kinds: str) -> None:

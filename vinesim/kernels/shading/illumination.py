@@ -8,14 +8,14 @@ import warp as wp
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.raster.primitives import LEAF, Shapes
 from vinesim.kernels.shading.deferred import Light, ambient_light, seen_surface, shadow_turn, sun_share
-from vinesim.kernels.shading.materials import Materials, smoothstep
+from vinesim.kernels.shading.materials import Materials
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SOIL_RATIO = wp.constant(0.72)
-SOD_RATIO = wp.constant(1.15)
-"""Green over red of the picture's ground: up to the first it is bare soil, from the second on sod."""
+SOD_RATIO = wp.constant(1.45)
+"""Green over red of the picture's ground: up to the first it is bare soil, from the second on sod. GUESSED."""
 
 
 @wp.func
@@ -70,7 +70,8 @@ def illuminate_pixels(
             plain = s.geometric_normal
             through = float(0.0)
             if i == -2:
-                sod = smoothstep(SOIL_RATIO, SOD_RATIO, s.albedo[1] / wp.max(s.albedo[0], 1.0e-6))
+                ratio = s.albedo[1] / wp.max(s.albedo[0], 1.0e-6)
+                sod = wp.clamp((ratio - SOIL_RATIO) / (SOD_RATIO - SOIL_RATIO), 0.0, 1.0)
             elif shapes.kind[i] == LEAF:
                 through = transmission
                 if wp.dot(plain, d) > 0.0:
