@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import pathlib
 from collections.abc import Container, Iterable, Sequence
+from typing import cast
 
 import msgspec
 import numpy as np
@@ -121,12 +122,15 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return getattr(self, SENSOR_KINDS[kind].table, None)
 
 
-SidecarFile: type[Sidecar] = msgspec.defstruct(
-    "SidecarFile",
-    [(kind.table, tuple[kind.mount, ...] | None, None) for kind in SENSOR_KINDS.values()],
-    bases=(Sidecar,),
-    frozen=True,
-    forbid_unknown_fields=True,
+SidecarFile = cast(
+    "type[Sidecar]",
+    msgspec.defstruct(
+        "SidecarFile",
+        [(kind.table, tuple[kind.mount, ...] | None, None) for kind in SENSOR_KINDS.values()],
+        bases=(Sidecar,),
+        frozen=True,
+        forbid_unknown_fields=True,
+    ),
 )
 """The whole file."""
 
