@@ -87,9 +87,9 @@ def running_client(device: str, plants: str) -> Iterator[tuple[Client, sensor_pr
     scene = load_scene("demo")
     model = generate(scene)
     robot = load_description("vinebot")
-    cameras = tuple(msgspec.structs.replace(robot.cameras[0], name=f"camera_{i}") for i in range(CAMERAS))
-    lidars = (msgspec.structs.replace(robot.lidars[0], type="os1_64"),)
-    robot = dataclasses.replace(robot, cameras=cameras, lidars=lidars)
+    cameras = tuple(msgspec.structs.replace(robot.sensors_of("camera")[0], name=f"camera_{i}") for i in range(CAMERAS))
+    lidars = (msgspec.structs.replace(robot.sensors_of("lidar")[0], type="os1_64"),)
+    robot = dataclasses.replace(robot, sensors=(*cameras, *lidars))
     sensor_process.run_sensor_worker = render_all
     with contextlib.ExitStack() as stack:
         bus = stack.enter_context(MemoryHub().bus("robot"))

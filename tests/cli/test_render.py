@@ -6,7 +6,9 @@ import errno
 import os
 import pathlib
 
+import cv2
 import msgspec
+import numpy as np
 import pytest
 
 from tests.support.long_rows import long
@@ -64,6 +66,37 @@ def test_a_wrong_path_is_named_before_anything_is_rendered(text: str, words: str
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_sensor_looks_as_well_and_leaves_the_picture_as_it_is(tmp_path: pathlib.Path) -> None:
+    view = {"at": "0.4,1.2,1.3", "look": "3,1,1.7"}
+    render(tmp_path / "alone", **view)
+    render(tmp_path / "both", **view, sensors=["multispectral:rededge_mx"])
+    alone = files(tmp_path / "alone")
+    both = files(tmp_path / "both")
+    assert {name: both[name] for name in alone} == alone
+    bands = ["blue", "green", "ndvi", "nir", "red", "red_edge"]
+    assert sorted(both.keys() - alone.keys()) == ["rededge_mx.json", *(f"rededge_mx_{band}.png" for band in bands)]
+    nir = cv2.imdecode(np.frombuffer(both["rededge_mx_nir.png"], np.uint8), cv2.IMREAD_UNCHANGED)
+    assert (nir.shape, nir.dtype) == ((120, 160), np.uint16)
+    record = msgspec.json.decode(both["rededge_mx.json"])
+    assert [band["name"] for band in record["bands"]] == ["blue", "green", "red", "red_edge", "nir"]
+
+
+@pytest.mark.parametrize(
+    ("sensors", "words"),
+    [
+        (["radar:x"], "--sensor is 'radar:x'; give KIND:FILE, of the kind multispectral"),
+        (["multispectral"], "give KIND:FILE"),
+        (["camera:d435"], "of the kind multispectral"),
+        (["multispectral:rededge_mx"] * 2, "two of the name 'rededge_mx'"),
+    ],
+)
+def test_wrong_sensors_are_one_line(tmp_path: pathlib.Path, sensors: list[str], words: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        render(tmp_path / "out", at="0.4,1.2,1.3", look="3,1,1.7", sensors=sensors)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
 
 
 def test_a_viewpoint_is_needed_and_only_once(tmp_path: pathlib.Path) -> None:

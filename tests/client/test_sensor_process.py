@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import logging
 import os
@@ -30,7 +31,7 @@ from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import CameraFrame, HumanSpec
+from vinesim.scene.values import CameraFrame, HumanSpec, MultispectralMount, SensorMode, SensorPacing
 from vinesim.sensors.camera.camera import CameraSpec
 
 CAMERA = "head_front_camera"
@@ -84,6 +85,23 @@ def robot_with_standby() -> Iterator[Robot]:
     with one.sensors:
         one.sensors.attach(one.client)
         yield one
+
+
+def test_a_multispectral_camera_is_rendered_beside_the_others():
+    """As any kind of sensor that a robot's TOML file names."""
+    scene = load_scene("demo")
+    vinebot = load_description("vinebot")
+    mount = MultispectralMount("bands", vinebot.sensors[0].frame, "rededge_mx", rate=10.0, size=(64, 48))
+    vinebot = dataclasses.replace(vinebot, sensors=(*vinebot.sensors, mount))
+    model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
+    pacing = SensorPacing(SensorMode.LOCKSTEP)
+    with SensorProcess("robot", scene, model, vinebot, ros=False, pacing=pacing) as sensors:
+        bus = MemoryHub().bus("robot")
+        client = Client(scene, model, vinebot, bus, name="robot", pose=spawn_pose(scene, 0))
+        sensors.attach(client)
+        done = lambda: sensors.report()["frames"].get("bands", 0) >= 2  # noqa: E731
+        wait(lambda: (client.tick(), time.sleep(0.003), done())[-1], "two pictures")
+        assert sensors.report()["frames"].keys() == {CAMERA, "lidar", "bands"}
 
 
 @pytest.mark.skipif(wp.get_cuda_device_count() > 0, reason="needs a GPU that is gone")

@@ -39,16 +39,13 @@ class Node:
     def __init__(self) -> None:
         self.set_parameters: dict[str, object] = {}
         self.scans: list[LidarScan] = []
-        self.publish_lidar = self.scans.append
+        self.publish = self.scans.append
 
     def rate(self, _name: str) -> float:
         return 1.0 / SCAN_PERIOD
 
-    def camera_outputs_wanted(self, _name: str) -> CameraOutput:
-        return CameraOutput.NONE
-
-    def lidar_outputs_wanted(self, _name: str) -> CameraOutput:
-        return CameraOutput.DEPTH
+    def outputs_wanted(self, name: str) -> CameraOutput:
+        return CameraOutput.DEPTH if name == "lidar" else CameraOutput.NONE
 
 
 class OneProcess:

@@ -276,7 +276,7 @@ def test_a_sidecar_from_the_network_names_no_sensor_file(vinebot):
     """Sensors act where the robot is simulated; a file name in their place is not read."""
     sidecar = '{"cameras": [{"name": "x", "frame": "base_link", "type": "../../etc/passwd"}], "groups": {}}'
     found = resolve_description(hello(vinebot, sidecar=sidecar), vinebot)
-    assert all("passwd" not in camera.type for camera in found.cameras)
+    assert all("passwd" not in camera.type for camera in found.sensors_of("camera"))
 
 
 def test_a_full_disk_costs_the_robot_that_joins_and_not_the_tick(vinebot, monkeypatch, caplog):

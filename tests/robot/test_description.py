@@ -72,7 +72,7 @@ def test_vinebot_is_a_dual_arm_carrier(vinebot: RobotDescription) -> None:
     for side in ("left", "right"):
         assert vinebot.groups[f"arm_{side}"].joints == tuple(f"arm_{side}_{i}_joint" for i in range(1, 8))
         assert f"gripper_{side}_cutter_link" in vinebot.link_anchors
-    assert vinebot.cameras[0].frame == "head_front_camera_rgb_optical_frame"
+    assert vinebot.sensors_of("camera")[0].frame == "head_front_camera_rgb_optical_frame"
     assert vinebot.notes == ()
     for drive, home in zip(vinebot.drives, vinebot.home, strict=True):
         assert drive.lower <= home <= drive.upper, drive.joint
@@ -190,8 +190,10 @@ def test_tiago_pro_loads() -> None:
     for shape in (shape for link in parse(tiago.urdf).links for shape in (*link.visuals, *link.collisions)):
         if shape.geometry.mesh is not None:
             assert pathlib.Path(shape.geometry.mesh.filename).is_absolute()
-    assert tiago.cameras[0].frame.endswith("optical_frame")
-    ahead = frames.rotate(tiago.link_poses(tiago.home)[tiago.cameras[0].frame][3:], np.array([0.0, 0.0, 1.0]))
+    assert tiago.sensors_of("camera")[0].frame.endswith("optical_frame")
+    ahead = frames.rotate(
+        tiago.link_poses(tiago.home)[tiago.sensors_of("camera")[0].frame][3:], np.array([0.0, 0.0, 1.0])
+    )
     assert ahead[0] > 0.9
     assert abs(ahead[1]) < 1e-3
 
@@ -240,7 +242,7 @@ def test_defaults_without_a_sidecar(tmp_path: pathlib.Path) -> None:
     assert shoulder.armature == pytest.approx(0.02 * 10.0 / 1.0)
     assert shoulder.damping == pytest.approx(2.0 * np.sqrt(200.0 * (0.1 + 0.2)))
     assert (turret.lower, turret.upper) == (-np.inf, np.inf)
-    assert simple.cameras[0].frame == "camera_optical_frame"
+    assert simple.sensors_of("camera")[0].frame == "camera_optical_frame"
     assert any("caster" in note for note in simple.notes)
 
 
@@ -372,7 +374,7 @@ def test_quality_size_and_rate_of_a_camera_come_from_the_sidecar(tmp_path: pathl
         "[[cameras]]\nname = 'wrist'\nframe = 'arm'\ntype = 'd435'\nquality = 'full'\nsize = [320, 240]\nrate = 15.0\n"
         "[[cameras]]\nname = 'chest'\nframe = 'arm'\ntype = 'd435'\n"
     )
-    wrist, chest = load_description(file).cameras
+    wrist, chest = load_description(file).sensors_of("camera")
     assert (wrist.quality, wrist.size, wrist.rate) == ("full", (320, 240), 15.0)
     assert (chest.quality, chest.size, chest.rate) == ("fast", None, None)
 

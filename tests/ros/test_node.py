@@ -142,7 +142,7 @@ def test_large_messages_reach_another_process():
     static = [("base_footprint", "base_link", REST)]
     with (
         RobotNode("vinebot", URDF, static_transforms=static) as robot,
-        SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
+        SensorNode("vinebot_sensors", sensors={"head_front_camera": "camera", "lidar": "lidar"}) as sensors,
         # a second of messages may wait: on a busy machine the other process gets its turn late
         topic_monitor(*small, *large, *latched, queue=100) as report,
     ):
@@ -163,11 +163,11 @@ def test_large_messages_reach_another_process():
             for name in small:
                 offered[name] += 1
             if tick * 3 % 10 < 3:
-                sensors.publish_camera(camera_frame(t))
+                sensors.publish(camera_frame(t))
                 offered[large[0]] += 1
                 offered[large[1]] += 1
             if tick % 10 == 0:
-                sensors.publish_lidar(lidar_scan(t, 100_000))
+                sensors.publish(lidar_scan(t, 100_000))
                 offered[large[2]] += 1
         wait_until(lambda: not sensors.has_pending)
         received = report()
@@ -186,7 +186,7 @@ def test_every_topic_is_heard_with_its_official_type():
     poses = np.tile(REST, (2, 1))
     with (
         RobotNode("vinebot", URDF) as robot,
-        SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
+        SensorNode("vinebot_sensors", sensors={"head_front_camera": "camera", "lidar": "lidar"}) as sensors,
         topic_monitor() as report,
     ):
         robot.publish_environment_static(("pole_0",), poses[:1])
@@ -200,8 +200,8 @@ def test_every_topic_is_heard_with_its_official_type():
             robot.publish_clock(t)
             robot.publish_robot_state(robot_sample(t, contacts=(contact,)))
             robot.publish_sound(t, bytes(640))
-            sensors.publish_camera(camera_frame(t, 32, 24))
-            sensors.publish_lidar(lidar_scan(t, 10))
+            sensors.publish(camera_frame(t, 32, 24))
+            sensors.publish(lidar_scan(t, 10))
             robot.publish_environment(t, names, poses)
             robot.publish_diagnostics(t, [ComponentStatus("simulation")])
 
@@ -248,7 +248,7 @@ def test_ten_seconds_of_every_step_wait_for_a_subscriber_and_five_pictures_or_cl
     elastic = ControllerSpec("see", ControllerKind.SERIES_ELASTIC, ("k",))
     with (
         RobotNode("vinebot", URDF, imus=["base_imu"], wrenches=["wrist"], controllers=[elastic]) as robot,
-        SensorNode("vinebot_sensors", cameras=["camera"], lidars=["lidar"]) as sensors,
+        SensorNode("vinebot_sensors", sensors={"camera": "camera", "lidar": "lidar"}) as sensors,
     ):
         depths = {name: topic.publisher.qos_profile.depth for name, topic in robot._topics.items()}
         assert {name: depths[name] for name in steps} == dict.fromkeys(steps, 1000)
@@ -304,7 +304,7 @@ TYPES = {
 def test_no_message_is_built_without_a_subscriber(monkeypatch):
     with (
         RobotNode("vinebot", URDF) as robot,
-        SensorNode("vinebot_sensors", cameras=["head_front_camera"], lidars=["lidar"]) as sensors,
+        SensorNode("vinebot_sensors", sensors={"head_front_camera": "camera", "lidar": "lidar"}) as sensors,
         StockNode() as peer,
     ):
         heard: list[JointState] = []
@@ -315,8 +315,8 @@ def test_no_message_is_built_without_a_subscriber(monkeypatch):
 
         def tick() -> None:
             robot.publish_robot_state(robot_sample(1.0))
-            sensors.publish_camera(camera_frame(1.0, 32, 24))
-            sensors.publish_lidar(lidar_scan(1.0, 10))
+            sensors.publish(camera_frame(1.0, 32, 24))
+            sensors.publish(lidar_scan(1.0, 10))
             peer.spin()
 
         wait_until(lambda: len(heard) >= 20, tick)
@@ -353,7 +353,7 @@ def test_the_area_of_interest_is_a_circle_around_the_base_and_there_is_none_with
 
 
 def test_subscribers_are_counted_by_family_and_knows_its_topics():
-    with SensorNode("vinebot_sensors", cameras=["left", "left_arm"]) as node, StockNode() as peer:
+    with SensorNode("vinebot_sensors", sensors={"left": "camera", "left_arm": "camera"}) as node, StockNode() as peer:
         subscription = peer.node.create_subscription(
             Image, "/left_arm/depth/image_raw", lambda _: None, rclpy.qos.qos_profile_sensor_data
         )
@@ -558,7 +558,7 @@ def test_contacts_are_one_cloud_a_step():
 
 
 def test_the_newest_replaces_what_waits_and_is_counted():
-    with SensorNode("vinebot", cameras=["left"]) as node:
+    with SensorNode("vinebot", sensors={"left": "camera"}) as node:
         topic = node._topics["left/rgb/image_raw"]
         busy = threading.Event()
         go = threading.Event()
@@ -582,7 +582,7 @@ def test_the_newest_replaces_what_waits_and_is_counted():
 
 
 def test_a_message_that_cannot_be_built_is_counted_and_the_rest_goes_on(caplog):
-    with SensorNode("vinebot", cameras=["left"]) as node:
+    with SensorNode("vinebot", sensors={"left": "camera"}) as node:
         topic = node._topics["left/rgb/image_raw"]
         for _ in range(3):
             before = topic.dropped
@@ -599,7 +599,10 @@ def test_closing_leaves_nothing_behind():
     handler = signal.getsignal(signal.SIGINT)
     threads = set(threading.enumerate())
     for _ in range(3):
-        for node in (RobotNode("vinebot", URDF), SensorNode("vinebot_sensors", cameras=["head_front_camera"])):
+        for node in (
+            RobotNode("vinebot", URDF),
+            SensorNode("vinebot_sensors", sensors={"head_front_camera": "camera"}),
+        ):
             assert signal.getsignal(signal.SIGINT) is handler
             node.close()
             node.close()
@@ -624,8 +627,11 @@ def test_names_that_ros_refuses_are_said_in_one_line(arguments, words):
 
 
 def test_unknown_camera_is_named():
-    with SensorNode("vinebot", cameras=["left"]) as node, pytest.raises(ValueError, match=r"no camera 'right'.*: left"):
-        node.publish_camera(camera_frame(0.0, 32, 24, name="right"))
+    with (
+        SensorNode("vinebot", sensors={"left": "camera"}) as node,
+        pytest.raises(ValueError, match=r"no sensor 'right'.*: left"),
+    ):
+        node.publish(camera_frame(0.0, 32, 24, name="right"))
 
 
 def test_the_monitor_counts_gaps_and_stamps_that_go_back():

@@ -241,7 +241,7 @@ def test_a_parameter_file_counts_from_the_start(tmp_path):
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     with (
         RobotNode("r", "<robot name='r'/>", params_file=file) as node,
-        SensorNode("s", cameras=["cam"], params_file=file) as sensors,
+        SensorNode("s", sensors={"cam": "camera"}, params_file=file) as sensors,
         StockNode() as peer,
     ):
         node.publish_environment_static(("pole_0",), REST[None])
@@ -284,12 +284,12 @@ def test_depth_labels_and_rates_of_sensors():
     labels = np.ones((6, 8), np.int32)
     frame = CameraFrame(1.0, "camera", info, REST, np.zeros((6, 8, 3), np.uint8), depth, labels, exact)
     images: list[Image] = []
-    with SensorNode("r_sensors", cameras=["camera"], rates={"camera": 30.0}) as node, StockNode() as peer:
+    with SensorNode("r_sensors", sensors={"camera": "camera"}, rates={"camera": 30.0}) as node, StockNode() as peer:
         peer.node.create_subscription(Image, "camera/depth/image_raw", images.append, 10)
         peer.node.create_subscription(Image, "camera/labels", lambda _: None, 10)
 
         def tick() -> None:
-            node.publish_camera(frame)
+            node.publish(frame)
             peer.spin(0.01)
 
         def last() -> tuple[str, float]:
@@ -297,7 +297,7 @@ def test_depth_labels_and_rates_of_sensors():
             return images[-1].encoding, float(np.frombuffer(images[-1].data, kind)[0])
 
         wait_until(lambda: images and last() == ("32FC1", 1.5), tick, "depth")
-        assert node.camera_outputs_wanted("camera") == CameraOutput.DEPTH | CameraOutput.LABELS
+        assert node.outputs_wanted("camera") == CameraOutput.DEPTH | CameraOutput.LABELS
         put = Setter(peer, "/r_sensors", tick)
         for name, value in (
             ("camera.exact_depth", True),
@@ -308,7 +308,7 @@ def test_depth_labels_and_rates_of_sensors():
         ):
             assert put(name, value) == ""
         wait_until(lambda: last() == ("16UC1", 1250.0), tick, "exact depth in millimetres")
-        assert node.camera_outputs_wanted("camera") == CameraOutput.EXACT_DEPTH
+        assert node.outputs_wanted("camera") == CameraOutput.EXACT_DEPTH
         assert node.rate("camera") == 5.0
         for name, value in (("camera.rate", 0.0), ("camera.jpeg_quality", 101), ("camera.exact_depth", "yes")):
             assert put(name, value), name
@@ -320,11 +320,11 @@ def test_ranges_of_a_lidar_without_its_errors():
     above = frames.pose(np.array([0.0, 0.0, 1.2]))
     (plane, view) = sensor_scenes.world()
     times = itertools.count()
-    with SensorNode("r_sensors", lidars=["lidar"]) as node, StockNode() as peer:
+    with SensorNode("r_sensors", sensors={"lidar": "lidar"}) as node, StockNode() as peer:
         peer.node.create_subscription(PointCloud2, "lidar/points", clouds.append, 10)
         lidar = Lidar(LidarSpec.load("vlp16"), "lidar")
-        wanted = lambda: node.lidar_outputs_wanted("lidar")  # noqa: E731
-        sensor = ScheduledSensor(lidar, node.publish_lidar, wanted)
+        wanted = lambda: node.outputs_wanted("lidar")  # noqa: E731
+        sensor = ScheduledSensor(lidar, node.publish, wanted)
         scheduler = SensorScheduler(sensor_scenes.empty(), [sensor], primitives=plane)
 
         def tick() -> None:
@@ -339,7 +339,7 @@ def test_ranges_of_a_lidar_without_its_errors():
             return float(np.abs(heights + 1.2).max())
 
         wait_until(lambda: clouds, tick, "a cloud")
-        assert node.lidar_outputs_wanted("lidar") == CameraOutput.DEPTH
+        assert node.outputs_wanted("lidar") == CameraOutput.DEPTH
         assert error() > 0.005
         put = Setter(peer, "/r_sensors", tick)
         assert put("lidar.exact_ranges", True) == ""

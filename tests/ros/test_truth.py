@@ -318,16 +318,16 @@ def test_the_example_of_a_perception_node_finds_bunches_in_colour_and_depth(peer
             found.append(np.array([words[4], words[6], words[8]], float))
 
     with (
-        SensorNode("sensors", cameras=["head_front_camera"]) as node,
+        SensorNode("sensors", sensors={"head_front_camera": "camera"}) as node,
         subprocess.Popen([sys.executable, str(file)], stdout=subprocess.PIPE, text=True) as finder,
     ):
         reader = threading.Thread(target=listen, args=(finder.stdout,))
         reader.start()
-        wait_until(lambda: node.camera_outputs_wanted("head_front_camera") & CameraOutput.DEPTH)
+        wait_until(lambda: node.outputs_wanted("head_front_camera") & CameraOutput.DEPTH)
         ticks = itertools.count(1)
 
         def send() -> None:
-            node.publish_camera(dataclasses.replace(picture, time=0.1 * next(ticks)))
+            node.publish(dataclasses.replace(picture, time=0.1 * next(ticks)))
             time.sleep(0.1)
 
         wait_until(lambda: len(found) >= 6, send)

@@ -29,6 +29,7 @@ from vinesim.core.errors import UsageError, WriteError
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.spec import load_scene
+from vinesim.scene.values import MultispectralMount
 from vinesim.sensors.export import annotations, dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.spec_file import SensorError
@@ -351,6 +352,27 @@ def test_a_damaged_file_makes_its_image_missing(whole: pathlib.Path, tmp_path: p
     assert dataset.missing_images(out, IMAGES) == []
     damage(next((out / kind).glob("000003.*")))
     assert dataset.missing_images(out, IMAGES) == [3]
+
+
+def test_a_sensor_adds_its_images_and_a_damaged_one_is_missing(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:
+    out = tmp_path / "set"
+    sensors = (MultispectralMount("bands", "optical", "rededge_mx", size=(64, 48)),)
+    plan = DatasetPlan(load_scene(scene), 5, "d435", (64, 48), sensors=sensors)
+    dataset.prepare_folder(plan, out, 1)
+    assert list(dataset.render_images(plan, out, [0])) == [0]
+    assert dataset.missing_images(out, 1) == []
+    record = json.loads((out / "records" / "000000.json").read_text())
+    assert record["sensors"]["bands"]["full_scale"] == 32768
+    nir = cv2.imread(str(out / "bands" / "nir" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    assert (nir.shape, nir.dtype) == ((48, 64), np.uint16)
+    before = nir.copy()
+    (out / "bands" / "nir" / "000000.png").unlink()
+    assert dataset.missing_images(out, 1) == [0]
+    list(dataset.render_images(plan, out, [0]))
+    after = cv2.imread(str(out / "bands" / "nir" / "000000.png"), cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(after, before)
+    with pytest.raises(DatasetError, match="was begun with sensors"):
+        dataset.prepare_folder(DatasetPlan(load_scene(scene), 5, "d435", (64, 48)), out, 1)
 
 
 @pytest.mark.long

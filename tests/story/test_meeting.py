@@ -136,7 +136,7 @@ class Meeting:
 
     def seen_by_robot(self) -> set[str]:
         """People in a picture of the robot's own camera."""
-        mount = self.robot.robot.description.cameras[0]
+        mount = self.robot.robot.description.sensors_of("camera")[0]
         spec = CameraSpec.load(mount.type)
         primitives = self.primitives
         primitives.update(self.robot.physics.snapshot())

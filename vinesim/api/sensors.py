@@ -15,7 +15,7 @@ import numpy as np
 from vinesim.api.simulation import Simulation, base_pose
 from vinesim.core.errors import UsageError
 from vinesim.robot.drives.controlled_robot import Robot
-from vinesim.scene.values import CameraFrame, CameraInfo, LidarScan
+from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, LidarMount, LidarScan
 from vinesim.sensors.camera import camera as rgbd
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN
 from vinesim.sensors.export import images
@@ -69,8 +69,7 @@ class Camera:
             robot: take the pose of a frame of this robot instead.
             frame: which one; the frame of the robot's first camera unless given.
         """
-        if robot is not None and frame is None and robot.description.cameras:
-            frame = robot.description.cameras[0].frame
+        frame = frame or _first_frame(robot, CameraMount.kind)
         if self._camera is None or self._last is not simulation:
             sun = DEFAULT_SUN if simulation.scene is None else simulation.scene.sun.direction()
             self._camera = rgbd.Camera(
@@ -116,8 +115,7 @@ class Lidar:
             robot: take the pose of a frame of this robot instead.
             frame: which one; the frame of the robot's first lidar unless given.
         """
-        if robot is not None and frame is None and robot.description.lidars:
-            frame = robot.description.lidars[0].frame
+        frame = frame or _first_frame(robot, LidarMount.kind)
         device = simulation.device
         if device not in self._lidars:
             self._lidars[device] = lidar.Lidar(self.spec, self._name, seed=self._seed, device=device)
@@ -131,6 +129,12 @@ def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndar
     if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
         raise UsageError(f"cannot look from {start.tolist()} at {end.tolist()}; give two points [3] m that differ")
     return images.look_at(start, end)
+
+
+def _first_frame(robot: Robot | None, kind: str) -> str | None:
+    """Where the first sensor of a kind sits on a robot; None if there is none."""
+    mounts = () if robot is None else robot.description.sensors_of(kind)
+    return mounts[0].frame if mounts else None
 
 
 def _sensor_pose(pose: Sequence[float] | np.ndarray | None, robot: Robot | None, frame: str | None) -> np.ndarray:

@@ -9,14 +9,14 @@ import os
 import pathlib
 import signal
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from vinesim.cli.render import parse_size
+from vinesim.cli.render import parse_sensors, parse_size
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.core.errors import UsageError, WriteError
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
@@ -61,6 +61,7 @@ def run(
     renderer: str,
     device: str,
     scheduler: str | None = None,
+    sensor: Sequence[str] | None = None,
 ) -> int:
     """Render the missing images, then gather the annotations of all images; the exit code."""
     if seed < 0:
@@ -80,6 +81,7 @@ def run(
         randomizer,
         renderer_selection.check_renderer(renderer, device),
         device,
+        parse_sensors(sensor or (), None if size is None else parse_size(size)),
     )
     columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     running: list[Worker] = []

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from vinesim.client.composition.scene_composer import SceneComposer
     from vinesim.scene.model import Model
     from vinesim.scene.spec import Scene
-    from vinesim.scene.values import CameraInfo, Snapshot
+    from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
     from vinesim.sensors.camera.camera import CameraSpec
     from vinesim.sensors.primitives.ray_caster import RayCaster
     from vinesim.sensors.primitives.scene_primitives import Primitives
@@ -63,10 +63,12 @@ def run(
     time: float = 0.0,
     renderer: str = "warp",
     device: str = "cpu",
+    sensors: Sequence[str] = (),
 ) -> int:
     """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON.
 
-    The viewpoint is ``at`` and ``look``; those of a ``path`` file go to the folders ``0000``, ``0001``, ... of ``out``.
+    Each of ``sensors`` looks from there as well, into ``<sensor>_<image>.png`` and ``<sensor>.json``. The viewpoint is
+    ``at`` and ``look``; those of a ``path`` file go to the folders ``0000``, ``0001``, ... of ``out``.
     """
     viewpoints = _viewpoints(at, look, path)
     if device != "cpu":  # these imports cost half a second
@@ -86,6 +88,7 @@ def run(
     renderer_selection.check_renderer(renderer, device)
     spec = CameraSpec.load(camera)
     info = resized_intrinsics(spec, None if size is None else parse_size(size))
+    mounts = parse_sensors(sensors, None if size is None else parse_size(size))
     plan = with_seed(load_scene(scene), seed)
     staged = parse_composition(robots, people, crates)
     if hour is not None:
@@ -101,7 +104,7 @@ def run(
     primitives.update(view)
     for viewpoint in viewpoints:
         _check_not_enclosed(primitives, viewpoint)
-    stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info, time)
+    stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info, time, mounts)
     try:
         with concurrent.futures.ThreadPoolExecutor(1, "png") as writer:
             written: list[concurrent.futures.Future[None]] = []
@@ -154,6 +157,8 @@ class _Stage:
     info: CameraInfo
     time: float
     """[s] Simulated, for the sun."""
+    sensors: tuple[RenderedMount, ...]
+    """Which look as well, from the camera's place."""
 
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
         """The picture from a viewpoint, and in words what is in sight."""
@@ -162,6 +167,7 @@ class _Stage:
         from vinesim.sensors.camera.camera import Camera
         from vinesim.sensors.export import annotations as formats
         from vinesim.sensors.export import images as picture
+        from vinesim.sensors.sensor import SensorSetting, export_frame
 
         pose = picture.look_at(viewpoint.eye, viewpoint.target)
         seen = ground_truth.render_buffers(self.primitives, self.info, pose)
@@ -195,6 +201,11 @@ class _Stage:
             "camera": formats.camera_record(self.spec.model, self.info, pose),
             "truth": {**described, "bunches": formats.bunch_records(truths, self.info)},
         }
+        setting = SensorSetting(self.plan.sun.direction(self.time), device=self.primitives.device)
+        for mount in self.sensors:
+            kept = export_frame(mount, self.primitives, self.view, pose, setting)
+            images |= {f"{mount.name}_{name}": values for name, values in kept.images.items()}
+            records[mount.name] = kept.record
         in_sight = [one for one in truths if one.pixels]
         return _Picture(images, records), (
             f"{len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
@@ -299,6 +310,27 @@ def parse_point(option: str, text: str) -> np.ndarray:
     if value.shape != (3,) or not np.isfinite(value).all() or np.abs(value).max() > 1e4:
         raise UsageError(f"{option} is {text!r}; give X,Y,Z in metres, such as 1.2,0.8,1.4")
     return value
+
+
+def parse_sensors(texts: Sequence[str], size: tuple[int, int] | None) -> tuple[RenderedMount, ...]:
+    """The sensors of ``--sensor``, pictures of the given ``size`` [px]; :class:`UsageError` if one is wrong."""
+    from vinesim.scene.values import SENSOR_KINDS, PictureMount
+    from vinesim.sensors.sensor import maker
+
+    mounts: dict[str, RenderedMount] = {}
+    kinds = [kind for kind in SENSOR_KINDS if texts and maker(kind).export is not None]
+    for text in texts:
+        kind, _, file = text.partition(":")
+        if kind not in kinds or not file:
+            raise UsageError(f"--sensor is {text!r}; give KIND:FILE, of the kind {' or '.join(kinds)}")
+        maker(kind).rate(file)  # raises SensorError
+        mount = SENSOR_KINDS[kind].mount(pathlib.Path(file).stem, "camera_optical_frame", file)
+        if isinstance(mount, PictureMount):
+            mount = msgspec.structs.replace(mount, size=size)
+        if mount.name in mounts:
+            raise UsageError(f"--sensor {text}: there are two of the name {mount.name!r}; rename one of the files")
+        mounts[mount.name] = mount
+    return tuple(mounts.values())
 
 
 def parse_size(text: str) -> tuple[int, int]:

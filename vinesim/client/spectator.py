@@ -15,11 +15,11 @@ from vinesim.net.replication.replication_state import SPECTATOR
 from vinesim.net.replication.replicator import Replicator
 from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.description import RobotDescription
-from vinesim.scene.values import CameraFrame, CameraInfo, HumanPose, RobotUpdate
+from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, HumanPose, RobotUpdate
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import images
 from vinesim.sensors.primitives.scene_primitives import Primitives
-from vinesim.sensors.scheduler import load_kernels
+from vinesim.sensors.sensor import load_kernels
 from vinesim.wind.sway import Sway
 
 EYE_HEIGHT = 1.6
@@ -107,7 +107,7 @@ class PictureWriter:
     ) -> None:
         """One picture every ``period`` [s] of simulated time, into a ``folder`` that exists."""
         if device == "cpu":
-            load_kernels()
+            load_kernels(CameraMount.kind)
         focal = 0.5 * self.WIDTH / np.tan(0.5 * self.ANGLE)
         info = CameraInfo(
             self.WIDTH, self.HEIGHT, focal, focal, 0.5 * (self.WIDTH - 1), 0.5 * (self.HEIGHT - 1), "viewpoint"

@@ -1,4 +1,4 @@
-"""The ROS 2 node of a robot's cameras and lidars, as their drivers are on a real robot.
+"""The ROS 2 node of a robot's sensors, as their drivers are on a real robot.
 
 Frames are passed by the thread that renders them; a thread of the node builds and sends the messages. Of each topic
 only the newest frame waits: an older one that was not sent is replaced and counted as dropped.
@@ -6,57 +6,91 @@ only the newest frame waits: an older one that was not sent is replaced and coun
 
 from __future__ import annotations
 
+import importlib
 import pathlib
 import threading
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, Protocol
 
 from vinesim.ros.messages import message_packages
 from vinesim.ros.node import Node
-from vinesim.ros.publishers.camera import CameraPublisher
-from vinesim.ros.publishers.lidar import LidarPublisher
-from vinesim.ros.topic import Build, PendingMessage, Topic
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan
+from vinesim.ros.parameters import Parameters
+from vinesim.ros.topic import Advertise, Build, PendingMessage, Topic
+from vinesim.scene.values import SENSOR_KINDS, CameraOutput, SensorFrame
 
 TRUTH = "publish_truth"
 """Name of a parameter."""
-SensorPublisher = TypeVar("SensorPublisher", CameraPublisher, LidarPublisher)
+
+
+class SensorPublisher(Protocol):
+    """The topics of one sensor: ``PUBLISHER`` of the module that :class:`~vinesim.scene.values.SensorKind` names."""
+
+    packages: ClassVar[tuple[str, ...]]
+    """Message packages that must be importable and may not come with ROS."""
+
+    def __init__(
+        self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
+    ) -> None:
+        """``number`` counts the sensors of its kind from 0; ``channels`` are its images, if its data file decides."""
+        ...
+
+    @property
+    def truth(self) -> Sequence[Topic]:
+        """Topics that no real sensor has."""
+        ...
+
+    def wanted(self) -> CameraOutput:
+        """What the present subscribers need."""
+        ...
+
+    def pending(self, frame: Any) -> Iterator[PendingMessage]:
+        """The messages of one frame, the cheap ones first."""
+        ...
+
+
+def publisher(kind: str) -> type[SensorPublisher]:
+    """What publishes sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    return importlib.import_module(SENSOR_KINDS[kind].publisher).PUBLISHER
 
 
 class SensorNode(Node):
-    """The topics of ``cameras`` and ``lidars``, the names under which they publish."""
+    """The topics of ``sensors``: the kind of each by the name under which it publishes."""
 
     def __init__(
         self,
         name: str,
         *,
         namespace: str = "",
-        cameras: Sequence[str] = (),
-        lidars: Sequence[str] = (),
+        sensors: Mapping[str, str],
+        channels: Mapping[str, Sequence[str]] | None = None,
         rates: Mapping[str, float] | None = None,
         params_file: pathlib.Path | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """``rates``: those of sensors [Hz], with which their parameters start; others have none. ``params_file``,
-        ``parameters``: see :class:`Node`."""
-        if cameras:
-            message_packages.ensure_importable(["vision_msgs"])
-        self._camera_names = cameras
-        self._lidar_names = lidars
+        """``channels``: images of a sensor, where its data file decides which there are. ``rates``: those of sensors
+        [Hz], with which their parameters start; others have none. ``params_file``, ``parameters``: see :class:`Node`.
+        """
+        self._kinds = sensors
+        self._channels = channels or {}
+        needed = {package: None for kind in sensors.values() for package in publisher(kind).packages}
+        if needed:
+            message_packages.ensure_importable(needed)
         self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}
         """The newest message of each topic; the one that waits longest is the first."""
         self._changed = threading.Condition()
         self._sending = False
-        super().__init__(name, namespace, (*cameras, *lidars), params_file, parameters)
+        super().__init__(name, namespace, tuple(sensors), params_file, parameters)
 
     def _open(self) -> None:
         parameters = self._parameters
-        self._cameras = {one: CameraPublisher(self._advertise, one, parameters) for one in self._camera_names}
-        self._lidars = {  # Nav2 expects /scan
-            one: LidarPublisher(self._advertise, one, f"{one}/scan" if i else "scan", parameters)
-            for i, one in enumerate(self._lidar_names)
-        }
+        self._publishers: dict[str, SensorPublisher] = {}
+        count = dict.fromkeys(self._kinds.values(), 0)
+        for sensor, kind in self._kinds.items():
+            self._publishers[sensor] = publisher(kind)(
+                self._advertise, sensor, parameters, number=count[kind], channels=self._channels.get(sensor, ())
+            )
+            count[kind] += 1
         for sensor, rate in self._rates.items():
             parameters.declare(
                 f"{sensor}.rate", rate, "Pictures or revolutions a second [Hz].", (0.1, max(rate, 100.0))
@@ -64,8 +98,9 @@ class SensorNode(Node):
         parameters.declare(TRUTH, True, "Publish labels of pictures, and detections.", changed=self._mute_truth)
 
     def _mute_truth(self) -> None:
-        for camera in self._cameras.values():
-            camera.mute_truth(not self._parameters[TRUTH])
+        for one in self._publishers.values():
+            for topic in one.truth:
+                topic.mute(not self._parameters[TRUTH])
 
     def rate(self, sensor: str) -> float:
         """Rate [Hz] that is asked for of a sensor of ``rates``."""
@@ -78,24 +113,13 @@ class SensorNode(Node):
         with self._changed:
             self._changed.notify_all()
 
-    def publish_camera(self, frame: CameraFrame) -> None:
-        """Publish one picture of one of ``cameras``; :class:`ValueError` if there is no such camera."""
-        self._enqueue(self._publisher(self._cameras, "camera", frame.name).pending(frame))
+    def publish(self, frame: SensorFrame) -> None:
+        """Publish one frame of one of ``sensors``; :class:`ValueError` if there is no such sensor."""
+        self._enqueue(self._publisher(frame.name).pending(frame))
 
-    def publish_lidar(self, scan: LidarScan) -> None:
-        """Publish one revolution of one of ``lidars``; :class:`ValueError` if there is no such lidar."""
-        self._enqueue(self._publisher(self._lidars, "lidar", scan.name).pending(scan))
-
-    def camera_outputs_wanted(self, camera: str) -> CameraOutput:
-        """What subscribers need of the frames of one of ``cameras``; :class:`ValueError` if there is no such camera."""
-        return self._publisher(self._cameras, "camera", camera).wanted()
-
-    def lidar_outputs_wanted(self, lidar: str) -> CameraOutput:
-        """What subscribers need of the scans of one of ``lidars``: depth, exact depth, or none.
-
-        :class:`ValueError` if there is no such lidar.
-        """
-        return self._publisher(self._lidars, "lidar", lidar).wanted()
+    def outputs_wanted(self, sensor: str) -> CameraOutput:
+        """What subscribers need of the frames of one of ``sensors``; :class:`ValueError` if there is no such sensor."""
+        return self._publisher(sensor).wanted()
 
     @property
     def has_pending(self) -> bool:
@@ -103,10 +127,11 @@ class SensorNode(Node):
         with self._changed:
             return bool(self._pending) or self._sending
 
-    def _publisher(self, kinds: Mapping[str, SensorPublisher], kind: str, name: str) -> SensorPublisher:
-        if name not in kinds:
-            raise ValueError(f"no {kind} {name!r} in this node; it was made with: {', '.join(kinds) or 'none'}")
-        return kinds[name]
+    def _publisher(self, name: str) -> SensorPublisher:
+        if name not in self._publishers:
+            known = ", ".join(self._publishers) or "none"
+            raise ValueError(f"no sensor {name!r} in this node; it was made with: {known}")
+        return self._publishers[name]
 
     def _enqueue(self, messages: Iterable[PendingMessage], *, always: bool = False) -> None:
         with self._changed:

@@ -1,7 +1,7 @@
 """The schedule of a robot's sensors: it renders those that are due and wanted, and counts the frames that are late.
 
-A camera renders a whole frame at once, from the newest snapshot. A lidar fires at every snapshot the shots that are
-due, from where it was at each of them, and delivers a revolution after its last shot.
+A sensor renders a whole frame at once, from the newest snapshot; so do cameras. A swept sensor takes at every snapshot
+the parts that are due, from where it was at each of them, and delivers a frame after the last: so do lidars.
 """
 
 from __future__ import annotations
@@ -9,28 +9,15 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
-import warp as wp
 
-from vinesim.kernels.lidar import lidar_echoes, lidar_raster
-from vinesim.kernels.raster import transform_primitives
 from vinesim.scene.model import Model
-from vinesim.scene.values import CameraFrame, CameraOutput, LidarScan, SensorMode, SensorPacing, Snapshot
-from vinesim.sensors.camera.camera import Camera, load_camera_kernels
-from vinesim.sensors.ground_truth import visible_bunches
-from vinesim.sensors.lidar.lidar import Lidar
-from vinesim.sensors.lidar.spinning_scan import SpinningScan
+from vinesim.scene.values import CameraOutput, SensorFrame, SensorMode, SensorPacing, Snapshot
 from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.sensors.sensor import Sensor, SweptSensor
 from vinesim.wind.sway import Sway
-
-
-def load_kernels() -> None:
-    """Compile the kernels of cameras and lidars, or read them from the cache, before the first frame is due."""
-    load_camera_kernels()
-    for module in (transform_primitives, lidar_raster, lidar_echoes):
-        wp.load_module(module, device="cpu")
-
 
 LEAST_RATE_MARGIN = 0.9
 """Live sensors are taken so much more often than their least rate asks, since snapshots come at whole steps."""
@@ -38,16 +25,16 @@ COST_GAIN = 0.3
 """Share of the newest frame in the time that frames take."""
 
 DemandQuery = Callable[[], CameraOutput]
-"""The outputs of a sensor that are wanted now; a lidar scans if there is any, exactly if it is exact depth alone."""
+"""The outputs of a sensor that are wanted now: it renders if there is any."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ScheduledSensor:
     """One sensor, the callback for its output, and what is wanted of it."""
 
-    sensor: Camera | Lidar
-    deliver: Callable[[CameraFrame | LidarScan], None]
-    """Called with every frame or scan."""
+    sensor: Sensor
+    deliver: Callable[[Any], None]
+    """Called with every frame."""
     wanted: DemandQuery = lambda: CameraOutput.ALL
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
@@ -97,21 +84,21 @@ class SensorScheduler:
         self._next_time = dict.fromkeys(names, -np.inf)
         self._is_first = dict.fromkeys(names, True)
         """Whether a sensor has delivered at most one frame since it became wanted; the first may take longer."""
-        self._scans = {m.name: SpinningScan(m.sensor, m.rate) for m in sensors if isinstance(m.sensor, Lidar)}
+        self._sweeps = {m.name: m.sensor.sweep(m.rate) for m in sensors if isinstance(m.sensor, SweptSensor)}
         self._pacing = pacing
         self._on_taken = on_taken
         self._taken: dict[str, float] = {}
         """Simulated time of the newest snapshot that each wanted sensor has taken [s]."""
         self._costs: dict[str, float] = {}
-        """Real time that a frame or revolution of each sensor takes, smoothed [s]."""
+        """Real time that a frame of each sensor takes, smoothed [s]."""
         self._unfinished = dict.fromkeys(names, 0.0)
-        """Real time that the present revolution of each lidar has taken so far [s]."""
+        """Real time that the present frame of each swept sensor has taken so far [s]."""
         self._sway = Sway(model)
         self._moved = np.zeros(len(model.tree_first), bool)
         """[tree] whether it moved since the primitives were posed."""
 
     def warm_up(self, snapshot: Snapshot, poses: SensorPoses) -> Iterator[str]:
-        """Render one frame or revolution of every sensor and discard it; yields the name of each before.
+        """Render one frame of every sensor and discard it; yields the name of each before.
 
         The first of each takes many times as long as the others: buffers, tables and the last kernels are made.
         """
@@ -119,14 +106,7 @@ class SensorScheduler:
         self._update_primitives(snapshot, poses)
         for scheduled in self.sensors:
             yield scheduled.name
-            pose = poses[scheduled.name]
-            if isinstance(scheduled.sensor, Camera):
-                scheduled.sensor.render(self.primitives, pose, snapshot.time, outputs=outputs)
-            else:
-                lidar = scheduled.sensor
-                lidar.begin_revolution()
-                lidar.fire(self.primitives, 0, np.repeat(pose[None], lidar.firings, 0))
-                lidar.finish_revolution(pose, snapshot.time)
+            scheduled.sensor.frame(self.primitives, snapshot, poses[scheduled.name], outputs)
 
     def advance(
         self, snapshot: Snapshot, poses: SensorPoses, earlier: Sequence[tuple[float, SensorPoses]] = ()
@@ -136,13 +116,13 @@ class SensorScheduler:
         ``earlier``: poses of the sensors between the last call and this one, with their times [s].
         """
         self._moved[snapshot.moved_trees] = True
-        for name, scan in self._scans.items():
+        for name, sweep in self._sweeps.items():
             for moment, then in (*earlier, (snapshot.time, poses)):
                 if name in then:
-                    scan.pose_history.add(moment, then[name])
+                    sweep.add_pose(moment, then[name])
         due = [m for m in self.sensors if self._is_due(m, snapshot.time, poses)]
         for scheduled in self.sensors:
-            if scheduled in due or (scheduled.name in self._scans and scheduled.name in self._taken):
+            if scheduled in due or (scheduled.name in self._sweeps and scheduled.name in self._taken):
                 self._taken[scheduled.name] = snapshot.time
         self._on_taken()
         if not due:
@@ -187,13 +167,13 @@ class SensorScheduler:
     def _gap(self, scheduled: ScheduledSensor) -> float:
         """Longest simulated time between two snapshots that the mode allows a sensor to take [s]."""
         is_live = self._pacing.mode is SensorMode.LIVE
-        if isinstance(scheduled.sensor, Lidar) and not is_live:
-            return 1.0 / scheduled.sensor.rate  # a revolution that is taken later than this is left out
+        if scheduled.name in self._sweeps and not is_live:
+            return 1.0 / scheduled.sensor.rate  # a frame that is taken later than this is left out
         return max(scheduled.period, LEAST_RATE_MARGIN / self._pacing.least_rate) if is_live else scheduled.period
 
     def _due_time(self, scheduled: ScheduledSensor) -> float:
-        """When the next picture of a camera is due [s]: the world must get so far."""
-        return -np.inf if scheduled.name in self._scans else self._next_time[scheduled.name]
+        """When the next frame that is rendered at once is due [s]: the world must get so far."""
+        return -np.inf if scheduled.name in self._sweeps else self._next_time[scheduled.name]
 
     def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> Snapshot:
         """Pose the primitives; the snapshot as it is drawn, good until the next call."""
@@ -203,26 +183,16 @@ class SensorScheduler:
         self._moved[:] = False
         return seen
 
-    def _results(
-        self, scheduled: ScheduledSensor, snapshot: Snapshot, pose: np.ndarray
-    ) -> Iterator[CameraFrame | LidarScan]:
+    def _results(self, scheduled: ScheduledSensor, snapshot: Snapshot, pose: np.ndarray) -> Iterator[SensorFrame]:
         """Render what a sensor has to deliver of a snapshot that the primitives show."""
-        now = snapshot.time
-        if isinstance(scheduled.sensor, Camera):
-            camera = scheduled.sensor
-            outputs = scheduled.wanted()
-            frame = camera.render(self.primitives, pose, now, outputs=outputs)
-            if CameraOutput.BUNCHES in outputs:
-                bunches = visible_bunches(self.primitives, snapshot, camera.info, frame.pose, camera.rasterizer)
-                frame = dataclasses.replace(frame, bunches=bunches)
-            yield frame
+        sweep = self._sweeps.get(scheduled.name)
+        if sweep is None:
+            yield scheduled.sensor.frame(self.primitives, snapshot, pose, scheduled.wanted())
             return
-        scan = self._scans[scheduled.name]
-        scheduled.sensor.is_exact = scheduled.wanted() == CameraOutput.EXACT_DEPTH
-        scan.set_period(scheduled.period)
-        missed = scan.dropped
-        yield from scan.advance(self.primitives, now)
-        self.dropped[scheduled.name] += scan.dropped - missed
+        sweep.set_demand(scheduled.period, scheduled.wanted())
+        missed = sweep.dropped
+        yield from sweep.advance(self.primitives, snapshot.time)
+        self.dropped[scheduled.name] += sweep.dropped - missed
 
     def _is_due(self, scheduled: ScheduledSensor, now: float, poses: SensorPoses) -> bool:
         """Whether a sensor has something to render at simulation time ``now`` [s]; counts the frames it has missed."""
@@ -231,13 +201,13 @@ class SensorScheduler:
             self._next_time[name] = -np.inf  # a subscriber that returns gets a frame at once, and missed none
             self._is_first[name] = True
             self._taken.pop(name, None)
-            if name in self._scans:
-                self._scans[name].cancel(now)
+            if name in self._sweeps:
+                self._sweeps[name].cancel(now)
                 self._unfinished[name] = 0.0
             return False
         self._taken.setdefault(name, now)
-        if name in self._scans:
-            return self._scans[name].is_due(now)
+        if name in self._sweeps:
+            return self._sweeps[name].is_due(now)
         due = self._next_time[name]
         period = scheduled.period
         if now < due - 2.0 * period:  # time was set back

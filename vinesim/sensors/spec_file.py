@@ -26,7 +26,7 @@ class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SensorError(DataError):
-    """A camera or lidar file that cannot be used. The text is one line."""
+    """A sensor's file that cannot be used. The text is one line."""
 
 
 def load(folder: str, name: str, kind: type[T]) -> T:
@@ -54,6 +54,10 @@ def _check(path: pathlib.Path, spec: msgspec.Struct, place: str = "") -> None:
                     raise SensorError(f"{path}: {place}{field} is {wrong[0]:g} {unit}; give {low:g} to {high:g} {unit}")
         elif isinstance(found, msgspec.Struct):
             _check(path, found, f"{place}{field}.")
+        elif isinstance(found, tuple):
+            for number, one in enumerate(found):
+                if isinstance(one, msgspec.Struct):
+                    _check(path, one, f"{place}{field}[{number}].")
 
 
 def noise_rng(seed: int, name: str, number: int) -> np.random.Generator:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, Device, ImageSize, Renderer, Scene, Seed
+from vinesim.cli.commands.options import Camera, Device, ImageSize, Renderer, Scene, Seed, Sensors
 
 
 def scene_show(
@@ -89,6 +89,7 @@ def render(
     crate: Annotated[
         list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
     ] = None,
+    sensor: Sensors = None,
     renderer: Renderer = "warp",
     device: Device = "cpu",
 ) -> None:
@@ -101,6 +102,7 @@ def render(
     Examples:
       vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7
       vinesim render demo --path viewpoints.csv --out tour
+      vinesim render demo --at 0.4,1.2,1.3 --look 3,1,1.7 --sensor multispectral:rededge_mx
       vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
       vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick
       --crate 1.8,0.75,0,0.4
@@ -123,6 +125,7 @@ def render(
         robots=robot or (),
         people=person or (),
         crates=crate or (),
+        sensors=sensor or (),
     )
     raise typer.Exit(code)
 
@@ -133,6 +136,7 @@ def dataset(
     scene: Scene = "demo",
     seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
     camera: Camera = "d435",
+    sensor: Sensors = None,
     size: ImageSize = None,
     workers: Annotated[
         int | None,

@@ -17,6 +17,12 @@ Camera = Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")]
 ImageSize = Annotated[
     str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")
 ]
+Sensors = Annotated[
+    list[str] | None,
+    typer.Option(
+        help="KIND:FILE: looks from the camera's place as well, such as multispectral:rededge_mx; may repeat."
+    ),
+]
 Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")]
 StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
 

@@ -21,11 +21,9 @@ from vinesim.robot.description.loader import load_description
 from vinesim.ros import middleware
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene, with_seed
+from vinesim.scene.values import SENSOR_KINDS
 from vinesim.web import page_files
 
-CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info")
-COSTLY_TOPICS = ("depth/points", "labels")
-"""Topics of a camera that the listener leaves after the first message: no user looks at so much all the time."""
 VISITOR_SENSOR_HZ = "1"
 """The visitor has come to see a bunch move; its own sensors only have to be there."""
 
@@ -36,7 +34,7 @@ class ListenedTopics:
 
     always: tuple[str, ...]
     once: tuple[str, ...]
-    """Only until their first message."""
+    """Only until their first message: no user looks at so much all the time."""
     events: tuple[str, ...]
     """The start does not wait for these: they may stay silent."""
     owners: Mapping[str, str]
@@ -165,7 +163,7 @@ def _start_clients(
 
 
 def listened_topics(robot: RobotDescription) -> ListenedTopics:
-    """All topics of the picker; of the visitor its joints, its first picture and its first scan."""
+    """All topics of the picker; of the visitor its joints, and the first frame of each sensor."""
     always = [
         "/clock",
         "/robot_description",
@@ -180,18 +178,12 @@ def listened_topics(robot: RobotDescription) -> ListenedTopics:
     ]
     once = []
     owners = {f"/{VISITOR}/joint_states": VISITOR}
-    for camera in robot.cameras:
-        owner = f"{camera.name} of {PICKER}"
-        always += [f"/{camera.name}/{topic}" for topic in CAMERA_TOPICS]
-        once += [f"/{camera.name}/{topic}" for topic in COSTLY_TOPICS]
-        owners |= {f"/{camera.name}/{topic}": owner for topic in (*CAMERA_TOPICS, *COSTLY_TOPICS)}
-    for lidar in robot.lidars:
-        always.append(f"/{lidar.name}/points")
-        owners[f"/{lidar.name}/points"] = f"{lidar.name} of {PICKER}"
-    for sensor, topic in (
-        *((c, "rgb/image_raw") for c in robot.cameras),
-        *((lidar, "points") for lidar in robot.lidars),
-    ):
-        once.append(f"/{VISITOR}/{sensor.name}/{topic}")
-        owners[once[-1]] = f"{sensor.name} of {VISITOR}"
+    for sensor in robot.sensors:
+        kind = SENSOR_KINDS[sensor.kind]
+        always += [f"/{sensor.name}/{topic}" for topic in kind.topics]
+        costly = [f"/{sensor.name}/{topic}" for topic in kind.costly_topics]
+        visited = f"/{VISITOR}/{sensor.name}/{kind.topics[0]}"
+        once += [*costly, visited]
+        owners |= dict.fromkeys((*always[-len(kind.topics) :], *costly), f"{sensor.name} of {PICKER}")
+        owners[visited] = f"{sensor.name} of {VISITOR}"
     return ListenedTopics(tuple(always), tuple(once), ("/vine/contacts",), owners)

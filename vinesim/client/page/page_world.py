@@ -18,13 +18,13 @@ from vinesim.rigid.human_posture import SIDES
 from vinesim.scene.appearance import load_shears
 from vinesim.scene.ids import Organ, object_name
 from vinesim.scene.model import Model
-from vinesim.scene.values import INTENTIONS, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
+from vinesim.scene.values import INTENTIONS, CameraMount, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
 from vinesim.sensors.camera.exposure import usual_exposure
 from vinesim.sensors.camera.sunlight import OutdoorLight
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.primitives.static_primitives import row_layout
-from vinesim.sensors.scheduler import load_kernels
+from vinesim.sensors.sensor import load_kernels
 from vinesim.web import array_message
 from vinesim.web.page_input import PageInput, ReplayCommand, TrackedPerson
 from vinesim.web.page_server import PageServer
@@ -255,7 +255,7 @@ class PageWorld:
     def _lay_out(self) -> Primitives:
         """The primitives of plants and ground."""
         if self._primitives is None:
-            load_kernels()
+            load_kernels(CameraMount.kind)
             self._sway = Sway(self._client.model)
             self._primitives = Primitives(self._client.model, grass=GRASS)
         return self._primitives

@@ -8,10 +8,11 @@ from vinesim.core import allocator, frames
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
-from vinesim.scene.values import Snapshot
+from vinesim.scene.values import CameraMount, LidarMount, Snapshot
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
-from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
+from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
+from vinesim.sensors.sensor import load_kernels
 
 SCENE = "demo"
 CAMERA = "d435"
@@ -22,7 +23,7 @@ SIZE = (64, 48)
 
 def rehearse() -> None:
     """Render with sensors of a small vineyard on the CPU, and release their memory."""
-    load_kernels()
+    load_kernels(CameraMount.kind, LidarMount.kind)
     scene = load_scene(SCENE)
     spec = CameraSpec.load(CAMERA)
     model = generate(scene)

@@ -31,10 +31,13 @@ from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
 from vinesim.scene.state import State
 from vinesim.scene.values import (
+    SENSOR_KINDS,
     CameraFrame,
+    CameraMount,
     CameraOutput,
-    LidarScan,
+    RenderedMount,
     SegmentPoses,
+    SensorFrame,
     SensorMode,
     SensorPacing,
     Snapshot,
@@ -62,7 +65,7 @@ NICENESS = 10
 """The client's loop and its ROS process come first, but a renderer that is much nicer starves beside other programs
 (docs/decisions/sensor-process.md)."""
 POSE_HISTORY = 128
-"""Poses of the sensors that are kept for lidars: of 2.5 s."""
+"""Poses of the sensors that are kept for swept ones: of 2.5 s."""
 OFFSET_HISTORY = 512
 """Offsets of the world's time that are kept for the stamps of scans: of 10 s."""
 
@@ -100,8 +103,8 @@ class SensorConfig:
 
     @property
     def sensor_frames(self) -> dict[str, str]:
-        """Link that carries each camera and lidar, by name; the order of poses in snapshots."""
-        return {mount.name: mount.frame for mount in (*self.description.cameras, *self.description.lidars)}
+        """Link that carries each sensor, by name; the order of poses in snapshots."""
+        return {mount.name: mount.frame for mount in self.description.sensors}
 
 
 class SensorChannel:
@@ -184,6 +187,7 @@ class SensorWorker:
         self._last_number = 0
         self._pose_count = 0
         self._keeper = PictureKeeper() if config.keep_pictures else None
+        self._kept_camera = next((mount.name for mount in config.description.sensors_of(CameraMount.kind)), "")
         self._is_lockstep = config.pacing.mode is SensorMode.LOCKSTEP
         self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
         """Of all that each sensor has delivered, in lockstep."""
@@ -213,15 +217,15 @@ class SensorWorker:
 
     def _open_node(self, stack: contextlib.ExitStack) -> SensorNode:
         from vinesim.ros.sensor_node import SensorNode
+        from vinesim.sensors.sensor import maker
 
         config = self.config
-        description = self.config.description
         return stack.enter_context(
             SensorNode(
                 f"{ros_name(config.name)}_sensors",
                 namespace=config.namespace,
-                cameras=[m.name for m in description.cameras],
-                lidars=[m.name for m in description.lidars],
+                sensors={mount.name: mount.kind for mount in config.description.sensors},
+                channels={mount.name: maker(mount.kind).channels(mount.type) for mount in config.description.sensors},
                 rates=self._rates(),
                 params_file=config.params_file,
                 parameters=config.parameters,
@@ -230,46 +234,39 @@ class SensorWorker:
 
     def _rates(self) -> dict[str, float]:
         """Rates of all sensors at the start [Hz]."""
-        from vinesim.sensors.camera.camera import CameraSpec
-        from vinesim.sensors.lidar.lidar import LidarSpec
+        from vinesim.sensors.sensor import maker
 
         given = self.config.sensor_hz
-        description = self.config.description
-        cameras = {m.name: given or m.rate or CameraSpec.load(m.type).rate.value for m in description.cameras}
-        return cameras | {m.name: given or LidarSpec.load(m.type).rate.value for m in description.lidars}
+        return {m.name: given or m.rate or maker(m.kind).rate(m.type) for m in self.config.description.sensors}
 
     def _present_rate(self, name: str) -> Callable[[], float] | None:
         """The rate of a sensor that its parameter says."""
         return None if self.node is None else partial(self.node.rate, name)
 
     def _open_sensors(self) -> SensorScheduler:
-        from vinesim.sensors.camera.camera import Camera, CameraSpec
-        from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
         from vinesim.sensors.primitives.scene_primitives import Primitives
-        from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler, load_kernels
+        from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
+        from vinesim.sensors.sensor import SensorSetting, load_kernels, maker
 
+        config = self.config
         device = self._working_device()
         with self._awaiting_progress():
             compile_kernels(SENSOR_PACKAGES, device)
         self._awaits("kernels and scene")
         if device == "cpu":
-            load_kernels()
-        config = self.config
-        sensors = []
+            load_kernels(*{mount.kind: None for mount in config.description.sensors})
         seed = zlib.crc32(config.name.encode())  # no two robots have the same noise
-        for i, mount in enumerate(config.description.cameras):
-            spec = CameraSpec.load(mount.type)
-            info = spec.info(mount.frame, size=mount.size)
-            camera = Camera(spec, info, mount.name, config.sun, quality=mount.quality, seed=seed, device=device)
-            wanted = self._camera_demand(mount.name, self._keeper if i == 0 else None)
-            rate = config.sensor_hz or mount.rate
-            present = self._present_rate(mount.name)
-            sensors.append(ScheduledSensor(camera, self._deliver_camera, wanted, rate, present))
-        for mount in config.description.lidars:
-            lidar = Lidar(LidarSpec.load(mount.type), mount.name, mount.frame, seed=seed, device=device)
-            wanted = self._lidar_demand(mount.name)
-            present = self._present_rate(mount.name)
-            sensors.append(ScheduledSensor(lidar, self._deliver_lidar, wanted, config.sensor_hz, present))
+        setting = SensorSetting(config.sun, seed, device=device)
+        sensors = [
+            ScheduledSensor(
+                maker(mount.kind).make(mount, setting),
+                self._deliver,
+                self._demand(mount),
+                config.sensor_hz or mount.rate,
+                self._present_rate(mount.name),
+            )
+            for mount in config.description.sensors
+        ]
         primitives = Primitives(config.model, renderer=config.renderer, device=device)
         return SensorScheduler(
             config.model, sensors, primitives=primitives, pacing=config.pacing, on_taken=self._publish_pace
@@ -279,31 +276,25 @@ class SensorWorker:
         """The device of the configuration, or the CPU if it cannot be used any more, which is logged and reported."""
         device = self.config.device
         if device != "cpu" and (fault := device_fault(device)) is not None:
-            log.error("cameras and lidars of %s compute on the CPU: %s", self.config.name, fault)
+            log.error("the sensors of %s compute on the CPU: %s", self.config.name, fault)
             device = "cpu"
         self.pipe.send(("device", device))
         return device
 
-    def _camera_demand(self, name: str, keeper: PictureKeeper | None) -> Callable[[], CameraOutput]:
-        """The outputs of a camera that its subscribers need now, and its ``keeper``."""
-        whole = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
+    def _demand(self, mount: RenderedMount) -> Callable[[], CameraOutput]:
+        """The outputs of a sensor that its subscribers need now, and those for which its pictures are kept."""
+        name = mount.name
+        whole = SENSOR_KINDS[mount.kind].whole
+        keeper = self._keeper if name == self._kept_camera else None
         node = self.node
 
         def demand() -> CameraOutput:
-            if self._is_lockstep:
-                return whole if node is None else whole | node.camera_outputs_wanted(name)
-            is_kept = keeper is not None and keeper.wants(self._time, self._frame_score)
-            wanted = CameraOutput.NONE if node is None else node.camera_outputs_wanted(name)
-            return wanted | whole if is_kept else wanted
+            wanted = CameraOutput.NONE if node is None else node.outputs_wanted(name)
+            if self._is_lockstep or (keeper is not None and keeper.wants(self._time, self._frame_score)):
+                return wanted | whole
+            return wanted
 
         return demand
-
-    def _lidar_demand(self, name: str) -> Callable[[], CameraOutput]:
-        """What the subscribers of a lidar need now."""
-        node = self.node
-        if self._is_lockstep:
-            return lambda: CameraOutput.DEPTH
-        return lambda: CameraOutput.NONE if node is None else node.lidar_outputs_wanted(name)
 
     # ------------------------------------------------------------------ loop
 
@@ -443,28 +434,22 @@ class SensorWorker:
             statistics |= {"sent": self.node.sent, "ros_dropped": self.node.dropped}
         return statistics
 
-    def _deliver_camera(self, frame: CameraFrame | LidarScan) -> None:
-        assert isinstance(frame, CameraFrame)
+    def _deliver(self, frame: Any) -> None:
+        """Digest, publish and perhaps keep a frame: any :class:`SensorFrame`."""
         if self._is_lockstep:
-            self._digest(frame.name, frame.time, frame.rgb, frame.depth, frame.labels)
+            self._digest(frame)
         if self.node is not None:
-            self.node.publish_camera(dataclasses.replace(frame, time=self._offsets.world_time(frame.time)))
-        keeper = self._keeper if frame.name == self.scheduler.sensors[0].name else None
+            self.node.publish(dataclasses.replace(frame, time=self._offsets.world_time(frame.time)))
+        keeper = self._keeper if frame.name == self._kept_camera else None
         if keeper is not None and keeper.wants(frame.time, self._frame_score):
+            assert isinstance(frame, CameraFrame)
             keeper.keep(frame, self._frame_score)
 
-    def _deliver_lidar(self, scan: CameraFrame | LidarScan) -> None:
-        assert isinstance(scan, LidarScan)
-        if self._is_lockstep:
-            self._digest(scan.name, scan.time, scan.xyz, scan.intensity, scan.labels)
-        if self.node is not None:
-            self.node.publish_lidar(dataclasses.replace(scan, time=self._offsets.world_time(scan.time)))
-
-    def _digest(self, name: str, moment: float, *arrays: np.ndarray | None) -> None:
-        digest = self._digests[name]
-        digest.update(np.float64(moment).tobytes())
-        for array in arrays:
-            digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    def _digest(self, frame: SensorFrame) -> None:
+        digest = self._digests[frame.name]
+        digest.update(np.float64(frame.time).tobytes())
+        for array in frame.measured:
+            digest.update(np.ascontiguousarray(array).tobytes())
 
     def _save_kept_frame(self, folder: pathlib.Path) -> None:
         failure = ""

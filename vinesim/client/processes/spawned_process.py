@@ -115,8 +115,11 @@ class SpawnedProcess:
 
 def sensor_modules(ros: bool) -> tuple[str, ...]:
     """What a sensor process needs, with a ROS node or without."""
-    modules = ("vinesim.client.processes.sensor_worker", "vinesim.sensors.scheduler")
-    return (*modules, "vinesim.ros.sensor_node") if ros else modules
+    usual = ("vinesim.sensors.camera.camera", "vinesim.sensors.lidar.lidar")
+    modules = ("vinesim.client.processes.sensor_worker", "vinesim.sensors.scheduler", *usual)
+    if not ros:
+        return modules
+    return (*modules, "vinesim.ros.sensor_node", "vinesim.ros.publishers.camera", "vinesim.ros.publishers.lidar")
 
 
 def start_early(title: str, modules: Sequence[str]) -> None:

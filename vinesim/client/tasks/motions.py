@@ -8,6 +8,7 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.robot.drives.controlled_robot import Robot
+from vinesim.scene.values import CameraMount
 
 
 class DriveTo:
@@ -55,10 +56,9 @@ class LookAt:
         description = robot.description
         self.robot = robot
         self.point = point
-        self._joints = (
-            description.joint_indices("head") if "head" in description.groups and description.cameras else None
-        )
-        self._camera = description.cameras[0].frame if description.cameras else ""
+        cameras = description.sensors_of(CameraMount.kind)
+        self._joints = description.joint_indices("head") if "head" in description.groups and cameras else None
+        self._camera = cameras[0].frame if cameras else ""
         self._steps_per_correction = round(self.PERIOD / robot.rigid.dt)
         self._step = 0
 

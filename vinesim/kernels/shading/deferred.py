@@ -130,6 +130,22 @@ def specular_light(
 
 
 @wp.func
+def sun_share(
+    light: Light, near: ShadowMap, far: ShadowMap, s: Surface, p: wp.vec3, plain: wp.vec3, turn: wp.vec2
+) -> float:
+    """Share of the sun's disc that a surface at ``p`` with the geometric normal ``plain`` sees."""
+    away = plain
+    if wp.dot(plain, light.sun) < 0.0:
+        away = -plain
+    lit = sun_visibility(near, p, away, turn, light.sample_spiral, light.shadow_taps)
+    if lit < 0.0:
+        lit = sun_visibility(far, p, away, turn, light.sample_spiral, light.shadow_taps)
+        if lit < 0.0:
+            lit = wp.where(s.sky > 0.7, 1.0, s.sky)
+    return lit
+
+
+@wp.func
 def shade_surface(
     materials: Materials,
     light: Light,
@@ -151,14 +167,7 @@ def shade_surface(
     ndl = wp.dot(n, light.sun)
     lit = float(0.0)
     if ndl > 0.0 or s.transmission[0] > 0.0 or s.wrap[0] > 0.0:
-        away = plain
-        if wp.dot(plain, light.sun) < 0.0:
-            away = -plain
-        lit = sun_visibility(near, p, away, turn, light.sample_spiral, light.shadow_taps)
-        if lit < 0.0:
-            lit = sun_visibility(far, p, away, turn, light.sample_spiral, light.shadow_taps)
-            if lit < 0.0:
-                lit = wp.where(s.sky > 0.7, 1.0, s.sky)
+        lit = sun_share(light, near, far, s, p, plain, turn)
     direct = wp.vec3(
         wp.max((ndl + s.wrap[0]) / (1.0 + s.wrap[0]), 0.0),
         wp.max((ndl + s.wrap[1]) / (1.0 + s.wrap[1]), 0.0),
@@ -189,6 +198,35 @@ def shade_surface(
 
 
 @wp.func
+def seen_surface(
+    shapes: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3, footprint: float, slant: float
+) -> Surface:
+    """The surface of primitive ``i`` (-2: the ground) at ``p``, seen along the unit ray ``d``; ``footprint`` and ``slant``
+    are the lengths that one pixel covers across and along the line of sight [m]."""
+    s = Surface()
+    if i >= 0:
+        kind = shapes.kind[i]
+        if kind == LEAF:
+            s = leaf_surface(shapes, materials, i, p, d, footprint)
+        elif kind == SPHEROID and materials.material[i] == BERRY:
+            s = berry_surface(shapes, materials, i, p, footprint)
+        else:
+            s = solid_surface(shapes, materials, i, p, footprint)
+    else:
+        s = ground_surface(materials, p, footprint, slant)
+    return s
+
+
+@wp.func
+def shadow_turn(light: Light, left: int, top: int) -> wp.vec2:
+    """Cosine and sine of the angle by which the shadow samples are turned at a pixel: interleaved gradient noise
+    (Jimenez 2014)."""
+    f = 0.06711056 * float(left) + 0.00583715 * float(top)
+    f = 52.9829189 * (f - wp.floor(f))
+    return light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
+
+
+@wp.func
 def surface_light(
     shapes: Shapes,
     materials: Materials,
@@ -208,22 +246,11 @@ def surface_light(
     d = ray / scale
     p = lens.eye + ray * z
     footprint = z * float(block) / lens.fx
-    # interleaved gradient noise (Jimenez 2014) turns the shadow samples from place to place
-    f = 0.06711056 * float(left) + 0.00583715 * float(top)
-    f = 52.9829189 * (f - wp.floor(f))
-    turn = light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
+    turn = shadow_turn(light, left, top)
     kind = wp.int32(-1)
-    s = Surface()
     if i >= 0:
         kind = shapes.kind[i]
-        if kind == LEAF:
-            s = leaf_surface(shapes, materials, i, p, d, footprint)
-        elif kind == SPHEROID and materials.material[i] == BERRY:
-            s = berry_surface(shapes, materials, i, p, footprint)
-        else:
-            s = solid_surface(shapes, materials, i, p, footprint)
-    else:
-        s = ground_surface(materials, p, footprint, footprint * z * scale / lens.eye[2])
+    s = seen_surface(shapes, materials, i, p, d, footprint, footprint * z * scale / lens.eye[2])
     return shade_surface(materials, light, near, far, s, kind, p, d, z * scale, turn)
 
 

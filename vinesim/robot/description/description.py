@@ -11,8 +11,8 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.robot.description.grippers import AnyGripper, Cutter
 from vinesim.robot.description.kinematics import MovingJoints
-from vinesim.robot.description.sidecar import BaseLimits, CameraMount, JointGroup, SensorMount
-from vinesim.scene.values import ControllerSpec, Drive, RobotSpec, SensorPacing
+from vinesim.robot.description.sidecar import BaseLimits, JointGroup
+from vinesim.scene.values import ControllerSpec, Drive, RenderedMount, RobotSpec, SensorMount, SensorPacing
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -38,8 +38,8 @@ class RobotDescription:
     """[fixed, 7] child in parent."""
     link_anchors: dict[str, tuple[str, np.ndarray]]
     """Of every link: the moving link (or the root) it is fixed to, and its pose [7] there."""
-    cameras: tuple[CameraMount, ...]
-    lidars: tuple[SensorMount, ...]
+    sensors: tuple[RenderedMount, ...]
+    """All that is rendered, in the order of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
     sensor_pacing: SensorPacing
@@ -65,6 +65,10 @@ class RobotDescription:
     def cutters(self) -> tuple[Cutter, ...]:
         """Those of the grippers that cut."""
         return tuple(gripper for gripper in self.grippers if isinstance(gripper, Cutter))
+
+    def sensors_of(self, kind: str) -> tuple[RenderedMount, ...]:
+        """Its sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`, in the order of its file."""
+        return tuple(mount for mount in self.sensors if mount.kind == kind)
 
     def joint_indices(self, group: str) -> np.ndarray:
         """Indices of a group's joints in joint arrays; KeyError if there is no such group."""

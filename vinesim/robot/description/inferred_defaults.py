@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Container
+from collections.abc import Callable, Container
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
-from vinesim.robot.description.sidecar import CameraMount, JointGroup, SensorMount
+from vinesim.robot.description.sidecar import JointGroup
+from vinesim.scene.values import CameraMount, LidarMount, RenderedMount
 
 
 def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
@@ -56,11 +57,18 @@ def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[CameraMount, 
     return (CameraMount(name, found, "d435"),)
 
 
-def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[SensorMount, ...]:
+def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[LidarMount, ...]:
     """A VLP-16 in the first link named a lidar or laser, one in front before others; adds to ``notes``."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
     if not found:
         return ()
     notes.append(f"a vlp16 is taken to sit in {found[0]!r}")
-    return (SensorMount("lidar", found[0], "vlp16"),)
+    return (LidarMount("lidar", found[0], "vlp16"),)
+
+
+SENSOR_GUESSES: dict[str, Callable[[etree._Element, list[str]], tuple[RenderedMount, ...]]] = {
+    CameraMount.kind: guess_cameras,
+    LidarMount.kind: guess_lidars,
+}
+"""By kind of sensor; of other kinds there is none where the TOML file names none."""

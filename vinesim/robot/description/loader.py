@@ -25,7 +25,7 @@ from vinesim.robot.description.controllers import command_interfaces, make_contr
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.drive_parameters import home_positions, make_drives
 from vinesim.robot.description.grippers import guess_fingers, warn_of_unlisted_fingers
-from vinesim.robot.description.inferred_defaults import guess_cameras, guess_groups, guess_lidars
+from vinesim.robot.description.inferred_defaults import SENSOR_GUESSES, guess_groups
 from vinesim.robot.description.kinematics import joint_origin, link_anchors, moving_joints
 from vinesim.robot.description.meshes import find_installed, replace_unopened_meshes, resolve_meshes
 from vinesim.robot.description.repairs import (
@@ -53,7 +53,7 @@ from vinesim.robot.description.urdf import (
     read_xml,
     set_friction,
 )
-from vinesim.scene.values import SensorPacing
+from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorPacing
 
 log = logging.getLogger(__name__)
 
@@ -90,9 +90,7 @@ def load_description(
     repair_joints(root, assumed)
     repair_inertias(root, assumed)
     sidecar = read_sidecar(file.with_suffix(".toml")) if sidecar is None else sidecar
-    cameras = sidecar.cameras if sidecar.cameras is not None else guess_cameras(root, notes)
-    lidars = sidecar.lidars if sidecar.lidars is not None else guess_lidars(root, notes)
-    sidecar = msgspec.structs.replace(sidecar, cameras=cameras, lidars=lidars)
+    sensors = _sensors(sidecar, root, notes)
     set_friction(root, sidecar.friction, file.with_suffix(".toml"))
     check_friction(root, file)
     srdf = file.parent / sidecar.srdf if sidecar.srdf else file.with_suffix(".srdf")
@@ -109,7 +107,9 @@ def load_description(
     check_masses(parsed, file, notes)
     add_missing_masses(root, parsed, base, order, assumed)
     urdf = etree.tostring(root, encoding="unicode")
-    description = _assemble(parse_robot(root), base, order, file, urdf, sidecar, notes, assumed, is_remote=is_remote)
+    description = _assemble(
+        parse_robot(root), base, order, file, urdf, sidecar, sensors, notes, assumed, is_remote=is_remote
+    )
     description = dataclasses.replace(description, meshes=meshes, is_remote=is_remote)
     for note in notes:
         log.info("%s: %s", file.name, note)
@@ -131,6 +131,17 @@ def _locate(name: str) -> pathlib.Path:
         raise DescriptionError(f"{name}: {error}") from error
 
 
+def _sensors(sidecar: Sidecar, root: etree._Element, notes: list[str]) -> tuple[RenderedMount, ...]:
+    """The sensors of the TOML file; of a kind that it does not name, those guessed from the URDF (``notes``)."""
+    found: list[RenderedMount] = []
+    for kind in SENSOR_KINDS:
+        given = sidecar.mounts(kind)
+        if given is None and kind in SENSOR_GUESSES:
+            given = SENSOR_GUESSES[kind](root, notes)
+        found += given or ()
+    return tuple(found)
+
+
 def _assemble(
     robot: Robot,
     base: str,
@@ -138,6 +149,7 @@ def _assemble(
     file: pathlib.Path,
     urdf: str,
     sidecar: Sidecar,
+    sensors: tuple[RenderedMount, ...],
     notes: list[str],
     assumed: list[str],
     *,
@@ -155,7 +167,7 @@ def _assemble(
             driven_by_group = {name: group.joints for name, group in sidecar.groups.items()}
             warn_of_unlisted_fingers(driven_by_group, fingers, robot.joints, assumed)
         sidecar = msgspec.structs.replace(sidecar, grippers=fingers)
-    check_sidecar(sidecar, set(names), anchors, file.with_suffix(".toml"))
+    check_sidecar(sidecar, sensors, set(names), anchors, file.with_suffix(".toml"))
     fixed = [joint for joint in robot.joints if joint.type == "fixed"]
     description = RobotDescription(
         name=robot.name,
@@ -169,8 +181,7 @@ def _assemble(
         fixed_frames=tuple((joint.parent, joint.child) for joint in fixed),
         fixed_poses=np.array([joint_origin(joint) for joint in fixed]).reshape(-1, 7),
         link_anchors=anchors,
-        cameras=sidecar.cameras or (),
-        lidars=sidecar.lidars or (),
+        sensors=sensors,
         sensor_pacing=SensorPacing(sidecar.sensors.mode, sidecar.sensors.least_rate),
         imus=sidecar.imus,
         wrenches=sidecar.wrenches,

@@ -7,15 +7,15 @@ which the file calls ``rotor``, ``elastic`` and ``elastic_damping``.
 from __future__ import annotations
 
 import pathlib
-from collections.abc import Container, Iterable
-from typing import Literal
+from collections.abc import Container, Iterable, Sequence
+from typing import cast
 
 import msgspec
 import numpy as np
 
 from vinesim.robot.description.grippers import AnyGripper, Cutter
 from vinesim.robot.description.urdf import description_error
-from vinesim.scene.values import SensorMode, SensorPacing
+from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorMode, SensorMount, SensorPacing
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -68,31 +68,8 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         }
 
 
-MIN_CAMERA_SIZE = 16
-MAX_CAMERA_SIZE = 4096
-"""Bounds of the width and height of a camera's picture [px]."""
-
-
-class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sensor: its name in topics, the frame it sits in, and the file in ``data/cameras`` or ``data/lidars``."""
-
-    name: str
-    frame: str
-    type: str = ""
-
-
-class CameraMount(SensorMount, frozen=True, forbid_unknown_fields=True):
-    """A camera, and in which quality and how often it is rendered live."""
-
-    quality: Literal["fast", "full", "still"] = "fast"
-    size: tuple[int, int] | None = None
-    """Width and height [px] with the same angle of view; the camera's own unless given."""
-    rate: float | None = None
-    """Pictures a second [Hz]; the camera's own unless given."""
-
-
 class SensorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Whether simulated time waits for the robot's cameras and lidars: :class:`vinesim.scene.values.SensorPacing`."""
+    """Whether simulated time waits for the robot's sensors: :class:`vinesim.scene.values.SensorPacing`."""
 
     mode: SensorMode = SensorMode.LIVE
     least_rate: float = SensorPacing().least_rate
@@ -111,12 +88,10 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The whole file; None where a sensor list is to be guessed from the URDF."""
+    """The file without the tables of :data:`~vinesim.scene.values.SENSOR_KINDS`, which :data:`SidecarFile` adds."""
 
     base: BaseLimits = BaseLimits()
     groups: dict[str, JointGroup] = {}
-    cameras: tuple[CameraMount, ...] | None = None
-    lidars: tuple[SensorMount, ...] | None = None
     sensors: SensorTable = SensorTable()
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
@@ -137,13 +112,30 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """Those of ``grippers`` and ``cutters``."""
         return (*(self.grippers or ()), *self.cutters)
 
+    def mounts(self, kind: str) -> tuple[RenderedMount, ...] | None:
+        """The sensors of a kind; None where the file does not say, and they are to be guessed from the URDF."""
+        return getattr(self, SENSOR_KINDS[kind].table, None)
+
+
+SidecarFile = cast(
+    "type[Sidecar]",
+    msgspec.defstruct(
+        "SidecarFile",
+        [(kind.table, tuple[kind.mount, ...] | None, None) for kind in SENSOR_KINDS.values()],
+        bases=(Sidecar,),
+        frozen=True,
+        forbid_unknown_fields=True,
+    ),
+)
+"""The whole file."""
+
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:
     """The file's content, defaults if there is no file; :class:`DescriptionError` if it has unknown or unfit keys."""
     if not file.is_file():
         return Sidecar()
     try:
-        return msgspec.toml.decode(file.read_bytes(), type=Sidecar)
+        return msgspec.toml.decode(file.read_bytes(), type=SidecarFile)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
         raise description_error(file, str(error), "see data/robots/vinebot.toml for what may be said") from error
 
@@ -172,7 +164,7 @@ def decode_sidecar(text: str) -> Sidecar:
     if len(text) > MAX_REMOTE_SIDECAR:
         raise description_error(origin, f"{len(text)} B", f"send at most {MAX_REMOTE_SIDECAR} B")
     try:
-        found = msgspec.json.decode(text, type=Sidecar) if text else Sidecar()
+        found = msgspec.json.decode(text, type=SidecarFile) if text else Sidecar()
     except (msgspec.DecodeError, msgspec.ValidationError, RecursionError) as error:
         raise description_error(origin, str(error), "use the same release of vinesim") from error
     arrays = {name: values for group in found.groups.values() for name, values in group.arrays().items() if values}
@@ -184,7 +176,13 @@ def decode_sidecar(text: str) -> Sidecar:
     return Sidecar(base=found.base, groups=found.groups)
 
 
-def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str], file: pathlib.Path) -> None:
+def check_sidecar(
+    sidecar: Sidecar,
+    sensors: Sequence[RenderedMount],
+    driven: Container[str],
+    links: Container[str],
+    file: pathlib.Path,
+) -> None:
     """Raise :class:`DescriptionError` unless all names are ``driven`` joints or ``links`` and all values are fit."""
     for name, group in sidecar.groups.items():
         _check_group(name, group, driven, links, file)
@@ -192,24 +190,17 @@ def check_sidecar(sidecar: Sidecar, driven: Container[str], links: Container[str
         gripper.check(sidecar.groups, links, file)
     if not all(0.0 <= slip < 1.0 for slip in sidecar.base.slip):
         raise description_error(file, f"slip of {sidecar.base.slip}", "give shares from 0 to below 1")
-    mounts: Iterable[SensorMount] = (
-        *(sidecar.cameras or ()),
-        *(sidecar.lidars or ()),
-        *sidecar.imus,
-        *sidecar.wrenches,
-    )
+    mounts: Iterable[SensorMount] = (*sensors, *sidecar.imus, *sidecar.wrenches)
     for mount in mounts:
         if mount.frame not in links:
             raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
     if not 0.01 <= sidecar.sensors.least_rate <= 1000.0:
         found = f"sensors have the least_rate {sidecar.sensors.least_rate}"
         raise description_error(file, found, "give 0.01 to 1000 Hz")
-    for camera in sidecar.cameras or ():
-        if camera.size is not None and not all(MIN_CAMERA_SIZE <= n <= MAX_CAMERA_SIZE for n in camera.size):
-            bounds = f"give width and height from {MIN_CAMERA_SIZE} to {MAX_CAMERA_SIZE} px"
-            raise description_error(file, f"{camera.name!r} has the size {list(camera.size)}", bounds)
-        if camera.rate is not None and not 0.01 <= camera.rate <= 1000.0:
-            raise description_error(file, f"{camera.name!r} has the rate {camera.rate}", "give 0.01 to 1000 Hz")
+    for sensor in sensors:
+        if (fault := sensor.fault()) is not None:
+            found, remedy = fault
+            raise description_error(file, f"{sensor.name!r} has {found}", remedy)
 
 
 def _check_group(

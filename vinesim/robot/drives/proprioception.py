@@ -9,8 +9,7 @@ import numpy as np
 from vinesim.core import frames
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
-from vinesim.robot.description.sidecar import SensorMount
-from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, Wrench
+from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, SensorMount, Wrench
 
 
 class BodySensors:

@@ -46,6 +46,7 @@ from vinesim.scene.values import (
     Intention,
     JointSample,
     LidarScan,
+    MultispectralFrame,
     RobotSample,
     Wrench,
 )
@@ -217,17 +218,17 @@ def contact_cloud(sample: RobotSample, links: Mapping[str, int], bunch_of_body: 
 
 def rgb_image(frame: CameraFrame) -> Image:
     """The picture, rgb8."""
-    return _image(frame, frame.rgb, "rgb8", np.uint8)
+    return image(frame, frame.rgb, "rgb8", np.uint8)
 
 
 def depth_image(frame: CameraFrame) -> Image:
     """Depth along z [m], 32FC1; NaN no return, -Inf too near, +Inf too far (REP-118)."""
-    return _image(frame, frame.depth, "32FC1", np.float32)
+    return image(frame, frame.depth, "32FC1", np.float32)
 
 
 def depth_image_millimetres(frame: CameraFrame) -> Image:
     """Depth along z [mm], 16UC1; 0 where there is none or it is beyond 65.535 m (REP-118)."""
-    return _image(frame, depth_millimetres(frame.depth), "16UC1", np.uint16)
+    return image(frame, depth_millimetres(frame.depth), "16UC1", np.uint16)
 
 
 QUANTIZATION = 100.0
@@ -265,7 +266,7 @@ def compressed_depth(frame: CameraFrame, *, is_millimetres: bool = False) -> Com
 
 def label_image(frame: CameraFrame) -> Image:
     """Label of every pixel (:func:`vinesim.scene.ids.label`), 32SC1."""
-    return _image(frame, frame.labels, "32SC1", np.int32)
+    return image(frame, frame.labels, "32SC1", np.int32)
 
 
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
@@ -370,7 +371,8 @@ def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus])
     return DiagnosticArray(header=header(time, ""), status=statuses)
 
 
-def _image(frame: CameraFrame, pixels: np.ndarray, encoding: str, dtype: type) -> Image:
+def image(frame: CameraFrame | MultispectralFrame, pixels: np.ndarray, encoding: str, dtype: type) -> Image:
+    """``pixels`` [height, width, ...] of a picture as an image of this encoding."""
     pixels = np.ascontiguousarray(pixels, dtype)
     if pixels.shape[:2] != (frame.info.height, frame.info.width):
         raise ValueError(

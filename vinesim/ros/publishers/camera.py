@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import ClassVar
 
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from vinesim.ros.messages import convert
 from vinesim.ros.parameters import Parameters
-from vinesim.ros.topic import SENSOR_DATA, TRANSIENT_LOCAL, Advertise, PendingMessage
+from vinesim.ros.topic import SENSOR_DATA, TRANSIENT_LOCAL, Advertise, PendingMessage, Topic
 from vinesim.scene.values import CameraFrame, CameraOutput
 
 RGB = CameraOutput.RGB
@@ -26,7 +27,11 @@ class CameraPublisher:
     Its parameters: ``<name>.exact_depth``, ``<name>.depth_encoding_16uc1``, ``<name>.jpeg_quality``.
     """
 
-    def __init__(self, advertise: Advertise, name: str, parameters: Parameters) -> None:
+    packages: ClassVar = ("vision_msgs",)
+
+    def __init__(
+        self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
+    ) -> None:
         # vision_msgs can be imported once the node has seen to it
         from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 
@@ -63,10 +68,10 @@ class CameraPublisher:
             **dict.fromkeys(self._bunches, CameraOutput.BUNCHES),
         }
 
-    def mute_truth(self, is_muted: bool) -> None:
-        """Whether labels and detections are kept back."""
-        for topic in (self._labels, *self._bunches):
-            topic.mute(is_muted)
+    @property
+    def truth(self) -> tuple[Topic, ...]:
+        """Labels and detections."""
+        return self._labels, *self._bunches
 
     def wanted(self) -> CameraOutput:
         """The outputs that the present subscribers need; a picture if there are none but of camera_info."""
@@ -101,3 +106,6 @@ class CameraPublisher:
         for topic, needs in self._needs.items():
             if needs in made:
                 yield topic, builds[topic]
+
+
+PUBLISHER = CameraPublisher

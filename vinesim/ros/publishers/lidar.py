@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
+from typing import ClassVar
 
 from sensor_msgs.msg import LaserScan, PointCloud2
 
@@ -14,17 +15,23 @@ from vinesim.scene.values import CameraOutput, LidarScan
 
 
 class LidarPublisher:
-    """``<name>/points``: x y z intensity ring time; return_type too if the lidar reports two returns of a shot. And
-    ``scan_topic``: its laser nearest to the horizontal. Its parameter: ``<name>.exact_ranges``."""
+    """``<name>/points``: x y z intensity ring time; return_type too if the lidar reports two returns of a shot.
+    ``scan``, as Nav2 expects it, of the first lidar, or ``<name>/scan``: its laser nearest to the horizontal. Its
+    parameter: ``<name>.exact_ranges``."""
 
-    def __init__(self, advertise: Advertise, name: str, scan_topic: str, parameters: Parameters) -> None:
+    packages: ClassVar = ()
+    truth: ClassVar = ()
+
+    def __init__(
+        self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
+    ) -> None:
         self._parameters = parameters
         self._exact = f"{name}.exact_ranges"
         parameters.declare(
             self._exact, False, "What the middle of each beam meets, exactly, instead of what the sensor measures."
         )
         self._points = advertise(PointCloud2, f"{name}/points", SENSOR_DATA)
-        self._scan = advertise(LaserScan, scan_topic, SENSOR_DATA)
+        self._scan = advertise(LaserScan, f"{name}/scan" if number else "scan", SENSOR_DATA)
 
     def wanted(self) -> CameraOutput:
         """Depth as the lidar measures it, or exact, if there are subscribers."""
@@ -37,3 +44,6 @@ class LidarPublisher:
         yield self._points, partial(convert.lidar_cloud, scan)
         if scan.level is not None:
             yield self._scan, partial(convert.laser_scan, scan)
+
+
+PUBLISHER = LidarPublisher

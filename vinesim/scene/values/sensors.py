@@ -1,10 +1,12 @@
-"""What cameras and lidars measure."""
+"""The sensors that a robot can carry: what each kind measures, how it is mounted, and the table of the kinds."""
 
 from __future__ import annotations
 
 import dataclasses
 import enum
+from typing import ClassVar, Literal, Protocol
 
+import msgspec
 import numpy as np
 
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
@@ -14,6 +16,65 @@ MIN_BERRY_PIXELS = 4
 
 Box = tuple[int, int, int, int]
 """First column, first row, last column, last row (inclusive)."""
+MIN_CAMERA_SIZE = 16
+MAX_CAMERA_SIZE = 4096
+"""Bounds of the width and height of a camera's picture [px]."""
+
+
+class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sensor of a robot, as a table of its TOML file says: its name in topics, the link it sits in, its data file."""
+
+    name: str
+    frame: str
+    type: str = ""
+
+
+class RenderedMount(SensorMount, frozen=True, forbid_unknown_fields=True):
+    """A sensor that is rendered: one of :data:`SENSOR_KINDS`."""
+
+    kind: ClassVar[str]
+    """Name of its kind."""
+    rate: float | None = None
+    """Frames a second [Hz]; the sensor's own unless given."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """What is wrong with its values, and the remedy; None if they are fit."""
+        if self.rate is not None and not 0.01 <= self.rate <= 1000.0:
+            return f"the rate {self.rate}", "give 0.01 to 1000 Hz"
+        return None
+
+
+class PictureMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
+    """A sensor that delivers pictures."""
+
+    size: tuple[int, int] | None = None
+    """Width and height [px] with the same angle of view; the sensor's own unless given."""
+
+    def fault(self) -> tuple[str, str] | None:
+        """See :meth:`RenderedMount.fault`."""
+        if self.size is not None and not all(MIN_CAMERA_SIZE <= n <= MAX_CAMERA_SIZE for n in self.size):
+            bounds = f"give width and height from {MIN_CAMERA_SIZE} to {MAX_CAMERA_SIZE} px"
+            return f"the size {list(self.size)}", bounds
+        return super().fault()
+
+
+class SensorFrame(Protocol):
+    """What a sensor delivers at once; a frozen dataclass, so that its time can be replaced."""
+
+    @property
+    def time(self) -> float:
+        """[s]"""
+        ...
+
+    @property
+    def name(self) -> str:
+        """The sensor's name."""
+        ...
+
+    @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """The arrays that two runs in lockstep must have equal to the bit."""
+        ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -54,7 +115,7 @@ class SensorPacing:
 
 
 class CameraOutput(enum.Flag):
-    """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for."""
+    """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for. Others render if any is."""
 
     RGB = enum.auto()
     DEPTH = enum.auto()
@@ -156,6 +217,11 @@ class CameraFrame:
     """Of every bunch of which at least one pixel is seen, by index."""
 
     @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """See :attr:`SensorFrame.measured`."""
+        return self.rgb, self.depth, self.labels
+
+    @property
     def outputs(self) -> CameraOutput:
         """The parts that were made."""
         made = CameraOutput.NONE if self.bunches is None else CameraOutput.BUNCHES
@@ -229,6 +295,134 @@ class LidarScan:
     """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
 
     @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """See :attr:`SensorFrame.measured`."""
+        return self.xyz, self.intensity, self.labels
+
+    @property
     def organs(self) -> np.ndarray:
         """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
         return self.labels // LABEL_STRIDE
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Band:
+    """One band of a multispectral camera. Its response is a Gaussian."""
+
+    name: str
+    centre: float
+    """[nm]"""
+    width: float
+    """Between the wavelengths at which the response is half of its greatest [nm]."""
+    irradiance: float
+    """Of a level surface in the open, sun and sky [W/(m2 nm)]."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class MultispectralFrame:
+    """One picture in several bands, which all show the same at the same pixel."""
+
+    time: float
+    name: str
+    info: CameraInfo
+    pose: np.ndarray
+    """[7] optical frame in the world when the picture was taken."""
+    bands: tuple[Band, ...]
+    """By wavelength."""
+    reflectance: np.ndarray
+    """[band, height, width] float32: light over that of a level white panel in the open. In shadow it is less than what
+    the surface reflects, on a leaf that faces a low sun it is more."""
+    labels: np.ndarray
+    """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
+
+    @property
+    def measured(self) -> tuple[np.ndarray, ...]:
+        """See :attr:`SensorFrame.measured`."""
+        return (self.reflectance,)
+
+    @property
+    def radiance(self) -> np.ndarray:
+        """[band, height, width] float32 W/(m2 sr nm)."""
+        irradiance = np.array([band.irradiance for band in self.bands], np.float32)
+        return self.reflectance * (irradiance / np.float32(np.pi))[:, None, None]
+
+    def band(self, name: str) -> np.ndarray:
+        """Reflectance [height, width] in a band; :class:`KeyError` if there is none of that name."""
+        return self.reflectance[{band.name: k for k, band in enumerate(self.bands)}[name]]
+
+    @property
+    def ndvi(self) -> np.ndarray:
+        """[height, width] float32: (nir - red) / (nir + red), 0 where both are dark (Rouse et al. 1974)."""
+        red = self.band("red")
+        nir = self.band("nir")
+        total = nir + red
+        return np.divide(nir - red, total, out=np.zeros_like(total), where=total > 0.0)
+
+
+class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
+    """An RGB-D camera, and in which quality it is rendered live."""
+
+    kind: ClassVar[str] = "camera"
+    quality: Literal["fast", "full", "still"] = "fast"
+
+
+class LidarMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
+    """A spinning lidar."""
+
+    kind: ClassVar[str] = "lidar"
+
+
+class MultispectralMount(PictureMount, frozen=True, forbid_unknown_fields=True):
+    """A multispectral camera."""
+
+    kind: ClassVar[str] = "multispectral"
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class SensorKind:
+    """A kind of sensor, as all layers know it. The layers above are named, not imported: each imports its own part."""
+
+    table: str
+    """Its array of tables in the TOML file of a robot."""
+    mount: type[RenderedMount]
+    """One such table."""
+    maker: str
+    """Module of vinesim.sensors whose ``MAKER`` is the :class:`vinesim.sensors.sensor.SensorMaker`."""
+    publisher: str
+    """Module of vinesim.ros.publishers whose ``PUBLISHER`` is the :class:`vinesim.ros.sensor_node.SensorPublisher`."""
+    whole: CameraOutput
+    """What is rendered of it where every frame counts: in lockstep."""
+    topics: tuple[str, ...]
+    """Topics below its name that a user watches all the time; the first alone shows that it works."""
+    costly_topics: tuple[str, ...] = ()
+    """Topics below its name that a user looks at now and then."""
+
+
+SENSOR_KINDS: dict[str, SensorKind] = {
+    CameraMount.kind: SensorKind(
+        table="cameras",
+        mount=CameraMount,
+        maker="vinesim.sensors.camera.camera",
+        publisher="vinesim.ros.publishers.camera",
+        whole=CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS,
+        topics=("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info"),
+        costly_topics=("depth/points", "labels"),
+    ),
+    LidarMount.kind: SensorKind(
+        table="lidars",
+        mount=LidarMount,
+        maker="vinesim.sensors.lidar.lidar",
+        publisher="vinesim.ros.publishers.lidar",
+        whole=CameraOutput.DEPTH,
+        topics=("points",),
+    ),
+    MultispectralMount.kind: SensorKind(
+        table="multispectral_cameras",
+        mount=MultispectralMount,
+        maker="vinesim.sensors.camera.multispectral",
+        publisher="vinesim.ros.publishers.multispectral",
+        whole=CameraOutput.RGB,
+        topics=("ndvi/image_raw", "ndvi/camera_info"),
+    ),
+}
+"""All kinds by name. A robot's sensors are in this order, those of one kind in the order of its file."""

@@ -23,16 +23,18 @@ from vinesim.kernels.shading import deferred, light_plants, light_points, shadow
 from vinesim.kernels.shading.shadow_maps import ShadowMap
 from vinesim.kernels.stereo import stereo_rows
 from vinesim.scene.plant_parameters import Number
-from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput
+from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, CameraOutput, Snapshot
 from vinesim.sensors import spec_file
 from vinesim.sensors.camera.exposure import Exposure
 from vinesim.sensors.camera.live_light import LiveLight
 from vinesim.sensors.camera.live_light import shadow_maps as shadow_maps_of
 from vinesim.sensors.camera.stereo import Stereo, StereoSpec
 from vinesim.sensors.camera.sunlight import DEFAULT_SUN, Sunlight, SunPath
+from vinesim.sensors.ground_truth import visible_bunches
 from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole, supersampled
 from vinesim.sensors.raster.lens_map import LensError, LensMap, lens_map
+from vinesim.sensors.sensor import SensorMaker, SensorSetting
 
 
 class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -206,6 +208,14 @@ class Camera:
         """Frames a second [Hz]."""
         return self.spec.rate.value
 
+    def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> CameraFrame:
+        """See :class:`vinesim.sensors.sensor.Sensor`; with the truth of the bunches if that is needed."""
+        frame = self.render(primitives, pose, snapshot.time, outputs=outputs)
+        if CameraOutput.BUNCHES in outputs:
+            bunches = visible_bunches(primitives, snapshot, self.info, frame.pose, self.rasterizer)
+            frame = dataclasses.replace(frame, bunches=bunches)
+        return frame
+
     def render(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, outputs: CameraOutput = CameraOutput.ALL
     ) -> CameraFrame:
@@ -346,3 +356,21 @@ class Camera:
             outputs=[self._exposure.radiance],
             device=self.device,
         )
+
+
+def _make(mount: CameraMount, setting: SensorSetting) -> Camera:
+    spec = CameraSpec.load(mount.type)
+    return Camera(
+        spec,
+        spec.info(mount.frame, size=mount.size),
+        mount.name,
+        setting.sun,
+        quality=mount.quality,
+        device=setting.device,
+        threads=setting.threads,
+        seed=setting.seed,
+        image_index=setting.number,
+    )
+
+
+MAKER = SensorMaker(lambda name: CameraSpec.load(name).rate.value, _make, load_camera_kernels)

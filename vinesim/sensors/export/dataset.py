@@ -26,7 +26,7 @@ from vinesim.scene.generation.vineyard import generate_uncached
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene, Season, sun_direction
-from vinesim.scene.values import CameraInfo, Snapshot
+from vinesim.scene.values import CameraInfo, RenderedMount, Snapshot
 from vinesim.sensors import ground_truth
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export import annotations as formats
@@ -35,6 +35,7 @@ from vinesim.sensors.export.files import remove_partial_files, write_files
 from vinesim.sensors.primitives.bunch_primitives import Ripeness
 from vinesim.sensors.primitives.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
+from vinesim.sensors.sensor import SensorSetting, export_frame
 from vinesim.sensors.spec_file import SensorError
 
 IMAGES_PER_VINEYARD = 5
@@ -116,6 +117,8 @@ class DatasetPlan:
     """Actors and wind; without it all plants hang at rest."""
     renderer: str = "warp"
     device: str = "cpu"
+    sensors: tuple[RenderedMount, ...] = ()
+    """Which look as well, from the camera's place."""
 
     def settings(self) -> dict[str, Any]:
         """All that decides what the images show, as JSON."""
@@ -129,6 +132,7 @@ class DatasetPlan:
             "renderer": self.renderer,
             "device": self.device.partition(":")[0],  # the same on each of several GPUs
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
+            "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
         }
 
     def vineyard(self, number: int) -> Scene:
@@ -202,10 +206,17 @@ class VineyardRenderer:
             "ids": formats.encode_labels(frame.labels),
             "berries": formats.encode_berry_numbers(seen),
         }
+        setting = SensorSetting(sun, self.plan.seed, image, self.plan.device, threads=1)
+        for mount in self.plan.sensors:
+            kept = export_frame(mount, self.primitives, snapshot, seen.pose, setting)
+            pixels |= {f"{mount.name}/{name}": values for name, values in kept.images.items()}
+            record.setdefault("sensors", {})[mount.name] = kept.record
         files = {_file_of(kind, image): picture.encode_png(values) for kind, values in pixels.items()}
         files[_file_of("labels", image)] = formats.yolo_labels(bunches, self.info.width, self.info.height).encode()
         record["files"] = {name: len(data) for name, data in files.items()}
         files[_file_of("records", image)] = formats.json_text(record).encode()
+        for kind in pixels:
+            (folder / kind).mkdir(parents=True, exist_ok=True)
         write_files({folder / name: [data] for name, data in files.items()})
 
     def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
@@ -350,7 +361,7 @@ def _is_whole(folder: pathlib.Path, image: int) -> bool:
     expected = {_file_of(kind, image) for kind in _FOLDERS if kind != "records"}
     try:
         record = msgspec.json.decode((folder / _file_of("records", image)).read_bytes(), type=_RecordedFiles)
-        return record.files.keys() == expected and all(
+        return record.files.keys() >= expected and all(
             (folder / name).stat().st_size == size for name, size in record.files.items()
         )
     except (OSError, msgspec.DecodeError):

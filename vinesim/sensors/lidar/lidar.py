@@ -20,13 +20,15 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
-from vinesim.kernels.lidar import lidar_echoes
+from vinesim.kernels.lidar import lidar_echoes, lidar_raster
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.plant_parameters import Number
-from vinesim.scene.values import LevelLaser, LidarScan
+from vinesim.scene.values import CameraOutput, LevelLaser, LidarMount, LidarScan, Snapshot
 from vinesim.sensors import spec_file
 from vinesim.sensors.lidar.lidar_rasterizer import LidarRasterizer
+from vinesim.sensors.lidar.spinning_scan import SpinningScan
 from vinesim.sensors.primitives.scene_primitives import Primitives
+from vinesim.sensors.sensor import SensorMaker, SensorSetting
 from vinesim.sensors.spec_file import Numbers
 
 MAX_RAYS = 8
@@ -178,6 +180,8 @@ class Lidar:
         self.revolution = 0
         """Of the present revolution."""
         self.lasers = len(spec.elevation.value)
+        self.firing_period = spec.firing_period.value
+        """Between two firings [s]."""
         self.firings = round(1.0 / (spec.rate.value * spec.firing_period.value))
         """Of one revolution."""
         within = np.arange(self.lasers) * spec.laser_period.value
@@ -260,6 +264,14 @@ class Lidar:
         self.fire(primitives, 0, np.broadcast_to(pose, (self.firings, 7)))
         return self.finish_revolution(pose, time)
 
+    def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> LidarScan:
+        """See :class:`vinesim.sensors.sensor.Sensor`: a revolution while nothing moves."""
+        return self.scan(primitives, pose, snapshot.time)
+
+    def sweep(self, rate: float | None) -> SpinningScan:
+        """See :class:`vinesim.sensors.sensor.SweptSensor`."""
+        return SpinningScan(self, rate)
+
     def begin_revolution(self) -> None:
         """A new revolution, exact or as the lidar measures: :attr:`is_exact`."""
         self._receiver = self._exact if self.is_exact else self._measuring
@@ -339,3 +351,18 @@ class Lidar:
             level=self.level,
             returned=(which + 1).astype(np.uint8) if self.spec.returns == "dual" else None,
         )
+
+
+def _make(mount: LidarMount, setting: SensorSetting) -> Lidar:
+    spec = LidarSpec.load(mount.type)
+    lidar = Lidar(spec, mount.name, mount.frame, setting.device, seed=setting.seed, threads=setting.threads)
+    lidar.revolution = setting.number
+    return lidar
+
+
+def _load_kernels() -> None:
+    for module in (lidar_raster, lidar_echoes):
+        wp.load_module(module, device="cpu")
+
+
+MAKER = SensorMaker(lambda name: LidarSpec.load(name).rate.value, _make, _load_kernels)

@@ -7,13 +7,40 @@ interpolated to each firing, however late it is computed; plants and objects are
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Protocol
 
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.scene.values import LidarScan
-from vinesim.sensors.lidar.lidar import Lidar
+from vinesim.scene.values import CameraOutput, LidarScan
 from vinesim.sensors.primitives.scene_primitives import Primitives
+
+
+class SpinningHead(Protocol):
+    """What fires: :class:`vinesim.sensors.lidar.lidar.Lidar`."""
+
+    is_exact: bool
+    revolution: int
+    firings: int
+    firing_period: float
+    """Between two firings [s]."""
+
+    @property
+    def rate(self) -> float:
+        """Revolutions a second [Hz]."""
+        ...
+
+    def begin_revolution(self) -> None:
+        """Begin one."""
+        ...
+
+    def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
+        """Firings from ``first`` on, one for each pose [firing, 7]."""
+        ...
+
+    def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
+        """What was reported; ``pose`` [7] and ``time`` [s] of the first firing."""
+        ...
 
 
 class PoseHistory:
@@ -55,18 +82,27 @@ class PoseHistory:
 class SpinningScan:
     """Revolutions of one lidar, fired sector by sector."""
 
-    def __init__(self, lidar: Lidar, rate: float | None = None) -> None:
+    def __init__(self, lidar: SpinningHead, rate: float | None = None) -> None:
         """``rate``: revolutions per second to deliver [Hz]; the rate of the lidar unless given, never more."""
         self.lidar = lidar
         self.pose_history = PoseHistory()
         self.dropped = 0
         """Revolutions that ended before their first firing could be computed."""
-        self.set_period(1.0 / rate if rate else 0.0)
+        self._set_period(1.0 / rate if rate else 0.0)
         self._start: float | None = None
         self._next_column = 0
 
-    def set_period(self, period: float) -> None:
-        """Time from one revolution to the next [s], never less than the lidar takes for one."""
+    def add_pose(self, time: float, pose: np.ndarray) -> None:
+        """The lidar was at ``pose`` [7] at ``time`` [s]."""
+        self.pose_history.add(time, pose)
+
+    def set_demand(self, period: float, outputs: CameraOutput) -> None:
+        """Time from one revolution to the next [s], and whether exact depth alone is needed of it."""
+        self._set_period(period)
+        self.lidar.is_exact = outputs == CameraOutput.EXACT_DEPTH
+
+    def _set_period(self, period: float) -> None:
+        """Never less than the lidar takes for one."""
         self._period = max(1.0 / self.lidar.rate, period)
 
     def cancel(self, now: float) -> None:
@@ -85,7 +121,7 @@ class SpinningScan:
         while self._start is not None:
             lidar = self.lidar
             start = self._start
-            step = self.lidar.spec.firing_period.value
+            step = self.lidar.firing_period
             due = min(int((now - start) / step + 1e-6) + 1, lidar.firings) if now >= start - 1e-9 else 0
             if due > self._next_column:
                 times = start + step * np.arange(self._next_column, due)
