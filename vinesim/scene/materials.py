@@ -15,10 +15,10 @@ from vinesim.scene.plant_parameters import Number
 
 
 class Material(enum.IntEnum):
-    """What the surface of a body is made of, as far as contacts depend on it."""
+    """Material of a body's surface, as far as contacts depend on it."""
 
     UNKNOWN = 0
-    """Of no pair in the table."""
+    """Material for which the table lists no pair."""
     BARK = 1
     """Canes, arms and trunks."""
     SHOOT = 2
@@ -30,7 +30,7 @@ class Material(enum.IntEnum):
     RUBBER = 5
     PLASTIC = 6
     STEEL = 7
-    """And other bare metal."""
+    """Steel and other bare metal."""
     SOIL = 8
 
 
@@ -44,11 +44,11 @@ OF_ORGAN = {
     Organ.BUNCH: Material.BERRY,
     Organ.BOX: Material.PLASTIC,
 }
-"""Materials of plants, trellis and crates; a pole is of no known material."""
+"""Materials of plants, trellis and crates; poles are missing, because their material is unknown."""
 
 
 class _ContactFile(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Numbers by pair, written ``bark-steel``, in either order."""
+    """Numbers by pair of materials, written ``bark-steel`` in either order."""
 
     friction: dict[str, Number] = {}
     stiffness: dict[str, Number] = {}
@@ -66,10 +66,10 @@ def materials_of_organs(organs: np.ndarray) -> np.ndarray:
 
 
 def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarray:
-    """``friction`` [1] or ``stiffness`` [N/m] of each two materials, symmetric [material, material].
+    """Table of ``friction`` [1] or ``stiffness`` [N/m] of all pairs of materials, symmetric [material, material].
 
-    ``default``: of pairs that the file does not list. ``name``: of a file in ``data/materials``, or a path. Raises
-    :class:`DataError` for a pair or a unit that it cannot be.
+    ``default`` is used for pairs that the file does not list. ``name`` is the name of a file in ``data/materials``, or
+    a path. Raises :class:`DataError` for an unknown pair or a wrong unit.
     """
     table = np.full((len(Material), len(Material)), float(default))
     for (a, b), value in _listed(quantity, name).items():
@@ -78,7 +78,7 @@ def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarr
 
 
 def pair_numbers(name: str = "contact") -> dict[str, dict[str, Number]]:
-    """All numbers of the file with their sources, by quantity and pair as written."""
+    """All numbers of the file with their sources, by quantity and by pair as written in the file."""
     file = load_toml(find_data_file("materials", name, ".toml"), _ContactFile)
     return {"friction": file.friction, "stiffness": file.stiffness}
 
