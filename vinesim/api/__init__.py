@@ -1,1 +1,1 @@
-"""The public Python interface: what ``import vinesim`` offers, composed of the packages below."""
+"""The public Python interface of ``import vinesim``, composed of the packages below."""

@@ -4,7 +4,7 @@
         client.robot.command_base(0.3, 0.0, client.time)
         client.run(0.4)
 
-A base command lapses after half a second unless it is repeated.
+A base command expires after half a second unless it is repeated.
 """
 
 from __future__ import annotations
@@ -49,20 +49,22 @@ class Client:
         certificates: pathlib.Path | None = None,
         device: str = "cpu",
     ) -> None:
-        """Join.
+        """Join the world.
 
         Args:
-            scene: the same for all clients of a world, seed included.
-            robot: name of one in ``data/robots``, or the path of a URDF file.
+            scene: scene, which must be equal for all clients of a world, including its seed.
+            robot: name from ``data/robots``, or the path of a URDF file.
             name: unique name of this actor in the world.
-            connect: endpoint of the server such as ``tcp/127.0.0.1:7447``; alone in a world of its own unless given.
-            pose: (x, y, yaw) in m and rad, or [7] of the base; a start place of the scene unless given.
+            connect: endpoint of the server such as ``tcp/127.0.0.1:7447``; without it the client is alone in its own
+                world.
+            pose: (x, y, yaw) in m and rad, or pose [7] of the base; by default a start place of the scene.
             spawn: number of that start place.
             certificates: folder of this actor's certificate, for a server with TLS.
-            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``: where plants are stepped.
+            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants.
 
         Raises:
-            NameTaken: an actor of this name is there. Refused: the server said no. Both name the remedy.
+            NameTaken: the world has an actor of this name. The message gives the remedy.
+            Refused: the server refused the client. The message gives the remedy.
         """
         self.scene: Scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.model: Model = generate(self.scene)
@@ -103,14 +105,16 @@ class Client:
 
     @property
     def received_bytes(self) -> int:
-        """[B] Received since it joined of plants and objects: their motion, events and what lasts. Not poses of
-        actors."""
+        """[B] Bytes received about plants and objects since joining: motion, events and lasting facts.
+
+        Poses of actors are not included.
+        """
         counters = self._client.replicator.counters
         return sum(family.bytes_in for family in (counters.environment, counters.event, counters.retained))
 
     @property
     def time(self) -> float:
-        """[s] Simulated since this client joined."""
+        """[s] Simulated time since this client joined."""
         return self._client.physics.time
 
     @property
@@ -119,8 +123,7 @@ class Client:
         return tuple(sorted(self._client.remote_actors))
 
     def actor_pose(self, name: str) -> np.ndarray:
-        """Pose [7] of the base of this client's robot or of a remote one; ``KeyError`` if there is none of that
-        name."""
+        """Pose [7] of the base of this client's robot or of a remote actor; ``KeyError`` for an unknown name."""
         if name != self._client.name and name not in self._client.remote_actors:
             raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
         return self._client.physics.rigid.base_state(name)[0]
@@ -131,10 +134,10 @@ class Client:
             self._client.tick()
 
     def run(self, seconds: float) -> None:
-        """Step for so much simulated time, as fast as the world's time passes: slower than real time if one of its
-        clients cannot follow.
+        """Step for ``seconds`` of simulated time at the pace of the world.
 
-        The world does not wait for a client in Python, which may stand still between two calls.
+        The world is slower than real time if one of its clients cannot follow. It does not wait for a client in Python,
+        because this may pause between two calls.
         """
         loop = paced_loop(self._client, is_shared=self._is_shared)
         for _ in range(round(seconds / loop.dt)):
@@ -144,8 +147,10 @@ class Client:
         self._client.follow_steps(None)
 
     def page(self, port: int = 0) -> Page:
-        """Show this client's vineyard in browsers of this machine, and in a cell of a notebook, until it is closed or
-        the client leaves; ``port`` 0: any that is free."""
+        """Show this client's vineyard in browsers on this machine, or in a cell of a notebook.
+
+        The page is served until it is closed or the client leaves. ``port`` 0: any free port.
+        """
         from vinesim.api.page import Page
 
         page = Page(self._client, port)

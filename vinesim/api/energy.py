@@ -1,4 +1,4 @@
-"""Energy and momentum of plants, from their state alone: for checks, plots and learning."""
+"""Energy and momentum of plants, computed from their state, for checks, plots and learning."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ class Energy:
 
     kinetic: float
     elastic: float
-    """Of joint springs and of ties to wires; 0 where all are slack."""
+    """Energy of joint springs and of ties to wires; 0 if all are slack."""
     gravitational: float
-    """Of the height of the centres of mass above z = 0."""
+    """Potential energy of the centres of mass above z = 0."""
 
     @property
     def total(self) -> float:
-        """[J] Sum of the three."""
+        """[J] Sum of kinetic, elastic and gravitational energy."""
         return self.kinetic + self.elastic + self.gravitational
 
 
@@ -37,11 +37,12 @@ class Momentum:
 
 
 def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None = None) -> Energy:
-    """Energy of some trees [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to date.
+    """Energy of ``trees`` [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to date.
 
-    Kinetic: sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic: k theta^2 / 2 about each joint axis, where
-    theta is the rotation vector of the joint, and k d^2 / 2 of each tie; k d (d + u) / 2 with its share of the wire
-    that it deflects by u; of a root on an arm that is twisted by u, less k u (theta - theta as drawn) / 2.
+    Kinetic energy is the sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic energy is the sum of
+    k theta^2 / 2 about each joint axis, with theta the rotation vector of the joint, and of k d^2 / 2 for each tie. A
+    tie that deflects a wire by u counts k d (d + u) / 2, which includes its share of the wire. For a root on an arm
+    that is twisted by u, k u (theta - theta as drawn) / 2 is subtracted.
     """
     model = plants.model
     state = plants.state
@@ -65,7 +66,7 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
 
 
 def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Momentum:
-    """Linear and angular momentum of some trees [k] (all unless given). Poses and velocities must be up to date."""
+    """Linear and angular momentum of ``trees`` [k] (all unless given). Poses and velocities must be up to date."""
     mass, com, velocity, omega, inertia = _motion(plants, _moving_bodies(plants, trees))
     impulse = mass[:, None] * velocity
     spin = np.cross(com, impulse) + np.einsum("bij,bj->bi", inertia, omega)
@@ -73,7 +74,7 @@ def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Mom
 
 
 def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.ndarray:
-    """Bodies [k] that move for themselves; fused berry clusters are part of the body of their bunch."""
+    """Bodies [k] that are simulated; fused berry clusters are part of the body of their bunch."""
     model = plants.model
     size = np.where(plants.state.tree_fine, model.tree_size, model.tree_core)
     number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
@@ -84,7 +85,10 @@ def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.n
 
 
 def _motion(plants: ArticulationSolver, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Mass [k], centre of mass [k, 3], its velocity [k, 3], angular velocity [k, 3], inertia [k, 3, 3]; world axes."""
+    """Mass [k], position [k, 3] and velocity [k, 3] of the centre of mass, angular velocity [k, 3], inertia [k, 3, 3].
+
+    All are in world axes.
+    """
     pose = plants.state.body_q[bodies].astype(float)
     speed = plants.state.body_qd[bodies].astype(float)
     arm = frames.rotate(pose[:, 3:], plants.body_com[bodies].astype(float))

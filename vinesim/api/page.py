@@ -1,4 +1,4 @@
-"""The vineyard of a client in a browser, or in a cell of a notebook."""
+"""Shows the vineyard of a client in a browser or in a cell of a notebook."""
 
 from __future__ import annotations
 
@@ -12,17 +12,19 @@ from vinesim.web.page_server import PageServer
 
 
 class Page:
-    """The live vineyard as a client has it: a notebook shows it in the cell whose last expression it is.
+    """The live vineyard of a client. A notebook shows it in a cell that ends with this object.
 
-    Pages need the extra ``web``, and a browser on the same machine. They show what the client steps.
+    Pages need the extra ``web`` and a browser on the same machine. They change only while the client steps.
     """
 
     height = 480
-    """Of the cell [px]."""
+    """Height of the cell [px]."""
 
     def __init__(self, client: Client, port: int = 0) -> None:
-        """Serve from now on; ``port`` 0: any that is free. :class:`UsageError` if the port is taken or there are no
-        files for pages."""
+        """Start serving; ``port`` 0: any free port.
+
+        :class:`UsageError` if the port is taken or the files of the page are missing.
+        """
         page_files.check()
         world = PageWorld(client)
         self._server = PageServer(world, port)
@@ -33,11 +35,11 @@ class Page:
 
     @property
     def address(self) -> str:
-        """To be opened in a browser of this machine."""
+        """Address to open in a browser on this machine."""
         return self._server.address
 
     def close(self) -> None:
-        """Serve no longer; further calls do nothing."""
+        """Stop serving; further calls do nothing."""
         if self._collect in self._posts:
             self._posts.remove(self._collect)
             self._server.__exit__()

@@ -1,9 +1,9 @@
-"""Picking single bunches with vinebot: which a hand reaches, how much room it has there, and whether the pick succeeds.
+"""Picks single bunches with vinebot: finds reachable bunches and the room for the hand, and simulates the pick.
 
     for grasp in reachable_grasps("demo"):
         print(grasp.bunch, grasp.clearance, attempt_pick("demo", grasp).picked)
 
-Planned and controlled with poses read from the simulation: this is about arm, hand, blade and canopy, not perception.
+Planning and control use poses from the simulation, so this tests arm, hand, blade and canopy, but not perception.
 """
 
 from __future__ import annotations
@@ -24,43 +24,43 @@ from vinesim.scene.spec import Scene, load_scene
 from vinesim.world import Physics
 
 ROBOT = "vinebot"
-"""Whose hand and arms grasps are planned for."""
+"""Robot for which grasps are planned."""
 _END_PHASE = "drive"
-"""The task's first phase after the bunch has been cut and drawn back."""
+"""First phase of the task after the bunch has been cut and drawn back."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Grasp:
-    """How one bunch can be taken: from the place where the hand has most room about it."""
+    """A grasp of one bunch, from the position where the hand has the most room around it."""
 
     bunch: int
     side: str
-    """Arm: left or right."""
+    """Arm, left or right."""
     base: np.ndarray
     """[7] Pose of the robot's base in the world."""
     clearance: float
-    """[m] Of the open hand to anything but its bunch; negative if it overlaps wood or fruit. Counted up to 30 mm."""
+    """[m] Distance of the open hand to everything but its bunch, up to 30 mm; negative if it overlaps wood or fruit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PickAttempt:
-    """One bunch that was tried."""
+    """Result of an attempt to pick one bunch."""
 
     bunch: int
     clearance: float
-    """[m] See :class:`Grasp`."""
+    """[m] Clearance of the hand, see :class:`Grasp`."""
     picked: bool
-    """Cut, in the hand, and drawn back to the robot."""
+    """Whether the bunch was cut, is in the hand, and was drawn back to the robot."""
     reason: str
-    """Why not; empty if picked."""
+    """Reason why the pick failed; empty if it succeeded."""
     others: int
-    """Bunches beside it that came off their vines."""
+    """Number of other bunches that came off their vines."""
 
 
 def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: float = 3.0) -> list[Grasp]:
-    """The bunches of a scene within ``reach`` [m] of its start place ``spawn`` that a hand reaches, freest bases first.
+    """Grasps of bunches within ``reach`` [m] of the scene's start place ``spawn``, most room for the hand first.
 
-    The base may move. Also those are listed about which the hand has no room.
+    The base may move. Bunches that a hand can reach are listed even if the hand has no room around them.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     found = planning.freest_bases(generate(scene), start_pose(scene, spawn)[:2], reach)
@@ -68,7 +68,7 @@ def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: f
 
 
 def attempt_pick(scene: Scene | str | pathlib.Path | Model, grasp: Grasp) -> PickAttempt:
-    """Pick one bunch in a vineyard of its own, at rest before: reach, grasp, cut, draw back. Some 2 s of one core."""
+    """Pick one bunch in a separate vineyard at rest: reach, grasp, cut, draw back. It takes about 2 s on one core."""
     if isinstance(scene, Model):
         model = scene
     else:
@@ -76,7 +76,7 @@ def attempt_pick(scene: Scene | str | pathlib.Path | Model, grasp: Grasp) -> Pic
     physics = Physics(model)
     picker = Robot(physics.rigid, load_description(ROBOT), "picker", pose=grasp.base)
     picker.fit_cutters(physics)
-    # box and path of the plan are those of phases that are not reached
+    # box and path of the plan belong to phases that are not reached
     plan = PickPlan(grasp.bunch, grasp.side, grasp.base, 0, grasp.base[None, :2], 0.0)
     task = PickBunch(physics, picker, plan)
     while not task.is_done and task.phase != _END_PHASE:

@@ -22,25 +22,25 @@ class RecordedMessage:
     """One message of a recording."""
 
     time: float
-    """[s] since the first message."""
+    """[s] Time since the first message."""
     actor: str
-    """Name of the client's actor that sent it; empty for the server."""
+    """Name of the actor whose client sent the message; empty for the server."""
     key: str
-    """Key that it was published on."""
+    """Key on which the message was published."""
     data: dict[str, Any]
-    """What it says, as JSON values; ``raw`` holds its bytes in base64."""
+    """Content of the message as JSON values; ``raw`` has its bytes in base64."""
 
 
 class Recording:
-    """A recording that ``vinesim record`` wrote, open for reading."""
+    """A recording by ``vinesim record``, open for reading."""
 
     def __init__(self, path: str | pathlib.Path) -> None:
-        """Read the file; :class:`~vinesim.net.recording.mcap_reader.InvalidRecording` if it is none."""
+        """Read a file; :class:`~vinesim.net.recording.mcap_reader.InvalidRecording` if it is not a recording."""
         self._recording = read_recording(pathlib.Path(path))
 
     @property
     def info(self) -> dict[str, str]:
-        """What the recorder knew: release, protocol, world, scene, seed, digest."""
+        """Metadata: release, protocol, world, scene, seed, digest."""
         return dict(self._recording.metadata)
 
     @property
@@ -50,12 +50,12 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """[s] from the first message to the last."""
+        """[s] Time from the first message to the last."""
         return self._recording.length if self._recording.messages else 0.0
 
     @property
     def damage(self) -> str:
-        """Empty, or in one line why the file is shorter than it should be; all messages before that can be read."""
+        """One line that says why the file is truncated, or empty. All messages before the damage can be read."""
         return self._recording.damage
 
     def __len__(self) -> int:
@@ -63,7 +63,7 @@ class Recording:
         return len(self._recording.messages)
 
     def __iter__(self) -> Iterator[RecordedMessage]:
-        """All messages in the order of time."""
+        """All messages in order of time."""
         for entry in self._recording.messages:
             data = describe_message(entry.key, entry.payload)
             yield RecordedMessage(entry.time - self._recording.start, sender_of(entry.key), entry.key, data)

@@ -1,9 +1,9 @@
-"""Cameras and lidars that look at a simulation: from a pose, or from a frame of a robot.
+"""Cameras and lidars for a simulation, at a given pose or in a frame of a robot.
 
     frame = Camera("d435").render(simulation, look_at((1.0, -1.0, 1.5), (0.0, 0.0, 1.2)))
     scan = Lidar("vlp16").scan(simulation, robot=robot)
 
-A sensor may look at several simulations in turn; it computes on the device of the one that it looks at.
+A sensor may be used with several simulations in turn; it computes on the device of the simulation.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from vinesim.sensors.lidar import lidar
 
 
 class Camera:
-    """An RGB-D camera of a kind in ``data/cameras``, or of a file."""
+    """An RGB-D camera described by a file in ``data/cameras`` or another file."""
 
     def __init__(
         self,
@@ -35,18 +35,19 @@ class Camera:
         name: str = "camera",
         seed: int = 0,
     ) -> None:
-        """A camera that is not mounted yet.
+        """Make a camera.
 
         Args:
             kind: name or path of a camera file; :class:`~vinesim.sensors.spec_file.SensorError` if it cannot be used.
-            size: width and height [px] with the same angle of view; the camera's own unless given.
-            quality: ``"fast"``, ``"full"`` or ``"still"``: what a picture may cost, not exact depth and labels.
-            name: with ``seed`` it decides the noise of the measured depth.
+            size: width and height [px] at the same angle of view; the camera's own size unless given.
+            quality: ``"fast"``, ``"full"`` or ``"still"``: cost and quality of the picture. Exact depth and labels do
+                not depend on it.
+            name: determines the noise of the measured depth, together with ``seed``.
             seed: see ``name``.
         """
         self.spec = rgbd.CameraSpec.load(kind)
         self.info: CameraInfo = resized_intrinsics(self.spec, size)
-        """Intrinsics."""
+        """Intrinsics of the camera."""
         self._name = name
         self._quality = quality
         self._seed = seed
@@ -65,9 +66,9 @@ class Camera:
 
         Args:
             simulation: the world to look at.
-            pose: [7] of the optical frame in the world (z forward, x right, y down), as :func:`look_at` makes it.
-            robot: take the pose of a frame of this robot instead.
-            frame: which one; the frame of the robot's first camera unless given.
+            pose: pose [7] of the optical frame in the world (z forward, x right, y down), as from :func:`look_at`.
+            robot: use the pose of a frame of this robot instead.
+            frame: name of that frame; the frame of the robot's first camera unless given.
         """
         frame = frame or _first_frame(robot, CameraMount.kind)
         if self._camera is None or self._last is not simulation:
@@ -87,10 +88,10 @@ class Camera:
 
 
 class Lidar:
-    """A spinning lidar of a kind in ``data/lidars``, or of a file."""
+    """A spinning lidar described by a file in ``data/lidars`` or another file."""
 
     def __init__(self, kind: str = "vlp16", *, name: str = "lidar", seed: int = 0) -> None:
-        """A lidar that is not mounted yet; ``name`` and ``seed`` decide the noise.
+        """Make a lidar; ``name`` and ``seed`` determine its noise.
 
         :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
         """
@@ -111,9 +112,9 @@ class Lidar:
 
         Args:
             simulation: the world to measure.
-            pose: [7] of the lidar in the world (x forward, z up), or (x, y, yaw) for one that stands on the ground.
-            robot: take the pose of a frame of this robot instead.
-            frame: which one; the frame of the robot's first lidar unless given.
+            pose: pose [7] of the lidar in the world (x forward, z up), or (x, y, yaw) for a lidar on the ground.
+            robot: use the pose of a frame of this robot instead.
+            frame: name of that frame; the frame of the robot's first lidar unless given.
         """
         frame = frame or _first_frame(robot, LidarMount.kind)
         device = simulation.device
@@ -123,7 +124,7 @@ class Lidar:
 
 
 def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Pose [7] of the optical frame of a camera at ``eye`` [3] m that points at ``target`` [3] m, upright."""
+    """Pose [7] of the optical frame of an upright camera at ``eye`` [3] m that looks at ``target`` [3] m."""
     start = np.asarray(eye, float)
     end = np.asarray(target, float)
     if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
@@ -138,7 +139,7 @@ def _first_frame(robot: Robot | None, kind: str) -> str | None:
 
 
 def _sensor_pose(pose: Sequence[float] | np.ndarray | None, robot: Robot | None, frame: str | None) -> np.ndarray:
-    """Pose [7] of a sensor in the world; :class:`UsageError` unless it was given in exactly one way."""
+    """Pose [7] of a sensor in the world; :class:`UsageError` unless either ``pose`` or ``robot`` is given."""
     if (pose is None) == (robot is None):
         raise UsageError("the sensor has no place, or two; give either a pose [7] or a robot")
     if robot is None:

@@ -38,15 +38,15 @@ if TYPE_CHECKING:
     from vinesim.sensors.primitives.scene_primitives import Primitives
 
 Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]
-"""What can be simulated: a model, a scene or the name or path of one, canes."""
+"""Things that can be simulated: a model, a scene, the name or path of a scene, one or more canes."""
 
 
 class Simulation:
     """A world that moves when :meth:`step` is called; nothing runs in the background.
 
-    Trees that are in equilibrium start asleep, all others awake. A tree falls asleep when it has come to rest
-    (``sleep_distance`` and the like of ``parameters``) and wakes when something touches it; sleeping trees cost
-    nothing.
+    Trees in equilibrium start asleep, all others awake. A tree falls asleep when it has come to rest (see
+    ``sleep_distance`` and related fields of ``parameters``) and wakes when something touches it. Sleeping trees cost no
+    time.
     """
 
     def __init__(
@@ -63,17 +63,16 @@ class Simulation:
         """Build the world; it does not move until :meth:`step`.
 
         Args:
-            source: see :data:`Source`. A scene brings its physics parameters and its wind.
+            source: see :data:`Source`. A scene provides its physics parameters and its wind.
             dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
-            parameters: all numbers of the physics, in place of those of the scene.
-            sleep: whether trees at rest fall asleep, in place of ``parameters.sleep``.
+            parameters: all numbers of the physics; they replace the parameters of the scene.
+            sleep: whether trees at rest fall asleep; it replaces ``parameters.sleep``.
             detach: whether bunches detach when they are pulled too hard.
-            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``: where plants are stepped, and cameras and lidars that look
-                at this world compute.
-            threads: of the CPU that share the plants.
+            device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
+            threads: number of CPU threads for the plants.
         """
         self.scene: Scene | None = None
-        """The scene that was simulated; None for a model or canes."""
+        """The simulated scene; None for a model or canes."""
         if isinstance(source, (str, pathlib.Path)):
             source = load_scene(source)
         if isinstance(source, Scene):
@@ -84,11 +83,11 @@ class Simulation:
         chosen = parameters or (self.scene.physics if self.scene else PhysicsParameters())
         changes = {name: value for name, value in (("dt", dt), ("sleep", sleep)) if value is not None}
         self.parameters: PhysicsParameters = msgspec.structs.replace(chosen, **changes)
-        """All numbers of the physics; they are fixed from the start."""
+        """All numbers of the physics; they cannot be changed later."""
         self.device = device
-        """Where plants are stepped and sensors compute."""
+        """Device for stepping plants and for sensors."""
         self.physics = Physics(model, parameters=self.parameters, device=device, threads=threads, detachment=detach)
-        """The solver below, for what this class does not offer."""
+        """The underlying physics, for functions that this class does not offer."""
         self.robots: dict[str, Robot] = {}
         """Robots by name; their commands take effect in the next step."""
         self._robots_added = 0
@@ -104,11 +103,11 @@ class Simulation:
     # ------------------------------------------------------------------ time
 
     def step(self, count: int = 1) -> None:
-        """Advance by ``count`` steps of :attr:`dt`. Wrenches that were applied act in all of them, then end."""
+        """Advance by ``count`` steps of :attr:`dt`. Applied wrenches act in all these steps and then end."""
         if not isinstance(count, int | np.integer) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._detachments = []
-        for name in self.robots.keys() - set(self.physics.rigid.robots):  # one that was told to remove itself
+        for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that removed themselves
             self._forget_robot(name)
         for _ in range(count):
             for robot in self.robots.values():
@@ -126,7 +125,7 @@ class Simulation:
 
     @property
     def time(self) -> float:
-        """[s] since the start."""
+        """[s] Simulated time since the start."""
         return self.physics.time
 
     @property
@@ -152,7 +151,7 @@ class Simulation:
 
     @property
     def awake(self) -> np.ndarray:
-        """[k] numbers of the trees that are awake, sorted."""
+        """[k] Indices of the awake trees, sorted."""
         return self.physics.plants.awake.copy()
 
     @property
@@ -187,7 +186,7 @@ class Simulation:
         return pose[:3] + frames.rotate(pose[3:], np.array([float(self.model.body_length[body]), 0.0, 0.0]))
 
     def tip_body(self, tree: int = 0) -> int:
-        """Number of the last body of a tree's main axis: from the root on, always the first piece of cane."""
+        """Index of the last body of a tree's main axis, found by following the first child that is a piece of cane."""
         bodies = self.model.bodies_of(self._tree(tree))
         body = bodies.start
         while True:
@@ -198,13 +197,13 @@ class Simulation:
             body = bodies.start + int(following[0])
 
     def snapshot(self) -> Snapshot:
-        """The whole world at the current time, for sensors: a value that never changes."""
+        """The whole world at the current time, for sensors. It does not change when the simulation steps."""
         return self.physics.snapshot()
 
     # ------------------------------------------------------------------ actions
 
     def wake(self, tree: int | None = None) -> None:
-        """Let a tree move from the next step on, or all trees; needed after joint rotations were written."""
+        """Wake a tree, or all trees, for the next step. Call it after joint rotations were written."""
         trees = np.arange(len(self.model.tree_first)) if tree is None else np.array([self._tree(tree)])
         self.physics.wake(trees)
 
@@ -215,10 +214,10 @@ class Simulation:
         torque: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
         at: Sequence[float] | np.ndarray | None = None,
     ) -> None:
-        """Push a plant's body during the next call of :meth:`step`; several wrenches add up. Its tree wakes.
+        """Push a plant's body during the next call of :meth:`step`. Several wrenches add up. The body's tree wakes.
 
         Args:
-            body: number in the model.
+            body: index in the model.
             force: [3] N, world axes.
             torque: [3] N m, world axes.
             at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
@@ -247,8 +246,8 @@ class Simulation:
 
         Args:
             robot: name of the robot.
-            link: of its URDF; ``RobotError`` if there is none of that name.
-            force: [3] N, world axes; replaces that of an earlier call for this link.
+            link: name of a link of its URDF; ``RobotError`` if there is none of that name.
+            force: [3] N, world axes; replaces the force of an earlier call for this link.
             torque: [3] N m, world axes.
             at: [3] m in the world, the point where the force acts; the link's centre of mass unless given.
         """
@@ -262,13 +261,12 @@ class Simulation:
         self._pushed.add((robot, link))
 
     def cut(self, body: int) -> None:
-        """Cut a cane at the base of a body: what grows on it falls. The cut is the body's joint, not within a
-        segment."""
+        """Cut a cane at the joint of a body; the body and everything that grows on it fall."""
         body = self._body(body)
         self.physics.cut(body)
 
     def pick(self, bunch: int) -> None:
-        """Detach a bunch from its vine: it falls."""
+        """Detach a bunch from its vine, so that it falls."""
         self.physics.pick(checked_index("bunch", bunch, len(self.model.bunch_body), UsageError))
 
     def add_robot(
@@ -278,7 +276,7 @@ class Simulation:
         *,
         name: str = "",
     ) -> Robot:
-        """Add a robot by the name of one in ``data/robots`` or the path of a URDF file.
+        """Add a robot, given by a name from ``data/robots`` or the path of a URDF file.
 
         Args:
             robot: name or path; :class:`~vinesim.robot.description.urdf.DescriptionError` if it cannot be used.
@@ -296,7 +294,7 @@ class Simulation:
         return added
 
     def remove_robot(self, name: str) -> None:
-        """Remove a robot and its cutters; what it held falls."""
+        """Remove a robot and its cutters; objects that it held fall."""
         if name not in self.robots:
             raise UsageError(f"no robot {name!r}; there are: {', '.join(self.robots) or 'none'}")
         self.robots[name].remove()
@@ -309,7 +307,7 @@ class Simulation:
     # ------------------------------------------------------------------ sensors
 
     def primitives(self) -> Primitives:
-        """What cameras and lidars see, at the current time (built once)."""
+        """Visible primitives for cameras and lidars, at the current time. They are built in the first call."""
         if self._primitives is None:
             from vinesim.sensors.primitives.scene_primitives import Primitives
 
@@ -330,7 +328,7 @@ class Simulation:
 
 
 def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]; :class:`UsageError` otherwise."""
+    """Pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]; :class:`UsageError` for others."""
     given = _numbers(pose)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
         shown = given.tolist() if given.ndim else pose
@@ -362,7 +360,7 @@ def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.nda
 
 
 def _numbers(value: Sequence[float] | np.ndarray) -> np.ndarray:
-    """An array of what was given; of one NaN if it is not an array of numbers."""
+    """``value`` as an array of numbers; an array of one NaN if it is not one."""
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""The same function for many seeds or parameters, on all cores; what a killed process had is done again.
+"""Maps a function over many seeds or parameters on all cores; tasks of killed processes are repeated.
 
 def tip(seed):
     simulation = vinesim.Simulation(vinesim.CaneBuilder(tip_mass=0.01 * seed))
@@ -24,14 +24,14 @@ from vinesim.core.errors import UsageError
 log = logging.getLogger(__name__)
 
 MAX_LOSSES = 3
-"""How often the worker of one parameter may die before the parameter is taken for what kills it."""
+"""Number of times that the worker of one parameter may die until the parameter is taken to be the cause."""
 
 P = TypeVar("P")
 R = TypeVar("R")
 
 
 class WorkerLost(RuntimeError):
-    """A worker died again and again with the same parameter; the text says which one."""
+    """A worker died repeatedly with the same parameter; the message names the parameter."""
 
     exit_code = 5
 
@@ -42,12 +42,13 @@ def sweep(
     """The results of ``function`` for all parameters, in their order.
 
     Args:
-        function: of one parameter; a function of a module, since processes import it by its name. What it raises ends
-            the sweep.
-        parameters: seeds, or anything that can be pickled.
-        workers: processes on this machine; one for each core unless given.
-        executor: takes the tasks instead: anything with ``submit`` as :class:`concurrent.futures.Executor` has it, a
-            cluster's for example. Whether it repeats what a killed worker had is its own matter; Dask's does.
+        function: function of one parameter. It must be defined in a module, because processes import it by name. An
+            exception from it ends the sweep.
+        parameters: seeds, or other values that can be pickled.
+        workers: number of processes on this machine; one for each core unless given.
+        executor: executor for the tasks instead of these processes: an object with the method ``submit`` of
+            :class:`concurrent.futures.Executor`, such as a cluster. Whether tasks of killed workers are repeated
+            depends on the executor; Dask repeats them.
 
     Raises:
         WorkerLost: a worker died :data:`MAX_LOSSES` times with the same parameter.
@@ -67,7 +68,7 @@ def sweep(
     lost = [0] * len(tasks)
     while missing := [index for index in range(len(tasks)) if index not in results]:
         first = missing[0]
-        # Of the tasks that were at work any may have killed its process: after two losses the first one goes alone.
+        # any of the running tasks may have killed its process, so after two losses the first one runs alone
         chosen = [first] if lost[first] >= MAX_LOSSES - 1 else missing
         if _all_done(function, tasks, chosen, number, results):
             continue
@@ -82,8 +83,8 @@ def sweep(
 def _all_done(
     function: Callable[[P], R], tasks: list[P], chosen: list[int], workers: int, results: dict[int, R]
 ) -> bool:
-    """Run the chosen tasks in processes until all are done, or a process dies: False. ``results`` has what is done."""
-    # A fresh interpreter for each process: Warp and Zenoh do not survive a fork.
+    """Run the ``chosen`` tasks in processes and add to ``results``. Returns False if a process died before the end."""
+    # a fresh interpreter for each process, because Warp and Zenoh do not survive a fork
     context = multiprocessing.get_context("spawn")
     with concurrent.futures.ProcessPoolExecutor(min(workers, len(chosen)), mp_context=context) as pool:
         futures = {pool.submit(function, tasks[index]): index for index in chosen}

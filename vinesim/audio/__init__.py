@@ -1,1 +1,1 @@
-"""Voices and sounds: frames, the law of loudness, who hears spectators, decoding, mixing at a microphone."""
+"""Voices and sounds: frames, loudness over distance, who hears whom, decoding, mixing at a microphone."""

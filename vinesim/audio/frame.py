@@ -1,7 +1,7 @@
-"""Frames of sound as they cross the network and the page's socket: 20 ms of mono, coded by Opus or as PCM16.
+"""Frames of sound on the network and on the page's socket: 20 ms of mono sound, coded by Opus or as PCM16.
 
-An Opus frame is one packet with one frame of 20 ms (RFC 6716, section 3.1), PCM16 is 16 bit little-endian at
-:data:`SAMPLE_RATE`.
+An Opus frame is one packet with one frame of 20 ms (RFC 6716, section 3.1). PCM16 has signed 16-bit little-endian
+samples at :data:`SAMPLE_RATE`.
 """
 
 from __future__ import annotations
@@ -11,19 +11,19 @@ import enum
 import numpy as np
 
 SAMPLE_RATE = 16_000
-"""[Hz] Of PCM16, and of robots' microphones and loudspeakers: what speech recognition expects."""
+"""[Hz] Sample rate of PCM16 and of robots' microphones and loudspeakers; speech recognition expects it."""
 
 FRAME = 0.02
-"""[s] Sound in one frame."""
+"""[s] Duration of one frame."""
 
 FRAME_SAMPLES = 320
 """Samples of a frame of PCM16."""
 
 MAX_OPUS = 800
-"""[B] Longest Opus packet; speech at 24 kbit/s has 60."""
+"""[B] Longest Opus packet that is accepted; speech at 24 kbit/s needs 60."""
 
 _OPUS_20_MS = frozenset((1, 5, 9, 13, 15, 19, 23, 27, 31))
-"""Configurations of Opus with frames of 20 ms (RFC 6716, table 2)."""
+"""Configuration numbers of Opus with frames of 20 ms (RFC 6716, table 2)."""
 
 
 class Codec(enum.IntEnum):
@@ -34,7 +34,7 @@ class Codec(enum.IntEnum):
 
 
 def find_fault(codec: int, data: bytes) -> str:
-    """Why ``data`` is no frame of this codec; empty: it is one, as far as its length and first byte say."""
+    """The reason why ``data`` is not a frame of this codec; empty if its length and first byte are valid."""
     if codec == Codec.PCM16:
         return "" if len(data) == 2 * FRAME_SAMPLES else f"PCM16 of {len(data)} B, not {2 * FRAME_SAMPLES}"
     if codec != Codec.OPUS:
@@ -50,10 +50,10 @@ def find_fault(codec: int, data: bytes) -> str:
 
 
 def to_pcm(samples: np.ndarray) -> bytes:
-    """PCM16 of samples [n] from -1 to 1; clipped beyond."""
+    """Samples [n] as PCM16; values outside -1 to 1 are clipped."""
     return np.round(np.clip(samples, -1.0, 1.0) * 32767.0).astype("<i2").tobytes()
 
 
 def from_pcm(data: bytes) -> np.ndarray:
-    """Samples [n] float32 from -1 to 1 of PCM16; an odd last byte is left out."""
+    """PCM16 as samples [n] float32 from -1 to 1; an odd last byte is left out."""
     return np.frombuffer(data, "<i2", len(data) // 2).astype(np.float32) / np.float32(32767.0)

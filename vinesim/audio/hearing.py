@@ -1,25 +1,27 @@
-"""Who hears whom, and how loud."""
+"""Which actors hear which, and how loudness falls with distance."""
 
 from __future__ import annotations
 
 import enum
 
-# How loud a sound is at a distance: the free field's 1/d, nothing beyond hearing reach.
+# Loudness at a distance: 1/d as in a free field, zero beyond REACH.
 
 
 REFERENCE = 1.0
-"""[m] Up to here a sound is as loud as it was recorded."""
+"""[m] Up to this distance a sound is as loud as it was recorded."""
 
 REACH = 25.0
-"""[m] Beyond it nothing is heard, and no voice crosses the network. GUESSED."""
+"""[m] Beyond this distance nothing is heard, and no voice crosses the network. GUESSED."""
 
 FADE = 5.0
-"""[m] Before :data:`REACH`: here loudness falls to nothing, so that nothing begins at once. GUESSED."""
+"""[m] Loudness fades to zero over this last distance before :data:`REACH`, so no sound begins abruptly. GUESSED."""
 
 
 def gain(distance: float) -> float:
-    """Amplitude of a sound at a ``distance`` [m], relative to that within :data:`REFERENCE`: 1/d, and 0 from
-    :data:`REACH` on."""
+    """Amplitude of a sound at a ``distance`` [m], relative to its amplitude within :data:`REFERENCE`.
+
+    It falls with 1/d and is 0 from :data:`REACH` on.
+    """
     if not distance < REACH:
         return 0.0
     return REFERENCE / max(distance, REFERENCE) * min(1.0, (REACH - distance) / FADE)
@@ -34,7 +36,7 @@ class SpectatorsSpeakTo(enum.StrEnum):
 
     NOBODY = "nobody"
     PEOPLE = "people"
-    """People and other spectators; robots are deaf to them."""
+    """People and other spectators hear spectators; robots do not."""
     ALL = "all"
 
 

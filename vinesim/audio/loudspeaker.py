@@ -1,4 +1,4 @@
-"""A robot's loudspeaker: plays what it is given, frame by frame, at the pace of time."""
+"""A robot's loudspeaker: plays queued sound frame by frame in real time."""
 
 from __future__ import annotations
 
@@ -9,30 +9,31 @@ from collections.abc import Iterator
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES
 
 MAX_QUEUED = 30.0
-"""[s] Sound that waits to be played; more is refused."""
+"""[s] Longest sound that can be queued; more is refused."""
 
 PREPARATION = 0.06
-"""[s] Sound that must wait, or time that must pass, before it begins: so messages join without gaps."""
+"""[s] Playing begins when the queue holds this much sound or this time has passed, so that messages join without
+gaps."""
 
 _FRAME_BYTES = 2 * FRAME_SAMPLES
 
 
 class Loudspeaker:
-    """Takes PCM16 of any length, from any thread, and gives it out in frames; the last one ends with silence."""
+    """Splits PCM16 of any length into frames; the last frame is padded with silence. Safe for several threads."""
 
     def __init__(self) -> None:
         self.refused = 0
-        """Bytes that found no room."""
+        """Number of bytes refused because the queue was full."""
         self._waiting: collections.deque[bytes] = collections.deque()
         self._rest = b""
         self._due: float | None = None
-        """[s] When the next frame begins; None: it is silent."""
+        """[s] Time at which the next frame begins; None while nothing is played."""
         self._waits_since: float | None = None
-        """[s] When the sound that has not begun yet was first seen."""
+        """[s] Time at which :meth:`frames` first saw the queued sound; None while nothing waits to begin."""
         self._lock = threading.Lock()
 
     def play(self, pcm: bytes) -> None:
-        """Play PCM16 behind what waits."""
+        """Append PCM16 to the queue."""
         with self._lock:
             room = round(MAX_QUEUED / FRAME) * _FRAME_BYTES - len(self._waiting) * _FRAME_BYTES - len(self._rest)
             self.refused += max(len(pcm) - max(room, 0), 0)
@@ -42,7 +43,10 @@ class Loudspeaker:
             self._rest = data[whole:]
 
     def frames(self, now: float) -> Iterator[tuple[float, bytes]]:
-        """Frames that were played until ``now`` [s], and when each began; the first begins a frame before ``now``."""
+        """Frames played until ``now`` [s], each with the time at which it began.
+
+        The first frame of a sound begins one frame before ``now``.
+        """
         with self._lock:
             if self._due is None and (self._waiting or self._rest):
                 self._waits_since = now if self._waits_since is None else self._waits_since

@@ -1,8 +1,7 @@
-"""What a microphone records: the sum of all voices and tones near it, each by its loudness there, in blocks of 20 ms.
+"""A microphone: records the sum of all voices and tones near it in blocks of 20 ms, each as loud as it is there.
 
-Frames of sound are stamped with the network time at which they began. A block is recorded :attr:`Microphone.delay`
-after its end, so that frames that are under way still reach it; one that comes too late is counted, and the delay
-grows.
+A frame of sound is stamped with the network time at which it began. A block is recorded :attr:`Microphone.delay` after
+its end, so that frames on their way still reach it. A frame that arrives later is counted, and the delay grows.
 """
 
 from __future__ import annotations
@@ -16,19 +15,20 @@ from vinesim.audio import opus
 from vinesim.audio.frame import FRAME, FRAME_SAMPLES, SAMPLE_RATE, Codec, from_pcm
 
 DELAY = 0.06
-"""[s] From the end of a block until it is recorded, at first."""
+"""[s] Initial delay from the end of a block until it is recorded."""
 
 MAX_DELAY = 0.3
-"""[s] The same at most; voices may be 500 ms late (CANOPIES D6.4, section 5.5)."""
+"""[s] Largest delay from the end of a block until it is recorded; voices may be 500 ms late (CANOPIES D6.4, section
+5.5)."""
 
 MAX_CONCEALED = 3
-"""Lost frames in a row that are filled with the one before."""
+"""Largest number of consecutive lost frames that are replaced by a copy of the last frame."""
 
 CAPACITY = 2.0
-"""[s] Sound that is stored; what is stamped later than this after the present is not of it."""
+"""[s] Length of the ring buffer; frames stamped further in the future are dropped."""
 
 MAX_SPEAKERS = 64
-"""Voices that are followed at a time; the one that has been silent for longest is forgotten."""
+"""Largest number of voices at a time; beyond it the voice that was silent longest is forgotten."""
 
 _RING = round(CAPACITY * SAMPLE_RATE)
 
@@ -39,13 +39,13 @@ class HeardFrame:
 
     speaker: str
     number: int
-    """Of the frame, counted by the speaker, modulo 65,536."""
+    """Sequence number of the frame, counted by the speaker, modulo 65,536."""
     time: float
-    """[s] of the network, when it began."""
+    """[s] Network time at which the frame began."""
     codec: Codec
     data: bytes
     gain: float
-    """Amplitude at the hearer, relative to that at the speaker."""
+    """Ratio of the amplitude at the hearer to the amplitude at the speaker."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -53,52 +53,52 @@ class Block:
     """Recorded sound."""
 
     time: float
-    """[s] of the network, of the first sample."""
+    """[s] Network time of the first sample."""
     samples: np.ndarray
-    """[:data:`FRAME_SAMPLES`] float32; louder sounds go beyond 1"""
+    """[:data:`FRAME_SAMPLES`] float32; the sum of loud sounds may exceed 1."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Voice:
-    """What is known of one speaker."""
+    """State of one speaker."""
 
     number: int
     end: int
-    """Sample after the last one."""
+    """Index of the sample after the speaker's last one."""
     gain: float
     last: np.ndarray
     decoder: opus.OpusDecoder | None = None
 
 
 class Microphone:
-    """Mixes sound; not for several threads."""
+    """Mixes sounds into blocks. Use it from one thread only."""
 
     def __init__(self) -> None:
         self.delay = DELAY
-        """[s] From the end of a block until it is recorded."""
+        """[s] Delay from the end of a block until it is recorded."""
         self.lost = 0
-        """Frames that never came."""
+        """Number of frames that never arrived."""
         self.late = 0
-        """Frames that came when their block had been recorded."""
+        """Number of frames that arrived after their block had been recorded."""
         self.undecoded = 0
-        """Frames that could not be decoded."""
+        """Number of frames that could not be decoded."""
         self._mix = np.zeros(_RING, np.float32)
         self._next: int | None = None
-        """First sample of the next block; None: nothing was recorded."""
+        """Index of the first sample of the next block; None until the first block."""
         self._voices: dict[str, _Voice] = {}
         self._tones: dict[str, tuple[int, float, float]] = {}
-        """Sample up to which a tone is mixed, its amplitude there and its frequency [Hz]."""
+        """By source: sample up to which its tone is mixed, the amplitude at that sample, and the frequency [Hz]."""
 
     @property
     def missed(self) -> int:
-        """Frames that are not in what was recorded."""
+        """Number of frames that are missing from the recording."""
         return self.lost + self.late + self.undecoded
 
     def hear(self, frame: HeardFrame) -> None:
         """Mix a frame that has arrived."""
         voice = self._voices.pop(frame.speaker, None)
         step = 1 if voice is None else (frame.number - voice.number) % 65536
-        if voice is not None and not 0 < step < 32768:  # twice, or overtaken
+        if voice is not None and not 0 < step < 32768:  # received twice or out of order
             self._voices[frame.speaker] = voice
             self.late += step != 0
             return
@@ -130,11 +130,13 @@ class Microphone:
         self._voices[frame.speaker] = _Voice(frame.number, start + len(samples), frame.gain, samples, decoder)
 
     def sound(self, source: str, frequency: float, gain: float, now: float) -> None:
-        """Mix a tone of ``frequency`` [Hz] up to ``now`` [s] of the network, from where it was mixed before; its
-        amplitude goes from what it was to ``gain``. Frequency 0: it ends."""
+        """Mix a tone of ``frequency`` [Hz] up to network time ``now`` [s], from where this source was mixed before.
+
+        The amplitude changes linearly from its previous value to ``gain``. Frequency 0 ends the tone.
+        """
         end = round(now * SAMPLE_RATE)
         start, before, last = self._tones.pop(source, (end, 0.0, frequency))
-        if start < end - 2 * FRAME_SAMPLES:  # it was not heard for a while
+        if start < end - 2 * FRAME_SAMPLES:  # the tone was out of hearing for a while
             start = end - 2 * FRAME_SAMPLES
             before = 0.0
         frequency = frequency or last
@@ -147,7 +149,7 @@ class Microphone:
         self._tones[source] = end, gain, frequency
 
     def blocks(self, now: float) -> Iterator[Block]:
-        """Blocks that are complete at ``now`` [s] of the network."""
+        """Blocks that are complete at network time ``now`` [s]."""
         ready = int((now - self.delay) * SAMPLE_RATE)
         if self._next is None or not self._next - _RING < ready < self._next + _RING // 2:
             self._mix[:] = 0.0  # the first, or the clock was set
@@ -161,7 +163,7 @@ class Microphone:
             self._next += FRAME_SAMPLES
 
     def _add(self, start: int, samples: np.ndarray) -> bool:
-        """Add samples at their place; whether all of them were in time."""
+        """Add samples to the ring buffer from sample ``start`` on. Returns whether all of them were in time."""
         if self._next is None:
             return True
         skip = max(self._next - start, 0)
@@ -172,7 +174,7 @@ class Microphone:
         return skip == 0
 
     def _conceal(self, voice: _Voice, count: int) -> None:
-        """Fill ``count`` samples that were lost with the last frame, fading."""
+        """Replace ``count`` lost samples by repetitions of the voice's last frame that fade out."""
         count = min(count, MAX_CONCEALED * FRAME_SAMPLES)
         filled = np.resize(voice.last, count) * np.linspace(voice.gain, 0.0, count, dtype=np.float32)
         self._add(voice.end, filled)
@@ -180,7 +182,7 @@ class Microphone:
     def _decode(
         self, frame: HeardFrame, decoder: opus.OpusDecoder | None
     ) -> tuple[np.ndarray | None, opus.OpusDecoder | None]:
-        """Samples of a frame, None if it cannot be decoded; the decoder of that speaker."""
+        """Samples of a frame (None if it cannot be decoded), and the speaker's decoder for its next frame."""
         if frame.codec is Codec.PCM16:
             return from_pcm(frame.data), decoder
         if decoder is None:

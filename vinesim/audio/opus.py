@@ -9,7 +9,7 @@ import numpy as np
 from vinesim.audio.frame import FRAME_SAMPLES, SAMPLE_RATE
 
 OPUS_RATE = 48_000
-"""[Hz] At which PyAV decodes."""
+"""[Hz] Sample rate at which PyAV decodes."""
 
 _FACTOR = OPUS_RATE // SAMPLE_RATE
 _TAPS = 48
@@ -17,7 +17,7 @@ _HALF = (_TAPS - 1) / 2.0
 _TIME = (np.arange(_TAPS) - _HALF) / _FACTOR
 _LOW_PASS = (0.9 * np.sinc(0.9 * _TIME) * np.hamming(_TAPS)).astype(np.float32)
 _LOW_PASS /= _LOW_PASS.sum()
-"""Windowed sinc with its cut-off at 7.2 kHz: what is above half of :data:`SAMPLE_RATE` would become other tones."""
+"""Windowed sinc with its cut-off at 7.2 kHz. It prevents aliasing of frequencies above half of :data:`SAMPLE_RATE`."""
 
 
 def is_available() -> bool:
@@ -29,7 +29,7 @@ class OpusDecoder:
     """Decodes the packets of one speaker, in order."""
 
     def __init__(self) -> None:
-        """ImportError without PyAV."""
+        """Raises ImportError if PyAV is not installed."""
         import av
 
         self._av = av
@@ -43,7 +43,7 @@ class OpusDecoder:
         return codec
 
     def decode(self, packet: bytes) -> np.ndarray | None:
-        """Samples [:data:`FRAME_SAMPLES`] float32 from -1 to 1; None for what is no Opus packet of 20 ms."""
+        """Samples [:data:`FRAME_SAMPLES`] float32 from -1 to 1; None if ``packet`` is not an Opus packet of 20 ms."""
         try:
             decoded = [frame.to_ndarray() for frame in self._codec.decode(self._av.Packet(packet))]
         except ValueError:

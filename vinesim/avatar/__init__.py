@@ -1,5 +1,5 @@
-"""People that this client moves: a person, its haptic feedback and shears, finger poses, estimated legs, a script.
+"""People whom this client moves: pose sources, haptic feedback, shears, finger poses, estimated legs.
 
-Their bodies in the physics are in ``vinesim.rigid``; copies of other clients' people in
+The bodies of people in the physics are in ``vinesim.rigid``, the copies of other clients' people in
 ``vinesim.client.remote``.
 """

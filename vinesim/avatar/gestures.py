@@ -1,7 +1,7 @@
-"""Gestures: named finger poses of a hand, those that the buttons of a controller make, and a person's own.
+"""Gestures: named finger poses of a hand, either made by the buttons of a controller or defined by the user.
 
-A button that is touched bends the thumb, the trigger the index finger, the grip the other three (D6.4, section 3.4):
-six of their eight combinations are gestures. A person's own poses stand in a TOML file, and on the buttons a and b:
+Touching a button bends the thumb, the trigger bends the index finger, the grip bends the other three (D6.4, section
+3.4). Six of the eight combinations are gestures. A TOML file can define more poses and assign them to buttons a and b:
 
     [poses]
     victory = [1.0, 0.0, 0.0, 1.0, 1.0]   # thumb, index, middle, ring, little finger
@@ -22,7 +22,7 @@ import msgspec
 from vinesim.core.toml_loader import DataError, load_toml
 
 FingerBend = tuple[float, float, float, float, float]
-"""[1] One number for each finger, from the thumb on; see :class:`vinesim.scene.values.HumanPose`."""
+"""[1] Bend of each finger from 0 to 1, thumb first; see :class:`vinesim.scene.values.HumanPose`."""
 
 OPEN_HAND: FingerBend = (0.0, 0.0, 0.0, 0.0, 0.0)
 FIST: FingerBend = (1.0, 1.0, 1.0, 1.0, 1.0)
@@ -34,10 +34,10 @@ GESTURES: dict[str, FingerBend] = {
     "thumb_and_index": (0.0, 0.0, 1.0, 1.0, 1.0),
     "pinch": (1.0, 1.0, 0.0, 0.0, 0.0),
 }
-"""The six gestures. Of the two other combinations a bent thumb alone is near the open hand, a bent index finger alone
-near the pinch."""
+"""The six gestures. The two other combinations need no name: a bent thumb alone is close to the open hand, a bent index
+finger alone is close to the pinch."""
 MAX_DIFFERENCE = 0.4
-"""A finger that is bent by more than this otherwise makes another gesture [1]. GUESSED."""
+"""Largest difference of any finger's bend at which a hand still shows a gesture [1]. GUESSED."""
 
 _Bend = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
@@ -61,13 +61,13 @@ class Gestures:
     """The finger poses that one person can make."""
 
     poses: Mapping[str, FingerBend] = dataclasses.field(default_factory=lambda: dict(GESTURES))
-    """By name: the six, and the person's own."""
+    """By name: the poses of :data:`GESTURES` and the person's own."""
     buttons: Mapping[str, FingerBend] = dataclasses.field(default_factory=dict)
-    """Poses on the buttons ``a`` and ``b`` of either controller (x and y of a left one)."""
+    """Poses assigned to the buttons ``a`` and ``b`` of either controller (labelled x and y on a left one)."""
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Gestures:
-        """The six and those of a file; :class:`GestureError` in one line if it cannot be used."""
+        """The poses of :data:`GESTURES` and of a file; raises :class:`GestureError` if the file cannot be used."""
         given = load_toml(path, _GestureFile, GestureError)
         poses = GESTURES | given.poses
         buttons = {button: name for button, name in msgspec.structs.asdict(given.buttons).items() if name}
@@ -77,17 +77,17 @@ class Gestures:
         return cls(poses, {button: poses[name] for button, name in buttons.items()})
 
     def name_of(self, fingers: tuple[float, ...]) -> str:
-        """Name of the pose that ``fingers`` make, empty if none is near."""
+        """Name of the pose closest to ``fingers``; empty if none is within :data:`MAX_DIFFERENCE`."""
         away = {name: max(abs(a - b) for a, b in zip(fingers, pose, strict=True)) for name, pose in self.poses.items()}
         nearest = min(away, key=lambda name: away[name])
         return nearest if away[nearest] <= MAX_DIFFERENCE else ""
 
 
 def finger_bend(*, closed: bool) -> FingerBend:
-    """The fingers of a hand that is closed or open."""
+    """Finger pose of a closed or open hand."""
     return FIST if closed else OPEN_HAND
 
 
 def shears_grip(*, closed: bool) -> FingerBend:
-    """The fingers of a hand around shears that are closed or open. GUESSED."""
+    """Finger pose of a hand that holds closed or open shears. GUESSED."""
     return (0.4, 0.8, 0.8, 0.8, 0.8) if closed else (0.2, 0.5, 0.5, 0.5, 0.5)

@@ -1,4 +1,4 @@
-"""Estimates hips and feet of a person of whom only head and hands are tracked."""
+"""Estimates the hips and feet of a person whose head and hands alone are tracked."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ LIFT_HEIGHT = 0.08
 
 
 class LegEstimator:
-    """Hips below the head, and feet that make a step when they are left behind.
+    """Places the hips below the head, and lets a foot step when the body has moved away from it.
 
-    The feet depend on their past: two estimators of the same head do not give the same legs.
+    The feet depend on past motion: two estimators with the same head pose may give different legs.
     """
 
     def __init__(self, pose: HumanPose, dt: float = 0.01) -> None:
-        """``pose``: at the start; ``dt`` [s] between calls of :meth:`update`."""
+        """``pose``: pose at the start; ``dt`` [s]: time between calls of :meth:`update`."""
         self.dt = dt
         self._below_head = frames.compose(
             frames.inverse(_upright(pose.head)), np.stack([pose.hips, pose.left_foot, pose.right_foot])
@@ -30,17 +30,17 @@ class LegEstimator:
         self._feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
         self._start = self._feet.copy()
         self._swing = [1.0, 1.0]
-        """[foot] Phase of its step, 0 to 1."""
+        """[foot] Phase of the foot's step, 0 to 1."""
         self._head = np.asarray(pose.head[:3], float).copy()
 
     def stand(self, head: np.ndarray) -> None:
-        """Both feet under a head at ``head`` [7], wherever they were: the person was put there."""
+        """Put both feet under the head pose ``head`` [7] at once, for a person who was moved there without walking."""
         self._feet = frames.compose(_upright(head), self._below_head)[1:]
         self._swing = [1.0, 1.0]
         self._head = np.asarray(head[:3], float).copy()
 
     def update(self, head: np.ndarray) -> np.ndarray:
-        """Hips and both feet [3, 7] a time ``dt`` later, with the head at ``head`` [7]."""
+        """Advance by ``dt`` to the head pose ``head`` [7]; returns the poses [3, 7] of the hips and both feet."""
         there = frames.compose(_upright(head), self._below_head)
         ahead = (head[:3] - self._head) / self.dt * SWING_TIME
         self._head = np.asarray(head[:3], float).copy()
@@ -63,5 +63,5 @@ class LegEstimator:
 
 
 def _upright(head: np.ndarray) -> np.ndarray:
-    """The pose [7] of a head, with its yaw alone."""
+    """The pose [7] of a head without its pitch and roll."""
     return frames.pose(head[:3], frames.from_yaw(frames.to_yaw(head[3:])))

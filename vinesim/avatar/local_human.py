@@ -1,4 +1,4 @@
-"""A person whom this client moves: pose from a source, shears, update for other clients, haptic feedback."""
+"""A person whom this client moves: pose from a source, shears, messages for other clients, haptic feedback."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ class LocalHuman:
     """A person in the physics whose tracked points a source gives in every step."""
 
     def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
-        """``source(time)`` gives the pose at the end of the coming step, which begins at simulation ``time`` [s]."""
+        """``source(time)`` gives the pose at the end of the step that begins at simulation ``time`` [s]."""
         self.physics = physics
         self.name = spec.name
         self.source = source
         physics.add_human(spec)
         self.pose = spec.pose
         self.intention = ""
-        """What the person indicates to do; see :meth:`indicate`."""
+        """The current intention; see :meth:`indicate`."""
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the person's controllers after the last step."""
         self.closures: tuple[Closure, ...] = ()
-        """How shears in the hands closed in the last step."""
+        """What shears did that closed in the last step."""
         self._feedback = HapticFeedback(physics, spec.name)
         self._shears = tuple(Shears(physics, spec.name, side) for side in SIDES)
         self._sent_points = spec.pose.points
         self._busy_steps = physics.parameters.steps(physics.parameters.hand_contact_duration)
-        """For how many steps a hand counts as busy after it pushed a robot or held something."""
+        """Number of steps for which a hand counts as busy after it pushed a robot or held something."""
         self._steps_since_busy = [self._busy_steps] * len(SIDES)
         self._hand_wrenches: dict[str, dict[str, np.ndarray]] = {}
 
@@ -48,15 +48,17 @@ class LocalHuman:
         self.intention = intention
 
     def control(self, time: float) -> None:
-        """Before a step: move to where the source says."""
+        """Before a step: move the person to the pose from the source."""
         self.pose = self.source(time)
         self.physics.move_human(self.name, self.pose)
         for shears in self._shears:
             shears.control(self.pose)
 
     def update(self, now: float) -> HumanUpdate:
-        """After a step: pose and velocity for other clients; busy hands are where they are, not at their
-        controllers."""
+        """After a step: pose and velocity for other clients.
+
+        Busy hands are sent at their simulated poses, free hands at the poses of their controllers.
+        """
         self.closures = tuple(closure for shears in self._shears if (closure := shears.closure()) is not None)
         self.haptics = (*self._feedback.update(), *(closure.haptic(self.name) for closure in self.closures))
         self._hand_wrenches, pushing = self.physics.rigid.hand_wrenches(self.name)
@@ -69,7 +71,7 @@ class LocalHuman:
             if self._is_busy(i):
                 points[_HANDS[i]] = hand.pose
             if was_busy != self._is_busy(i):
-                before[_HANDS[i]] = points[_HANDS[i]]  # from the controller to the palm or back: no velocity
+                before[_HANDS[i]] = points[_HANDS[i]]  # a switch between controller and simulated hand is no motion
         way = points[:, :3] - before[:, :3]
         turn = frames.log(frames.multiply(points[:, 3:], frames.conjugate(before[:, 3:])))
         velocity = np.concatenate([way, turn], 1) / self.physics.dt
@@ -82,14 +84,14 @@ class LocalHuman:
         return HumanUpdate(self.name, now, pose, velocity, self.intention)
 
     def between_blades(self) -> tuple[str, ...]:
-        """What the shears in the left and the right hand would cut now, in words: see :meth:`Shears.between`."""
+        """What the shears in the left and right hand would cut now, as in :meth:`Shears.between`; "" without shears."""
         return tuple(
             shears.between() if getattr(self.pose, f"{side}_shears") else ""
             for shears, side in zip(self._shears, SIDES, strict=True)
         )
 
     def hand_wrenches_on(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Wrenches [6] of the hands on some ``robots`` in the last step, by robot and link; after :meth:`update`."""
+        """Wrenches [6] of the hands on ``robots`` in the last step, by robot and link. Call it after :meth:`update`."""
         return {robot: links for robot, links in self._hand_wrenches.items() if robot in robots}
 
     def _is_busy(self, hand: int) -> bool:
@@ -100,15 +102,15 @@ class LocalHuman:
 
 
 class HapticFeedback:
-    """Vibrations of one person's controllers: a pulse when a contact begins, then as strong as the force."""
+    """Vibrations of one person's controllers: a pulse when a contact begins, then vibration in proportion to force."""
 
     def __init__(self, physics: Physics, name: str) -> None:
-        """``name`` of a person in ``physics``."""
+        """``name``: name of a person in ``physics``."""
         self.physics = physics
         self.name = name
         self._period = physics.parameters.steps(physics.parameters.haptic_period)
         self._contact_steps: dict[str, int] = {}
-        """By side: steps since the contact began."""
+        """By side: number of steps since the contact began."""
 
     def update(self) -> tuple[Haptic, ...]:
         """The vibrations of the last step, left hand first; call it once after each step."""
@@ -130,7 +132,7 @@ class HapticFeedback:
         return tuple(found)
 
 
-# Shears in a hand of a person: when the hand closes, their blades close and cut the wood between them.
+# Shears in a person's hand: when the hand closes, the blades close and cut the wood between them.
 
 
 CUT_PULSE = (1.0, 0.1)
@@ -140,16 +142,16 @@ MISS_PULSE = (0.3, 0.03)
 
 @dataclasses.dataclass(frozen=True)
 class Closure:
-    """How shears closed: what they cut."""
+    """Result of one closing of shears."""
 
     side: str
-    """Of the hand that holds them."""
+    """Side of the hand that holds the shears."""
     bunches: int
     canes: int
     resistance: float
-    """[N] Cutting force of the strongest wood between the blades, cut or not; 0 if there was none."""
+    """[N] Force needed to cut the strongest wood between the blades, whether it was cut or not; 0 without wood."""
     force: float
-    """[N] Largest force of the blades."""
+    """[N] Largest force that the blades can apply."""
 
     @property
     def has_cut(self) -> bool:
@@ -158,7 +160,7 @@ class Closure:
 
     @property
     def sentence(self) -> str:
-        """What a user is told."""
+        """Message for the user."""
         shears = f"The shears in the {self.side} hand"
         if self.has_cut:
             pieces = (("bunch", "bunches", self.bunches), ("cane", "canes", self.canes))
@@ -173,15 +175,15 @@ class Closure:
         return f"{shears} missed: there was no wood between the blades."
 
     def haptic(self, actor: str) -> Haptic:
-        """The vibration by which the person feels it."""
+        """The vibration that tells the person about the closing."""
         return Haptic(actor, self.side, True, *(CUT_PULSE if self.has_cut else MISS_PULSE))
 
 
 class Shears:
-    """The shears that one hand can take: a blade in the physics, which closes only while the hand has them."""
+    """The shears that one hand can take: a blade in the physics that closes only while the hand holds the shears."""
 
     def __init__(self, physics: Physics, name: str, side: str) -> None:
-        """``name`` of a person in ``physics``, ``side`` of the hand."""
+        """``name``: name of a person in ``physics``; ``side``: side of the hand."""
         model = appearance.load_shears()
         self.side = side
         self._monitor = physics.detachment_monitor
@@ -191,15 +193,17 @@ class Shears:
         self._was_closed = False
 
     def control(self, pose: HumanPose) -> None:
-        """Before a step: close the blades if the hand closes in this ``pose``, and did not before."""
+        """Before a step: close the blades if the hand is closed in ``pose`` and was open before."""
         is_closed = bool(getattr(pose, f"{self.side}_closed"))
         if is_closed and not self._was_closed and getattr(pose, f"{self.side}_shears"):
             self._blade.close(self._force)
         self._was_closed = is_closed
 
     def between(self) -> str:
-        """After a step: what the blades would cut if they closed now, "bunch" or "cane"; "strong wood" if all that is
-        there is too strong for them; "" if nothing is there."""
+        """After a step: what the blades would cut if they closed now, "bunch" or "cane".
+
+        "strong wood" if all wood between the blades is too strong for them; "" if nothing is between them.
+        """
         wood = self._monitor.wood_in_mouth(self._blade)
         weak = [bunch for body, bunch in wood if self._monitor.cutting_force(body) <= self._force]
         if not weak:
@@ -207,7 +211,7 @@ class Shears:
         return "bunch" if max(weak) >= 0 else "cane"
 
     def closure(self) -> Closure | None:
-        """After a step: how the blades closed in it; None if they did not."""
+        """After a step: the result if the blades closed in this step, otherwise None."""
         blade = self._blade
         if blade.closures == self._closures:
             return None

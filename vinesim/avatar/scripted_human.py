@@ -19,13 +19,13 @@ from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanPose
 
 WALK_SPEED = 1.1
-"""[m/s] GUESSED."""
+"""[m/s] Speed of walking forwards. GUESSED."""
 BACK_SPEED = 0.5
-"""[m/s] GUESSED."""
+"""[m/s] Speed of walking backwards. GUESSED."""
 TURN_RATE = 2.5
-"""[rad/s] GUESSED."""
+"""[rad/s] Rate of turning on the spot. GUESSED."""
 REACH_SPEED = 0.5
-"""[m/s] Of a hand that reaches for something. GUESSED."""
+"""[m/s] Speed of a hand that reaches for something. GUESSED."""
 
 
 class ScriptedHuman:
@@ -46,12 +46,12 @@ class ScriptedHuman:
         self._actions: deque[Iterator[None]] = deque()
 
     def do(self, *actions: Iterator[None]) -> ScriptedHuman:
-        """Add actions, which are done one after the other."""
+        """Append actions to the script; they are done one after the other."""
         self._actions.extend(actions)
         return self
 
     def __call__(self, time: float) -> HumanPose:
-        """The pose a step later."""
+        """Advance by one step; returns the pose at its end."""
         while self._actions and next(self._actions[0], self) is self:
             self._actions.popleft()
         stand = self._standing_frame()
@@ -83,7 +83,7 @@ class ScriptedHuman:
             yield
 
     def back(self, until: Callable[[], bool], most: float = 1.5) -> Iterator[None]:
-        """Walk backwards until a condition holds, at most so far [m]."""
+        """Walk backwards until ``until()`` is true or the distance ``most`` [m] is covered."""
         for _ in range(round(most / (BACK_SPEED * self.dt))):
             if until():
                 return
@@ -92,7 +92,7 @@ class ScriptedHuman:
             yield
 
     def face(self, to: tuple[float, float]) -> Iterator[None]:
-        """Turn to a point (x, y) [m]."""
+        """Turn towards a point (x, y) [m]."""
         way = np.asarray(to, float)[:2] - self._place
         goal = float(np.arctan2(way[1], way[0])) if np.linalg.norm(way) > 1e-6 else self._heading
         while abs(off := (goal - self._heading + np.pi) % (2.0 * np.pi) - np.pi) > 1e-9:
@@ -100,7 +100,7 @@ class ScriptedHuman:
             yield
 
     def reach(self, side: str, point: Callable[[], np.ndarray], *, close: bool = True) -> Iterator[None]:
-        """Move a palm to a point [3] in the world, which may move meanwhile, and close the hand there."""
+        """Move a palm to the world position ``point()`` [3] m, which is read in every step; then close the hand."""
         while True:
             goal = np.asarray(point(), float)
             here = frames.compose(self._standing_frame(), self._hands[side])
@@ -119,7 +119,7 @@ class ScriptedHuman:
         yield
 
     def withdraw(self, side: str, way: float = 1.0) -> Iterator[None]:
-        """Move a hand back to its rest pose, or a share ``way`` of the distance."""
+        """Move a hand towards its rest pose by the share ``way`` of the distance; 1 moves it all the way."""
         start = self._hands[side].copy()
         goal = self._rest[side]
         for tick in range(
@@ -135,7 +135,7 @@ class ScriptedHuman:
         yield
 
     def wait(self, seconds: float) -> Iterator[None]:
-        """Stand still."""
+        """Stand still for ``seconds`` [s]."""
         for _ in range(round(seconds / self.dt)):
             yield
 
@@ -143,7 +143,7 @@ class ScriptedHuman:
 
     @property
     def place(self) -> np.ndarray:
-        """Where the person stands [2] m."""
+        """Position (x, y) [2] m of the person."""
         return self._place.copy()
 
     def _standing_frame(self) -> np.ndarray:

@@ -15,12 +15,12 @@ from vinesim.rigid.human_posture import standing_pose
 from vinesim.scene.values import HumanPose
 
 MAX_PERIOD = 0.1
-"""Inputs that are further apart are not interpolated over the whole time between them [s]. GUESSED."""
+"""Longest time over which motion between two inputs is interpolated [s]. GUESSED."""
 MAX_MOTION = 0.5
-"""A head that moves further than this [m] between two inputs was put elsewhere, as physics takes it
-(``PhysicsParameters.teleport_distance``): nothing moves there on the way."""
+"""A head that moves further than this between two inputs counts as teleported and is not interpolated [m]. The physics
+has the same rule (``PhysicsParameters.teleport_distance``)."""
 _SMOOTHING = 0.2
-"""Weight of the newest interval in the mean time between inputs [1]."""
+"""Weight of the newest interval in the running mean of the time between inputs [1]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -30,20 +30,20 @@ class TrackedPoints:
     head: np.ndarray
     """[7] m, 1, world: between the eyes, x forward, z up."""
     left: np.ndarray | None = None
-    """[7] of the palm as in :class:`HumanPose`; None: it hangs down."""
+    """Pose [7] of the left palm as in :class:`HumanPose`; None: the hand hangs down."""
     right: np.ndarray | None = None
     closed: tuple[bool, bool] = (False, False)
-    """Left, right."""
+    """Whether the left and the right hand are closed."""
     fingers: tuple[FingerBend, FingerBend] = (OPEN_HAND, OPEN_HAND)
     shears: tuple[bool, bool] = (False, False)
-    """Whether the left and the right hand have shears: their fingers are then around them."""
+    """Whether the left and the right hand hold shears; their fingers then close around the shears."""
 
 
 class TrackedHuman:
     """A source for :class:`vinesim.avatar.local_human.LocalHuman`.
 
-    Inputs come at the rate of a display, 60 to 90 a second, steps are 100 a second: between inputs the points move
-    evenly, so that their velocities are those of the person; that costs one interval of delay.
+    Inputs arrive at the rate of a display, 60 to 90 Hz, while steps run at 100 Hz. Between inputs the points move at
+    constant velocity, so that they have the person's velocities. This delays them by one interval between inputs.
     """
 
     def __init__(
@@ -54,13 +54,16 @@ class TrackedHuman:
         clock: Callable[[], float] | None = None,
         gestures: Gestures | None = None,
     ) -> None:
-        """Stands at ``root`` [7] until the first input; ``clock`` [s] measures their intervals: unless given, steps."""
+        """Stands at ``root`` [7] until the first input. ``clock`` [s] measures the intervals between inputs.
+
+        Without a ``clock`` the intervals are counted in steps of ``dt``.
+        """
         self.dt = dt
         self.gestures = gestures or Gestures()
         """The finger poses that this person can make."""
         self.pose = standing_pose(root, height)
         self._below_head = frames.compose(frames.inverse(self.pose.head), np.stack([self.pose.left, self.pose.right]))
-        """Of hands that hang down, in the upright frame of the head."""
+        """Poses [2, 7] of hands that hang down, in the upright frame of the head."""
         self._legs = LegEstimator(self.pose, dt)
         self._lock = threading.Lock()
         self._next: TrackedPoints | None = None
@@ -74,12 +77,12 @@ class TrackedHuman:
         self._share = 1.0
 
     def take(self, points: TrackedPoints) -> None:
-        """The newest input; may be called from any thread."""
+        """Set the newest input; may be called from any thread."""
         with self._lock:
             self._next = points
 
     def __call__(self, time: float) -> HumanPose:
-        """The pose a step later."""
+        """Advance by one step; returns the pose at its end."""
         self._steps += 1
         with self._lock:
             points = self._next
@@ -112,7 +115,7 @@ class TrackedHuman:
         return self.pose
 
     def _begin(self, points: TrackedPoints) -> None:
-        """Move to an input from where everything is now."""
+        """Start to move from the current pose to the pose of an input."""
         now = self._steps * self.dt if self._clock is None else self._clock()
         if self._points is not None:
             interval = float(np.clip(now - self._input_at, self.dt, MAX_PERIOD))
@@ -131,7 +134,7 @@ class TrackedHuman:
 
 
 def _between(start: np.ndarray, goal: np.ndarray, share: float) -> np.ndarray:
-    """Poses [k, 7] at a ``share`` of the way."""
+    """Poses [k, 7] interpolated between ``start`` (``share`` 0) and ``goal`` (``share`` 1)."""
     way = frames.log(frames.multiply(frames.conjugate(start[:, 3:]), goal[:, 3:]))
     turn = frames.multiply(start[:, 3:], frames.exp(share * way))
     return np.concatenate([start[:, :3] + share * (goal[:, :3] - start[:, :3]), turn], 1)

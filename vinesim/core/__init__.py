@@ -1,1 +1,1 @@
-"""What every other package builds on: frames, arrays, files, errors, progress."""
+"""Base layer of all other packages: frames, arrays, files, errors, progress."""

@@ -1,10 +1,11 @@
-"""The C allocator of this process: large blocks that are freed go back to the system at once, small ones in time.
+"""Settings of glibc's allocator: freed large blocks return to the system at once, freed pages of the heap regularly.
 
-glibc raises its threshold for blocks of their own to the largest block that was ever freed, up to 32 MiB: after the
-first tables of a vineyard have come and gone, all smaller ones lie in the heap, which keeps the gaps between them. A
-threshold that is set stays (mallopt(3)). Gaps between small blocks it keeps for good: on a busy machine messages wait,
-and whenever more of them wait than ever before, the heap grows. So free pages are given back every minute. Other C
-libraries are left as they are.
+glibc allocates a block with mmap if it is larger than a threshold, and otherwise in the heap. By default it raises the
+threshold to the largest block that was ever freed, up to 32 MiB. After the first tables of a vineyard have been freed,
+later ones would therefore lie in the heap, which keeps the gaps between them. A threshold set by mallopt(3) stays.
+
+The heap also keeps the gaps between small blocks. On a busy machine messages queue up, and the heap grows whenever the
+queue is longer than ever before. So free pages are given back every minute. Other C libraries are left as they are.
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ import threading
 import time
 
 BLOCK_SIZE = 4 << 20
-"""Blocks from this size on [bytes] lie outside the heap: tables of a scene do, arrays of one picture do not."""
+"""Blocks of at least this size [bytes] lie outside the heap: tables of a scene do, arrays of one picture do not."""
+
 KEPT_SIZE = 64 << 20
-"""So much free memory at the end of the heap is kept [bytes], as glibc does when it sets the threshold itself."""
+"""Free memory kept at the end of the heap [bytes]; glibc keeps the same amount when it sets the threshold itself."""
+
 TRIM_PERIOD = 60.0
-"""From one time to the next at which free pages are given back [s]."""
+"""Period at which free pages are given back to the system [s]."""
 _TRIM_THRESHOLD = -1
 _MMAP_THRESHOLD = -3
-"""Numbers of glibc's malloc.h."""
+"""Parameter numbers of mallopt(3), from glibc's malloc.h."""
 
 
 @functools.cache
@@ -58,7 +61,7 @@ def _trim_for_ever(library: ctypes.CDLL, period: float) -> None:
 def release_free_memory() -> None:
     """Collect garbage, frozen objects included, and give free pages of the heap back to the system.
 
-    It takes up to a second: when all is built, or built anew.
+    It takes up to a second, so call it only after the world was built or rebuilt.
     """
     frozen = gc.get_freeze_count()
     gc.unfreeze()

@@ -37,7 +37,7 @@ def array(*shape: str | int, unit: str, dtype: Any = np.float32, fill: float | t
     """Declare an array field of a :class:`StructOfArrays`.
 
     Args:
-        *shape: axes: a name is a count shared by all fields of the struct, a number is fixed.
+        *shape: one entry for each axis. A name is a count shared by all fields of the struct, a number is a fixed size.
         unit: SI unit, ``"1"`` for pure numbers.
         dtype: type of the elements.
         fill: default value of an element or of a row.
@@ -85,7 +85,7 @@ class StructOfArrays:
         return counts
 
     def check(self) -> Self:
-        """Raise :class:`ValueError` naming the first field of wrong type, shape or with a non-finite value."""
+        """Return ``self``; :class:`ValueError` names the first field of wrong type or shape or with NaN or infinity."""
         self.counts()
         for name, dim in self.array_fields().items():
             value = getattr(self, name)

@@ -6,11 +6,11 @@ import pathlib
 
 
 class DataFileNotFound(FileNotFoundError):
-    """A scene, robot, camera or lidar that is neither a file nor ships with vinesim; the text lists the known names."""
+    """A data file that neither exists nor ships with vinesim; the message lists the known names."""
 
 
 def data_dir() -> pathlib.Path:
-    """The folder ``data``: inside the installed package, or beside it in a checkout."""
+    """The folder ``data``: inside the installed package, or next to it in a checkout."""
     package = pathlib.Path(__file__).resolve().parent.parent
     return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
 

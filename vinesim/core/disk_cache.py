@@ -1,12 +1,12 @@
-"""Arrays that take long to compute, kept on disk: by name and by a digest of all that they follow from.
+"""Disk cache of arrays that take long to compute. The key is a name and a digest of everything they are computed from.
 
     arrays = load_or_make("soil", digest, make)
 
 The folder is ``$VINESIM_CACHE`` if that is set, else ``vinesim`` in the user's folder for caches: ``$XDG_CACHE_HOME``
 or ``~/.cache``, ``~/Library/Caches`` on macOS, ``%LOCALAPPDATA%`` on Windows. It may be deleted at any time.
 
-Of several processes that miss an entry one makes it and the others wait. A file that is broken, truncated or of another
-version is made anew. Where the folder cannot be written, everything is computed as without a cache, after one warning.
+When several processes miss the same entry, one makes it and the others wait. A file that is broken, truncated or of
+another version is replaced. If the folder cannot be written, everything is computed without a cache after one warning.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ from vinesim.core.progress import ProgressLine
 log = logging.getLogger(__name__)
 
 MAX_SIZE = 1 << 30
-"""Size of all entries [bytes]; those that were not used for longest are deleted."""
+"""Largest total size of the entries [bytes]; beyond it the least recently used entries are deleted."""
 LOCK_TIMEOUT = 120.0
-"""How long to wait for another process that makes an entry, before making it as well [s]."""
+"""Time to wait for another process that is making an entry [s]; after it this process makes the entry too."""
 _LEFTOVER_AGE = 3600.0
-"""Age from which a temporary file belongs to a process that was killed [s]."""
+"""A temporary file older than this is taken to be left over from a killed process [s]."""
 _POLL_PERIOD = 0.02
-"""Between two attempts to get a lock [s]."""
+"""Time between two attempts to get a lock [s]."""
 
 Arrays = dict[str, np.ndarray]
 
@@ -65,8 +65,8 @@ def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndar
     """The arrays of ``make``, from the cache if they are there.
 
     Args:
-        name: what they are; part of the file's name.
-        digest: of everything that the arrays follow from, the code included: see :func:`source_digest`.
+        name: name of the arrays; part of the file's name.
+        digest: digest of everything that the arrays are computed from, the code included: see :func:`source_digest`.
         make: computes them. Called once, and only if no entry is found; its errors are passed on.
     """
     try:
@@ -86,7 +86,7 @@ def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndar
 
 
 def load(name: str, digest: str) -> Arrays | None:
-    """The arrays that :func:`keep` was given; None if they are not there or broken."""
+    """The arrays stored by :func:`keep` or :func:`load_or_make`; None if the file is missing or broken."""
     try:
         return _read(folder() / f"{name}-{digest}.npz")
     except RuntimeError as error:  # no home folder
@@ -95,7 +95,7 @@ def load(name: str, digest: str) -> Arrays | None:
 
 
 def keep(name: str, digest: str, arrays: Mapping[str, np.ndarray]) -> None:
-    """Keep arrays that came from elsewhere; if the folder cannot be written, that is said once."""
+    """Store arrays in the cache. Warns once if the folder cannot be written."""
     try:
         _write(folder() / f"{name}-{digest}.npz", dict(arrays))
     except RuntimeError as error:
@@ -105,7 +105,7 @@ def keep(name: str, digest: str, arrays: Mapping[str, np.ndarray]) -> None:
 def source_digest(*sources: pathlib.Path | str | bytes) -> str:
     """A digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and bytes.
 
-    It holds the version of numpy too, whose functions may change a last bit between versions.
+    The digest includes the version of NumPy, because results may differ in the last bit between versions.
     """
     h = hashlib.blake2b(np.__version__.encode(), digest_size=8)
     for source in sources:
@@ -122,7 +122,7 @@ def source_digest(*sources: pathlib.Path | str | bytes) -> str:
 
 
 def _warn(error: Exception) -> None:
-    """One warning a process: the cache cannot be used."""
+    """Warn, once in each process, that the cache cannot be used."""
     if not _warned.is_set():
         _warned.set()
         log.warning("no cache on disk, so every start computes its tables anew (set VINESIM_CACHE): %s", error)
@@ -132,14 +132,14 @@ def _read(path: pathlib.Path) -> Arrays | None:
     """The arrays of a file; None if it is not there or broken."""
     try:
         with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}  # checks the checksum of each
+            arrays = {name: data[name] for name in data.files}  # reading checks the checksums
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
         log.info("%s is made anew: %s", path, error)
         return None
     with contextlib.suppress(OSError):
-        os.utime(path)  # its time of use
+        os.utime(path)  # the time of last use, for _prune
     return arrays
 
 
@@ -164,7 +164,7 @@ def _write(path: pathlib.Path, arrays: Arrays) -> None:
 
 
 def _prune(place: pathlib.Path) -> None:
-    """Delete what killed processes have left, then entries, oldest first, until the rest is small enough."""
+    """Delete files left by killed processes, then the least recently used entries until :data:`MAX_SIZE` is met."""
     now = time.time()
     entries = []
     for file in place.iterdir():
@@ -184,10 +184,11 @@ def _prune(place: pathlib.Path) -> None:
 
 @contextlib.contextmanager
 def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") -> Iterator[bool]:
-    """Be the only process in work that has this ``name``; yields whether another process was waited for.
+    """Hold the lock ``name``, which excludes other processes; yields whether this process had to wait for it.
 
-    The lock ends with the process that holds it, however that ends. Goes on without it where there can be none, and
-    after ``timeout`` [s], :data:`LOCK_TIMEOUT` unless given. ``waiting_for``: logged after a second of waiting.
+    The system releases the lock when the process ends, in whatever way. The context is entered without the lock if the
+    file system has no locks, and after ``timeout`` [s] (:data:`LOCK_TIMEOUT` unless given). ``waiting_for`` is what
+    the log says after a second of waiting.
     """
     timeout = LOCK_TIMEOUT if timeout is None else timeout
     start = time.monotonic()
@@ -206,7 +207,7 @@ def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") ->
 
 
 def try_exclusive(name: str) -> contextlib.ExitStack | None:
-    """The lock of :func:`exclusive`, held until it is closed; None if another process has it."""
+    """Take the lock of :func:`exclusive`; closing the result releases it. None if another process holds the lock."""
     lock = contextlib.ExitStack()
     try:
         path = folder() / f"{name}.lock"

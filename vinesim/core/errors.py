@@ -17,7 +17,7 @@ class UsageError(ValueError):
 
 
 class WriteError(RuntimeError):
-    """Files that a command was asked for could not be written: a full disk, a read-only folder.
+    """Output files of a command could not be written: a full disk, a read-only folder.
 
     The message names the place, the reason and the remedy, in one line. The command line exits with code 5.
     """
@@ -27,11 +27,11 @@ class WriteError(RuntimeError):
 
 @contextlib.contextmanager
 def writing(place: str | os.PathLike[str]) -> Iterator[None]:
-    """What is written here goes to ``place``: an :class:`OSError` becomes a :class:`WriteError` that names it."""
+    """Context for writing to ``place``: turns an :class:`OSError` into a :class:`WriteError` that names the place."""
     try:
         yield
     except BrokenPipeError:
-        raise  # the reader of a stream is gone, which is no matter of files
+        raise  # the reader of a pipe is gone; no file is at fault
     except OSError as bad:
         reason = bad.strerror or str(bad)
         raise WriteError(f"{place} cannot be written: {reason}; make room there or give another place") from None

@@ -2,7 +2,7 @@
 
 * World: REP-103, x forward (east), y left (north), z up; metres, radians, seconds.
 * Quaternions are ``(x, y, z, w)``, unit, rotating body coordinates into parent coordinates (ROS, Warp, Newton).
-  MuJoCo alone writes ``(w, x, y, z)``; :func:`to_wxyz` and :func:`from_wxyz` are the only crossing.
+  Only MuJoCo uses ``(w, x, y, z)``; :func:`to_wxyz` and :func:`from_wxyz` convert.
 * A pose is seven numbers, position then quaternion: ``body_q[i] = (x, y, z, qx, qy, qz, qw)`` (``wp.transform``).
 * A velocity is six numbers, linear velocity of the body's origin then angular velocity, both in world axes.
 * Optical frames (REP-103 suffix ``_optical``): z forward, x right, y down.
@@ -19,7 +19,7 @@ IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
 """The unit quaternion, xyzw."""
 
 OPTICAL = np.array([-0.5, 0.5, -0.5, 0.5])
-"""Rotation of an optical frame seen from its camera link (x forward): xyzw."""
+"""Rotation of an optical frame relative to its camera link (x forward), xyzw."""
 
 # taking by an array of indices is four times as fast as by a list
 _NEXT = np.array([1, 2, 0])
@@ -29,11 +29,11 @@ _W_LAST = np.array([1, 2, 3, 0])
 
 
 _MANY = 512
-"""Numbers from which it is quicker to compute each component of all vectors by itself."""
+"""Array size [elements] above which computing component by component is faster."""
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of vectors [..., 3]; takes a tenth of the time of ``np.cross``, which matters in every step."""
+    """Cross product of vectors [..., 3], ten times as fast as ``np.cross``."""
     if a.size + b.size > _MANY:
         result = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -80,17 +80,17 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _length(v: np.ndarray) -> np.ndarray:
-    """Euclidean norm [..., 1] of vectors [..., n]; of many short ones in a fraction of the time of numpy's."""
+    """Euclidean norm [..., 1] of vectors [..., n]; faster than NumPy's for many short vectors."""
     if v.size <= _MANY or v.shape[-1] not in (3, 4) or v.dtype.kind != "f":
         return np.linalg.norm(v, axis=-1, keepdims=True)
     total = v[..., 0] * v[..., 0]
-    for i in range(1, v.shape[-1]):  # in the order in which numpy adds them
+    for i in range(1, v.shape[-1]):  # in NumPy's order of summation, so that the bits agree
         total += v[..., i] * v[..., i]
     return np.sqrt(total)[..., None]
 
 
 def normalize(q: np.ndarray) -> np.ndarray:
-    """Unit quaternion or vector; a zero one stays zero."""
+    """Quaternions or vectors [..., n] divided by their norms; zero stays zero."""
     q = np.asarray(q)
     length = _length(q)
     return q / np.where(length > 0.0, length, 1.0)
@@ -178,7 +178,7 @@ def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = Valu
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Pose ``b`` [..., 7], given in the frame ``a`` [..., 7], in the parent frame of ``a``."""
+    """Product of poses [..., 7]: expresses ``b``, which is given in the frame ``a``, in the parent frame of ``a``."""
     a = np.asarray(a)
     b = np.asarray(b)
     return np.concatenate([a[..., :3] + rotate(a[..., 3:], b[..., :3]), multiply(a[..., 3:], b[..., 3:])], axis=-1)

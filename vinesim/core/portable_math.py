@@ -1,9 +1,9 @@
-"""Functions whose last bits do not depend on the CPU, for numbers that all machines must agree on.
+"""Mathematical functions that give the same bits on every CPU.
 
-NumPy computes these with vectors where a CPU has AVX-512, and rounds otherwise there: a vineyard generated on such a
-CPU would be another one, by its digest, than on all others, and its clients would be refused. Here each number goes
-through the C library, as NumPy's does on other CPUs. NumPy's sines, cosines, square roots and products are the same on
-all. The C library itself rounds otherwise where a CPU has no FMA (x86 of 2012 and before).
+On CPUs with AVX-512, NumPy computes these functions with vector instructions, which round differently. A vineyard
+generated there would have another digest than on other CPUs, and the server would refuse its clients. Here each number
+is computed by the C library, as NumPy does on other CPUs. NumPy's sines, cosines, square roots and products agree on
+all CPUs. The C library itself rounds differently on CPUs without FMA (x86 of 2012 and before).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What a program says while something takes long: one line that is updated on a terminal, else a line now and then."""
+"""Progress messages of long operations: one line that is updated on a terminal, otherwise a new line now and then."""
 
 from __future__ import annotations
 
@@ -7,20 +7,22 @@ import time
 from typing import Self, TextIO
 
 log = logging.getLogger("vinesim.core.progress")
-"""What is worth a line on the terminal because it takes longer than a second: see :class:`ProgressLine`. An empty text
-ends the line."""
+"""Logger of progress texts, used by :class:`ProgressLine`. An empty text ends the line."""
+
 PERIOD = 1.0
-"""Between two texts of a :class:`ProgressLine` [s]."""
+"""Least time between two texts of a :class:`ProgressLine` [s]."""
+
 LINE_PERIOD = 5.0
-"""Between two lines where no line can be updated [s]."""
+"""Least time between two lines where a line cannot be updated, as in a log file [s]."""
+
 _ERASE = "\r\x1b[K"
-"""To the beginning of the line, and erase all of it."""
+"""Terminal control sequence: return to the beginning of the line and erase the line."""
 
 
 class ProgressLine:
-    """A line that says how far a program is with one thing, logged again and again while that lasts.
+    """A line that shows the progress of one operation. A context manager: leaving it ends the line.
 
-    A context: it ends the line. Nothing is logged in the first second, as most things are done by then.
+    Nothing is logged in the first second, because most operations end within it.
     """
 
     def __init__(self) -> None:
@@ -28,7 +30,7 @@ class ProgressLine:
         self._is_shown = False
 
     def show(self, text: str) -> None:
-        """Log the text of now, if the last one is :data:`PERIOD` old."""
+        """Log ``text`` if at least :data:`PERIOD` has passed since the last one."""
         if (now := time.monotonic()) >= self._due:
             self._due = now + PERIOD
             self._is_shown = True
@@ -56,7 +58,7 @@ class ProgressHandler(logging.Handler):
         text = record.getMessage()
         try:
             if self._is_terminal:
-                # the cursor returns to the beginning, where whatever else is printed then goes
+                # the cursor returns to the beginning, so that other output overwrites this line
                 self._stream.write(f"{_ERASE}vinesim: {text}\r" if text else _ERASE)
             elif text and time.monotonic() >= self._next_line:
                 self._next_line = time.monotonic() + LINE_PERIOD

@@ -1,4 +1,4 @@
-"""Loads TOML files into frozen structs; errors are one line: file, place, finding, remedy."""
+"""Loads TOML files into frozen structs. An error is one line: file, place, finding, remedy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _KINDS = {
 
 
 class DataError(ValueError):
-    """A data file that cannot be used. The text is one line."""
+    """A data file that cannot be used. The message is one line."""
 
 
 def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
@@ -60,7 +60,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
     """Place, finding and remedy from msgspec's text, which ends in ``- at `$.a[0].b```."""
     what, _, where = message.partition(" - at `$")
     place = where.rstrip("`").lstrip(".")
-    if "[...]" in place:  # below a name that the file chose, which msgspec does not tell
+    if "[...]" in place:  # msgspec writes [...] for a key that the file chose
         return f"{place}: {what}; correct it there"
     steps = [int(s) if s.isdigit() else s for s in re.findall(r"[^.\[\]]+", place)]
     found: Any = data
@@ -88,7 +88,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
 
 
 def _step_in(kind: Any, steps: list[Any]) -> Any:
-    """The msgspec type that stands at ``steps`` below ``kind``."""
+    """The msgspec type at the path ``steps`` inside ``kind``."""
     at: Any = msgspec.inspect.type_info(kind)
     for step in steps:
         if isinstance(at, msgspec.inspect.StructType):

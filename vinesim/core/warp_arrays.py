@@ -10,9 +10,9 @@ import warp as wp
 
 
 class SharedArrays:
-    """One NumPy array for each field of a Warp struct, and ``struct`` over the same memory.
+    """One NumPy array for each field of a Warp struct, and ``struct``, the Warp struct over the same memory.
 
-    The arrays are attributes; they stay where they are as long as this object lives.
+    The arrays are attributes of this object and keep their addresses as long as it lives.
     """
 
     def __init__(self, kind: Any, /, **arrays: np.ndarray) -> None:
@@ -45,8 +45,10 @@ def share(data: np.ndarray, dtype: Any) -> wp.array:
 
 
 def entry(data: np.ndarray, place: int = 0) -> ctypes.c_int32:
-    """An entry of an int32 array that is contiguous, over the same memory: the number of threads of a launch in a
-    sequence."""
+    """Entry ``place`` of a contiguous int32 array as a ctypes integer over the same memory.
+
+    It serves as the number of threads of a launch in a sequence of launches.
+    """
     return ctypes.c_int32.from_buffer(data.data, data.itemsize * place)
 
 

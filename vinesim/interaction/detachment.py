@@ -1,8 +1,8 @@
-"""Detachment: bunches pulled or bent off their peduncles, and what a closing blade cuts.
+"""Detachment: bunches that are pulled or bent off their peduncles, and wood that is cut by a closing blade.
 
-A bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight; on the tree stay
-its peduncle and a stub of a gram, so the tree's numbering never changes. A cane that is cut falls with all that grows
-on it, its bunches still hanging from it (:meth:`ArticulationSolver.cut`).
+A detached bunch becomes a free body of the rigid world in the same tick, with its pose, velocity and weight. Its
+peduncle and a stub of one gram stay on the tree, so the numbering of the tree's bodies never changes. A cane that is
+cut falls with everything that grows on it, including its bunches (:meth:`ArticulationSolver.cut`).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import Contact, Detachment
 
 STUB_MASS = 1e-3
-"""What stays of a bunch on the tree [kg]."""
+"""Mass of the stub that stays on the tree in place of a bunch [kg]."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -38,27 +38,27 @@ class Blade:
     actor: str
     link: str
     pose: np.ndarray
-    """[7] of the mouth's middle in the link: x along the blades, y from blade to blade, z across their plane."""
+    """[7] pose of the mouth's centre in the link: x along the blades, y from blade to blade, z across their plane."""
     half: np.ndarray
-    """[3] m, half edges of the mouth; half[1] is the reach: how far to either side wood is caught."""
+    """[3] m, half edges of the mouth; half[1] is the distance to either side within which wood is caught."""
     force: float = np.inf
-    """[N] with which it closes at most."""
+    """[N] Largest closing force."""
     closing: bool = False
     closures: int = 0
-    """How often it has closed so far."""
+    """Number of times the blade has closed so far."""
     detachments: tuple[Detachment, ...] = ()
-    """What it cut off its plant when it closed last."""
+    """Parts that the blade cut off when it last closed."""
     resistance: float = 0.0
-    """[N] Cutting force of the strongest piece that was in its mouth then, cut or not; 0 if there was none."""
+    """[N] Cutting force of the strongest piece in the mouth at the last closing, cut or not; 0 if it was empty."""
 
     def close(self, force: float = np.inf) -> None:
-        """Shut with at most ``force`` [N], and open again: cuts what is in the mouth at the end of the coming step."""
+        """Close with at most ``force`` [N] and open again; cuts the wood in the mouth at the end of the coming step."""
         self.closing = True
         self.force = force
 
 
 class DetachmentMonitor:
-    """Watches the peduncles of awake trees and the blades that close, and detaches what breaks or is cut."""
+    """Monitors the peduncles of awake trees and closing blades, and detaches parts that break or are cut."""
 
     def __init__(
         self,
@@ -67,8 +67,8 @@ class DetachmentMonitor:
         contact_solver: ContactSolver,
         parameters: PhysicsParameters = PhysicsParameters(),
     ) -> None:
-        """``parameters``: ``detachment_duration`` says how long a peduncle must be overloaded, ``cutting_strength``
-        what a blade has to overcome."""
+        """``parameters``: uses ``detachment_duration``, after which an overloaded peduncle breaks, and
+        ``cutting_strength``."""
         self._overload_limit = parameters.steps(parameters.detachment_duration)
         self._cutting_strength = parameters.cutting_strength
         self.plants = plants
@@ -76,7 +76,7 @@ class DetachmentMonitor:
         self.contact_solver = contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
-        """Hands that hold plants, as contacts: the actor that holds a bunch may have pulled it off."""
+        """Hands that hold plants, as contacts. They identify the actor who pulled off a bunch."""
         model = plants.model
         self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
         self._bunch_of = model.bunch_of_body()
@@ -120,7 +120,7 @@ class DetachmentMonitor:
     # ------------------------------------------------------------------ the tick
 
     def update(self, *, check_load: bool = True) -> tuple[Detachment, ...]:
-        """After a commit: all that parted since the last call, sorted by body. ``strain`` off: only what is cut."""
+        """After a commit: all detachments since the last call, sorted by body. ``check_load`` off: only cuts."""
         if check_load:
             self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
@@ -130,8 +130,7 @@ class DetachmentMonitor:
         return told
 
     def _detach_overloaded(self) -> None:
-        """Detach the bunches whose peduncles have been overloaded for long enough, on trees that this client
-        simulates."""
+        """Detach bunches whose peduncles were overloaded for ``detachment_duration``, on trees simulated here."""
         self._list_awake_bunches()
         self._longest[0] = 0
         self._count_overloaded_steps()
@@ -152,7 +151,7 @@ class DetachmentMonitor:
                 self._pick(bunch, cause, actor, self._peduncles.carried[i].copy())
 
     def _list_awake_bunches(self) -> None:
-        """List the bunches of awake trees, those that have been picked included."""
+        """List the bunches of awake trees, including picked ones."""
         awake = self.plants.awake
         if awake is not self._awake:
             self._awake = awake
@@ -163,7 +162,7 @@ class DetachmentMonitor:
             self._peduncles.places[: len(bunches)] = self.plants.buffers.slots[self.plants.model.bunch_body[bunches]]
 
     def _cut_with_blades(self) -> None:
-        """Cut what is in the mouths that are closing."""
+        """Cut the wood in the mouths of closing blades."""
         self.plants.forward_kinematics()
         for blade in self.blades:
             if blade.closing:
@@ -184,18 +183,17 @@ class DetachmentMonitor:
                 blade.detachments = tuple(self._detachments[before:])
 
     def wood_in_mouth(self, blade: Blade) -> list[tuple[int, int]]:
-        """After a step: bodies that a blade would cut if it were strong enough, and the bunch that each carries; -1: a
-        cane."""
+        """After a step: bodies that a blade would cut if strong enough, each with its bunch, or -1 for a cane."""
         bodies = self._bodies_in_mouth(blade).tolist()
         found = [(body, int(self._bunch_of[body])) for body in bodies]
         return [(body, bunch) for body, bunch in found if bunch < 0 or self.plants.state.bunch_attached[bunch]]
 
     def cutting_force(self, body: int) -> float:
-        """[N] that it takes to cut a piece of wood across: its cross-section at the root end times its strength."""
+        """Force [N] to cut a piece of wood: its cross-section at the root end times ``cutting_strength``."""
         return self._cutting_strength * math.pi * float(self.plants.model.body_radius[body, 0]) ** 2
 
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
-        """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the one next to the root."""
+        """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the piece nearest the root."""
         model = self.plants.model
         body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
@@ -206,7 +204,7 @@ class DetachmentMonitor:
         start = frames.rotate(frames.conjugate(mouth[3:]), body_q[near, :3] - mouth[:3])
         along = frames.rotate(frames.multiply(frames.conjugate(mouth[3:]), body_q[near, 3:]), np.array([1.0, 0.0, 0.0]))
         along = along * model.body_length[near, None]
-        # the part of each axis between the planes of the box, side by side (slab test)
+        # slab test: the part of each axis inside the box
         along = np.where(np.abs(along) < 1e-12, 1e-12, along)
         one = (-blade.half - start) / along
         other = (blade.half - start) / along
@@ -219,7 +217,7 @@ class DetachmentMonitor:
         return caught[~self._has_marked_ancestor(caught, inside)]
 
     def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
-        """Which of some bodies [k] grow on a marked one [body], with no cut between them."""
+        """Whether ``bodies`` [k] grow on a body in ``marked`` [body] bool, without a cut in between [k] bool."""
         parent = self.plants.model.body_parent
         cut = self.plants.state.body_cut
         below = np.zeros(len(bodies), bool)
@@ -232,8 +230,10 @@ class DetachmentMonitor:
     # ------------------------------------------------------------------ one at a time
 
     def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
-        """Detach one bunch; it keeps its pose and velocity. Call it between steps. :class:`ValueError` if it cannot
-        be."""
+        """Detach one bunch, which keeps its pose and velocity. Call it between steps.
+
+        :class:`ValueError` if the bunch cannot be detached.
+        """
         bunch = checked_index("bunch", bunch, len(self._overloaded_steps))
         if not self.plants.state.bunch_attached[bunch]:
             raise ValueError(f"bunch {bunch} was picked already")
@@ -249,10 +249,11 @@ class DetachmentMonitor:
         plants.forward_kinematics(np.array([tree]))
         shapes = self.contact_solver.capsules
         state = plants.state
-        # as touched so far, its clusters where they are: what holds it must not feel the difference
+        # the shapes in use so far, with the clusters where they are, so that what holds the bunch feels no difference
         here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
         of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
-        velocity = plants.berry_clusters.fuse(bunch)  # first cut, then fused: its vine and its neighbours feel nothing
+        # cut before fusing, so that its vine and its neighbours feel nothing
+        velocity = plants.berry_clusters.fuse(bunch)
         local = frames.compose(frames.inverse(state.body_q[body].astype(float)), state.body_q[shapes.body[of]])
         start, end = (
             local[:, :3] + frames.rotate(local[:, 3:], at[of].astype(float)) for at in (shapes.start, shapes.end)
@@ -278,9 +279,9 @@ class DetachmentMonitor:
         self._record(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
-        """Cut a piece of cane off its parent; all that grows on it falls with it. Call it between steps.
+        """Cut a piece of cane off its parent; everything that grows on it falls with it. Call it between steps.
 
-        :class:`ValueError` if it cannot be cut.
+        :class:`ValueError` if the piece cannot be cut.
         """
         plants = self.plants
         body = checked_index("body", body, len(self._wood))
@@ -299,16 +300,16 @@ class DetachmentMonitor:
         self._record(body, -1, cause, actor, carried)
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Detach one bunch because another client has, and place it: ``pose`` [7] m, xyzw, ``velocity`` [6] m/s, rad/s.
+        """Detach a bunch that another client has detached, and place it at ``pose`` [7] with ``velocity`` [6].
 
-        It is not among this client's detachments.
+        It is not listed in this client's detachments.
         """
         self._pick(bunch, "told", "", np.zeros(6))
         self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
 
     def apply_remote_cut(self, body: int) -> None:
-        """Cut a body off its parent because another client has."""
+        """Cut a body off its parent that another client has cut off."""
         if not self.plants.state.body_cut[body]:
             tree = int(self.plants.model.body_tree[body])
             self.plants.wake(tree)
@@ -330,6 +331,6 @@ class DetachmentMonitor:
 
 
 def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner [3] m of the box, in the world's axes, around a bunch at ``pose`` [7]."""
+    """Lower and upper corner [3] m of the world-aligned bounding box of a bunch at ``pose`` [7]."""
     ends = pose[:3] + frames.rotate(pose[3:], np.stack([bunch.start, bunch.end]))
     return (ends - bunch.radius[:, None]).min((0, 1)), (ends + bunch.radius[:, None]).max((0, 1))

@@ -1,7 +1,7 @@
-"""Dormant free bunches: picked bunches that are known and drawn, but have no body while no actor is near.
+"""Dormant free bunches: picked bunches that are drawn, but have no body in the physics while no actor is near.
 
-A client that joins late learns of a thousand picked bunches at once. A body for each would cost milliseconds to make
-and time in every step; an entry here costs nothing until :meth:`DormantBunches.activate` gives it a body.
+A client that joins late is informed of a thousand picked bunches at once. Creating a body for each would take
+milliseconds, and time in every step. A dormant bunch costs nothing until :meth:`DormantBunches.activate`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vinesim.scene.values import RigidVisual
 
 
 class DormantBunches:
-    """Picked bunches without bodies, each at a pose in the frame of its support."""
+    """Picked bunches without bodies. Each has a pose in the frame of its support."""
 
     def __init__(
         self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, supports: SupportTracker
@@ -33,10 +33,10 @@ class DormantBunches:
         self._support: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
         self._place: dict[int, np.ndarray] = {}
-        """Poses [7] in the world, for those whose support does not exist."""
+        """World pose [7] of each bunch, used while its support does not exist."""
         self._visuals: tuple[RigidVisual, ...] | None = ()
         self._groups: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
-        """By support: its name, rows of :meth:`visuals`, poses [k, 7] in its frame and in the world without it."""
+        """For each support: name, rows of :meth:`visuals`, poses [k, 7] in its frame, world poses [k, 7] without it."""
         capsules = contact_solver.capsules
         of_bunches = np.flatnonzero(
             (plants.model.body_organ[capsules.body] == int(Organ.BUNCH)) & (capsules.level != 2)
@@ -51,10 +51,11 @@ class DormantBunches:
         return len(self._bunches)
 
     def add(self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None) -> None:
-        """Add picked bunches, or move them: ``poses`` [k, 7] in the frames of their ``supports`` (names), ``places``
-        [k, 7] in the world as long as the support does not exist (None: ``poses``).
+        """Add picked bunches, or move them.
 
-        Bunches that still hang are taken off their vines without waking these.
+        ``poses`` [k, 7] are in the frames of the ``supports`` (names). ``places`` [k, 7] are world poses for use while
+        a support does not exist (None: ``poses``). Bunches that still hang are removed from their vines, which are not
+        woken.
         """
         plants = self.plants
         model = self.plants.model
@@ -83,7 +84,7 @@ class DormantBunches:
         self._visuals = None
 
     def activate(self, bunches: list[int]) -> None:
-        """Give some bunches their bodies, at their present poses and with the velocities of their supports."""
+        """Give ``bunches`` their bodies, at their present poses and with the velocities of their supports."""
         if bunches:
             states = {bunch: self._world_state(bunch) for bunch in bunches}
             self.rigid.add_bunches({bunch: (self._bunches.pop(bunch), *states[bunch]) for bunch in bunches})
@@ -92,7 +93,7 @@ class DormantBunches:
             self._visuals = None
 
     def _world_state(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
-        """World pose [7] and velocity [6]."""
+        """World pose [7] and velocity [6] of a dormant bunch."""
         state = self.supports.to_world(self._support[bunch], self._relative[bunch])
         return (self._place[bunch], np.zeros(6)) if state is None else state
 

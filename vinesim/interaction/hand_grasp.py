@@ -1,9 +1,8 @@
-"""Grasps of people's hands: what a hand holds, whether plant, box, bunch, robot or static geom.
+"""Grasps of people's hands, which can hold plants, boxes, bunches, robots and static geoms.
 
-A rigid body is welded to the hand. A plant is held by a spring between the grasped point and the controller: the spring
-of
-the hand itself, solved implicitly with the plant's own, and the hand is placed on the plant. When a bunch is detached
-from its vine in a hand, the hand goes on holding it as a rigid body.
+A rigid body is welded to the hand. A plant is held by the hand's own spring, between the grasped point and the
+controller. This spring is solved implicitly together with the plant's springs, and the hand is placed on the plant. If
+a bunch in a hand is detached from its vine, the hand continues to hold it as a rigid body.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ class _PlantGrasp:
     point: np.ndarray
     """[3] m, the grasped point in the body's frame."""
     bunch: int
-    """Which bunch the body is, -1 if it is none."""
+    """Index of the bunch if the body is one, otherwise -1."""
 
 
 class GraspManager:
@@ -47,11 +46,11 @@ class GraspManager:
         self.contacts: tuple[Contact, ...] = ()
         """Hands that held a plant in the last step, as contacts; their ``distance`` is 0."""
         self.refused_grasps = 0
-        """Hands that closed on a plant in vain since the start: too many bodies were held, or one by too many hands."""
+        """Number of grasps of plants refused since the start: too many bodies were held, or one by too many hands."""
         self._grasps: dict[tuple[str, str], _PlantGrasp] = {}
         """Held plants, by person and side."""
         self._steps_to_grasp: dict[tuple[str, str], int] = {}
-        """How many more steps a hand that closed on nothing still grasps, by person and side."""
+        """Number of steps for which a hand that closed on nothing can still grasp, by person and side."""
         self._grasp_steps = rigid.parameters.steps(rigid.parameters.grasp_duration)
 
     @property
@@ -64,7 +63,7 @@ class GraspManager:
     # ------------------------------------------------------------------ the step
 
     def begin_step(self) -> None:
-        """Before a step: close and open hands, and pull the plants that are held."""
+        """Before a step: close and open hands, and pull the held plants."""
         for human, hand in self._local_hands():
             key = human.spec.name, hand.side
             if key in self._grasps and not hand.on_plant:  # the person left and joined again
@@ -82,7 +81,7 @@ class GraspManager:
             self.plants.wake(self.held_trees)
 
     def end_step(self, detachments: tuple[Detachment, ...]) -> None:
-        """After a step: place hands on the plants that they hold; go on holding bunches that were detached."""
+        """After a step: place hands on the plants that they hold, and weld detached bunches to their hands."""
         detached = {detachment.body: detachment.bunch for detachment in detachments if detachment.bunch >= 0}
         contacts = []
         if self._grasps:
@@ -108,7 +107,7 @@ class GraspManager:
         self.rigid.release(name, side)
 
     def remove_ties_of(self, name: str) -> None:
-        """Release all plants that a person holds who is removed."""
+        """Release all plants held by a person who is being removed."""
         for key in [key for key in self._grasps if key[0] == name]:
             self._remove_tie(key)
 
@@ -119,7 +118,7 @@ class GraspManager:
         return [(human, hand) for human in humans if not human.is_remote for hand in human.hands]
 
     def _close(self, human: HumanBody, hand: HandBody) -> None:
-        """Grasp what is nearest to the hand, if anything is near enough."""
+        """Grasp the plant or body nearest to the hand if it is near enough."""
         key = (human.spec.name, hand.side)
         distance = self.rigid.parameters.grasp_distance
         palm = self.rigid.hand_sample(*key).pose
@@ -134,7 +133,7 @@ class GraspManager:
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
             try:
                 tie = self.plants.add_tie(body, hand.grasp_pose[:3], hand.stiffness, hand.damping)
-            except TieLimitError:  # the hand has closed on nothing, and does not try again before it opens
+            except TieLimitError:  # the hand counts as closed on nothing, and does not try again until it opens
                 self.refused_grasps += 1
                 self._steps_to_grasp[key] = 0
                 return
@@ -144,7 +143,7 @@ class GraspManager:
             self.rigid.grasp(*key, *rigid[1:])
 
     def _pull(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> None:
-        """Set the anchor of the spring, no further from the plant than the hand's force allows."""
+        """Set the anchor of the spring, limiting its distance from the plant to what the hand's force allows."""
         at = self._grasped_point(grasp)
         velocity = human.controller_velocity(hand, self.rigid.dt)
         pull = human.controller_pose(hand)[:3] + hand.damping / hand.stiffness * velocity - at
@@ -152,12 +151,12 @@ class GraspManager:
         self.plants.tie_anchor[grasp.tie] = at + pull * min(1.0, most / max(float(np.linalg.norm(pull)), 1e-12))
 
     def _grasped_point(self, grasp: _PlantGrasp) -> np.ndarray:
-        """[3] m in the world."""
+        """Position [3] m of the grasped point in the world."""
         pose = self.plants.state.body_q[grasp.body].astype(float)
         return pose[:3] + frames.rotate(pose[3:], grasp.point)
 
     def _place_on_plant(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> Contact:
-        """Place a hand on the plant that it holds and set its force; the same as a contact."""
+        """Place a hand on the plant that it holds and set its force. Returns this force as a contact."""
         plants = self.plants
         pose = plants.state.body_q[grasp.body].astype(float)
         motion = plants.state.body_qd[grasp.body].astype(float)
@@ -169,7 +168,7 @@ class GraspManager:
         return Contact(human.spec.name, hand.link, grasp.body, at, -hand.force, 0.0)
 
     def _is_bunch_gone(self, grasp: _PlantGrasp) -> bool:
-        """Whether a held bunch was detached otherwise, for example by another client."""
+        """Whether a held bunch was detached by something else, for example by another client."""
         return grasp.bunch >= 0 and not self.plants.state.bunch_attached[grasp.bunch]
 
     def _remove_tie(self, key: tuple[str, str]) -> None:

@@ -1,12 +1,11 @@
-"""Support tracking: in which frame a box or a free bunch rests, and whether it moves in that frame.
+"""Support tracking: on which support a box or a free bunch rests, and whether it moves relative to it.
 
 Every object has a *support*: the ground, the box in which it lies, or the link of a robot that carries or grips it. An
-object that has been still in its support's frame for ``support_rest_duration`` is at rest, however the support moves: a
-bunch in a box, a box on a robot. It stays at rest until it has moved by more than a band. Then its support is
-determined
-anew among what it touches, the ground before all others: a box that is pushed along the ground is not supported by what
-pushes it. Hands of people are no supports, as their copies on other clients are not exact enough: what they hold is
-never at rest.
+object that has been still in its support's frame for ``support_rest_duration`` is at rest, however the support moves;
+examples are a bunch in a box and a box on a robot. It stays at rest until it leaves a band around its anchor pose. Then
+a new support is chosen among the things that it touches. The ground has priority, because a box pushed along the ground
+is not supported by the pusher. Hands of people are not supports, because their copies on other clients are not exact
+enough. Objects in hands are never at rest.
 """
 
 from __future__ import annotations
@@ -22,10 +21,10 @@ from vinesim.scene.ids import ObjectKind, object_id, parse_object_name
 STILL_BAND = 0.005, float(np.radians(1.0))
 """[m, rad] An object that moves and turns less than this in its support's frame is still. TUNED."""
 CARRIED_BAND = 0.015, float(np.radians(5.0))
-"""[m, rad] The same on a robot's link: what it carries is shaken, and is not sent while it stays near its place.
+"""[m, rad] Band of an object on a robot's link, which shakes it. The object is not sent while it stays in the band.
 TUNED."""
 SHAKEN_BAND = 0.05, float(np.radians(30.0))
-"""[m, rad] The same in a box that moves, where bunches rock and roll; in a box at rest :data:`STILL_BAND` counts.
+"""[m, rad] Band of a bunch in a moving box, where it rocks and rolls. In a box at rest :data:`STILL_BAND` applies.
 TUNED."""
 
 GROUND = ""
@@ -39,27 +38,28 @@ _NO_PAIRS = np.zeros((0, 2), np.int64)
 class SupportTracker:
     """Poses, velocities and supports of all boxes and free bunches, and which of them are at rest.
 
-    Objects are named by :func:`vinesim.scene.ids.object_id`. Per object, the tracker counts the steps for which it has
-    stayed within its band about an anchor pose in its support's frame.
+    Objects have the ids of :func:`vinesim.scene.ids.object_id`. For each object the tracker counts the steps for which
+    it has stayed within its band around an anchor pose in its support's frame.
     """
 
     def __init__(self, rigid: RigidWorld) -> None:
         self.rigid = rigid
         self._rest_steps = rigid.parameters.steps(rigid.parameters.support_rest_duration)
         self.object_ids = np.zeros(0, np.int64)
-        """[object] Boxes, then free bunches, sorted; a row of the tables below for each."""
+        """[object] Ids of boxes, then of free bunches, sorted. The tables below have a row for each object."""
         self._generation = -1
         self._support = np.zeros(0, np.int64)
         """[object] MuJoCo body of the support, 0 for the ground."""
         self._anchor_pose = np.zeros((0, 7))
-        """[object, 7] in the support's frame: where the object came to rest."""
+        """[object, 7] Anchor pose in the support's frame, around which the object may move within its band."""
         self._still_steps = self._slow_steps = np.zeros(0, np.int64)
-        """[object] For how many steps it has been within its band, and slower than ``support_move_speed``."""
+        """[object] Number of steps for which the object has been within its band, and slower than
+        ``support_move_speed``."""
         self._row_of_object: dict[int, int] = {}
         self._touching_pairs = _NO_PAIRS
         """[k, 2] Row and MuJoCo body of all contacts of the last step."""
         self._bands_before = self._bands_on_ground = np.zeros((0, 2))
-        """[object, 2] m, rad: bands in the last step, and bands of objects that all rest on the ground."""
+        """[object, 2] m, rad, bands in the last step; and the bands if all objects rest on the ground."""
         self._touched: list[tuple[int, str]] | None = None
         self._all_sleep = False
         """Whether all objects slept after the last step."""
@@ -68,8 +68,7 @@ class SupportTracker:
     # ------------------------------------------------------------------ the tick
 
     def update(self) -> None:
-        """After a step: find out which objects are still in their support's frame; determine the supports of the
-        others."""
+        """After a step: determine which objects are still in their support's frame, and the supports of the others."""
         self._update_tables()
         d = self.rigid.mj_data
         move_speed = self.rigid.parameters.support_move_speed
@@ -80,7 +79,7 @@ class SupportTracker:
         self._all_sleep = bool(asleep.all())
         if all_slept and self._all_sleep and self._bands_before is self._bands_on_ground and not self._support.any():
             self._slow_steps += 1
-            # MuJoCo reports none of what sleeps
+            # MuJoCo reports no contacts of sleeping objects
             self._touching_pairs = _NO_PAIRS
             self._touched = None
             return
@@ -115,7 +114,7 @@ class SupportTracker:
             self._still_steps[restarted] = 0
 
     def _held_rows(self) -> list[int]:
-        """Rows of what hands hold: at rest it would stay where it is when the hand opens."""
+        """Rows of the objects in hands. If one were at rest, it would stay in place when the hand opens."""
         held = (hand.held for name in self.rigid.humans for hand in self.rigid.human(name).hands)
         numbers = (parse_object_name(one[0]) for one in held if one is not None)
         return [self._row_of_object[number] for number in numbers if number in self._row_of_object]
@@ -128,15 +127,14 @@ class SupportTracker:
 
     @property
     def touched(self) -> list[tuple[int, str]]:
-        """(object, actor) for every moving object that is touched by robots, people, boxes (``box/3``) or free
-        bunches."""
+        """(object, actor) for every moving object and each robot, person, box (``box/3``) or free bunch touching it."""
         self._update_tables()
         if self._touched is None:
             self._touched = self._list_touched()
         return self._touched
 
     def objects_moved_by(self, actor: str) -> set[int]:
-        """Moving objects that an actor touches, directly or through other objects."""
+        """Moving objects that ``actor`` touches directly or through other objects."""
         self._update_tables()
         moves = self._still_steps < self._rest_steps
         if not moves.any():
@@ -178,7 +176,7 @@ class SupportTracker:
         return object_id in self._row_of_object
 
     def object_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] and velocity [6] (of its origin, angular; world axes)."""
+        """Pose [7] of an object, and its velocity [6] (linear velocity of the origin, then angular; world axes)."""
         row = self._row_of(object_id)
         d = self.rigid.mj_data
         pose = self._poses(np.array([row]))[0]
@@ -186,7 +184,7 @@ class SupportTracker:
         return pose, np.concatenate([v[:3], frames.rotate(pose[3:], v[3:])])
 
     def pose_on_support(self, object_id: int) -> tuple[str, np.ndarray]:
-        """The name of its support, and its pose [7] in the support's frame."""
+        """Name of an object's support, and pose [7] of the object in the support's frame."""
         row = self._row_of(object_id)
         self.rigid.update_kinematics()
         at = np.array([row])
@@ -212,7 +210,7 @@ class SupportTracker:
         return pose, np.concatenate([twist[3:], twist[:3]])
 
     def to_world(self, support: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """World poses [..., 7] and velocities [..., 6] of what is still in a support's frame at ``relative`` [..., 7].
+        """World poses [..., 7] and velocities [..., 6] of objects that rest on a support at ``relative`` [..., 7].
 
         None if the support does not exist.
         """
@@ -252,15 +250,15 @@ class SupportTracker:
         self.set_states(object_ids, here + np.where(far, 1.0, blend)[:, None] * (there - here), velocity)
 
     def set_at_rest(self, object_id: int, support: str, relative: np.ndarray) -> None:
-        """Set an object at rest in a support's frame at ``relative`` [7], as its owner says."""
+        """Set an object at rest at ``relative`` [7] in a support's frame, on behalf of its owner."""
         row = self._row_of(object_id)
         self._support[row] = self._body_of_support(support)
         self._anchor_pose[row] = relative
         self._still_steps[row] = self._rest_steps
 
     def set_moving(self, object_ids: list[int]) -> None:
-        """Set objects moving, as their owner says."""
-        rows = [self._row_of(object_id) for object_id in object_ids]  # first: new objects change the rows
+        """Mark objects as moving, on behalf of their owner."""
+        rows = [self._row_of(object_id) for object_id in object_ids]  # before the tables are used: it may rebuild them
         self._still_steps[rows] = 0
 
     # ------------------------------------------------------------------ inside
@@ -280,7 +278,7 @@ class SupportTracker:
         return pose
 
     def _relative(self, pose: np.ndarray, support: np.ndarray) -> np.ndarray:
-        """Poses [k, 7] in the frames of MuJoCo bodies [k]."""
+        """World poses ``pose`` [k, 7] expressed in the frames of the MuJoCo bodies ``support`` [k]."""
         moves = np.flatnonzero(support)
         if len(moves) == 0:
             return pose
@@ -294,7 +292,7 @@ class SupportTracker:
         return relative
 
     def _band_sizes(self) -> np.ndarray:
-        """[object, 2] m, rad: how far each may move and turn within its band."""
+        """[object, 2] m, rad, band of each object on its present support."""
         if not self._support.any():
             return self._bands_on_ground
         on = self._row_of_body[self._support]
@@ -303,7 +301,7 @@ class SupportTracker:
         return np.where(shaken[:, None], SHAKEN_BAND, np.where(carried[:, None], CARRIED_BAND, STILL_BAND))
 
     def _find_touching_pairs(self) -> np.ndarray:
-        """(row, MuJoCo body) of all contacts of the last step [k, 2], each from both sides."""
+        """[k, 2] Row and MuJoCo body of all contacts of the last step; contacts of two objects are listed twice."""
         m = self.rigid.mj_model
         d = self.rigid.mj_data
         if d.ncon == 0:
@@ -316,7 +314,7 @@ class SupportTracker:
         return np.stack([each // m.nbody, each % m.nbody], -1)
 
     def _find_supports(self, rows: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """Supports of some rows [k]: MuJoCo bodies [k]; ``inside`` [object]: whether it is still within its band."""
+        """Supports of ``rows`` [k] as MuJoCo bodies [k]; ``inside`` [object]: whether each is still in its band."""
         count = len(self.object_ids)
         row, other = self._touching_pairs.T
         kind = self._kind_of_body[other]
@@ -340,12 +338,12 @@ class SupportTracker:
             found[upper[supported]] = found[lower[supported]]
         touches = np.zeros(count, bool)
         touches[row[np.where(self._kind_of_body[other] == _STATIC, 0, other) == self._support[row]]] = True
-        asleep = self.rigid.mj_data.tree_asleep[self._tree] >= 0  # MuJoCo reports no contacts of these
+        asleep = self.rigid.mj_data.tree_asleep[self._tree] >= 0  # MuJoCo reports no contacts of sleeping objects
         keep = (inside & (touches | (found == _NONE))) | asleep
         return np.where(keep, self._support, np.where(found == _NONE, 0, found))[rows]
 
     def _rebuild_tables(self) -> None:
-        """Build the tables for MuJoCo's present model; the supports of objects are transferred by name."""
+        """Build the tables for MuJoCo's present model, transferring the supports of objects by name."""
         rigid = self.rigid
         m = rigid.mj_model
         rigid.update_kinematics()
@@ -407,7 +405,7 @@ class SupportTracker:
 
 
 def _is_outside_band(a: np.ndarray, b: np.ndarray, band: np.ndarray) -> np.ndarray:
-    """[k] bool: which poses [k, 7] differ by more than a ``band`` [k, 2] m, rad."""
+    """Whether poses ``a`` and ``b`` [k, 7] differ by more than ``band`` [k, 2] m, rad [k] bool."""
     offset = a[:, :3] - b[:, :3]
     chord = np.minimum(np.square(a[:, 3:] - b[:, 3:]).sum(1), np.square(a[:, 3:] + b[:, 3:]).sum(1))
     return (np.square(offset).sum(1) > np.square(band[:, 0])) | (chord > np.square(0.5 * band[:, 1]))

@@ -1,4 +1,4 @@
-"""Rigid geoms that plants collide with: MuJoCo's geoms, and the actor and link that each belongs to."""
+"""Rigid geoms that plants collide with: MuJoCo's geoms, each with its actor and link."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import structs
 
 _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
-    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))  # NumPy would compare with MuJoCo's own type entry by entry
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))  # int: NumPy compares with MuJoCo's enum entry by entry
     for name in ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
 )
 PLANE_HALF_SIZE = 1e6
-"""[m] Half edge of the box around the ground."""
+"""[m] Half edge of the bounding box of the ground."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -29,39 +29,39 @@ class RigidGeoms:
     body: np.ndarray
     """[geom] MuJoCo body."""
     kind: np.ndarray
-    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh; a flat mesh stands as
-    its box."""
+    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
+    replaced by its bounding box."""
     hull: np.ndarray
-    """[geom] number of its convex hull in :func:`vinesim.rigid.collision_geoms.hull_arrays`; -1 unless it is a mesh."""
+    """[geom] number of the convex hull in :func:`hull_arrays`; -1 if the geom is not a mesh."""
     size: np.ndarray
-    """[geom, 3] as MuJoCo writes it for the kind; of a mesh, half edges of its box."""
+    """[geom, 3] size as in MuJoCo's ``geom_size``; for a mesh, half edges of its bounding box."""
     half: np.ndarray
-    """[geom, 3] half edges of the box around the shape, in its own axes; of a plane, :data:`PLANE_HALF_SIZE` and no
+    """[geom, 3] half edges of the bounding box in the geom's axes; for a plane, :data:`PLANE_HALF_SIZE` and no
     height."""
     center: np.ndarray
     """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
-    """[geom] of the bounding sphere about the middle."""
+    """[geom] radius of the bounding sphere around the centre."""
     material: np.ndarray
     """[geom] :class:`Material`"""
     friction: np.ndarray
-    """[geom] Coulomb coefficient of its own; 0: that of the two materials in contact."""
+    """[geom] the geom's own Coulomb coefficient; 0: the coefficient depends on the two materials in contact."""
     dof: np.ndarray
-    """[geom] last degree of freedom that moves it (-1: none); its ancestors follow ``dof_parentid``."""
+    """[geom] last degree of freedom that moves the geom (-1: none); ``dof_parentid`` gives its ancestors."""
     root: np.ndarray
-    """[geom] root body of its kinematic tree, about whose centre of mass MuJoCo writes ``cvel`` and ``cdof``."""
+    """[geom] root body of the geom's kinematic tree; MuJoCo's ``cvel`` and ``cdof`` refer to its centre of mass."""
     actor: tuple[str, ...]
     link: tuple[str, ...]
 
 
 def owned_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGeoms:
-    """All geoms of some MuJoCo bodies; ``owner`` maps their numbers to actor and link."""
+    """All geoms of the MuJoCo bodies in ``owner``, which maps body numbers to actor and link."""
     ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)))
     return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
 
 
 def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
-    """Those of ``geoms`` that collide now: the geoms of a hand change with what it holds, and nothing else of them."""
+    """The subset of ``geoms`` that collides now. It changes when a hand grasps or releases something."""
     rows = np.flatnonzero(m.geom_contype[geoms.id] != 0)
     names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
     arrays: dict[str, Any] = {name: getattr(geoms, name)[rows] for name in names}
@@ -70,14 +70,14 @@ def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
 
 
 def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
-    """Ground, trellis and old wood: MuJoCo's first geoms, independent of the actors that join and leave."""
+    """Geoms of ground, trellis and old wood. They are MuJoCo's first geoms and do not depend on the actors."""
     ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
 def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> RigidGeoms:
-    """The properties of some geoms ``ids`` [k]; ``names``: actor and link of each."""
-    moved_by = m.body_weldid  # a body without joints moves with the one that it is welded to
+    """The properties of the geoms ``ids`` [k]; ``names``: actor and link of each geom."""
+    moved_by = m.body_weldid  # a body without joints moves with the body to which it is welded
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1)[moved_by]
     body = m.geom_bodyid[ids]
     kind = m.geom_type[ids].copy()
@@ -122,7 +122,7 @@ def concatenate(first: RigidGeoms, second: RigidGeoms) -> RigidGeoms:
 
 
 def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:
-    """[geom] a name that outlives a recompilation: actor, link and the geom's number on that link."""
+    """[geom] Name that stays valid after a recompilation: actor, link and the geom's number on that link."""
     seen: dict[tuple[str, str], int] = {}
     names = []
     for actor, link in zip(geoms.actor, geoms.link, strict=True):
@@ -131,22 +131,22 @@ def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:
     return names
 
 
-# Convex hulls of meshes for contacts with plants: planes and edges of the hull that MuJoCo made of each mesh.
+# Convex hulls of meshes for contacts with plants: planes and edges of the hull that MuJoCo computed for each mesh.
 
 
 COPLANAR_COSINE = 1.0 - 1e-9
-"""[1] Triangles whose normals agree better than this are one face."""
+"""[1] Triangles form one face if the cosine between their normals is larger than this."""
 
 
 def hull_numbers(m: mujoco.MjModel, ids: np.ndarray) -> np.ndarray:
-    """[geom] number of the hull of each of the geoms ``ids``: of its mesh, -1 for other kinds and for flat meshes."""
+    """[geom] Number of the hull of each geom in ``ids``, which is its mesh; -1 for other kinds and for flat meshes."""
     mesh = np.where(m.geom_type[ids] == _MESH, m.geom_dataid[ids], -1)
     has_hull = np.append(m.mesh_graphadr >= 0, False)
     return np.where(has_hull[mesh], mesh, -1).astype(np.int32)
 
 
 def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
-    """Hulls of all meshes of a world; those without a hull are empty."""
+    """Hulls of all meshes of a world; meshes without a hull have an empty one."""
     planes = [np.zeros((0, 4))]
     edges = [np.zeros((0, 2, 3))]
     sides = [np.zeros((0, 2), int)]
@@ -179,10 +179,11 @@ def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
 
 
 def _graph(m: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [vertex, 3] m of a mesh's hull, and its triangles [triangle, 3] as numbers of vertices.
+    """Vertices [vertex, 3] m of a mesh's hull, and its triangles [triangle, 3] as indices of vertices.
 
-    MuJoCo's ``mesh_graph``: counts of vertices and triangles, two lists for the vertices of which the second says where
-    they are in the mesh, the neighbours (vertices and 3 triangles), and the triangles by their place in the mesh.
+    MuJoCo's ``mesh_graph`` contains the numbers of vertices and triangles, two lists with an entry for each vertex (the
+    second one is its index in the mesh), the neighbours (vertices + 3 triangles entries), and the triangles as indices
+    in the mesh.
     """
     graph = m.mesh_graph[m.mesh_graphadr[mesh] :]
     count, faces = graph[:2].tolist()
@@ -193,17 +194,17 @@ def _graph(m: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
     return m.mesh_vert[m.mesh_vertadr[mesh] + places].astype(float), number[triangles]
 
 
-@functools.lru_cache(1024)  # a world is compiled anew whenever an actor joins
+@functools.lru_cache(1024)  # the world is recompiled whenever an actor joins
 def _cached_hull(vertices: bytes, triangles: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """:func:`faces_and_edges` of arrays that are given as bytes."""
+    """:func:`faces_and_edges` for arrays given as bytes, which can be hashed."""
     return faces_and_edges(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(triangles, int).reshape(-1, 3))
 
 
 def faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Planes [plane, 4] (outward normal, offset), edges [edge, 2, 3] m and their two planes [edge, 2] of a hull.
+    """Planes [plane, 4] (outward normal, offset), edges [edge, 2, 3] m and the two planes of each edge [edge, 2].
 
-    ``vertices`` [vertex, 3] m, ``triangles`` [triangle, 3] vertices. Triangles in one plane are one face; no edge is
-    between them.
+    ``vertices`` [vertex, 3] m and ``triangles`` [triangle, 3] (indices of vertices) describe a hull. Triangles in one
+    plane form one face without edges between them.
     """
     corner = vertices[triangles]
     normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -213,7 +214,7 @@ def faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
     normal = normal[has_area] / area[has_area, None]
     outward = np.einsum("fi,fi->f", normal, vertices[triangles[:, 0]] - vertices.mean(0)) >= 0.0
     normal[~outward] *= -1.0
-    # of triangles in one plane, the largest gives the plane: slivers have poor normals
+    # the largest triangle of a face defines its plane, because slivers have poor normals
     by_area = np.argsort(-area[has_area], kind="stable")
     plane_of = np.full(len(triangles), -1)
     kept = []
@@ -223,7 +224,7 @@ def faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.nda
         if not len(same):
             kept.append(triangle)
     n = normal[kept]
-    planes = np.column_stack([n, (n @ vertices.T).max(1)])  # so that no vertex is outside by rounding
+    planes = np.column_stack([n, (n @ vertices.T).max(1)])  # the maximum keeps all vertices inside despite rounding
     beside: dict[tuple[int, int], list[int]] = {}
     for triangle, plane in zip(triangles.tolist(), plane_of.tolist(), strict=True):
         for i, k in ((0, 1), (1, 2), (2, 0)):

@@ -10,10 +10,10 @@ _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 
 
 class EffectiveMass:
-    """H = M^ + Jc^T D Jc: mass with implicit servos, and the tangent stiffness of MuJoCo's active constraints.
+    """H = M^ + Jc^T D Jc: mass with implicit servos, plus the tangent stiffness of MuJoCo's active constraints.
 
-    These are joint limits, mimic joints, and contacts of rigid bodies with each other; D is that of the acceleration
-    that MuJoCo has found last, and for contacts that slide the Hessian of their friction cone. Only the kinematic trees
+    The constraints are joint limits, mimic joints and contacts between rigid bodies. D belongs to the acceleration that
+    MuJoCo computed last; for sliding contacts it is the Hessian of the friction cone. Only the kinematic trees
     concerned are factored.
     """
 
@@ -36,16 +36,16 @@ class EffectiveMass:
         return change
 
     def island_labels(self, d: mujoco.MjData) -> np.ndarray:
-        """[MuJoCo kinematic tree] a label that two share if a force on one may move the other in this step."""
+        """[MuJoCo kinematic tree] Labels; trees have equal labels if a force on one may move the other in this step."""
         m = self._world
         if d.nefc == 0:
             return self._each
         return np.where(d.tree_island >= 0, m.ntree + d.tree_island, self._each) if d.nisland else 0 * self._each
 
     def is_constrained(self, d: mujoco.MjData, bodies: np.ndarray) -> bool:
-        """Whether active constraints of MuJoCo bind one of these MuJoCo bodies [k].
+        """Whether active constraints of MuJoCo act on one of the MuJoCo ``bodies`` [k].
 
-        If not, the effective mass is M^, of which MuJoCo keeps a sparse factor L^T D L in ``qH``.
+        Otherwise the effective mass is M^, and MuJoCo has its sparse factor L^T D L in ``qH``.
         """
         if d.nefc == 0:
             return False
@@ -53,13 +53,13 @@ class EffectiveMass:
         return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
 
     def _coupled(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
-        """Degrees of freedom [k] that an impulse along ``J`` moves: of its trees and of those constrained to them."""
+        """Degrees of freedom [k] moved by an impulse along ``J``: of its trees and of trees constrained to them."""
         m = self._world
         touched = np.zeros(m.ntree, bool)
         touched[m.dof_treeid[J.any(axis=0)]] = True
         if d.nefc and d.nisland:
             island = d.tree_island
-            is_coupled = np.zeros(d.nisland + 1, bool)  # the last one stands for -1, trees without an island
+            is_coupled = np.zeros(d.nisland + 1, bool)  # the last entry is for island -1, trees without an island
             is_coupled[island[touched]] = True
             is_coupled[-1] = False
             touched |= is_coupled[island]
@@ -81,14 +81,14 @@ class _Block:
         self.column = self.at[column[self.entry]]
 
     def hessian(self, d: mujoco.MjData) -> np.ndarray:
-        """[k, k]: M^ and the tangent of the active constraints."""
+        """Matrix [k, k]: M^ plus the tangent stiffness of the active constraints."""
         H = np.zeros((self.count, self.count))
         diagonal = d.qHDiagInv[self.dofs]
         if diagonal.all():
             H[self.row, self.column] = d.qH[self.entry]
             H.ravel()[:: self.count + 1] = 1.0  # the diagonal
             H = H.T @ (H / diagonal[:, None])
-        else:  # nothing is implicit in the whole world: MuJoCo leaves the factor unset, and M^ is M
+        else:  # nothing in the world is implicit: MuJoCo leaves the factor unset, and M^ is M
             H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]
         if d.nefc:
             state = d.efc_state

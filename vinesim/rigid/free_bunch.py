@@ -1,7 +1,7 @@
-"""Picked bunches as free bodies of MuJoCo: spheres and capsules on a body that is taken from a pool.
+"""Picked bunches as free bodies of MuJoCo: spheres and capsules on a body from a pool.
 
-Compiling a MuJoCo world takes some ten milliseconds, so each world has a pool of bodies that are asleep and touch
-nothing. A bunch that leaves its vine gets one of them, with all constants that MuJoCo derives from its mass and shapes.
+Compiling a MuJoCo world takes about 10 ms, so each world has a pool of sleeping bodies that collide with nothing. A
+bunch that leaves its vine gets one of them, with all constants that MuJoCo derives from its mass and shapes.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import Shape
 
 MAX_GEOMS = 12
-"""Shapes that a body of the pool has room for."""
+"""Largest number of shapes of a body of the pool."""
 PARKING_HEIGHT = -100.0
-"""[m] Height of unused bodies of the pool: below the ground, where nothing is."""
+"""[m] Height of unused bodies of the pool, below the ground."""
 CONAFFINITY = ALL_BITS & ~CRATE_FLOOR
-"""Collision bits of what the shapes of a free bunch touch."""
+"""Collision bits with which the shapes of a free bunch collide."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
-"""MuJoCo's constraint impedance. TUNED: with still harder contacts a bunch is held a few micrometres deep, and a hand
-that moves loses contact for a step: fingers that hold with 25 N are then 3 mm further, and the bunch falls."""
+"""MuJoCo's constraint impedance. TUNED: with harder contacts a bunch is held with a penetration of a few micrometres,
+and a moving hand loses contact for a step. Fingers that hold with 25 N then move by 3 mm, and the bunch falls."""
 
 BODY_ARRAYS = (
     "body_mass",
@@ -39,7 +39,7 @@ BODY_ARRAYS = (
     "body_contype",
     "body_conaffinity",
 )
-"""Constants that MuJoCo derives from the mass and the shapes of a body."""
+"""Arrays of constants that MuJoCo derives for a body from its mass and shapes."""
 GEOM_ARRAYS = (
     "geom_type",
     "geom_contype",
@@ -56,26 +56,26 @@ GEOM_ARRAYS = (
     "geom_solimp",
     "geom_solref",
 )
-"""The same of a geom."""
+"""Arrays of properties and derived constants of a geom."""
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class FreeBunch:
-    """Mass and shapes of a picked bunch, in the frame that it had as a plant's body."""
+    """Mass and shapes of a picked bunch, in the frame of its former plant body."""
 
     mass: float
     """[kg]"""
     com: np.ndarray
-    """[3] m"""
+    """[3] m, centre of mass."""
     inertia: np.ndarray
-    """[3] kg m^2 about the centre of mass: moments xx, yy, zz."""
+    """[3] kg m^2, moments of inertia xx, yy, zz about the centre of mass."""
     product: np.ndarray
-    """[3] kg m^2: entries yz, zx, xy."""
+    """[3] kg m^2, entries yz, zx, xy of the inertia matrix."""
     start: np.ndarray
-    """[shape, 3] m; a capsule reaches from here to ``end``, a sphere has both in one place."""
+    """[shape, 3] m, start of a capsule's axis; for a sphere ``start`` equals ``end``."""
     end: np.ndarray
-    """[shape, 3] m"""
+    """[shape, 3] m, end of a capsule's axis."""
     radius: np.ndarray
     """[shape] m"""
 
@@ -101,7 +101,7 @@ def slot_name(slot: int) -> str:
 
 
 def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
-    """Add a body to the pool: asleep, with numbers that have no meaning yet; see :func:`disable_collision`."""
+    """Add a sleeping body with placeholder values to the pool; after compilation call :func:`disable_collision`."""
     body = spec.worldbody.add_body(
         name=slot_name(slot),
         pos=_parking_pose(slot)[:3],
@@ -121,16 +121,16 @@ def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
             contype=FREE_BUNCH,
             conaffinity=CONAFFINITY,
             userdata=geom_user(Material.BERRY),
-        )  # with collision bits, or MuJoCo makes no bounding volumes
+        )  # collision bits are needed for MuJoCo to create bounding volumes
 
 
 def _parking_pose(slot: int) -> np.ndarray:
-    """Pose [7] of an unused body, quaternion w first."""
+    """Pose [7] (wxyz) of an unused body."""
     return np.array([float(slot), 0.0, PARKING_HEIGHT, 1.0, 0.0, 0.0, 0.0])
 
 
 def compile_alone(bunch: FreeBunch, parameters: PhysicsParameters) -> mujoco.MjModel:
-    """A bunch in a world of its own; ``ValueError`` if it has too many shapes or none."""
+    """Compile a bunch in its own world; ``ValueError`` if it has too many shapes or none."""
     spec = mujoco.MjSpec()
     add_free_bunch(spec, bunch, parameters)
     return spec.compile()
@@ -180,8 +180,8 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
 def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco.MjModel) -> None:
     """Give a body of the pool the mass and shapes of a bunch, with all constants that MuJoCo derives from them.
 
-    ``mj_setConst`` would derive some of them, but neither bounding volumes nor the collision bits of whole bodies; so
-    they are copied from ``derived``, the model of :func:`compile_alone`.
+    ``mj_setConst`` would derive some of them, but not bounding volumes and the collision bits of whole bodies. So all
+    are copied from ``derived``, the model of :func:`compile_alone`.
     """
     body = world.body(slot_name(slot)).id
     for name in BODY_ARRAYS:
@@ -201,7 +201,7 @@ def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco
 
 
 def disable_collision(world: mujoco.MjModel, slot: int) -> None:
-    """Let nothing touch an unused body of the pool; after compiling."""
+    """Disable collisions of an unused body of the pool. Call it after compilation."""
     body = world.body(slot_name(slot)).id
     geoms = slice(world.body_geomadr[body], world.body_geomadr[body] + MAX_GEOMS)
     world.body_contype[body] = world.body_conaffinity[body] = 0

@@ -1,13 +1,12 @@
 """One person in MuJoCo's world: kinematic head, trunk and legs, and two hands on springs.
 
-A hand is a free body. It follows its controller until it touches something; then a spring pulls it to its controller,
-so
-that its force follows from how far it is held back: 100 N/m up to 100 N by default (CANOPIES D6.4, section 3.1.1). It
-holds rigid objects by a weld; what is lifted hangs from the same spring. Gravity does not act on a hand itself.
+A hand is a free body. It follows its controller until it touches something. Then a spring pulls it to its controller,
+so that its force depends on the distance from the controller: 100 N/m up to 100 N by default (CANOPIES D6.4, section
+3.1.1). It holds rigid objects by a weld, so a lifted object hangs from this spring. Gravity does not act on the hand.
 
-Head, trunk and legs are kinematic: exactly where the tracked points put them, whatever pushes them
-(``docs/decisions/hands.md``). Those of a remote person stop a robot, but push with a bounded force while they move, and
-pass through rigid bodies while its messages let them jump or push with more.
+Head, trunk and legs are kinematic: the tracked points determine their poses, whatever pushes them
+(``docs/decisions/hands.md``). Those parts of a remote person stop a robot, but push with a bounded force while they
+move. They pass through rigid bodies while messages make them jump or push harder than the bound.
 """
 
 from __future__ import annotations
@@ -28,27 +27,26 @@ from vinesim.scene.materials import Material
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, Shape
 
-# Body parts of a remote person: how much they push, and when they touch nothing.
+# Body parts of a remote person: how hard they push, and when they pass through other bodies.
 #
-# The kinematic parts give way to nothing, so one that a message moves against a robot would push it with any force. A
-# part that moves is therefore light, and heavy again when it stands still and touches nothing: a robot that drives
-# into a person who stands is stopped. One that jumps, or pushes too hard while it moves, passes through rigid bodies
-# until it overlaps no robot.
+# Kinematic parts do not yield, so a part that a message moves against a robot would push it with unlimited force. A
+# moving part is therefore light, and becomes heavy again when it stands still and touches nothing, so a standing person
+# stops a robot. A part that jumps, or pushes too hard while it moves, passes through rigid bodies until it overlaps no
+# robot.
 
 
 HEAVY_PART_MASS = 1e4
-"""[kg] No force changes the motion of a body as heavy as this within a step."""
+"""[kg] Mass of a heavy part, whose motion no force changes within a step."""
 LIGHT_PART_MASS = 0.3
-"""[kg] A contact can slow such a part down within a step, but not move it: so it pushes a robot with a force that its
-speed and its depth bound, m (v 2/tau + depth/tau^2) with MuJoCo's time constant tau of contacts (20 ms), however heavy
-the robot is. DERIVED: two legs that walk at 1.5 m/s push with 80 N, half of
-:data:`vinesim.rigid.human_body.MAX_REMOTE_FORCE`."""
+"""[kg] Mass of a light part. A contact can slow it down within a step, but not move it. So its force on a robot is
+bounded by its speed v and its depth, m (v 2/tau + depth/tau^2) with MuJoCo's time constant tau of contacts (20 ms),
+however heavy the robot is. DERIVED: two legs that walk at 1.5 m/s push with 80 N, half of :data:`MAX_REMOTE_FORCE`."""
 STILL_SPEED = 0.05
-"""[m/s] A part that is slower stands still: more than the noise of tracked points. TUNED."""
+"""[m/s] A slower part stands still. TUNED: more than the noise of tracked points."""
 
 
 class YieldingParts:
-    """Which parts [k] of one remote person are light, and which touch nothing now."""
+    """The parts [k] of one remote person that are light, and those that pass through other bodies."""
 
     def __init__(self, count: int) -> None:
         self.is_passing = np.zeros(count, bool)
@@ -57,7 +55,7 @@ class YieldingParts:
         self._bits = np.zeros((count, 2), int)
 
     def find_indices(self, m: mujoco.MjModel, bodies: np.ndarray) -> None:
-        """Find the geoms of the parts' ``bodies`` [k] and those of robots in a world that was compiled anew."""
+        """Find the geoms of the parts' ``bodies`` [k], and the geoms of robots, in a recompiled world."""
         self._bodies = bodies
         self._geoms = m.body_geomadr[bodies]
         self._bits = np.stack([m.geom_contype[self._geoms], m.geom_conaffinity[self._geoms]], 1)
@@ -73,10 +71,15 @@ class YieldingParts:
         force: np.ndarray,
         released: np.ndarray,
     ) -> None:
-        """Parts that are ``released`` [k] bool touch nothing from now on; others do again if they are clear of robots.
+        """Update which parts are light, and which pass through other bodies.
 
-        ``places`` [k, 3] m: origins of the parts at the end of this step; ``speed`` [k] m/s of the parts;
-        ``force`` [k] N on them in the last step.
+        Args:
+            m: MuJoCo's model.
+            d: MuJoCo's data.
+            places: [k, 3] m, origins of the parts at the end of this step.
+            speed: [k] m/s, speeds of the parts.
+            force: [k] N, forces on the parts in the last step.
+            released: [k] bool, parts that pass through other bodies from now on, until they overlap no robot.
         """
         passing = released | self.is_passing
         if passing.any():
@@ -88,7 +91,7 @@ class YieldingParts:
             self._apply(m)
 
     def _overlaps(self, m: mujoco.MjModel, d: mujoco.MjData, places: np.ndarray) -> np.ndarray:
-        """[k] Whether the bounding sphere of a part, wherever it turns, meets the bounding box of a robot's geom."""
+        """[k] Whether the bounding sphere of a part, in any orientation, meets the bounding box of a robot's geom."""
         reach = m.geom_rbound[self._geoms] + np.linalg.norm(m.geom_pos[self._geoms], axis=1)
         others = self._obstacles
         axes = d.geom_xmat[others].reshape(-1, 3, 3)
@@ -102,19 +105,19 @@ class YieldingParts:
         m.geom_conaffinity[self._geoms] = m.body_conaffinity[self._bodies] = bits[:, 1]
         mass = np.where(self.is_light, LIGHT_PART_MASS, HEAVY_PART_MASS)
         m.body_mass[self._bodies] = m.body_subtreemass[self._bodies] = mass
-        m.dof_M0[m.body_dofadr[self._bodies][:, None] + np.arange(3)] = mass[:, None]  # MuJoCo takes it from here
+        m.dof_M0[m.body_dofadr[self._bodies][:, None] + np.arange(3)] = mass[:, None]  # MuJoCo reads the mass here
         m.body_invweight0[self._bodies, 0] = 1.0 / mass  # softness of contacts
 
 
 KINEMATIC_MASS = HEAVY_PART_MASS
-"""[kg, kg m^2] Mass and inertia of the kinematic parts. They are free bodies with a velocity, not bodies without
-joints: those have no velocity in MuJoCo, and a leg would sink centimetres into what it kicks. No force changes the
-motion of a body as heavy as this within a step, and each step starts from the prescribed poses. Those of a remote
-person weigh less while they move: see :mod:`vinesim.rigid.human_body`."""
+"""[kg, kg m^2] Mass and inertia of the kinematic parts. They are free bodies, because bodies without joints have no
+velocity in MuJoCo, and a leg would sink centimetres into an object that it kicks. No force changes the motion of such
+a heavy body within a step, and each step starts from the prescribed poses. Parts of a remote person are lighter while
+they move, see :class:`YieldingParts`."""
 MAX_REMOTE_FORCE = 150.0
-"""[N] A remote person's parts that push with more together pass through from the next step on. READ: ISO/TS 15066,
-table A.2, allows 110 to 160 N between robots and trunk, arms and hands for contacts that last, twice that for
-shorter ones."""
+"""[N] Largest total force of a remote person's moving parts; if they push harder, they pass through from the next step
+on. READ: ISO/TS 15066, table A.2, allows 110 to 160 N between robots and trunk, arms and hands for lasting contacts,
+and twice that for short ones."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2.0]
 _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -125,7 +128,7 @@ _KINDS = {
 
 
 class HumanError(ValueError):
-    """A person that cannot be added or moved as asked."""
+    """A person that cannot be added or moved as requested."""
 
 
 class HumanBody:
@@ -139,10 +142,10 @@ class HumanBody:
         *,
         is_remote: bool = False,
     ) -> None:
-        """``code``: of :data:`HUMAN_CODES`.
+        """``code``: one of :data:`HUMAN_CODES`. ``is_remote``: another client moves the person and computes its grasps.
 
-        ``is_remote``: another client moves the person and computes what the hands hold. Raises :class:`HumanError` for
-        numbers that cannot be, :class:`vinesim.scene.appearance.AppearanceError` for an unknown outfit.
+        Raises :class:`HumanError` for invalid numbers, :class:`vinesim.scene.appearance.AppearanceError` for an unknown
+        outfit.
         """
         stiffness = parameters.hand_stiffness if spec.stiffness is None else spec.stiffness
         force = parameters.hand_force if spec.force is None else spec.force
@@ -156,17 +159,17 @@ class HumanBody:
         self.hands = tuple(HandBody(side, stiffness, force, parameters) for side in SIDES)
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
-        """[part] MuJoCo's bodies of :data:`BODY_PARTS`."""
+        """[part] MuJoCo bodies of :data:`BODY_PARTS`."""
         self.part_dofs = np.zeros((0, 6), int)
-        """[part, 6] MuJoCo's degrees of freedom of the same."""
+        """[part, 6] MuJoCo's degrees of freedom of :data:`BODY_PARTS`."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
         self._passing = YieldingParts(len(BODY_PARTS))
-        self._part_force = np.full(len(BODY_PARTS), np.inf)  # not known before the first step
+        self._part_force = np.full(len(BODY_PARTS), np.inf)  # unknown before the first step
         self._pushes_too_hard = np.zeros(len(BODY_PARTS), bool)
         self._posture = PostureSolver(spec.height)
         outfit = spec.outfit or appearance.outfit_of(spec.name)
         self.looks = appearance.load_human_model(spec.height, outfit=outfit)
-        """Its shapes, in its outfit."""
+        """The person's visible shapes in its outfit."""
         self._shears = appearance.load_shears()
         self.set_pose(spec.pose)
         self._last_poses = self._poses
@@ -186,7 +189,7 @@ class HumanBody:
         return (self._poses[at, :3] - self._last_poses[at, :3]) / dt
 
     def set_pose(self, pose: HumanPose) -> None:
-        """Set the tracked points: the body takes its pose at once, the hands are pulled. Raises :class:`HumanError`."""
+        """Set the tracked points. The body moves there at once, the hands are pulled. Raises :class:`HumanError`."""
         points = [getattr(pose, name) for name in POINT_NAMES]
         square = np.array([np.nan if np.shape(at) != (7,) else 0.0 * at[:3].sum() + at[3:] @ at[3:] for at in points])
         if not (abs(square - 1.0) < 1e-3).all():
@@ -207,7 +210,7 @@ class HumanBody:
 
     @property
     def shears_parts(self) -> tuple[str, ...]:
-        """Links of the shears that the hands have."""
+        """Link names of the shears in the hands."""
         return tuple(f"{hand.side}_{part}" for hand in self.hands if hand.has_shears for part in SHEARS_PARTS)
 
     def visual_poses(self, hands: np.ndarray) -> np.ndarray:
@@ -222,13 +225,13 @@ class HumanBody:
         return np.concatenate(poses)
 
     def hand(self, side: str) -> HandBody:
-        """The left or the right hand; :class:`HumanError` otherwise."""
+        """The left or the right hand; :class:`HumanError` for any other ``side``."""
         if side not in SIDES:
             raise HumanError(f"human {self.spec.name!r} has no {side!r} hand; it has: {', '.join(SIDES)}")
         return self.hands[SIDES.index(side)]
 
     def hand_sample(self, hand: HandBody, d: mujoco.MjData) -> HandSample:
-        """A hand after the last step."""
+        """State of a hand after the last step."""
         return hand.sample(d, self.controller_pose(hand))
 
     # ------------------------------------------------------------------ in MuJoCo
@@ -282,7 +285,7 @@ class HumanBody:
             )
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames) -> None:
-        """Find the person's bodies and joints in a world that was compiled anew."""
+        """Find the person's bodies and joints in a recompiled world."""
         name = self.spec.name
         self.part_bodies = np.array([names.body[f"{name}/{part}"] for part in BODY_PARTS], int)
         joints = [names.joint[f"{name}/{part}"] for part in BODY_PARTS]
@@ -298,7 +301,7 @@ class HumanBody:
         self.update_hand_collisions(m)
 
     def update_hand_collisions(self, m: mujoco.MjModel) -> None:
-        """Let empty hands touch what they can, unless their own client says that they are busy."""
+        """Enable collisions of empty hands, except hands that their own client reports as busy."""
         for hand in self.hands:
             if hand.held is None:
                 hand.set_collision(m, enabled=not hand.busy)
@@ -306,7 +309,7 @@ class HumanBody:
     # ------------------------------------------------------------------ the step
 
     def apply_controls(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
-        """Before a step: place the kinematic parts at its start with their velocity, and drive both hands."""
+        """Before a step: set poses and velocities of the kinematic parts at its start, and drive both hands."""
         p = self.parameters
         has_teleported = self._last_poses is not self._poses and self._has_teleported()
         if has_teleported:
@@ -336,7 +339,7 @@ class HumanBody:
             hand.apply_control(m, d, at[i], error, motion)
 
     def measure(self, d: mujoco.MjData) -> None:
-        """After a step: place the kinematic parts at its end and read the forces of the hands."""
+        """After a step: set the poses of the kinematic parts at its end, and read the forces of the hands."""
         self._last_poses = self._poses
         if self.is_remote:
             force = d.qfrc_constraint[self.part_dofs[:, :3]]
@@ -347,11 +350,11 @@ class HumanBody:
             hand.measure(d)
 
     def _has_teleported(self) -> bool:
-        moved = self._poses[0, :3] - self._last_poses[0, :3]  # of the head
+        moved = self._poses[0, :3] - self._last_poses[0, :3]  # motion of the head
         return float(moved @ moved) > self.parameters.teleport_distance * self.parameters.teleport_distance
 
     def _teleport(self, d: mujoco.MjData) -> None:
-        """Place the whole person without a velocity; hands that hold something stay where they are."""
+        """Place the whole person without velocity. Hands that hold something stay where they are."""
         self._last_poses = self._poses
         for hand in self.hands:
             if hand.held is None:
@@ -381,42 +384,42 @@ def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], frictio
     )
 
 
-# One hand of a person: a free body that a spring pulls to its controller, and a weld to what it holds.
+# One hand of a person: a free body that a spring pulls to its controller, and a weld to the object that it holds.
 
 
 class HandBody:
     """State of one hand and its indices in MuJoCo's arrays.
 
-    A hand follows its controller until it touches something. From then on it is pulled to its controller by a
-    spring, until it has touched nothing for ``hand_contact_duration``. A hand that holds something touches nothing.
+    A hand follows its controller until it touches something. From then on a spring pulls it to its controller, until
+    it has touched nothing for ``hand_contact_duration``. A hand that holds something does not collide.
     """
 
     def __init__(self, side: str, stiffness: float, max_force: float, parameters: PhysicsParameters) -> None:
-        """``side``: left or right; ``stiffness`` [N/m] and ``max_force`` [N] of its spring."""
+        """``side``: left or right; ``stiffness`` [N/m] and ``max_force`` [N]: of the hand's spring."""
         p = self.parameters = parameters
         self.side = side
         self.stiffness = stiffness
         self.max_force = max_force
         self.damping = 2.0 * math.sqrt(stiffness * p.hand_mass)
-        """[N s/m] of the spring: critical, so that an empty hand returns without overshoot."""
+        """[N s/m] Damping of the spring. It is critical, so that an empty hand returns without overshoot."""
         self.torsional_damping = 2.0 * math.sqrt(p.hand_torsional_stiffness * p.hand_inertia)
-        """[N m s/rad] likewise."""
+        """[N m s/rad] Critical damping of the torsional spring."""
         self.contact_steps = p.steps(p.hand_contact_duration)
         self.closed = False
-        """Whether the hand is to hold what it is near to."""
+        """Whether the hand shall grasp objects near it."""
         self.has_shears = self.is_squeezed = False
-        """Whether the hand has shears, and whether it closes, on them or on what it holds: to be seen."""
+        """Whether the hand has shears, and whether it is closed around shears or an object; both only affect looks."""
         self.busy = False
-        """Of a remote person's hand: it touches nothing here, since its own client computes what it pushes or holds."""
+        """Whether a remote person's hand is busy. A busy hand does not collide: its own client computes its forces."""
         self.steps_since_contact = self.contact_steps
         self.force = np.zeros(3)
-        """[3] N on the world in the last step, world axes."""
+        """[3] N, force of the hand on its surroundings in the last step, world axes."""
         self.held: tuple[str, str] | None = None
         """Actor and link that the hand holds."""
         self.grasp_pose = np.zeros(7)
-        """[7] of the hand in the frame of what it holds."""
+        """[7] pose of the hand in the frame of the object that it holds."""
         self.on_plant = False
-        """It holds a plant and is placed on it: see :mod:`vinesim.interaction.hand_grasp`."""
+        """Whether the hand holds a plant and is placed on it, see :mod:`vinesim.interaction.hand_grasp`."""
         self.collision_bits: tuple[int, int] = (0, 0)
         """MuJoCo's contype and conaffinity while the hand can touch something."""
         self.body = self.weld = -1
@@ -429,11 +432,11 @@ class HandBody:
 
     @property
     def is_on_spring(self) -> bool:
-        """Whether the spring pulls the hand: it touched something a short time ago."""
+        """Whether the spring pulls the hand, because it touched something within ``hand_contact_duration``."""
         return self.steps_since_contact < self.contact_steps
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames, actor: str) -> None:
-        """Find the hand of ``actor`` in a world that was compiled anew."""
+        """Find the hand of ``actor`` in a recompiled world."""
         name = f"{actor}/{self.link}"
         joint = names.joint[name]
         self.body = names.body[name]
@@ -458,7 +461,7 @@ class HandBody:
         Args:
             m: MuJoCo's model.
             d: MuJoCo's data.
-            pose: [7] of the hand.
+            pose: [7] pose of the hand.
             error: translation [m] and rotation vector [rad] from the hand to its goal.
             motion: translation [m] and rotation vector [rad] of the controller in this step.
         """
@@ -478,7 +481,7 @@ class HandBody:
         error: tuple[np.ndarray, np.ndarray],
         motion: tuple[np.ndarray, np.ndarray],
     ) -> None:
-        """Set the wrench of the spring, limited to what the hand can do."""
+        """Set the wrench of the spring, limited to the largest force and moment of the hand."""
         p = self.parameters
         dt = self.parameters.dt
         offset, angle = error
@@ -498,7 +501,7 @@ class HandBody:
         error: tuple[np.ndarray, np.ndarray],
         motion: tuple[np.ndarray, np.ndarray],
     ) -> None:
-        """Set the velocity of a free hand: with its controller, and towards it."""
+        """Set the velocity of a free hand: the velocity of its controller, plus a motion towards the controller."""
         p = self.parameters
         dt = self.parameters.dt
         offset, angle = error
@@ -509,7 +512,7 @@ class HandBody:
         d.xfrc_applied[self.body] = 0.0
 
     def _clip_to_obstacle(self, m: mujoco.MjModel, d: mujoco.MjData, at: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """A translation [3] m of a fast free hand, shortened if an obstacle is in its way."""
+        """The translation ``step`` [3] m of a fast free hand, shortened if an obstacle is in its way."""
         length = float(np.linalg.norm(step))
         if length < HAND_HALF_THICKNESS or self.busy:
             return step
@@ -520,7 +523,7 @@ class HandBody:
             ahead = mujoco.mj_ray(m, d, at + gone * way, way, None, 1, self.body, geom)
             if ahead < 0.0 or gone + ahead > length + HAND_HALF_THICKNESS:
                 return step
-            if m.geom_contype[geom[0]] & self.collision_bits[1]:  # not the person's own body, nor what is only drawn
+            if m.geom_contype[geom[0]] & self.collision_bits[1]:  # not the own body, nor visible shapes
                 return way * max(gone + ahead - 0.8 * HAND_HALF_THICKNESS, 0.0)
             gone += ahead + 1e-3
         return step
@@ -538,7 +541,7 @@ class HandBody:
             self.steps_since_contact = 0 if self.held is not None or reaction.any() else self.steps_since_contact + 1
 
     def sample(self, d: mujoco.MjData, controller: np.ndarray) -> HandSample:
-        """The hand after the last step; ``controller`` [7] is the pose of its controller."""
+        """State of the hand after the last step; ``controller`` [7] is the pose of its controller."""
         pose = np.concatenate([d.qpos[self.qpos][:3], frames.from_wxyz(d.qpos[self.qpos][3:])])
         return HandSample(pose, controller.copy(), self.force.copy(), self.steps_since_contact == 0, self.held)
 
@@ -568,7 +571,7 @@ class HandBody:
         self.set_collision(m, enabled=True)
 
     def set_collision(self, m: mujoco.MjModel, *, enabled: bool) -> None:
-        """Let the hand touch what it can touch, or nothing."""
+        """Enable or disable collisions of the hand."""
         geoms = slice(m.body_geomadr[self.body], m.body_geomadr[self.body] + m.body_geomnum[self.body])
         bit, meets = self.collision_bits if enabled else (0, 0)
         m.geom_contype[geoms] = m.body_contype[self.body] = bit
@@ -581,16 +584,16 @@ def _limited(limit: float, vector: np.ndarray) -> np.ndarray:
     return vector * (limit / length) if length > limit else vector
 
 
-# Wrenches of a person's hands on links of robots: from contacts, and from welds of hands that hold one.
+# Wrenches of a person's hands on links of robots, from contacts and from welds to held links.
 
 
 def hand_wrenches(
     m: mujoco.MjModel, d: mujoco.MjData, human: HumanBody, links: Mapping[int, tuple[str, str]]
 ) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
-    """Wrenches of the last step by robot and link, and which hands applied one (left, right).
+    """Wrenches in the last step by robot and link, and whether the left and the right hand applied one.
 
-    ``links`` names the MuJoCo bodies of robots: robot and link. A wrench [6] is a force [N] and a moment about the
-    link's centre of mass [N m], world axes, at the poses of the step's start.
+    ``links`` gives robot and link of the MuJoCo bodies of robots. A wrench [6] is a force [N] and a moment about the
+    link's centre of mass [N m], in world axes, at the poses at the start of the step.
     """
     wrenches: dict[str, dict[str, np.ndarray]] = {}
     applying = {hand.body: False for hand in human.hands}

@@ -1,4 +1,4 @@
-"""Collision shapes of people: one shape for each body part, three for each hand; and the proportions of a body."""
+"""Collision shapes, proportions and inverse kinematics of people: one shape for each body part, three for each hand."""
 
 from __future__ import annotations
 
@@ -26,23 +26,25 @@ BODY_PARTS = (
     "right_shank",
     "right_foot",
 )
-"""Kinematic bodies of a person, in the order in which :mod:`vinesim.rigid.human_posture` poses them."""
+"""Kinematic bodies of a person, in the order of :meth:`PostureSolver.body_parts`."""
 
+# lengths as fractions of a person's height; READ: Winter 2009, after Drillis and Contini
 THIGH_LENGTH = 0.245
 SHANK_LENGTH = 0.246
 ANKLE_HEIGHT = 0.039
 HIP_HALF_WIDTH = 0.095
 TRUNK_LENGTH = 0.288
-"""[1] Shares of a person's height. READ: Winter 2009, after Drillis and Contini."""
+
 EYES_TO_HEAD_BACK = 0.09
+"""[m] Backward distance from the point between the eyes to the middle of the head. GUESSED."""
 EYES_TO_HEAD_DOWN = 0.02
-"""[m] From between the eyes to the middle of the head. GUESSED."""
+"""[m] Downward distance from the point between the eyes to the middle of the head. GUESSED."""
 HAND_HALF_THICKNESS = 0.012
-"""[m] Half thickness of a palm. GUESSED."""
+"""[m] Half of the thickness of a palm. GUESSED."""
 PALM_TO_FINGERTIP = 0.13
-"""[m] From the middle of the palm to the tips of the fingers. GUESSED."""
+"""[m] Distance from the middle of the palm to the fingertips. GUESSED."""
 GRASP_POINTS = np.array([[0.0, 0.0, 0.0], [0.085, 0.0, 0.0]])
-"""[2, 3] m Middle of the palm and of the fingers, in the palm's frame."""
+"""[2, 3] m, middle of the palm and of the fingers, in the palm's frame."""
 SKIN_COLOR = (0.85, 0.62, 0.5, 1.0)
 CLOTH_COLOR = (0.98, 0.47, 0.16, 1.0)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
@@ -50,9 +52,9 @@ _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 @functools.cache
 def body_shapes(height: float) -> tuple[Shape, ...]:
-    """One shape for each of :data:`BODY_PARTS` of a person of this ``height`` [m], in the part's frame.
+    """One shape for each of :data:`BODY_PARTS` of a person of ``height`` [m], in the part's frame.
 
-    x runs along a limb; the origin is where the limb begins.
+    The x axis runs along a limb; the origin is at the beginning of the limb.
     """
 
     def limb(share: float, radius: float) -> Shape:
@@ -80,9 +82,9 @@ def body_shapes(height: float) -> tuple[Shape, ...]:
 
 @functools.cache
 def hand_shapes(side: str) -> tuple[Shape, ...]:
-    """Palm, fingers and thumb in the frame of the palm."""
+    """Shapes of palm, fingers and thumb in the frame of the palm."""
     thumb = np.array([0.02, 0.05 if side == "right" else -0.05, -0.006])
-    # flat faces: MuJoCo lets a capsule that lies along another touch it in one point only, and it rocks
+    # boxes, because two parallel capsules touch in only one point in MuJoCo and would rock
     return (
         Shape("box", (0.05, 0.04, HAND_HALF_THICKNESS), frames.pose(np.zeros(3)), SKIN_COLOR),
         Shape("box", (0.04, 0.036, HAND_HALF_THICKNESS - 0.003), frames.pose(GRASP_POINTS[1]), SKIN_COLOR),
@@ -90,7 +92,7 @@ def hand_shapes(side: str) -> tuple[Shape, ...]:
     )
 
 
-# Posture of people: poses of the body parts, the arms and the fingers from the tracked points.
+# Inverse kinematics of people: poses of body parts, arms and fingers from the tracked points.
 
 
 VISUAL_PARTS = (
@@ -101,17 +103,17 @@ VISUAL_PARTS = (
     "right_forearm",
     *(f"{side}_{finger}_{k + 1}" for side in SIDES for finger in appearance.FINGERS for k in range(PHALANGES)),
 )
-"""Parts that are only drawn: they connect head, chest and hands, and touch nothing."""
+"""Visible parts without collisions, which connect head, chest and hands, and the fingers."""
 EYE_HEIGHT = 0.939
+"""[1] Height of the eyes of a standing person, as a fraction of the person's height. READ: Winter 2009."""
 HIP_HEIGHT = 0.53
-"""[1] Heights above the ground of a standing person, as shares of the person's height. READ: Winter 2009."""
+"""[1] Height of the hips of a standing person, as a fraction of the person's height. READ: Winter 2009."""
 NECK_BELOW_EYES = -0.2
-"""[m] Height of the neck above the eyes. GUESSED."""
+"""[m] Height of the neck relative to the eyes. GUESSED."""
 
 
 def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
-    """Tracked points of a person of this ``height`` [m] who stands on ``root`` [7], hands before the hips, palms
-    down."""
+    """Tracked points of a person of ``height`` [m] who stands at ``root`` [7], hands before the hips, palms down."""
 
     def at(x: float, y: float, z: float) -> np.ndarray:
         return frames.compose(root, frames.pose(np.array([x, y, z])))
@@ -130,16 +132,15 @@ def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
 
 
 def body_posture(height: float, pose: HumanPose) -> np.ndarray:
-    """Poses [part, 7] of :data:`BODY_PARTS` of a person of this ``height`` [m]; see
-    :meth:`PostureSolver.body_parts`."""
+    """Poses [part, 7] of :data:`BODY_PARTS` of a person of ``height`` [m]; see :meth:`PostureSolver.body_parts`."""
     return PostureSolver(height).body_parts(pose)
 
 
 class PostureSolver:
-    """Inverse kinematics of one person, in kernels that are bound to the person's arrays."""
+    """Inverse kinematics of one person, computed by kernels that are bound to the person's arrays."""
 
     def __init__(self, height: float) -> None:
-        """``height`` [m] of the person."""
+        """``height`` [m]: height of the person."""
         points = len(POINT_NAMES) - 3
         poses = len(BODY_PARTS) + 2 * len(SIDES)
         self._tracked = np.zeros((points, 7))
@@ -184,7 +185,7 @@ class PostureSolver:
         )
 
     def body_parts(self, pose: HumanPose) -> np.ndarray:
-        """Poses [part, 7] of :data:`BODY_PARTS`; knees bend forward as hips and ankles require."""
+        """Poses [part, 7] of :data:`BODY_PARTS`. Knees bend forward as required by hips and ankles."""
         self._tracked[:] = pose.head, pose.hips, pose.left_foot, pose.right_foot
         self._pose_torso_and_legs(3)
         return self._parts.copy()
@@ -195,20 +196,20 @@ class PostureSolver:
         """Poses [part, 7] of :data:`VISUAL_PARTS`.
 
         Args:
-            chest: its pose [7].
-            head: its pose [7].
+            chest: pose [7] of the chest.
+            head: pose [7] of the head.
             hands: poses [2, 7] of the palms, left and right.
-            closed: [10] how far each finger is bent, 0 to 1, those of the left hand first.
+            closed: [10] bend of each finger from 0 to 1, left hand first.
         """
         self._ends[0], self._ends[1], self._ends[2:], self._closed[:] = chest, head, hands, closed
         self._pose_arms_and_fingers(3 + len(self._closed))
         return self._visual_parts.copy()
 
     def difference(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
-        """From poses to poses [k, 7]: translation [m], rotation vector [rad] in world axes and in start axes; [3, k,
-        3].
+        """Motions [3, k, 3] from poses ``start`` to poses ``goal`` [k, 7].
 
-        ``start`` and ``goal`` are given in pieces that are concatenated. The array is reused by the next call.
+        Rows are translation [m], rotation vector [rad] in world axes, and rotation vector in the axes of ``start``.
+        The arrays in each tuple are concatenated. The next call overwrites the result.
         """
         np.concatenate(start, out=self._start)
         np.concatenate(goal, out=self._goal)

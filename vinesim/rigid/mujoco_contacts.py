@@ -1,4 +1,4 @@
-"""Contacts that MuJoCo finds itself: which shapes collide, their friction, thin walls, and wires that give."""
+"""Contacts between rigid bodies in MuJoCo: collision pairs, friction, thin walls, and compliant wires."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from vinesim.scene.values import RobotSpec
 from vinesim.wires.deflected_wires import MAX_DEFLECTION, NO_TREE, DeflectedWires, WireContacts
 from vinesim.wires.elastic_supports import WIRE_DAMPING_TIME
 
-# Friction between two rigid bodies by their materials: MuJoCo itself takes one of the two geoms' coefficients.
+# Friction between two rigid bodies depends on both materials; MuJoCo alone would use a coefficient of one of the geoms.
 
 
 class PairFriction:
-    """Gives the contacts that MuJoCo found the coefficients of ``data/materials``, between its two stages."""
+    """Sets friction coefficients from ``data/materials`` in MuJoCo's contacts, between the two halves of a step."""
 
     def __init__(self, parameters: PhysicsParameters) -> None:
         self._table = pair_table("friction", parameters.friction)
         self._is_listed = self._table != parameters.friction
         self._material = np.zeros(0, np.int32)
-        """[geom] material; unknown where the geom has a coefficient of its own, which MuJoCo then takes."""
+        """[geom] material; UNKNOWN if the geom has its own coefficient, which MuJoCo then uses."""
 
     def find_materials(self, m: mujoco.MjModel) -> None:
-        """Find the materials of all geoms of a world that was compiled anew."""
+        """Find the materials of all geoms of a recompiled world."""
         material = m.geom_user[:, 0]
         has_own = m.geom_user[:, 1] > 0.0
         self._material = np.where(has_own, int(Material.UNKNOWN), material).astype(np.int32)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After ``mj_step1``: write the coefficients of listed pairs and, if there are any, the constraints anew."""
+        """After ``mj_step1``: write the coefficients of listed pairs and, if there are any, rebuild the constraints."""
         if d.ncon == 0:
             return
         first, second = self._material[d.contact.geom].T
@@ -51,23 +51,22 @@ class PairFriction:
         mujoco.mj_fwdVelocity(m, d)
 
 
-# Which links of a robot touch each other, and which shapes the ground.
+# Collisions between links of a robot, and of links with the ground.
 #
-# Links on both sides of a joint never touch; MuJoCo leaves those out by itself. Links that overlap while the robot
-# stands in its home pose do so by the shape that their collision hulls were given, not by their motion: such pairs
-# are left out, as MoveIt's Setup Assistant does. So are the pairs of the ``disable_collisions`` elements that an SRDF
-# file gives.
+# Links on both sides of a joint never collide; MuJoCo excludes these pairs by itself. Links that overlap in the home
+# pose do so because of their collision hulls, not because of motion. Such pairs are excluded, as by MoveIt's Setup
+# Assistant. The pairs in the ``disable_collisions`` elements of an SRDF file are excluded too.
 
 
 HOME_CLEARANCE = 1e-3
 """[m] Links that are nearer than this to each other, or to the ground, in the home pose count as overlapping. GUESSED:
-collision shapes are as exact, and servos hold the pose to that."""
+the accuracy of collision shapes and of servos that hold the pose."""
 
 
 def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> None:
-    """Let the links of a ``parsed`` robot touch each other and the ground; ``code``: its collision code.
+    """Let the links of a ``parsed`` robot collide with each other and the ground; ``code``: its collision code.
 
-    Shapes that are fixed to the base do not touch the ground: the base moves in a plane at its own height.
+    Shapes fixed to the base do not collide with the ground, because the base moves in a plane at its own height.
     """
     alone = parsed.copy()
     for number, geom in enumerate(alone.geoms):
@@ -97,13 +96,13 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> Non
 
 
 def disabled_pairs(urdf: str) -> list[tuple[str, str]]:
-    """Pairs of links in the elements ``disable_collisions`` of a URDF, where loading puts those of an SRDF."""
+    """Pairs of links in the ``disable_collisions`` elements of a URDF; loading inserts those of the SRDF there."""
     root = ElementTree.fromstring(urdf)
     return [(pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")]
 
 
 def _touching_at_home(m: mujoco.MjModel, given: RobotSpec) -> np.ndarray:
-    """Geoms [pair, 2] that touch in the home pose; ``m``: the robot alone, with its base fixed."""
+    """Pairs of geoms [pair, 2] that touch in the home pose; ``m``: the robot alone, with its base fixed."""
     d = mujoco.MjData(m)
     for drive, position in zip(given.drives, given.home, strict=True):
         d.joint(drive.joint).qpos[0] = position
@@ -118,22 +117,25 @@ def _touching_at_home(m: mujoco.MjModel, given: RobotSpec) -> np.ndarray:
 
 # Contacts of crates that are about to close within the step, so that thin walls do not end up inside each other.
 #
-# A crate that falls by half a metre moves 31 mm a step, its walls are 12 mm thick: found only where they overlap,
-# they would be pushed apart sideways, or not at all. Crates that are fast and approach another get a margin of what
-# they move in a step. A contact within it lets its gap close, but no further (a *speculative contact*).
+# A crate that has fallen half a metre moves 31 mm in a step, but its walls are 12 mm thick. If contacts were found only
+# after overlap, crates would be pushed apart sideways or not at all. So a fast crate that approaches another one gets a
+# margin as large as its motion in a step. A contact within the margin lets the gap close, but no further (a
+# *speculative contact*).
 
 
 MAX_STEP = CRATE_WALL / 4.0
-"""[m] A crate that moves less in a step has no margin. TUNED."""
+"""[m] A crate that moves less than this in a step has no margin. TUNED."""
 MAX_MARGIN = 0.1
-"""[m] Of a crate at 10 m/s."""
+"""[m] Largest margin, the motion of a crate at 10 m/s."""
 
 PASSING = 0.1
-"""[1] A crate whose motion relative to another points so little towards it passes it. TUNED."""
+"""[1] Two crates pass each other if the share of their relative velocity along the line between them is below this.
+TUNED."""
 STIFFNESS = 100.0
-"""[1] times an effective mass over dt^2: of a gap that would close further, so much is left as 1 is to it."""
+"""[1] Stiffness of a speculative contact in units of effective mass / dt^2; an overlap of about 1 / STIFFNESS of the
+excess motion remains."""
 NEVER_REACHED = 1e4
-"""[m] No gap closes by as much in a step."""
+"""[m] Gap larger than any motion in a step."""
 
 
 class SpeculativeContacts:
@@ -146,7 +148,7 @@ class SpeculativeContacts:
         self._has_margins = False
 
     def find_crates(self, m: mujoco.MjModel, numbers: Iterable[int]) -> None:
-        """Find the bodies and geoms of the boxes of these ``numbers`` in a world that was compiled anew."""
+        """Find the bodies and geoms of the boxes with these ``numbers`` in a recompiled world."""
         self._bodies = bodies = np.array(sorted(m.body(f"box/{number}").id for number in numbers), int)
         self._dof = m.body_dofadr[bodies][:, None] + np.arange(6)
         self._geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies))
@@ -156,7 +158,7 @@ class SpeculativeContacts:
         np.maximum.at(self._radius, self._crate_of_geom, corner)
 
     def set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> bool:
-        """Before ``mj_step1``: the margin of each crate; whether one has any."""
+        """Before ``mj_step1``: set the margin of each crate. Returns whether any crate has a margin."""
         if len(self._bodies) == 0:
             return False
         velocity = d.qvel[self._dof]
@@ -175,7 +177,7 @@ class SpeculativeContacts:
         return self._has_margins
 
     def _is_approaching(self, crate: int, velocity: np.ndarray, step: np.ndarray, position: np.ndarray) -> bool:
-        """Whether a crate is near another in the next step, and not just passing it."""
+        """Whether a crate comes near another one in the next step and is not just passing it."""
         offset = position - position[crate]
         relative = velocity - velocity[crate]
         distance = np.linalg.norm(offset, axis=1)
@@ -184,11 +186,11 @@ class SpeculativeContacts:
         return bool((is_met & (distance < self._radius + self._radius[crate] + step + step[crate])).any())
 
     def limit_closing(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After the constraints are made: contacts that are open may close, and no further, within the step.
+        """After the constraints are made: let open contacts close within the step, but no further.
 
-        Those that do not close at the speed of now are given up: MuJoCo's friction would push a body away from what it
-        slides along. MuJoCo computes stiffness and damping anew from ``solref`` whenever it solves. Without damping
-        there is no friction either.
+        Contacts that do not close at the present speed are disabled, because MuJoCo's friction would push a body away
+        from the body along which it slides. MuJoCo recomputes stiffness and damping from ``solref`` in every solve.
+        Contacts without damping have no friction either.
         """
         contact = d.contact
         dt = m.opt.timestep
@@ -200,33 +202,34 @@ class SpeculativeContacts:
         contact.solref[is_open] = -STIFFNESS / dt**2, 0.0
 
 
-# Contacts of rigid bodies with wires: MuJoCo's constraints, made as soft as the wires are.
+# Contacts of rigid bodies with wires: MuJoCo's constraints, made as soft as the wires.
 #
-# MuJoCo's step ``discrete`` treats a contact as an implicit spring and damper with a mass m of its own: impedance d and
-# reference (k, b) of a contact with an effective mass 1 / A at rest mean m = d / ((1 - d) A), stiffness m k and damping
-# m b. Here m is that of the piece of wire, so that the force is that of the wire's spring.
+# MuJoCo's integrator ``discrete`` treats a contact as an implicit spring and damper with its own mass m. Impedance d
+# and reference (k, b) of a contact with effective mass 1 / A at rest mean m = d / ((1 - d) A), stiffness m k and
+# damping m b. Here m is the mass of the piece of wire, so that the force is the force of the wire's spring.
 
 
 WIRE_MASS = 0.02
-"""[kg] of a piece of wire where it moves most. DERIVED: a third of 2 m of steel, 2.8 mm thick, weigh 0.03 kg."""
+"""[kg] Effective mass of a piece of wire at the point of largest motion. DERIVED: a third of 2 m of steel wire, 2.8 mm
+thick, weighs 0.03 kg."""
 MARGIN_LEVELS = (0.005, 0.02, 0.05, 0.1)
-"""[m] by which contacts with wires are found early; that which is enough for the fastest body is taken."""
+"""[m] Margins of contacts with wires; the smallest one that is enough for the fastest body is used."""
 # MuJoCo's mjMINIMP, mjMAXIMP
 _LEAST_IMPEDANCE = 1e-4
 _MOST_IMPEDANCE = 0.9999
-# of an impedance that is the same at all depths
+# parameters of solimp for an impedance that does not depend on depth
 _WIDTH = 1.0
 _MIDPOINT = 0.5
 _POWER = 2.0
 
 
 class SoftWires:
-    """What a MuJoCo world needs so that wires give."""
+    """Makes wires compliant in a MuJoCo world."""
 
     def __init__(self, wires: DeflectedWires) -> None:
         self._wires = wires
         self._geoms = np.append(np.zeros(FIRST_FIXED_GEOM, bool), wires.is_compliant)
-        """[MuJoCo geom, up to the last fixed piece] whether it is a wire that gives."""
+        """[MuJoCo geom, up to the last fixed piece] Whether the geom is a compliant wire."""
         self._numbers = np.flatnonzero(self._geoms)
         self._contacts = WireContacts(wires)
         self._at = self._row = np.zeros(0, int)
@@ -236,7 +239,7 @@ class SoftWires:
         self._world: mujoco.MjModel | None = None
 
     def use_world(self, m: mujoco.MjModel) -> None:
-        """Take over a world that was compiled anew, in which all wires are straight."""
+        """Take over a recompiled world, in which all wires are straight."""
         self._margin = m.geom_margin[: len(self._geoms)].copy()
         self._body_margin = float(m.body_margin[0])
         self._level = 0.0
@@ -251,7 +254,7 @@ class SoftWires:
         _widen_boxes(m, self._geoms)
 
     def _renumber(self, key: int, before: mujoco.MjModel | None) -> tuple[int, int]:
-        """The key that a pair of a wire and a geom of the world ``before`` has in this one, and its tree."""
+        """Present key and tree of a pair of wire and geom that had ``key`` in the world ``before``."""
         m = self._world
         if before is None or m is None or key >= 0:
             return 0, NO_TREE
@@ -264,7 +267,7 @@ class SoftWires:
         return -1 - int(wire * m.ngeom + geom), -1 - int(m.body_treeid[now])
 
     def place_geoms(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """Before ``mj_step1``: put the geoms of wires where they are. MuJoCo computes static poses only once."""
+        """Before ``mj_step1``: move the geoms of deflected wires, because MuJoCo computes static poses only once."""
         wires = self._wires
         for piece in {*self._moved.tolist(), *wires.deflected.tolist()}:
             geom = FIRST_FIXED_GEOM + piece
@@ -277,8 +280,10 @@ class SoftWires:
         self._set_margins(m, d)
 
     def _set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """Find contacts with wires as early as anything may come to them, or a deflected one spring back, in the step:
-        with the axis of a wire inside a box, MuJoCo would push the box along the wire."""
+        """Set margins so that all contacts of the step are found, also when a deflected wire springs back.
+
+        If the axis of a wire were inside a box, MuJoCo would push the box along the wire.
+        """
         rates = d.cvel
         reach = m.opt.timestep * max(float(rates.max()), -float(rates.min()))
         level = next((level for level in MARGIN_LEVELS if reach <= level), MARGIN_LEVELS[-1])
@@ -291,7 +296,7 @@ class SoftWires:
             m.body_margin[0] = max(self._body_margin, level)
 
     def soften(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After the constraints are made: contacts with wires end at the wires' springs."""
+        """After the constraints are made: give contacts with wires the stiffness of the wires' springs."""
         self._at = self._at[:0]
         if d.ncon == 0:
             return
@@ -315,7 +320,7 @@ class SoftWires:
         self._at = at
         self._row = row
         self._gap = gap + self._contacts.shift
-        self._damping_time = np.where(self._gap > 0.0, 0.0, WIRE_DAMPING_TIME)  # nor does it damp before it is touched
+        self._damping_time = np.where(self._gap > 0.0, 0.0, WIRE_DAMPING_TIME)  # no damping before contact
         self._mobility = np.array([self._measured.get(k, 0.0) for k in key.tolist()])
         is_new = self._mobility == 0.0
         self._mobility[is_new] = np.maximum(m.body_invweight0[body[is_new], 0], 1e-9)
@@ -327,7 +332,7 @@ class SoftWires:
             self._write(d)
 
     def _write(self, d: mujoco.MjData) -> None:
-        """Write impedance and reference of the contacts."""
+        """Write impedance and reference of the contacts to MuJoCo."""
         share = self._mobility * WIRE_MASS
         self._impedance = impedance = np.clip(share / (1.0 + share), _LEAST_IMPEDANCE, _MOST_IMPEDANCE)
         mass = impedance / ((1.0 - impedance) * self._mobility)
@@ -338,31 +343,33 @@ class SoftWires:
         d.contact.solref[self._at, 1] = -impedance * self._damping_time * self._rate
 
     def _measure(self, d: mujoco.MjData, dt: float) -> None:
-        """Find by which effective masses MuJoCo has scaled the contacts: those of its implicit step, which it does not
-        tell. They change little from step to step."""
+        """Compute the effective masses of the implicit step with which MuJoCo scaled the contacts.
+
+        MuJoCo does not report them. They change little from step to step.
+        """
         implicit = 1.0 + (self._damping_time + dt) * dt * self._rate
         self._mobility = d.efc_R[self._row] * implicit * self._impedance / (1.0 - self._impedance)
         self._measured = dict(zip(self._contacts.key.tolist(), self._mobility.tolist(), strict=True))
 
     def report(self, d: mujoco.MjData, dt: float) -> None:
-        """After the second half of a step: tell the wires what has pressed on them."""
+        """After the second half of a step: pass the contact forces to the wires."""
         if len(self._at):
             self._measure(d, dt)
             force = d.efc_force[self._row]
             stiffness = self._contacts.stiffness
-            # of the spring and damper: force = -stiffness (gap + dt v) - damping v
+            # from the law of spring and damper: force = -stiffness (gap + dt v) - damping v
             velocity = -(force + stiffness * self._gap) / (stiffness * (dt + self._damping_time))
             self._contacts.add_presses(force, velocity)
 
 
 def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """The shortest rotation [4], MuJoCo's order, from the direction of ``before`` [3] to that of ``after`` [3]."""
+    """Shortest rotation [4] (wxyz) from the direction of ``before`` [3] to the direction of ``after`` [3]."""
     size = math.sqrt((before @ before) * (after @ after))
     return frames.to_wxyz(frames.normalize(np.append(frames.cross(before, after), size + before @ after)))
 
 
 def _widen_boxes(m: mujoco.MjModel, is_wire: np.ndarray) -> None:
-    """Let MuJoCo's tree of boxes around static geoms hold wires wherever they may be."""
+    """Enlarge MuJoCo's bounding volume tree of static geoms so that it contains wires at any deflection."""
     first = int(m.body_bvhadr[0])
     count = int(m.body_bvhnum[0])
     if count == 0:

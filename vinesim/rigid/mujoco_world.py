@@ -1,6 +1,6 @@
 """The MuJoCo world that all rigid bodies share: its actors, its compilation and its kinematics.
 
-:class:`RigidWorld` adds the step; the classes between them add the access to robots, people and free bunches.
+:class:`RigidWorld` adds the step, and access to robots, people and free bunches.
 """
 
 from __future__ import annotations
@@ -40,28 +40,30 @@ class CompiledWorld:
     robots: tuple[RobotBody, ...]
     humans: tuple[HumanBody, ...]
     boxes: tuple[int, ...]
-    """Numbers of the boxes in it."""
+    """Numbers of the boxes in the world."""
     bunch_slots: int
-    """Number of free bunches that it has bodies for."""
+    """Number of bodies for free bunches."""
     mj_model: mujoco.MjModel
     names: WorldNames
     bunches: dict[int, tuple[int, FreeBunch]]
-    """Free bunches that have bodies in it already, each with its slot."""
+    """Free bunches that already have bodies in the world, each with its slot."""
     hulls: SharedArrays
     """See :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
     removed: tuple[RobotBody | HumanBody, ...] = ()
-    """Actors of the present world that it is made without."""
+    """Actors of the present world that are missing in this one."""
 
 
 def _log_mujoco_warnings() -> None:
-    """Let MuJoCo's warnings go to the log, unless the program handles them: MuJoCo itself would write a file
-    ``MUJOCO_LOG.TXT`` into the working folder. It warns once of each kind."""
+    """Send MuJoCo's warnings to the log, unless the program has set its own handler.
+
+    Otherwise MuJoCo writes a file ``MUJOCO_LOG.TXT`` into the working folder. It gives each kind of warning once.
+    """
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(_log.warning)
 
 
 class MujocoWorld:
-    """MuJoCo's model and data, and what they contain; compiled anew when an actor joins or leaves."""
+    """MuJoCo's model and data and the bodies in them; recompiled when an actor joins or leaves."""
 
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         self.model = model
@@ -71,9 +73,9 @@ class MujocoWorld:
         self._boxes = static_world.boxes_of(model)
         self._free_bunches: dict[int, FreeBunch] = {}
         self._bunch_slot: dict[int, int] = {}
-        """By free bunch: the number of its body in the pool."""
+        """Number of the body in the pool, by free bunch."""
         self._passing_bunches: set[int] = set()
-        """Free bunches that touch no fixed piece: they overlapped one when they were picked, and still do."""
+        """Free bunches that do not collide with fixed pieces, because they overlap one since they were picked."""
         self._derived: weakref.WeakKeyDictionary[FreeBunch, mujoco.MjModel] = weakref.WeakKeyDictionary()
         """Constants that MuJoCo derives from the mass and shapes of each free bunch."""
         self._pool_size = 0
@@ -82,10 +84,10 @@ class MujocoWorld:
         self.mj_model: mujoco.MjModel
         self.mj_data: mujoco.MjData
         self.contact_force: np.ndarray
-        """[dof] N or N m: generalised force of all contacts and of remote people in the last step."""
+        """[dof] N or N m, generalised force of all contacts and of remote people in the last step."""
         self._names: WorldNames
         self.generation = 0
-        """Counts changes of MuJoCo's model: views of its arrays must be renewed when this changes."""
+        """Counter of changes of MuJoCo's model; views of MuJoCo's arrays must be renewed when it changes."""
         self.owners: dict[int, tuple[str, str]] = {}
         """Actor and link of every MuJoCo body that can be added, removed or moved, as in :class:`RigidGeoms`."""
         self._link_sensors = LinkSensors()
@@ -97,52 +99,52 @@ class MujocoWorld:
 
     @property
     def dt(self) -> float:
-        """[s] Duration of a step; fixed."""
+        """[s] Duration of a step, which is constant."""
         return self.parameters.dt
 
     # ------------------------------------------------------------------ actors
 
     @property
     def robots(self) -> tuple[str, ...]:
-        """Names in the order in which they joined."""
+        """Names of the robots in the order in which they joined."""
         return tuple(self._robots)
 
     @property
     def humans(self) -> tuple[str, ...]:
-        """Names in the order in which they joined."""
+        """Names of the people in the order in which they joined."""
         return tuple(self._humans)
 
     @property
     def boxes(self) -> tuple[int, ...]:
-        """Numbers of the boxes that are here, in the order in which they came."""
+        """Numbers of the boxes in the order in which they were added."""
         return tuple(self._boxes)
 
     @property
     def free_bunches(self) -> tuple[int, ...]:
-        """Bunches that lie, fall or are held, in the order in which they left their vines."""
+        """Picked bunches with bodies, in the order in which they were added."""
         return tuple(self._free_bunches)
 
     @property
     def actors(self) -> tuple[str, ...]:
-        """Names of robots, then of people."""
+        """Names of the robots, then of the people."""
         return (*self._robots, *self._humans)
 
     def robot(self, name: str) -> RobotBody:
-        """The body of a robot; ``ValueError`` if there is none of this name."""
+        """The body of a robot; ``ValueError`` if no robot has this name."""
         try:
             return self._robots[name]
         except KeyError:
             raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
 
     def human(self, name: str) -> HumanBody:
-        """The body of a person; :class:`HumanError` if there is none of this name."""
+        """The body of a person; :class:`HumanError` if no person has this name."""
         try:
             return self._humans[name]
         except KeyError:
             raise HumanError(f"no human {name!r} here; there are: {', '.join(self._humans) or 'none'}") from None
 
     def _link_body(self, name: str, link: str) -> int:
-        """MuJoCo body of a robot's link; ``ValueError`` if there is none of this name."""
+        """MuJoCo body of a robot's link; ``ValueError`` if no link has this name."""
         robot = self.robot(name)
         try:
             return robot.bodies[link]
@@ -150,8 +152,7 @@ class MujocoWorld:
             raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
 
     def _body_of_object(self, actor: str, link: str) -> int:
-        """MuJoCo body of a link of an actor, of a box (``box/3``), of a free bunch (``bunch/7``) or of the
-        ``world``."""
+        """MuJoCo body of an actor's link, of a box (``box/3``), of a free bunch (``bunch/7``) or of the ``world``."""
         if actor in self._humans:
             return self._humans[actor].bodies[link]
         if actor in self._robots:
@@ -164,20 +165,20 @@ class MujocoWorld:
     # ------------------------------------------------------------------ kinematics
 
     def update_kinematics(self) -> None:
-        """Compute MuJoCo's poses from the present state: after a step they are those of the step's start."""
+        """Compute MuJoCo's poses from the present state; after a step they are still the poses of its start."""
         if not self._kinematics_current:
             mujoco.mj_kinematics(self.mj_model, self.mj_data)
             mujoco.mj_comPos(self.mj_model, self.mj_data)
             self._kinematics_current = True
 
     def invalidate_kinematics(self) -> None:
-        """Note that MuJoCo's state was changed from outside: its poses must be computed anew."""
+        """Mark MuJoCo's poses as out of date, because its state was changed from outside."""
         self._kinematics_current = False
 
     def link_pose(self, name: str, link: str) -> np.ndarray:
-        """World pose [7] of a robot's link, also of one that is fixed to its parent, or of a person's.
+        """World pose [7] of a link of a robot (including links fixed to their parents) or of a person.
 
-        ``ValueError`` if there is none of this name.
+        ``ValueError`` if no link has this name.
         """
         if name in self._humans:
             bodies = self._humans[name].bodies
@@ -188,10 +189,10 @@ class MujocoWorld:
             body = self._link_body(name, link)
         self.update_kinematics()
         w, x, y, z = self.mj_data.xquat[body].tolist()
-        return np.array([*self.mj_data.xpos[body].tolist(), x, y, z, w])  # in Python floats: half the time
+        return np.array([*self.mj_data.xpos[body].tolist(), x, y, z, w])  # Python floats take half the time
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """All rigid bodies that have a shape; the same tuple until one is added or removed."""
+        """All rigid bodies with visible shapes; the same tuple object until one is added or removed."""
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
@@ -202,7 +203,7 @@ class MujocoWorld:
         pose = np.empty((len(body), 7))
         pose[:, :3] = d.xpos[body]
         pose[:, 3:] = d.xquat[body][:, [1, 2, 3, 0]]
-        for human in self._humans.values():  # exactly as prescribed: MuJoCo normalises quaternions
+        for human in self._humans.values():  # exactly the prescribed poses, because MuJoCo normalises quaternions
             pose[self._visual_row[human.part_bodies]] = human.part_poses
             hands = self._visual_row[[hand.body for hand in human.hands]]
             first = hands[-1] + 1
@@ -213,8 +214,8 @@ class MujocoWorld:
     # ------------------------------------------------------------------ compilation
 
     def _compile_world(self, robots: tuple[RobotBody, ...], humans: tuple[HumanBody, ...]) -> CompiledWorld:
-        """Compile a world with these actors and a pool of bodies for free bunches; the world in use is not changed."""
-        # steps may go on meanwhile
+        """Compile a world with these actors and a pool of bodies for free bunches. The world in use does not change."""
+        # a copy, because steps may go on meanwhile
         slot_of = dict(self._bunch_slot)
         bodies = dict(self._free_bunches)
         slots = max(slot_of.values(), default=-1) + 1 + self.parameters.bunch_pool_size
@@ -229,8 +230,7 @@ class MujocoWorld:
             for slot in range(slots):
                 free_bunch.add_slot(spec, slot)
             mj_model = recompile.compile_without_contacts(spec)
-        # MuJoCo's solver tolerance is relative to it: an actor that joins would change when the solver stops for all
-        # others
+        # MuJoCo's solver tolerance is relative to it, so an actor that joins would change the results of all others
         mj_model.stat.meaninertia = 1.0
         for slot in range(slots):
             free_bunch.disable_collision(mj_model, slot)
@@ -248,11 +248,11 @@ class MujocoWorld:
         return derived
 
     def _recompile(self) -> None:
-        """Compile the world anew with the present actors and use it."""
+        """Recompile the world with the present actors."""
         self._replace_world(self._compile_world(tuple(self._robots.values()), tuple(self._humans.values())))
 
     def _replace_world(self, compiled: CompiledWorld) -> None:
-        """Use another compiled world; the state of every joint and body is transferred by its name."""
+        """Use another compiled world and transfer the states of all joints and bodies by their names."""
         before = (self.mj_model, self._names, self.mj_data, self.contact_force) if self.generation else None
         self.mj_model = compiled.mj_model
         self._names = compiled.names
@@ -291,7 +291,7 @@ class MujocoWorld:
         self._update_tables()
 
     def _restore_grasp(self, hand: HandBody) -> None:
-        """Weld a hand in a world that was compiled anew to what it holds, if that still exists."""
+        """In a recompiled world, weld a hand to the object that it holds, if the object still exists."""
         if hand.held is None:
             return
         try:
@@ -302,15 +302,17 @@ class MujocoWorld:
             hand.weld_to(self.mj_model, self.mj_data, body)
 
     def _update_tables(self) -> None:
-        """List all bodies and geoms anew after bodies were added or removed, and count :attr:`generation`."""
+        """Update the lists of bodies and geoms after bodies were added or removed, and increment :attr:`generation`."""
         bunch_body = self._list_visuals()
         self.owners = list_owners(self._boxes, self._names, self._robots, self._humans, bunch_body)
         self._owned_geoms = collision_geoms.owned_geoms(self.mj_model, self.owners)
         self._update_geoms()
 
     def _list_visuals(self) -> dict[int, int]:
-        """List what sensors draw anew after bodies were added or removed, or a hand took shears or put them away; the
-        MuJoCo body of every free bunch."""
+        """Update the list of visible bodies after bodies were added or removed, or a hand took or put away shears.
+
+        Returns the MuJoCo body of every free bunch.
+        """
         bunch_body = {i: self._names.body[free_bunch.slot_name(slot)] for i, slot in self._bunch_slot.items()}
         bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
         self._visuals, self._visual_body = list_visuals(self._boxes, self._names, self._robots, self._humans, bunches)
@@ -320,7 +322,7 @@ class MujocoWorld:
         return bunch_body
 
     def _show_lamps(self, robot: RobotBody) -> None:
-        """List the shapes of a robot anew after its indicator lights changed; only sensors need to know."""
+        """Update the visible shapes of a robot after its indicator lights changed."""
         prefix = robot.spec.name + "/"
         shown = robot.shown_shapes
         self._visuals = tuple(
@@ -331,12 +333,12 @@ class MujocoWorld:
         )
 
     def _update_geoms(self) -> None:
-        """List the geoms that collide anew after a hand closed or opened, and count :attr:`generation`."""
+        """Update the list of colliding geoms after a hand closed or opened, and increment :attr:`generation`."""
         self.generation += 1
         self.geoms = collision_geoms.colliding(self.mj_model, self._owned_geoms)
 
 
-# Tables of a compiled MuJoCo world: what sensors draw, and which actor owns which body.
+# Tables of a compiled MuJoCo world: visible bodies, and the owner of each body.
 
 
 def list_visuals(
@@ -346,7 +348,7 @@ def list_visuals(
     humans: Mapping[str, HumanBody],
     bunches: Mapping[int, tuple[FreeBunch, int]],
 ) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
-    """All rigid bodies that have a shape and their MuJoCo bodies [visual]; 0 for parts that are placed by posture.
+    """All rigid bodies with visible shapes, and their MuJoCo bodies [visual]; 0 for parts that the posture places.
 
     ``bunches`` gives the shapes and the MuJoCo body of every free bunch.
     """
@@ -382,7 +384,7 @@ def list_owners(
     humans: Mapping[str, HumanBody],
     bunch_body: Mapping[int, int],
 ) -> dict[int, tuple[str, str]]:
-    """By MuJoCo body: actor and link of everything that can be added, removed or moved."""
+    """Actor and link of every MuJoCo body that can be added, removed or moved."""
     owners = {names.body[f"box/{i}"]: (f"box/{i}", "box") for i in boxes}
     actors: dict[str, RobotBody | HumanBody] = {**robots, **humans}
     for name, actor in actors.items():
@@ -391,11 +393,11 @@ def list_owners(
     return owners
 
 
-# Sensors in links of robots: the wrench on the parent and the acceleration, measured in every step for all at once.
+# Sensors in links of robots: wrench on the parent and acceleration, measured in every step for all sensors at once.
 
 
 class LinkSensors:
-    """What the sensors measured in the last step, in frames of the step's start; a row for each sensor."""
+    """Measurements of all sensors in the last step, in frames at the start of the step. One row for each sensor."""
 
     def __init__(self) -> None:
         self._row: dict[tuple[str, str], int] = {}
@@ -403,17 +405,18 @@ class LinkSensors:
         self._body = self._root = np.zeros(0, int)
         """[sensor] MuJoCo body of the link, and of the root of its robot."""
         self._wrench = np.zeros((0, 6))
+        """[sensor, 6] N m, N, moment about ``_com`` and force of the parent on the link, world axes."""
         self._com = np.zeros((0, 3))
-        """[sensor, 6] moment about the robot's centre of mass and force of the parent on the link [N m, N]; [sensor, 3]
-        that centre [m]; world axes."""
+        """[sensor, 3] m, centre of mass of the robot in the world."""
         self._position = np.zeros((0, 3))
+        """[sensor, 3] m, position of the link in the world."""
         self._rotation = np.zeros((0, 9))
-        """[sensor, 3] m and [sensor, 9] row by row: pose of the link."""
+        """[sensor, 9] rotation matrix of the link in the world, row by row."""
         self._acceleration = np.zeros((0, 6))
-        """[sensor, 6] rad/s^2, m/s^2: see :meth:`acceleration`."""
+        """[sensor, 6] rad/s^2, m/s^2, see :meth:`acceleration`."""
 
     def find_indices(self, m: mujoco.MjModel, robots: Mapping[str, RobotBody]) -> None:
-        """Take over which links have sensors, in a world that was compiled anew; measurements are kept."""
+        """Find the links with sensors in a recompiled world. Measurements are kept."""
         keys = [(name, link) for name, robot in robots.items() for link in robot.sensor_links]
         kept = np.array([self._row.get(key, -1) for key in keys], int)
         for name in ("_wrench", "_com", "_position", "_rotation", "_acceleration"):
@@ -427,7 +430,7 @@ class LinkSensors:
         self._root = m.body_rootid[self._body]
 
     def measure(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """Measure the step that ends, while MuJoCo's poses are still those of its start."""
+        """At the end of a step: measure while MuJoCo's poses are still those of the start of the step."""
         body = self._body
         if not len(body):
             return
@@ -440,7 +443,7 @@ class LinkSensors:
             mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, link, self._acceleration[row], 1)
 
     def wrench(self, robot: str, link: str) -> np.ndarray:
-        """Force [N] and moment about the link's origin [N m] of the link on its parent [6], in the link's axes."""
+        """Wrench [6] of a link on its parent: force [N], moment [N m] about the link's origin, in the link's axes."""
         row = self._find(robot, link)
         (x, y, z) = (self._com[row] - self._position[row]).tolist()
         (u, v, w) = self._wrench[row, 3:].tolist()
@@ -449,7 +452,7 @@ class LinkSensors:
         return -np.concatenate([self._wrench[row, 3:] @ rotation, moment @ rotation])
 
     def acceleration(self, robot: str, link: str) -> np.ndarray:
-        """[6] rad/s^2, m/s^2: angular and proper linear acceleration of the link's origin, link axes."""
+        """Angular and proper linear acceleration [6] rad/s^2, m/s^2 of a link's origin, in the link's axes."""
         return self._acceleration[self._find(robot, link)].copy()
 
     def _find(self, robot: str, link: str) -> int:

@@ -1,4 +1,4 @@
-"""Wakes bodies that MuJoCo has put to sleep."""
+"""Recompiles a MuJoCo world without changing the state of its bodies, and wakes sleeping bodies."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import mujoco
 import numpy as np
 
 AWAKE_COUNTER = -1 - mujoco.mjMINAWAKE
-"""[step] Value of ``tree_asleep`` of a tree that has just been woken; MuJoCo counts it up to -1, then it may sleep."""
+"""[step] Value of ``tree_asleep`` for a tree that was just woken; MuJoCo counts up to -1, then the tree may sleep."""
 
 
 def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
-    """Wake the kinematic tree of a body: MuJoCo does so when ``tree_awake`` and ``tree_asleep`` disagree.
+    """Wake the kinematic tree of a body. MuJoCo wakes it because ``tree_awake`` and ``tree_asleep`` disagree.
 
-    A tree that is awake but at rest, as an object in a hand is, would fall asleep in the step in which it is released:
-    its counter starts anew.
+    The counter of an awake tree is restarted. Otherwise an object at rest in a hand would fall asleep in the step in
+    which it is released.
     """
     tree = m.body_treeid[body]
     if tree >= 0:
@@ -25,14 +25,14 @@ def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
 
 
 def keep_touching_awake(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
-    """Start the counters anew of all trees that touch the tree of a body: what rests on it may lose its support."""
+    """Restart the sleep counters of all trees that touch the tree of a body, because they may lose their support."""
     island = d.tree_island[m.body_treeid[body]]
     touching = (d.tree_island == island) & (d.tree_asleep < 0)
     if island >= 0:
         d.tree_asleep[touching] = AWAKE_COUNTER
 
 
-# Compiles a MuJoCo world anew and transfers the state of all bodies that stay, bit by bit.
+# Recompiles a MuJoCo world and transfers the state of all bodies that stay, bit by bit.
 
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -50,11 +50,11 @@ DOF_ARRAYS = (
     "qfrc_gravcomp",
     "qfrc_actuator",
 )
-"""Arrays of MuJoCo's data with one entry for each degree of freedom that last from step to step."""
+"""Arrays of MuJoCo's data with one entry for each degree of freedom whose values last from step to step."""
 
 
 def compile_without_contacts(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile without contacts: MuJoCo's compiler tries a step, in which all robots would overlap at the origin."""
+    """Compile without contacts, because MuJoCo's compiler tries a step in which all robots overlap at the origin."""
     spec.option.disableflags |= _CONSTRAINT
     world = spec.compile()
     world.opt.disableflags &= ~_CONSTRAINT
@@ -63,7 +63,7 @@ def compile_without_contacts(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 @dataclasses.dataclass(frozen=True)
 class WorldNames:
-    """Numbers of a compiled world's objects by their names: MuJoCo's own look-up takes 80 us a name."""
+    """Numbers of a compiled world's objects by name. MuJoCo's own look-up takes 80 us for each name."""
 
     joints: list[str]
     bodies: list[str]
@@ -80,7 +80,7 @@ class WorldNames:
 
 
 def object_names(m: mujoco.MjModel, address: np.ndarray) -> list[str]:
-    """Names of all joints, bodies or the like; ``address``: MuJoCo's ``name_jntadr``, ``name_bodyadr`` and so on."""
+    """Names of all joints, bodies or other objects; ``address``: MuJoCo's ``name_jntadr``, ``name_bodyadr`` etc."""
     text = m.names
     return [text[at : text.index(b"\0", at)].decode() for at in address.tolist()]
 
@@ -94,30 +94,29 @@ def transfer_state(
     new_names: WorldNames,
     unused: set[str],
 ) -> tuple[mujoco.MjData, np.ndarray]:
-    """State and contact forces [dof] of a new world: those of all joints and bodies of the old, and which of them
-    sleep.
+    """State and contact forces [dof] of a new world, taken from the joints and bodies of the old one, including sleep.
 
     Args:
-        old: MuJoCo's model so far.
-        old_names: its names.
+        old: the old model.
+        old_names: names of its objects.
         old_data: its state.
-        old_contact: [dof] generalised contact forces of the last step.
-        new: the model that takes its place; ``qpos0`` and sleep policies of bodies that stay are overwritten.
-        new_names: its names.
-        unused: names of free joints of both worlds that are not the same object.
+        old_contact: [dof] generalised contact forces of the last step in the old world.
+        new: the new model; ``qpos0`` and sleep policies of bodies that stay are overwritten.
+        new_names: names of its objects.
+        unused: names of free joints that exist in both worlds but belong to different objects.
     """
     pairs = _pairs(new_names.joints, old_names.joints, unused)
     to, source = np.array(pairs, int).reshape(-1, 2).T
     asleep = _sleeping_trees(old, old_data, new, pairs)
     touched_removed = _trees_touching_removed(old, old_data, source)
-    # MuJoCo takes a tree for asleep only when its data is made: at qpos0, which is therefore set to the present state
+    # MuJoCo puts trees to sleep when its data is created, at qpos0; so qpos0 is set to the present state
     free = new.jnt_type[to] == _FREE
     to_q, from_q = (_ranges(m.jnt_qposadr[joint], np.where(free, 7, 1)) for m, joint in ((new, to), (old, source)))
     to_v, from_v = (_ranges(m.jnt_dofadr[joint], np.where(free, 6, 1)) for m, joint in ((new, to), (old, source)))
     of_free = np.repeat(free, np.where(free, 7, 1))
     new.qpos0[to_q[of_free]] = old_data.qpos[from_q[of_free]]
     for tree in np.unique(new.dof_treeid[new.jnt_dofadr[to[free]]]).tolist():
-        if new.tree_sleep_policy[tree] != _NEVER:  # parts of people, whose masses change
+        if new.tree_sleep_policy[tree] != _NEVER:  # _NEVER: parts of people, whose masses change
             new.tree_sleep_policy[tree] = _INIT if tree in asleep else _ALLOWED
     new.opt.disableflags |= _CONSTRAINT
     data = mujoco.MjData(new)
@@ -146,7 +145,7 @@ def transfer_state(
 
 
 def _pairs(new: list[str], old: list[str], unused: set[str]) -> list[tuple[int, int]]:
-    """(index in the new world, index in the old) of every name that is in both."""
+    """(index in the new world, index in the old world) of every name that exists in both."""
     was = {name: number for number, name in enumerate(old)}
     return [(number, was[name]) for number, name in enumerate(new) if name in was and name not in unused]
 
@@ -157,7 +156,7 @@ def _ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 def _trees_touching_removed(old: mujoco.MjModel, old_data: mujoco.MjData, staying: np.ndarray) -> set[int]:
-    """Trees of the old world that touched or were held by a tree that is removed: they may not sleep at once."""
+    """Trees of the old world that touched or were held by a removed tree. They must not sleep at once."""
     gone = np.setdiff1d(np.arange(old.ntree), old.dof_treeid[old.jnt_dofadr[staying]])
     islands = np.unique(old_data.tree_island[gone])
     return set(np.flatnonzero(np.isin(old_data.tree_island, islands[islands >= 0])).tolist())
@@ -166,9 +165,9 @@ def _trees_touching_removed(old: mujoco.MjModel, old_data: mujoco.MjData, stayin
 def _sleeping_trees(
     old: mujoco.MjModel, old_data: mujoco.MjData, new: mujoco.MjModel, pairs: list[tuple[int, int]]
 ) -> dict[int, int]:
-    """Sleeping trees of the new world, each with the next tree of its cycle: those that wake together.
+    """Sleeping trees of the new world, each with the next tree of its cycle; the trees of a cycle wake together.
 
-    A tree that slept in a cycle with a removed tree wakes, and so does one that has just been woken.
+    Trees that slept in a cycle with a removed tree, or were just woken, are left out.
     """
     now = {int(old.dof_treeid[old.jnt_dofadr[j]]): int(new.dof_treeid[new.jnt_dofadr[i]]) for i, j in pairs}
     following = old_data.tree_asleep.tolist()

@@ -41,7 +41,7 @@ _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _HIPS = BODY_PARTS.index("hips")
 
 MAX_RATE = 1e4
-"""[m/s, rad/s] No body moves as fast, unless the simulation has become unstable."""
+"""[m/s, rad/s] A body that moves faster shows that the simulation has become unstable."""
 
 
 class RigidWorld(MujocoWorld):
@@ -50,14 +50,14 @@ class RigidWorld(MujocoWorld):
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         super().__init__(model, parameters=parameters)
         self.faults = 0
-        """Number of kinematic trees that were stopped: one of their numbers was not finite, or a rate too high."""
+        """Number of kinematic trees that were stopped because of a non-finite number or too high a rate."""
         self.last_fault = ""
-        """Time and names of the last ones; empty if there was none."""
+        """Time and names of the trees that were stopped last; empty if none was."""
 
     # ------------------------------------------------------------------ actors
 
     def add_robot(self, spec: RobotSpec) -> None:
-        """Add a robot at ``spec.pose`` and ``spec.home``; the state of all others is unchanged to the bit.
+        """Add a robot at ``spec.pose`` and ``spec.home``; the states of all other bodies are unchanged to the bit.
 
         Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
         """
@@ -65,21 +65,21 @@ class RigidWorld(MujocoWorld):
             pass
 
     def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
-        """Add a person at ``spec.pose``; the state of all others is unchanged to the bit. Raises :class:`HumanError`.
+        """Add a person at ``spec.pose``; the states of all other bodies are unchanged. Raises :class:`HumanError`.
 
-        ``is_remote``: another client moves the person; here the hands neither hold anything nor touch robots.
+        ``is_remote``: another client moves the person. The hands of the copy hold nothing and do not touch robots.
         """
         while not self.adopt(self.compile_with(spec, is_remote=is_remote)):
             pass
 
     def remove_robot(self, name: str) -> None:
-        """Remove a robot; the state of all others is unchanged to the bit."""
+        """Remove a robot; the states of all other bodies are unchanged to the bit."""
         self.robot(name)
         del self._robots[name]
         self._recompile()
 
     def remove_human(self, name: str) -> None:
-        """Remove a person; what the hands held is released."""
+        """Remove a person and release everything that the hands held."""
         self.human(name)
         del self._humans[name]
         self._recompile()
@@ -91,12 +91,16 @@ class RigidWorld(MujocoWorld):
         replaces: bool = False,
         without: Collection[str] = (),
     ) -> CompiledWorld:
-        """Compile the world with more actors, ``without`` those of some names, and with a full pool of spare bodies for
-        free bunches, for :meth:`adopt`.
+        """Compile a world with additional actors ``specs``, for :meth:`adopt`. Its pool for free bunches is full.
 
-        Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile, of several
-        robots without saying which. ``is_remote``: see :meth:`add_human`. ``replaces``: the robots
-        are here and keep their states; only their shapes are others.
+        Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile; if there are
+        several robots, it does not say which one.
+
+        Args:
+            specs: actors to add.
+            is_remote: see :meth:`add_human`.
+            replaces: the robots in ``specs`` exist already and keep their states; only their shapes change.
+            without: names of actors to remove.
         """
         robots = list(self._robots.values())
         humans = list(self._humans.values())
@@ -123,10 +127,9 @@ class RigidWorld(MujocoWorld):
             raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world that was compiled with more or fewer actors, with other shapes of robots, or with more room for
-        free bunches; between steps.
+        """Use a world from :meth:`compile_with`. Call it between steps.
 
-        False, and nothing is changed, if other actors or boxes came or went meanwhile: compile it anew.
+        Returns False and changes nothing if actors or boxes were added or removed meanwhile; then compile again.
         """
         present = tuple(
             actor for actor in (*self._robots.values(), *self._humans.values()) if actor not in compiled.removed
@@ -158,12 +161,11 @@ class RigidWorld(MujocoWorld):
         return True
 
     def actor_position(self, name: str) -> np.ndarray:
-        """[3] m Position of a robot's base or of a person's hips."""
+        """Position [3] m of a robot's base or of a person's hips."""
         return self.human(name).part_poses[_HIPS, :3] if name in self._humans else self.base_state(name)[0][:3]
 
     def penetrations(self) -> list[tuple[str, str, float]]:
-        """Pairs of actors or objects that overlapped when the step began, as :meth:`predict` found them, and depth
-        [m]."""
+        """Pairs of actors or objects that overlapped at the start of the last step, with the depth [m]."""
         m = self.mj_model
         d = self.mj_data
         found = []
@@ -177,7 +179,7 @@ class RigidWorld(MujocoWorld):
         return found
 
     def use_compliant_wires(self, wires: DeflectedWires) -> None:
-        """From now on what presses on a wire deflects it; before, wires are rigid."""
+        """Make wires compliant from now on; before this call they are rigid."""
         self._soft_wires = SoftWires(wires)
         self._soft_wires.use_world(self.mj_model)
 
@@ -196,7 +198,7 @@ class RigidWorld(MujocoWorld):
         has_margins = self._speculative_contacts.set_margins(m, d)
         if self._soft_wires is not None:
             self._soft_wires.place_geoms(m, d)
-        # qfrc_applied is still that of the last step: what pushed a sleeping box wakes it now
+        # qfrc_applied still holds the forces of the last step, so a force on a sleeping box wakes it now
         mujoco.mj_step1(m, d)
         if self._passing_bunches:
             self._end_passing()
@@ -206,7 +208,7 @@ class RigidWorld(MujocoWorld):
         if self._soft_wires is not None:
             self._soft_wires.soften(m, d)
         d.qfrc_applied.fill(0.0)
-        # the whole forward pass after the velocity stage: single calls of its parts leave out dt K v
+        # the whole forward pass after the velocity stage, because calls of its parts omit dt K v
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
     def apply_controls(self) -> None:
@@ -216,7 +218,7 @@ class RigidWorld(MujocoWorld):
 
     @property
     def velocity_free(self) -> np.ndarray:
-        """[dof] the prediction of :meth:`predict`; zero for sleeping trees, whose ``qacc`` MuJoCo does not update."""
+        """[dof] Velocity from :meth:`predict`; zero for sleeping trees, whose ``qacc`` MuJoCo does not update."""
         m = self.mj_model
         d = self.mj_data
         velocity = d.qvel + self.dt * d.qacc
@@ -226,7 +228,7 @@ class RigidWorld(MujocoWorld):
 
     @property
     def dof_names(self) -> list[tuple[str, int]]:
-        """[dof] joint (or free bunch) and number in it, which are the same after the world is compiled anew."""
+        """[dof] Name of the joint (or free bunch) and index within it; both stay the same after a recompilation."""
         m = self.mj_model
         bunch_in = {free_bunch.slot_name(slot): f"bunch/{bunch}" for bunch, slot in self._bunch_slot.items()}
         of = [bunch_in.get(name, name) for name in self._names.joints]
@@ -234,11 +236,11 @@ class RigidWorld(MujocoWorld):
 
     @property
     def islands(self) -> np.ndarray:
-        """See :meth:`EffectiveMass.island_labels`."""
+        """Island labels, see :meth:`EffectiveMass.island_labels`."""
         return self._effective_mass.island_labels(self.mj_data)
 
     def is_constrained(self, bodies: np.ndarray) -> bool:
-        """See :meth:`EffectiveMass.is_constrained`."""
+        """Whether constraints act on ``bodies``, see :meth:`EffectiveMass.is_constrained`."""
         return self._effective_mass.is_constrained(self.mj_data, bodies)
 
     def impulse_response(self, J: np.ndarray) -> np.ndarray:
@@ -247,9 +249,11 @@ class RigidWorld(MujocoWorld):
         return self._effective_mass.impulse_response(self.mj_data, J)
 
     def predict_with(self, force: np.ndarray) -> None:
-        """Predict again with generalised contact forces of plants, ``force`` [dof] N or N m: which constraints of
-        MuJoCo hold, slide or open under them."""
-        np.add(force, 0.0, out=self.mj_data.qfrc_applied)  # turns -0 into +0: -0 would keep sleeping boxes awake
+        """Predict again with the generalised contact forces of plants, ``force`` [dof] N or N m.
+
+        The forces may change which of MuJoCo's constraints hold, slide or open.
+        """
+        np.add(force, 0.0, out=self.mj_data.qfrc_applied)  # turns -0 into +0, because -0 would keep boxes awake
         mujoco.mj_forwardSkip(self.mj_model, self.mj_data, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
     def integrate(self, force: np.ndarray | None = None) -> None:
@@ -295,18 +299,18 @@ class RigidWorld(MujocoWorld):
         """Whether a number is not finite, or a rate beyond :data:`MAX_RATE`."""
         rate = self.mj_data.qvel
         position = self.mj_data.qpos
-        if rate.dot(rate) < MAX_RATE**2 and position.dot(position) < np.inf:  # enough, and the cheapest
+        if rate.dot(rate) < MAX_RATE**2 and position.dot(position) < np.inf:  # a cheap sufficient test
             return False
         return not (rate.min() > -MAX_RATE and rate.max() < MAX_RATE and np.isfinite(position).all())
 
     def _stop_faulty_trees(self) -> None:
-        """Stop the kinematic trees with a number that is not finite, or a rate beyond :data:`MAX_RATE`, where the step
-        began; the others go on."""
+        """Stop kinematic trees with a non-finite number or a rate beyond :data:`MAX_RATE`, at their poses before the
+        step. All other trees go on."""
         m = self.mj_model
         d = self.mj_data
         joint_tree = m.dof_treeid[m.jnt_dofadr]
         width = np.where(m.jnt_type == mujoco.mjtJoint.mjJNT_FREE, 7, 1)
-        tree = np.repeat(joint_tree, width)  # of each entry of qpos
+        tree = np.repeat(joint_tree, width)  # tree of each entry of qpos
         faulty = np.zeros(m.ntree, bool)
         faulty[m.dof_treeid[~(np.abs(d.qvel) < MAX_RATE)]] = True
         faulty[tree[~np.isfinite(d.qpos)]] = True
@@ -325,18 +329,18 @@ class RigidWorld(MujocoWorld):
         self.last_fault = f"t = {d.time:.2f} s: {names} moved by a number that is not finite or too fast; stopped"
 
     # ------------------------------------------------------------------ robots, by name
-    # Robots of a rigid world. Every method raises ``ValueError`` if no robot or link has the name given, and
-    # :class:`RobotError` for commands that are not finite or of another shape.
+    # Every method raises ``ValueError`` if no robot or link has the given name, and :class:`RobotError` for commands
+    # that are not finite or have the wrong shape.
 
     def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
-        """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest, with its targets there."""
+        """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest; these become its targets."""
         self._check_joints(name, position=position)
         _check_finite(name, "pose", pose, 7)
         self.robot(name).place(self.mj_model, self.mj_data, np.asarray(pose, float), position)
         self._kinematics_current = False
 
     def _check_joints(self, name: str, **commands: object) -> None:
-        """:class:`RobotError` unless each command that is given has one finite number for each drive."""
+        """Raise :class:`RobotError` unless each given command has one finite number for each drive."""
         count = len(self.robot(name).spec.drives)
         for what, given in commands.items():
             if given is not None:
@@ -362,14 +366,13 @@ class RigidWorld(MujocoWorld):
         """Set the gains of the servos and a feedforward ``effort`` (all [joint]); they last until the next call.
 
         Args:
-            name: of the robot.
+            name: name of the robot.
             stiffness: N m/rad or N/m; with zero gains a joint is driven by ``effort`` alone.
             damping: N m s/rad or N s/m.
             effort: N m or N, added within ``limit``.
-            limit: N m or N, of the servos; that of the drive unless a lower one is given.
-            exact: bool, joints that swing with just this damping; the others are damped as if it were larger by dt
-            times
-                stiffness, as stiff servos should be.
+            limit: N m or N, effort limit of the servos; by default the limit of the drive, which it cannot exceed.
+            exact: bool, joints that swing with exactly this damping. The other joints are damped as if ``damping`` were
+                larger by dt times stiffness, which suits stiff servos.
         """
         self._check_joints(name, stiffness=stiffness, damping=damping, effort=effort)
         self.robot(name).set_gains(self.mj_model, self.mj_data, (stiffness, damping, effort), limit, exact)
@@ -384,7 +387,7 @@ class RigidWorld(MujocoWorld):
     def follow_remote(
         self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> None:
-        """Pull the copy of a remote robot to its received state; it stays dynamic, so that a vine still holds it back.
+        """Pull the copy of a remote robot to its received state. It stays dynamic, so a vine can hold it back.
 
         ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
         """
@@ -403,10 +406,11 @@ class RigidWorld(MujocoWorld):
         wrench[:3], wrench[3:] = force, moment
 
     def set_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
-        """Apply the wrenches [6] by link with which remote people push a robot, until the next call.
+        """Apply the wrenches [6], by link, of remote people on a robot until the next call.
 
-        Force [N] and moment about the link's centre of mass [N m], world axes. :meth:`joint_measurements` counts them
-        as contacts. Raises :class:`RobotError` if a link does not exist or a wrench is not finite.
+        A wrench is a force [N] and a moment about the link's centre of mass [N m], world axes.
+        :meth:`joint_measurements` counts wrenches as contacts. Raises :class:`RobotError` if a link does not exist or a
+        wrench is not finite.
         """
         robot = self.robot(name)
         for link, wrench in wrenches.items():
@@ -415,7 +419,7 @@ class RigidWorld(MujocoWorld):
             robot.set_remote_wrenches(self.mj_data, wrenches)
 
     def set_indicator_color(self, name: str, color: Color | None) -> None:
-        """Set the colour of a robot's indicator lights, black for unlit; None: as its URDF has them."""
+        """Set the colour of a robot's indicator lights, black for unlit; None: the colour of the URDF."""
         robot = self.robot(name)
         robot.indicator_color = color
         self._show_lamps(robot)
@@ -425,8 +429,8 @@ class RigidWorld(MujocoWorld):
     def joint_measurements(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Position, velocity, effort and contact effort of the drives, each [joint] in the order of ``spec.drives``.
 
-        The effort is that of the drive in the last step: servo and its share of gravity compensation. The contact
-        effort is J^T f of the contacts with plants and with rigid bodies; at rest the two cancel.
+        The effort is the drive's effort in the last step, from servo and gravity compensation. The contact effort is
+        J^T f of the contacts with plants and rigid bodies. At rest both together balance the robot's weight.
         """
         robot = self.robot(name)
         d = self.mj_data
@@ -438,12 +442,14 @@ class RigidWorld(MujocoWorld):
         return self.mj_data.qpos[robot.q], self.mj_data.qvel[robot.v]
 
     def gravity_effort(self, name: str) -> np.ndarray:
-        """[joint] N m or N: the part of the drives' effort that carries the robot's own weight."""
+        """Part of the drives' effort that carries the robot's own weight, [joint] N m or N."""
         return self.mj_data.qfrc_gravcomp[self.robot(name).v]
 
     def joint_inertia(self, name: str) -> np.ndarray:
-        """[joint] kg m^2 or kg: inertia that each drive sees while the others stand, armature included, in this
-        pose."""
+        """Inertia seen by each drive in the present pose while the other joints stand still, [joint] kg m^2 or kg.
+
+        It includes the armature.
+        """
         return self.mj_data.M[self.robot(name).inertia_index]
 
     def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
@@ -459,11 +465,11 @@ class RigidWorld(MujocoWorld):
     # links
 
     def link_centre(self, name: str, link: str) -> np.ndarray:
-        """Centre of mass [3] m of a link at the last step's start; ``ValueError`` if there is none of this name."""
+        """Centre of mass [3] m of a link at the start of the last step; ``ValueError`` for an unknown name."""
         return self.mj_data.xipos[self._link_body(name, link)].copy()
 
     def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
-        """[6, joint]: velocity of the world ``point`` [3] of a link, then its angular velocity, per joint velocity."""
+        """Jacobian [6, joint] of the velocity of a link at the world ``point`` [3], and of its angular velocity."""
         robot = self.robot(name)
         body = self._link_body(name, link)
         self.update_kinematics()
@@ -479,19 +485,19 @@ class RigidWorld(MujocoWorld):
             self._link_sensors.find_indices(self.mj_model, self._robots)
 
     def link_wrench(self, name: str, link: str) -> np.ndarray:
-        """[6] N, N m about the link's origin: wrench of the link, and all beyond it, on its parent.
+        """Wrench [6] N, N m about the link's origin, of the link and everything beyond it on the link's parent.
 
-        In the link's axes, mean of the last step. Weight, inertia, pushes and contacts with rigid bodies are included;
-        contacts with plants are not: they are in ``Physics.contacts``.
+        It is the mean over the last step, in the link's axes. Weight, inertia, pushes and contacts with rigid bodies
+        are included. Contacts with plants are not included; they are in ``Physics.contacts``.
         """
         return self._link_sensors.wrench(name, link)
 
     def link_acceleration(self, name: str, link: str) -> np.ndarray:
-        """[6] rad/s^2, m/s^2: angular and proper acceleration of a link's origin in its axes; at rest 9.81 upwards."""
+        """Angular and proper acceleration [6] rad/s^2, m/s^2 of a link's origin in its axes; at rest 9.81 upwards."""
         return self._link_sensors.acceleration(name, link)
 
     def link_angular_velocity(self, name: str, link: str) -> np.ndarray:
-        """[3] rad/s of a link, in its axes."""
+        """Angular velocity [3] rad/s of a link, in its axes."""
         body = self._link_body(name, link)
         self.update_kinematics()
         jacobian = np.zeros((3, self.mj_model.nv))
@@ -499,11 +505,10 @@ class RigidWorld(MujocoWorld):
         return jacobian @ self.mj_data.qvel @ self.mj_data.xmat[body].reshape(3, 3)
 
     # ------------------------------------------------------------------ people, by name
-    # People of a rigid world. Every method raises :class:`HumanError` if no person or hand has the name given.
+    # Every method raises :class:`HumanError` if no person or hand has the given name.
 
     def move_human(self, name: str, pose: HumanPose) -> None:
-        """Set where a person's tracked points are at the end of the coming step, which hands are closed or have
-        shears."""
+        """Set a person's tracked points at the end of the coming step, and whether hands are closed or have shears."""
         human = self.human(name)
         busy = [hand.busy for hand in human.hands]
         shears = human.shears_parts
@@ -515,7 +520,7 @@ class RigidWorld(MujocoWorld):
             self._update_geoms()
 
     def hand_sample(self, name: str, side: str) -> HandSample:
-        """A person's ``"left"`` or ``"right"`` hand after the last step."""
+        """State of a person's ``"left"`` or ``"right"`` hand after the last step."""
         human = self.human(name)
         return human.hand_sample(human.hand(side), self.mj_data)
 
@@ -528,8 +533,7 @@ class RigidWorld(MujocoWorld):
     # grasps
 
     def grasp(self, name: str, side: str, actor: str, link: str) -> None:
-        """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are those of
-        ``RigidGeoms``."""
+        """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are as in ``RigidGeoms``."""
         hand = self.human(name).hand(side)
         body = self._body_of_object(actor, link)
         self.update_kinematics()
@@ -541,7 +545,7 @@ class RigidWorld(MujocoWorld):
         self._update_geoms()
 
     def grasp_plant(self, name: str, side: str, body: int) -> None:
-        """Let a hand hold a plant's ``body``: it touches nothing, and :meth:`place_hand` puts it on the plant."""
+        """Let a hand hold a plant's ``body``. The hand then collides with nothing; :meth:`place_hand` moves it."""
         hand = self.human(name).hand(side)
         hand.held = ("plants", f"body/{body}")
         hand.weld_to(self.mj_model, self.mj_data, None)
@@ -558,10 +562,9 @@ class RigidWorld(MujocoWorld):
         self._update_geoms()
 
     def nearest_to_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
-        """What a hand can grasp: gap [m], actor and link of the nearest rigid body; None if none is nearer than
-        ``reach``.
+        """Gap [m], actor and link of the rigid body nearest to a hand; None if none is nearer than ``reach`` [m].
 
-        The ground and the person's own body are left out.
+        The ground and the person's own body are ignored.
         """
         hand = self.human(name).hand(side)
         self.update_kinematics()
@@ -579,15 +582,14 @@ class RigidWorld(MujocoWorld):
         return best
 
     # ------------------------------------------------------------------ free bunches, by number
-    # Picked bunches as free bodies.
 
     @property
     def bunch_room(self) -> int:
-        """Number of free bunches that still get bodies without the world being compiled anew."""
+        """Number of free bunches that can still be added without a recompilation."""
         return self._pool_size - 1 - max(self._bunch_slot.values(), default=-1)
 
     def add_bunch(self, bunch: int, body: FreeBunch, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Add a bunch at ``pose`` [7] with ``velocity`` [6] (of its origin, angular; world axes)."""
+        """Add a bunch at ``pose`` [7] with ``velocity`` [6] (linear of its origin, then angular; world axes)."""
         self.add_bunches({bunch: (body, pose, velocity)})
 
     def add_bunches(self, bunches: dict[int, tuple[FreeBunch, np.ndarray, np.ndarray]]) -> None:
@@ -620,26 +622,28 @@ class RigidWorld(MujocoWorld):
         self._kinematics_current = False
 
     def remove_bunch(self, bunch: int) -> None:
-        """Remove a free bunch; the world is compiled anew."""
+        """Remove a free bunch. This recompiles the world."""
         del self._free_bunches[bunch], self._bunch_slot[bunch]
         self._passing_bunches.discard(bunch)
         self._recompile()
 
     def ignore_overlaps(self, bunch: int) -> None:
-        """Let a bunch that has just been picked pass through the fixed pieces (wood, wires, poles) if it overlaps one,
-        until it is clear of them: as it hung there, that overlap was no contact."""
+        """Let a bunch that was just picked pass through fixed pieces (wood, wires, poles) while it overlaps one.
+
+        Such an overlap was not a contact while the bunch hung there.
+        """
         self.update_kinematics()
         self._passing_bunches.add(bunch)
         self._end_passing()
 
     def _end_passing(self) -> None:
-        """Let passing bunches that are clear of all fixed pieces touch these again; MuJoCo's poses must be current."""
+        """Let passing bunches without overlap collide with fixed pieces again; MuJoCo's poses must be current."""
         clear = {bunch for bunch in self._passing_bunches if not self._overlaps_fixed_piece(bunch)}
         self._passing_bunches -= clear
         self._set_passing(clear, False)
 
     def _set_passing(self, bunches: set[int], passing: bool) -> None:
-        """Let free bunches touch fixed pieces or not."""
+        """Set whether free bunches pass through fixed pieces."""
         m = self.mj_model
         bits = free_bunch.CONAFFINITY & ~FIXED if passing else free_bunch.CONAFFINITY
         for bunch in bunches:
@@ -674,16 +678,16 @@ class RigidWorld(MujocoWorld):
         return self.mj_data.joint(free_bunch.slot_name(self._bunch_slot[bunch]))
 
     # ------------------------------------------------------------------ boxes, by number
-    # Boxes that come and go; those of the scene have the numbers that they have in its model.
+    # Boxes of the scene have the numbers of its model.
 
     def add_box(self, number: int, box: RigidBox) -> None:
-        """Add a box at rest; the state of all others is unchanged. ``ValueError`` if one has its number."""
+        """Add a box at rest; all other states are unchanged. ``ValueError`` if the number is taken."""
         if number in self._boxes:
             raise ValueError(f"box {number} is here already")
         self._use_boxes(self._boxes | {number: box})
 
     def remove_box(self, number: int) -> None:
-        """Remove a box; what lay in it or on it falls. ``ValueError`` if there is none of this number."""
+        """Remove a box; what lay in it or on it falls. ``ValueError`` if no box has this number."""
         if number not in self._boxes:
             raise ValueError(f"no box {number} here")
         self._use_boxes({other: box for other, box in self._boxes.items() if other != number})
@@ -697,11 +701,11 @@ class RigidWorld(MujocoWorld):
 
 
 def _check_finite(name: str, what: str, given: object, size: int) -> None:
-    """:class:`RobotError` unless a command consists of ``size`` finite numbers."""
+    """Raise :class:`RobotError` unless a command consists of ``size`` finite numbers."""
     values = np.asarray(given, float)
     if values.shape != (size,):
         raise RobotError(f"robot {name!r}: {what} has the shape {values.shape}; give {size} numbers")
-    if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():  # the first is the cheapest
+    if not math.isfinite(values.dot(values)) and not np.isfinite(values).all():  # a cheap test first
         raise RobotError(f"robot {name!r}: {what} is {values.tolist()}; give finite numbers")
 
 
@@ -713,7 +717,7 @@ def _free_code(
     others: Sequence[RobotBody | HumanBody],
     error: type[ValueError],
 ) -> int:
-    """A collision code that none of ``actors`` of its kind has; ``error`` if there is none or the name is taken."""
+    """A collision code that no actor of this kind has; ``error`` if no code is free or the name is taken."""
     if any(name == actor.spec.name for actor in (*actors, *others)):
         raise error(f"{kind} {name!r} is already here; give the newcomer another name")
     if "/" in name or not name:

@@ -1,7 +1,7 @@
 """One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links.
 
-MuJoCo's integrator damps a servo as if its D were larger by dt K, which keeps stiff servos and what they hold quiet. A
-compliant joint must swing with its own damping: for these :func:`split_damping` takes the surplus back.
+MuJoCo's integrator damps a servo as if its damping D were larger by dt K. This keeps stiff servos and their loads from
+oscillating. A compliant joint must swing with exactly its own damping; :func:`split_damping` removes the surplus.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from vinesim.scene.values import RobotSpec, Shape
 from vinesim.scene.values.signals import UNLIT, Color
 
 MIN_FRICTION = 1e-5
+"""[1] Smallest friction coefficient of a link, which is the smallest that MuJoCo accepts."""
 MAX_FRICTION = 10.0
-"""[1] Bounds of a link's own coefficient: the least that MuJoCo takes, and what hardly slips. Files give up to 1e14 for
-what never does."""
+"""[1] Largest friction coefficient of a link, which practically prevents slip; files give up to 1e14."""
 MAX_HULL_VERTICES = 64
-"""Most vertices of a mesh's convex hull, so that contacts with it have a bounded cost. TUNED."""
+"""Largest number of vertices of a mesh's convex hull, which bounds the cost of contacts. TUNED."""
 CONTACT_IMPEDANCE = (0.95, 0.99)
-"""[1] Least and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm that
-pushes against its own torso with all its effort stands 3 mm deep in it, with these less than 1 mm."""
+"""[1] Smallest and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm
+that pushes against its own torso at full effort penetrates by 3 mm, with these by less than 1 mm."""
 COPY_EFFORT_SHARE = 0.999
-"""[1] Share of its limit that the servo of a copy uses at most."""
+"""[1] Largest fraction of its effort limit that the servo of a copy uses."""
 _PLANAR = ("x", "y", "yaw")
 
 
@@ -43,7 +43,7 @@ class RobotBody:
     """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
 
     def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``code``: of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
+        """``code``: one of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
         check(spec)
         joints = len(spec.drives)
         pose = np.asarray(spec.pose, float)
@@ -55,53 +55,53 @@ class RobotBody:
         except ValueError as error:
             raise build_error(spec, error) from error
         self.shapes = shapes_of_robot(spec)
-        """By link: what sensors see while the indicator lights are off."""
+        """Visible shapes by link while the indicator lights are off."""
         self._shown_shapes: dict[Color | None, dict[str, tuple[Shape, ...]]] = {None: self.shapes}
         self.indicator_color: Color | None = None
         self.stiffness = np.array([d.stiffness for d in spec.drives], float)
         self.damping = np.array([d.damping for d in spec.drives], float)
         self.servo_limit = np.array([d.effort for d in spec.drives], float)
-        """[joint] N m or N: limit of the servos, at most ``effort_limit``."""
+        """[joint] N m or N, effort limit of the servos, at most ``effort_limit``."""
         self.effort_limit = self.servo_limit.copy()
-        """[joint] N m or N: limit of the drives, servo and gravity compensation together."""
+        """[joint] N m or N, effort limit of the drives for servo and gravity compensation together."""
         self.target = np.array(spec.home, float)
-        """[joint] rad or m: position to which the servos pull."""
+        """[joint] rad or m, target position of the servos."""
         self.target_velocity = np.zeros(joints)
         self.feedforward = np.zeros(joints)
-        """[joint] N m or N: effort in addition to that of the servos."""
+        """[joint] N m or N, effort added to the servos'."""
         self.control = np.zeros(joints)
-        """[joint] N m or N: MuJoCo's control in the last step; less K q and D v it is the effort of the servo."""
+        """[joint] N m or N, MuJoCo's control in the last step; minus K q and D v it is the effort of the servo."""
         self.base_target = np.array([pose[0], pose[1], frames.to_yaw(pose[3:])])
-        """[3] x, y, yaw (m, m, rad) to which the base's servos pull; moves with ``base_velocity``."""
+        """[3] x, y, yaw (m, m, rad), target of the base's servos; it moves with ``base_velocity``."""
         self.base_height = float(pose[2])
-        """[m] z of the base; it moves in a plane."""
+        """[m] Height z of the base, which moves in a horizontal plane."""
         self.base_velocity = np.zeros(3)
-        """[3] vx, vy, wz (m/s, m/s, rad/s) in the base's own axes."""
+        """[3] vx, vy, wz (m/s, m/s, rad/s), commanded velocity in the base's own axes."""
         self.base_gains = _base_gains(spec, parameters)
         """Stiffness and damping [3] of the base's servos along x, y and about z."""
         self._base_slip = np.array([parameters.base_slip])
         self.has_exact_damping = np.zeros(joints, bool)
-        """[joint] bool: the integrator must not add to its damping; see :func:`split_damping`."""
+        """[joint] bool, whether the joint has exactly its own damping; see :func:`split_damping`."""
         self.damping_at_start = np.zeros(joints)
-        """[joint] N m s/rad: part of the damping that acts on the velocity at the start of the step."""
+        """[joint] N m s/rad, part of the damping that acts on the velocity at the start of the step."""
         self.damping_at_end = np.zeros(joints)
-        """[joint] N m s/rad: part that MuJoCo applies to the velocity at its end, like the spring."""
+        """[joint] N m s/rad, part of the damping that acts on the velocity at the end of the step."""
         self.q = self.v = self.actuator = np.zeros(0, int)
         """[joint] Indices of the drives in MuJoCo's qpos, qvel and ctrl."""
         self.inertia_index = np.zeros(0, int)
         """[joint] Index of the drive's own inertia in MuJoCo's sparse mass matrix."""
         self.base_q = self.base_v = self.base_actuator = np.zeros(0, int)
-        """[3] The same of the base's x, y and yaw."""
+        """[3] Indices of the base's x, y and yaw in MuJoCo's qpos, qvel and ctrl."""
         self.bodies: dict[str, int] = {}
         self.sensor_links: list[str] = []
         """Links with a sensor, see :meth:`RigidWorld.add_link_sensor`."""
         self._controls_of: mujoco.MjData | None = None
         self.remote_wrenches: dict[str, np.ndarray] = {}
-        """By link: wrenches [6] of remote people; see :meth:`RigidWorld.set_remote_wrenches`."""
+        """Wrenches [6] of remote people by link; see :meth:`RigidWorld.set_remote_wrenches`."""
 
     @property
     def base_slip(self) -> float:
-        """[m or rad] Offset at which the base's servos give their full effort."""
+        """[m or rad] Offset from the target at which the base's servos give their full effort."""
         return float(self._base_slip[0])
 
     @base_slip.setter
@@ -110,8 +110,7 @@ class RobotBody:
 
     @property
     def shown_shapes(self) -> dict[str, tuple[Shape, ...]]:
-        """By link: what sensors see, with the indicator lights in their present colour; the same objects for the same
-        colour."""
+        """Visible shapes by link with the indicator lights in their present colour; same objects for equal colours."""
         color = self.indicator_color
         if color not in self._shown_shapes:
             kept = {None: self.shapes, UNLIT: self._shown_shapes.get(UNLIT, _with_lamps(self.shapes, UNLIT))}
@@ -139,7 +138,7 @@ class RobotBody:
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
     def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
-        """Find the robot's bodies and joints in a world that was compiled anew."""
+        """Find the robot's bodies and joints in a recompiled world."""
         name = self.spec.name
         driven = [f"{name}/{drive.joint}" for drive in self.spec.drives]
         planar = [f"{name}:{axis}" for axis in _PLANAR]
@@ -157,7 +156,7 @@ class RobotBody:
         self._controls_of = None
 
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
-        """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest, with its targets there."""
+        """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest; these become its targets."""
         self.target[:] = d.qpos[self.q] = position
         self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
         d.qvel[self.v] = d.qvel[self.base_v] = 0.0
@@ -174,7 +173,7 @@ class RobotBody:
         self._apply_controls(1)
 
     def _bind_controls(self, d: mujoco.MjData, dt: float) -> None:
-        """Bind the kernel that writes MuJoCo's controls: one call instead of twenty on arrays of ten numbers."""
+        """Bind the kernel that writes MuJoCo's controls: one call instead of twenty NumPy calls on short arrays."""
         self._controls_of = d
         (stiffness, damping) = self.base_gains
         drives = SharedArrays(
@@ -204,14 +203,14 @@ class RobotBody:
         )
 
     def transmitted_effort(self, d: mujoco.MjData) -> np.ndarray:
-        """[joint] N m or N: effort of the drives in the last step, servo and gravity compensation."""
-        # implicit servos: over the step they give the force of its end, not that of its start
+        """[joint] N m or N, effort of the drives in the last step: servo plus gravity compensation."""
+        # the servos are implicit: their force over the step is the force at the end of the step
         servo = self.control - self.stiffness * d.qpos[self.q] - self.damping_at_end * d.qvel[self.v]
-        servo = np.minimum(np.maximum(servo, -self.servo_limit), self.servo_limit)  # in a third of np.clip's time
+        servo = np.minimum(np.maximum(servo, -self.servo_limit), self.servo_limit)  # three times as fast as np.clip
         return np.minimum(np.maximum(servo + d.qfrc_gravcomp[self.v], -self.effort_limit), self.effort_limit)
 
     def take_over(self, other: RobotBody) -> None:
-        """Go on as ``other``, the same robot with other shapes: its targets, gains, limits and sensors."""
+        """Copy targets, gains, limits and sensors from ``other``, the same robot with other shapes."""
         for name in (
             "stiffness",
             "damping",
@@ -241,11 +240,10 @@ class RobotBody:
     def follow_remote(
         self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> None:
-        """Pull a copy to the received state: ``base_q`` [7], ``base_qd`` [6] world axes, ``position``, ``velocity``
-        [joint]."""
+        """Pull a copy to its received state; see :meth:`RigidWorld.follow_remote`."""
         self.command(position, velocity)
-        # MuJoCo does not take a servo as implicit that reaches its limit at the start of the step: a light joint that
-        # catches up would be thrown past its target
+        # MuJoCo treats a servo at its limit at the start of the step as explicit; a light joint that catches up would
+        # then be thrown past its target
         servo = self.servo_limit
         most = self.effort_limit
         weight = d.qfrc_gravcomp[self.v]
@@ -270,9 +268,9 @@ class RobotBody:
         limit: np.ndarray | None,
         exact: np.ndarray | None,
     ) -> None:
-        """Take other ``gains``: stiffness, damping, feedforward; see :meth:`RigidWorld.set_gains`.
+        """Set ``gains``: stiffness, damping, feedforward; see :meth:`RigidWorld.set_gains`.
 
-        The effort of the last step is kept, so that measurements of it do not change.
+        The measured effort of the last step does not change.
         """
         before = self.stiffness.copy()
         self.stiffness[:], self.damping[:], self.feedforward[:] = gains
@@ -287,7 +285,7 @@ class RobotBody:
         self.control[:] = given + self.stiffness * q + self.damping_at_end * v
 
     def set_remote_wrenches(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
-        """Set the wrenches [6] of remote people by link; :class:`RobotError` if there is no such link."""
+        """Set the wrenches [6] of remote people by link; :class:`RobotError` if a link does not exist."""
         if unknown := sorted(wrenches.keys() - self.bodies.keys()):
             raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, a link that it has not")
         for link in self.remote_wrenches.keys() - wrenches.keys():
@@ -297,7 +295,7 @@ class RobotBody:
         self.remote_wrenches = wrenches
 
     def remote_effort(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
-        """[dof] generalised force of the wrenches of remote people."""
+        """[dof] Generalised force of the wrenches of remote people."""
         total = np.zeros(m.nv)
         for link, wrench in self.remote_wrenches.items():
             body = self.bodies[link]
@@ -320,7 +318,7 @@ class RobotBody:
         m.actuator_forcerange[self.actuator, 1] = self.servo_limit
 
     def _mimics(self, m: mujoco.MjModel) -> dict[str, tuple[str, np.ndarray]]:
-        """Joints that mimic another joint: name -> (source, coefficients of the polynomial [5])."""
+        """Mimic joints by name: name of the source joint, and coefficients of the polynomial [5]."""
         joints = {}
         for e in np.flatnonzero(m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
             joint = m.joint(m.eq_obj1id[e]).name
@@ -331,7 +329,7 @@ class RobotBody:
 
 
 def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
-    """A robot without base and servos from its URDF; its shapes carry the collision ``code``."""
+    """A robot from its URDF, without base and servos; its shapes have the collision ``code``."""
     text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
     child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
     own_friction = link_friction(given.urdf)
@@ -343,9 +341,9 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
         geom.friction = contact_friction(friction if own is None else min(max(own, MIN_FRICTION), MAX_FRICTION))
         material = next(materials.get(geom.parent.name, iter(())), Material.UNKNOWN)
         geom.userdata = geom_user(material, has_own_friction=own is not None)
-        geom.priority = int(own is not None)  # or MuJoCo would take the larger coefficient of the two in contact
+        geom.priority = int(own is not None)  # otherwise MuJoCo uses the larger coefficient of the two geoms
         geom.solimp[:2] = CONTACT_IMPEDANCE
-    for mesh in child.meshes:  # bodies have their inertia from the URDF; a thin or open mesh has no volume
+    for mesh in child.meshes:  # the URDF gives the inertia of bodies; thin or open meshes have no volume
         mesh.inertia = mujoco.mjtMeshInertia.mjMESH_INERTIA_SHELL
         mesh.maxhullvert = MAX_HULL_VERTICES
     for body in child.bodies[1:]:
@@ -371,7 +369,10 @@ def _base_gains(spec: RobotSpec, parameters: PhysicsParameters) -> tuple[np.ndar
 
 
 def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, effort: float) -> None:
-    """Effort = control - stiffness q - damping v, cut off at ``effort``; the control carries both targets."""
+    """Add a servo with effort = control - stiffness q - damping v, limited to ``effort``.
+
+    The control contains the targets of position and velocity.
+    """
     bias = np.zeros(10)
     bias[1:3] = -stiffness, -damping
     gain = np.zeros(10)
@@ -393,14 +394,16 @@ def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float
 def split_damping(
     stiffness: np.ndarray, damping: np.ndarray, friction: np.ndarray, armature: np.ndarray, dt: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Split a servo's damping so that the joint swings as asked: parts [joint] at the end and at the start of the step.
+    """Split a servo's damping into parts [joint] for the end and the start of the step, so that its decay is exact.
 
-    With the spring at the end of the step, q + dt v, the scheme damps as if D were larger by dt K. So much is taken
-    from the part at the end, which makes the spring's share explicit. Half of the damping (``friction`` of the joint
-    included) acts on the velocity at the start: the trapezoidal rule, whose decay is right to third order in dt D / M.
-    The price is that the scheme is not stable for every inertia M. A - B >= dt K / 2 - 2 M / dt is needed, A and B
-    being the parts at the end (without - dt K) and at the start; M is at least ``armature``, so B is cut down, and if
-    that does not suffice A is raised: a joint that is too stiff for the step is damped more than asked.
+    The spring acts at the end of the step, at q + dt v, which damps as if D were larger by dt K. So dt K is subtracted
+    from the part at the end, which makes this share of the spring explicit. Half of the damping (including ``friction``
+    of the joint) acts on the velocity at the start. This is the trapezoidal rule, whose decay is exact to third order
+    in dt D / M.
+
+    The scheme is not stable for every inertia M. With A and B the parts at the end (before dt K is subtracted) and at
+    the start, stability needs A - B >= dt K / 2 - 2 M / dt, where M is at least ``armature``. So B is reduced, and if
+    that is not enough A is increased: a joint that is too stiff for the step has more damping than requested.
     """
     asked = damping + friction
     needed = np.maximum(0.0, 0.5 * dt * stiffness - 2.0 * armature / dt)
@@ -409,13 +412,15 @@ def split_damping(
 
 
 def build_error(spec: RobotSpec, error: ValueError) -> RobotError:
-    """What MuJoCo says against a robot, in one line."""
+    """MuJoCo's error about a robot, in one line."""
     return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")
 
 
 def _with_lamps(shapes: dict[str, tuple[Shape, ...]], color: Color | None) -> dict[str, tuple[Shape, ...]]:
-    """Shapes by link with indicator lights of a colour, which shine unless it is :data:`UNLIT`; a link without any
-    keeps its tuple."""
+    """Shapes by link with indicator lights in ``color``, lit unless it is :data:`UNLIT`.
+
+    Links without indicator lights keep their tuples.
+    """
     if color is None:
         return shapes
     red, green, blue = (part / 255.0 for part in color)

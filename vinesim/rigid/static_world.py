@@ -1,4 +1,4 @@
-"""The static world as MuJoCo sees it: ground, trellis, wood and crates; and the collision bits of all that is rigid."""
+"""The static world for MuJoCo: ground, trellis, wood and crates; and the collision bits of all rigid bodies."""
 
 from __future__ import annotations
 
@@ -17,24 +17,25 @@ from vinesim.scene.values import RigidBox, Shape
 CRATE_WALL = 0.012
 """[m] Thickness of a crate's bottom and walls. GUESSED."""
 MIN_STATIC_RADIUS = 0.006
-"""[m] Thinner pieces act on rigid bodies as if they were as thick. TUNED: what moves at 0.5 m/s is 5 mm deeper after a
-step; with the axis of a wire inside a box, MuJoCo would push the box along the wire's sides instead of off it."""
+"""[m] Smallest radius of pieces in contacts with rigid bodies; thinner pieces are treated as this thick. TUNED: a body
+at 0.5 m/s moves 5 mm in a step. If the axis of a wire were inside a box, MuJoCo would push the box along the wire."""
 CRATE_BED_DEPTH = 0.08
-"""[m] Depth to which a crate's bottom continues for free bunches alone. DERIVED: a bunch that falls a metre is 4 cm
-deeper after a step; in the middle of a bottom as thin as it looks it would be pushed out below."""
+"""[m] Thickness of a crate's bottom for free bunches alone. DERIVED: a bunch that has fallen a metre moves 4 cm in a
+step; a bottom of the visible thickness would push it out below."""
 CRATE_COLOR = (0.75, 0.15, 0.12, 1.0)
 
 FIRST_FIXED_GEOM = 1
-"""MuJoCo's number of the geom of the first fixed piece; the ground has 0, and the other pieces follow."""
+"""MuJoCo's geom number of the first fixed piece. The ground has number 0; the other pieces follow the first."""
 
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
-"""Collision bits. Free bunches touch the deep bed of a crate, all others its thin floor. Robots do not touch hands of
-remote people: the person's own client computes with what force they push."""
+"""Collision bits. Free bunches collide with the thick bed of a crate, all other bodies with its thin floor. Robots do
+not collide with hands of remote people, because the person's own client computes the forces of the hands."""
 _ROBOT_BITS = range(6, 18)
 _HUMAN_BITS = range(18, 31)
 ROBOTS = sum(1 << bit for bit in _ROBOT_BITS)
+"""Collision bits of which the codes of robots consist."""
 HUMANS = sum(1 << bit for bit in _HUMAN_BITS)
-"""Collision bits that codes of robots and of people consist of."""
+"""Collision bits of which the codes of people consist."""
 ALL_BITS = (1 << (_HUMAN_BITS[-1] + 1)) - 1
 _CODE_WEIGHT = 6
 
@@ -44,29 +45,30 @@ def _codes(bits: range) -> tuple[int, ...]:
 
 
 ROBOT_CODES = _codes(_ROBOT_BITS)
-HUMAN_CODES = _codes(_HUMAN_BITS)
-"""Collision codes: each actor has one of its own, so that it touches all others, and itself only where that is wanted.
+"""Collision codes of robots. Each actor has its own code, so it collides with all other actors, and with itself only if
+wanted.
 
-MuJoCo lets two geoms touch if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code
-as ``contype`` and all other bits in ``conaffinity``; a robot that touches itself has its code there, too. Codes of one
-kind all have six bits, so none contains another: each has a bit that the other has not. 31 bits thus tell 924 robots
-and 1716 people apart; a bit for each would do for 25.
+MuJoCo lets two geoms collide if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code
+as ``contype`` and all other bits in ``conaffinity``; a robot that collides with itself has its code there, too. All
+codes have six bits, so each code has a bit that any other code lacks. The 25 bits give codes for 924 robots and 1716
+people; one bit for each actor would allow only 25 actors.
 """
+HUMAN_CODES = _codes(_HUMAN_BITS)
+"""Collision codes of people, see :data:`ROBOT_CODES`."""
 
 
 def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[float]:
-    """Friction of a geom as MuJoCo takes it: sliding [1], torsional [m] and rolling [m]; the last two need condim 4,
-    6."""
+    """Friction of a geom for MuJoCo: sliding [1], torsional [m] (needs condim 4) and rolling [m] (needs condim 6)."""
     return [coefficient, 0.005, rolling_arm]
 
 
 def geom_user(material: int, *, has_own_friction: bool = False) -> list[float]:
-    """User data of a geom: its :class:`Material`, and whether its friction is its own, whatever it touches."""
+    """User data of a geom: its :class:`Material`, and whether it uses its own friction coefficient in all contacts."""
     return [float(material), float(has_own_friction)]
 
 
 def boxes_of(model: Model) -> dict[int, RigidBox]:
-    """The boxes of a scene as generated, by number."""
+    """The boxes of a generated scene, by number."""
     rows = zip(model.box_pose.astype(float), model.box_size.astype(float), model.box_mass.tolist(), strict=True)
     return {number: RigidBox(*row) for number, row in enumerate(rows)}
 
@@ -76,7 +78,7 @@ def build_static_world(
 ) -> mujoco.MjSpec:
     """A world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options.
 
-    ``boxes``: the crates by number; those of the model unless given.
+    ``boxes``: the crates by number; by default those of the model.
     """
     spec = mujoco.MjSpec()
     _set_options(spec, parameters)
@@ -120,16 +122,16 @@ def _set_options(spec: mujoco.MjSpec, parameters: PhysicsParameters) -> None:
     spec.option.integrator = mujoco.mjtIntegrator.mjINT_DISCRETE
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    # less, and a bunch creeps through the fingers; MuJoCo's noslip stage would hold it too, but piles never rest then
+    # with less, a bunch creeps through the fingers; MuJoCo's noslip stage would prevent it, but then piles never rest
     spec.option.impratio = 1000.0
-    # one invalid number must not reset the whole world: RigidWorld.integrate() stops the tree that it belongs to
+    # one invalid number must not reset the whole world; RigidWorld.integrate() stops only the tree concerned
     spec.option.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_AUTORESET)
-    # boxes and bunches at rest cost nothing; robots, being driven, never sleep
+    # boxes and bunches at rest cost no time; robots are driven and never sleep
     spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)
 
 
 def _add_crate(body: mujoco.MjsBody, size: np.ndarray, mass: float, friction: list[float]) -> None:
-    """Add the geoms of a crate of outer ``size`` [3] m and ``mass`` [kg], which its walls share by volume."""
+    """Add the geoms of a crate of outer ``size`` [3] m and ``mass`` [kg]; the mass is distributed by volume."""
     walls = crate_shapes(size)
     volume = [float(np.prod(wall.size)) for wall in walls]
     for wall, share in zip(walls, volume, strict=True):
@@ -157,7 +159,7 @@ def _add_crate(body: mujoco.MjsBody, size: np.ndarray, mass: float, friction: li
 
 
 def crate_shapes(size: np.ndarray) -> tuple[Shape, ...]:
-    """Bottom and four walls of an open box of outer ``size`` [3] m, origin in the middle of its underside."""
+    """Bottom and four walls of an open box of outer ``size`` [3] m; the origin is in the middle of the underside."""
     length, width, height = (float(s) / 2 for s in size)
     t = CRATE_WALL / 2
     walls = [

@@ -1,4 +1,4 @@
-"""URDF for the rigid world: checks, the text that MuJoCo compiles, and the shapes that sensors see."""
+"""URDF for the rigid world: checks, the text that MuJoCo compiles, and visible shapes."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from vinesim.scene.values import Mesh, RobotSpec, Shape
 
 
 class RobotError(ValueError):
-    """A robot that cannot be added; the text gives its name, the finding and a remedy."""
+    """A robot that cannot be added; the message gives its name, the finding and a remedy."""
 
 
 def check(spec: RobotSpec) -> None:
-    """Raise :class:`RobotError` for faults that MuJoCo does not notice, or reports less clearly."""
+    """Raise :class:`RobotError` for faults that MuJoCo does not detect or reports less clearly."""
     count = len(spec.drives)
     if np.shape(spec.home) != (count,):
         raise RobotError(f"robot {spec.name!r} has {count} drives and a home position of shape {np.shape(spec.home)}")
@@ -45,10 +45,9 @@ def check(spec: RobotSpec) -> None:
             raise RobotError(f"robot {spec.name!r}: {drive} must have gains of 0 or more and an effort above 0")
 
 
-@functools.lru_cache(16)  # robots of one kind share it
+@functools.lru_cache(16)  # shared by robots of one kind
 def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
-    """The URDF that MuJoCo compiles: without visuals; joints that are neither ``driven`` nor mimic another are
-    fixed."""
+    """The URDF for MuJoCo: without visuals, and with all joints fixed that are neither ``driven`` nor mimic joints."""
     root = ElementTree.fromstring(urdf)
     for link in root.iter("link"):
         for visual in link.findall("visual"):
@@ -67,8 +66,7 @@ def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
 
 @functools.lru_cache(16)
 def link_friction(urdf: str) -> dict[str, float]:
-    """Coulomb coefficient [1] of the links for which a URDF gives one: Gazebo's ``mu1`` or Bullet's
-    ``lateral_friction``."""
+    """Coulomb coefficient [1] by link, where the URDF gives one: Gazebo's ``mu1`` or Bullet's ``lateral_friction``."""
     root = ElementTree.fromstring(urdf)
     found = {}
     for link in root.findall("link"):
@@ -81,15 +79,15 @@ def link_friction(urdf: str) -> dict[str, float]:
 
 
 _MATERIALS = {"rubber": Material.RUBBER, "plastic": Material.PLASTIC, "metal": Material.STEEL}
-"""Material of contact of what looks like that surface."""
+"""Contact material by visible surface."""
 
 
 @functools.lru_cache(16)
 def collision_materials(urdf: str) -> dict[str, tuple[Material, ...]]:
     """Materials of the collision shapes of each link, in the order of the URDF.
 
-    A URDF names materials of what is seen: a collision shape is made of what the visual shape at the same place and of
-    the same size is made of, or else of what all visual shapes of its link are made of.
+    A URDF gives materials only for visual shapes. A collision shape has the material of the visual shape of equal pose
+    and size, or else the material that all visual shapes of its link share.
     """
     root = ElementTree.fromstring(urdf)
     paints = {m.get("name"): m for m in root.findall("material")}
@@ -128,7 +126,7 @@ def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
 
 
 def shapes_of_robot(spec: RobotSpec) -> dict[str, tuple[Shape, ...]]:
-    """:func:`shapes_of` of a robot, some of whose meshes may be in no file.
+    """Shapes of each link of a robot, as :func:`shapes_of`, also for meshes that were received instead of read.
 
     Raises :class:`RobotError` for triangles that cannot be shown.
     """
@@ -152,7 +150,7 @@ def shapes_of_robot(spec: RobotSpec) -> dict[str, tuple[Shape, ...]]:
 
 
 _SURFACES = {name: name for name in SURFACES} | {"steel": "metal", "aluminium": "metal", "lens": "glass"}
-"""Surface of a URDF's material, by a word of its name: ``rubber``, ``dark_rubber``, ``lamp_green``."""
+"""Surface by a word in the name of a URDF material, such as ``rubber``, ``dark_rubber`` or ``lamp_green``."""
 
 
 def _numbers(element: ElementTree.Element | None, key: str, default: str) -> np.ndarray:

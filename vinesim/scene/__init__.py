@@ -1,1 +1,1 @@
-"""What the vineyard is: scene files, the constants of a generated model, the state that changes, stable ids."""
+"""The vineyard as data: scene files, constants of a generated model, changing state, stable ids."""

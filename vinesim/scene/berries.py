@@ -1,8 +1,8 @@
-"""Berries of a bunch, derived from (count, seed): sensors see them and truth counts them, physics never simulates them.
+"""Berries of a bunch, derived from (count, seed), for sensors and ground truth; the physics has no berries.
 
-A small library of bunches is packed once by position-based relaxation, with berries of unit radius: each berry has a
-foot on the rachis, is pulled to it by its pedicel, and is pushed out of its neighbours. A bunch takes the prototype its
-seed names and scales it, so ten thousand bunches cost eighteen relaxations.
+A small library of prototypes is packed once by position-based relaxation, with berries of unit radius: each berry is
+pulled by its pedicel to its foot on the rachis and pushed out of its neighbours. A bunch scales the prototype that its
+seed selects, so ten thousand bunches need only eighteen relaxations.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ class Variety:
     colour: tuple[float, float, float]
     """Linear RGB reflectance."""
     radius: float
-    """Half thickness across the berry's axis [m]."""
+    """Half of the berry's thickness across its axis [m]."""
     elongation: float
-    """Length over thickness."""
+    """Ratio of length to thickness."""
 
     @property
     def volume_radius(self) -> float:
@@ -37,27 +37,27 @@ class Variety:
 
     @property
     def mass(self) -> float:
-        """Of one berry [kg]."""
+        """Mass of one berry [kg]."""
         return DENSITY * 4.0 / 3.0 * np.pi * self.volume_radius**3
 
 
 DENSITY = 1080.0
-"""Of a ripe berry [kg/m^3]: GUESSED from 18 % sugar."""
+"""Density of a ripe berry [kg/m^3]. GUESSED from 18 % sugar."""
 
 VARIETIES = tuple(
     Variety(b.name, b.colour.value, b.radius.value, b.elongation.value) for b in plant_parameters.load_varieties()
 )
-"""Indexed by ``Model.bunch_variety``."""
+"""Varieties, indexed by ``Model.bunch_variety``."""
 
 PROTOTYPE_BERRIES = (50, 64, 80, 97, 116, 140)
-"""Berries of the prototypes; a bunch takes the next larger one and leaves berries off at its tip."""
+"""Numbers of berries of the prototypes. A bunch takes the next larger prototype and leaves berries off at its tip."""
 MIN_BERRIES = 40
 MAX_BERRIES = PROTOTYPE_BERRIES[-1]
 _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
-"""Taper and wings of the three prototypes of each count: conical, shouldered, cylindrical with two wings."""
+"""Taper and number of wings of the three prototypes of each count: conical, shouldered, cylindrical with two wings."""
 _ITERATIONS = 400
 _SPREAD = 0.07
-"""Standard deviation of a berry's radius, share."""
+"""Standard deviation of a berry's radius, as a fraction of the radius."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ class BerryLayout:
     position: np.ndarray
     """[n, 3] m"""
     radius: np.ndarray
-    """[n] m, half thickness across the axis; half length is ``radius * elongation``."""
+    """[n] m, half of the thickness across the axis; half of the length is ``radius * elongation``."""
     axis: np.ndarray
     """[n, 3] unit, from pedicel to stylar scar."""
     foot: np.ndarray
@@ -75,33 +75,34 @@ class BerryLayout:
     rachis: np.ndarray
     """[line, point, 3] m, main axis and wings."""
     neighbours: np.ndarray
-    """[n, 8] int32, nearest first, -1 where there are fewer."""
+    """[n, 8] int32, indices of neighbouring berries, nearest first; -1 fills the rest."""
 
 
 def lay_out_berries(length: float, radius: float, count: int, variety: int, seed: int) -> BerryLayout:
-    """The berries of one bunch of ``Model``; it fits the hull ``length`` x ``radius`` [m] that :func:`hull` gave."""
+    """The berries of one bunch of ``Model``, scaled to a hull of ``length`` and ``radius`` [m]."""
     return _scaled(int(_prototype(count, seed)), int(count), float(length), float(radius), int(variety))
 
 
 def hull_size(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """Length and radius of bunches [..., 2] in units of the berry's volume radius."""
+    """Length and radius of the hulls of bunches [..., 2] in units of the berry's volume radius."""
     which = _prototype(count, seed)
     count = np.asarray(count)
     return np.stack([_tables()[0][which, count], _tables()[1][which]], -1)
 
 
 def segment_of(position: np.ndarray, length: float | np.ndarray, pieces: int | np.ndarray) -> np.ndarray:
-    """Which of the equal pieces of a rachis of this length points [..., 3] belong to; 0 is at the peduncle."""
+    """Index of the piece to which points [..., 3] belong if a rachis is cut into equal pieces; 0 is at the peduncle."""
     return np.clip((position[..., 0] * (pieces / length)).astype(int), 0, pieces - 1)
 
 
 def mass_by_segment(
     count: np.ndarray, seed: np.ndarray, pieces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How berries weigh on equal pieces of their rachis: bunches [n] cut into ``pieces`` [n], for unit mass and length.
+    """Mass of the berries on ``pieces`` [n] equal pieces of the rachis, for bunches [n] of unit mass and length.
 
-    Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3], axes of the
-    bunch's body; zero behind the last piece.
+    Returns:
+        Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3] in the
+        axes of the bunch's body; zero behind the last piece. ``most`` is the largest of ``pieces``.
     """
     which = _prototype(count, seed)
     position, radius = _packed()
@@ -131,7 +132,7 @@ def mass_by_segment(
 
 @functools.cache
 def _packed() -> tuple[np.ndarray, np.ndarray]:
-    """Positions [prototype, MOST, 3] and radii [prototype, MOST]; rounded as :func:`_tables` is."""
+    """Positions [prototype, MAX_BERRIES, 3] and radii [prototype, MAX_BERRIES], rounded as in :func:`_tables`."""
     position = np.zeros((len(prototypes()), MAX_BERRIES, 3))
     radius = np.zeros((len(prototypes()), MAX_BERRIES))
     for i, bunch in enumerate(prototypes()):
@@ -141,7 +142,7 @@ def _packed() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
-    """Number of the prototype: the next larger count, its shape by seed."""
+    """Index of a bunch's prototype: the next larger count, in the shape that the seed selects."""
     if np.min(count) < 1 or np.max(count) > MAX_BERRIES:
         raise ValueError(f"a bunch has 1 to {MAX_BERRIES} berries, not {np.min(count)} to {np.max(count)}")
     return np.searchsorted(PROTOTYPE_BERRIES, count) * len(_SHAPES) + np.asarray(seed, np.int64) % len(_SHAPES)
@@ -149,7 +150,7 @@ def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Length by prototype and count, radius by prototype; rounded so that a last bit cannot differ between machines."""
+    """Length by prototype and count, radius by prototype; rounded so that all machines have the same bits."""
     lengths = np.zeros((len(prototypes()), MAX_BERRIES + 1))
     for i, bunch in enumerate(prototypes()):
         reach = np.maximum.accumulate(bunch.position[:, 0] + bunch.radius)
@@ -178,7 +179,7 @@ def _scaled(which: int, count: int, length: float, radius: float, variety: int) 
 
 @functools.cache
 def prototypes() -> tuple[BerryLayout, ...]:
-    """The packed library, berries of unit volume radius sorted from the top of the bunch to its tip."""
+    """The packed prototypes: berries of unit volume radius, sorted from the top of the bunch to its tip."""
     digest = disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(frames.__file__))
     names = [field.name for field in dataclasses.fields(BerryLayout)]
 
@@ -220,7 +221,7 @@ def _pack() -> list[BerryLayout]:
 
 
 def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray, ...]:
-    """Loose berries around a rachis: position, foot, radius, rachis; units of the mean berry radius."""
+    """Position, foot and radius of loose berries, and their rachis, in units of the mean berry radius."""
     g = np.random.default_rng([seed, count])
     radius = np.clip(g.normal(1.0, _SPREAD, count), 0.8, 1.15)
     length = g.uniform(11.5, 13.5) * (count / 90.0) ** (1.0 / 3.0)
@@ -245,7 +246,7 @@ def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray,
 
 
 def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: list[int]) -> np.ndarray:
-    """Pack several bunches at once: pedicels pull for three quarters of the time, neighbours push all the time."""
+    """Pack several bunches at once: pedicels pull in the first 3/4 of the iterations, neighbours push in all."""
     p = position.copy()
     total = len(position)
     first = np.zeros(0, np.int64)
@@ -269,7 +270,7 @@ def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: li
 
 
 def _near(p: np.ndarray, sizes: list[int], reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of one bunch closer than ``reach``."""
+    """Pairs of berries of the same bunch that are closer than ``reach``."""
     firsts = []
     seconds = []
     start = 0

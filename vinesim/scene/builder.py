@@ -1,9 +1,8 @@
-"""Rods to bodies: how a segment of a rod gets its mass, inertia and joint springs, and trees become a :class:`Model`.
+"""Builds bodies from rods: mass, inertia and joint springs of segments; and assembles trees to a :class:`Model`.
 
-A segment of length h bends by half on either side of its middle, each half a spring 2EI/h. A joint is the two halves
-that
-meet there in series: EI/h within a rod, 2EI/h at a clamp, which adds no half (with EI/h the tip is 12.8 % off), and
-between unlike segments what their halves give in series.
+The bending of a segment of length h is split into two halves, each a spring of 2EI/h. A joint puts the two halves that
+meet there in series. This gives EI/h within a rod, and 2EI/h at a clamp, where there is only one half (with EI/h the
+deflection of the tip would be 12.8 % off). Unlike segments have unlike halves.
 """
 
 from __future__ import annotations
@@ -44,16 +43,16 @@ class RodMaterial:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BunchSegments:
-    """Bunches [n] cut across their rachis into a chain of segments of equal length: the head first, then clusters.
+    """Bunches [n] cut across the rachis into a chain of segments of equal length: first the head, then the clusters.
 
-    The frame of a segment is on the rachis where the segment begins, with the axes of the bunch. ``max`` is the largest
-    count of all bunches; rows of a bunch beyond its own count are zero.
+    The frame of a segment has its origin on the rachis at the beginning of the segment, and the axes of the bunch.
+    ``max`` is the largest count of all bunches; rows of a bunch beyond its own count are zero.
     """
 
     count: np.ndarray
-    """[n] segments of each bunch."""
+    """[n] number of segments of each bunch."""
     length: np.ndarray
-    """[n] m, of one segment."""
+    """[n] m, length of one segment."""
     mass: np.ndarray
     """[n, max] kg"""
     com: np.ndarray
@@ -61,13 +60,12 @@ class BunchSegments:
     inertia: np.ndarray
     """[n, max, 3] kg m^2, principal moments about the centre of mass."""
     radius: np.ndarray
-    """[n, max, 2] m, of the bunch's hull where a segment begins and ends."""
+    """[n, max, 2] m, radius of the bunch's hull at both ends of a segment."""
     stiffness: np.ndarray
-    """[n, max, 3] N m/rad, of the joint where a segment begins; the head's is the peduncle's."""
+    """[n, max, 3] N m/rad, stiffness of the joint at the beginning of a segment; for the head, of the peduncle."""
 
     def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, in the head's
-        frame."""
+        """Mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, head's frame."""
         along = self.length[:, None] * np.arange(self.mass.shape[1])
         centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
         mass = self.mass.sum(1)
@@ -87,15 +85,14 @@ def segment_bunches(
     rachis: plant_parameters.Rachis,
     stem_share: float,
 ) -> BunchSegments:
-    """Cut bunches [n] into segments that weigh what their own berries and stems weigh: a head and four to eight
-    clusters.
+    """Cut bunches [n] into a head and four to eight clusters; each segment has the mass of its own berries and stems.
 
     Args:
         mass: [n] kg.
-        length: [n] m, of the hull.
-        radius: [n] m, of the hull.
-        berry_count: [n].
-        seed: [n], which prototype of :mod:`vinesim.scene.berries`.
+        length: [n] m, length of the hull.
+        radius: [n] m, radius of the hull.
+        berry_count: [n] number of berries.
+        seed: [n] seed that selects the prototype of :mod:`vinesim.scene.berries`.
         rachis: parameters of the stem inside the bunch.
         stem_share: share of the mass that is stem.
     """
@@ -109,7 +106,7 @@ def segment_bunches(
     fruit = juice[:, None] * share
     com = com * length[:, None, None] - (h[:, None] * number)[..., None] * [1.0, 0.0, 0.0]
     inertia = juice[:, None, None] * inertia * (length * length)[:, None, None]
-    # a rod along the axis joins the berries
+    # the stem is a rod along the axis
     middle = np.where(here, 0.5 * h[:, None], 0.0)[..., None] * [1.0, 0.0, 0.0]
     total = np.where(here, fruit + stem, 1.0)[..., None]
     both = np.where(here[..., None], (fruit[..., None] * com + stem[..., None] * middle) / total, 0.0)
@@ -134,21 +131,21 @@ def segment_bunches(
 
 
 class TreeBuilder:
-    """Builds one tree: a list of bodies, parents before children, numbered from 0, the root.
+    """Builds one tree as a list of bodies, parents before children. The root has number 0.
 
-    Berry clusters are listed apart: :func:`assemble` numbers them behind all other bodies of their tree.
+    Berry clusters are in a separate list: :func:`assemble` numbers them after all other bodies of their tree.
     """
 
     def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
         """``pose`` [7]: the root's joint frame in the world; ``vine``: number of the vine, -1 for none.
 
-        :class:`ValueError` if the pose is none.
+        :class:`ValueError` if ``pose`` is not a pose.
         """
         self.pose = frames.checked_pose("tree: pose", pose)
         self.vine = vine
         self.bodies: list[dict[str, Any]] = []
         self.clusters: list[dict[str, Any]] = []
-        """Bodies behind the core, bunch by bunch; ``parent`` None is the cluster before."""
+        """Berry clusters, bunch by bunch; ``parent`` None means the cluster before."""
         self.bunches: list[dict[str, Any]] = []
         self.leaves: list[dict[str, Any]] = []
 
@@ -157,9 +154,8 @@ class TreeBuilder:
     ) -> int:
         """Append one body with explicit :class:`Model` fields (names without prefix) and return its number.
 
-        ``offset`` [3] m and ``rest`` [4] place its joint in the frame of ``parent`` (-1: the world's root frame).
-        :class:`ValueError` if the parent is not in the list yet, for a field that bodies do not have, or for a number
-        that no body can have.
+        ``offset`` [3] m and ``rest`` [4] place its joint in the frame of ``parent`` (-1: the tree's root frame).
+        :class:`ValueError` if the parent is not in the list, for an unknown field, or for a number out of range.
         """
         if not -1 <= parent < len(self.bodies):
             raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
@@ -184,20 +180,20 @@ class TreeBuilder:
     ) -> list[int]:
         """Append a (tapered) round rod as a chain of ``segments`` bodies and return their numbers.
 
-        The first joint is half a segment of this rod in series with what of the parent, if that is a segment of a rod,
-        lies between its middle and the joint; each part damps with its own material. :class:`ValueError` if a number is
-        not positive.
+        The spring of the first joint is half a segment of this rod, in series with the part of the parent between its
+        middle and the joint if the parent is a segment of a rod. Each part damps with its own material.
+        :class:`ValueError` if a number is not positive.
 
         Args:
-            parent: body that it grows on, -1 for a rod clamped at the root frame.
-            length: [m].
-            radius: [m] at the base and at the tip.
-            material: of the whole rod.
+            parent: body on which the rod grows, -1 for a rod clamped at the root frame.
+            length: length [m].
+            radius: radii at the base and at the tip [m].
+            material: material of the whole rod.
             segments: number of bodies.
-            organ: what the rod is.
-            offset: [3] m, the joint in the parent's frame; the parent's tip unless given.
-            rest: [4] rotation of the first segment against the parent.
-            bends: [segments, 4] rotation of each segment against the one before; straight unless given.
+            organ: organ of the bodies.
+            offset: [3] m, position of the joint in the parent's frame; the parent's tip unless given.
+            rest: [4] rotation of the first segment relative to the parent.
+            bends: [segments, 4] rotation of each segment relative to the one before; straight unless given.
         """
         if not (min(length, *radius, material.modulus, material.density) > 0.0 and segments >= 1):
             raise ValueError(
@@ -211,7 +207,7 @@ class TreeBuilder:
         above = self.bodies[parent] if 0 <= parent < len(self.bodies) else {}
         if offset is None:
             offset = (above.get("length", 0.0), 0.0, 0.0)
-        # [rad/N m] of the lower halves, and with the wood's damping
+        # compliance of each joint [rad/N m], plain and weighted with damping
         slack = 1.0 / near
         damped = material.damping / near
         slack[1:] += 1.0 / far[:-1]
@@ -271,19 +267,19 @@ class TreeBuilder:
 
         Args:
             parent: the last segment of the peduncle.
-            mass: [kg].
+            mass: mass of the bunch [kg].
             count: number of berries, 1 to 140.
-            seed: which prototype of :mod:`vinesim.scene.berries`.
+            seed: seed that selects the prototype of :mod:`vinesim.scene.berries`.
             variety: index into :data:`vinesim.scene.berries.VARIETIES`.
-            rest: [4] rotation against the parent.
-            offset: [3] m, its joint in the parent's frame; the parent's tip unless given.
-            stiffness: [3] N m/rad of its joint; the parent's unless given.
-            damping: [3] N m s/rad of its joint; the parent's unless given.
-            clusters: whether it can be refined into berry clusters.
-            parameters: of the rachis; ``data/plants/vine.toml`` unless given.
+            rest: [4] rotation relative to the parent.
+            offset: [3] m, position of the joint in the parent's frame; the parent's tip unless given.
+            stiffness: [3] N m/rad, stiffness of the joint; the parent's unless given.
+            damping: [3] N m s/rad, damping of the joint; the parent's unless given.
+            clusters: whether the bunch can be refined into berry clusters.
+            parameters: parameters of the rachis; ``data/plants/vine.toml`` unless given.
             **fields: further ``bunch_`` fields of the :class:`Model`.
 
-        :class:`ValueError` if the parent is not in the list, or for numbers that no bunch can have.
+        :class:`ValueError` if the parent is not in the list, or for a number out of range.
         """
         parent = checked_index("body", parent, len(self.bodies))
         variety = checked_index("variety", variety, len(berries.VARIETIES))
@@ -371,7 +367,7 @@ _FIELDS = {"offset", "rest", "organ", "com", "settled", *_POSITIVE, *_NOT_NEGATI
 
 
 def _check_fields(body: int, fields: dict[str, Any]) -> None:
-    """:class:`ValueError` naming the first field that a body does not have, or whose value it cannot have."""
+    """Raise :class:`ValueError` naming the first field that is unknown or has an invalid value."""
     for name, given in fields.items():
         if name not in _FIELDS:
             raise ValueError(f"body {body} has no field {name!r}; it has: {', '.join(sorted(_FIELDS))}")
@@ -385,7 +381,7 @@ def _check_fields(body: int, fields: dict[str, Any]) -> None:
 
 
 def shear_modulus(modulus: Any) -> Any:
-    """Shear modulus [...] Pa of wood with Young's modulus [...] Pa: that of Poisson's ratio 0.3."""
+    """Shear modulus [...] Pa of wood with Young's modulus [...] Pa, for Poisson's ratio 0.3."""
     return modulus / 2.6
 
 
@@ -399,13 +395,13 @@ def segment_properties(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Mass [...] kg, moments of inertia [..., 3] kg m^2 and half springs of tapered round segments of a rod.
 
-    The half springs are [..., 3] N m/rad each, near the start and far from it: twist, and bending by two axes. Each
-    half has the cross-section at its end of the segment, where the joints are.
+    The two half springs, near the start and near the end, are [..., 3] N m/rad each: torsion, and bending about two
+    axes. Each half has the cross-section at its end of the segment, where the joint is.
 
     Args:
         length: [...] m.
-        start: [...] m, radius where a segment begins.
-        end: [...] m, radius where it ends.
+        start: [...] m, radius at the beginning of a segment.
+        end: [...] m, radius at its end.
         modulus: [...] Pa, Young's modulus.
         density: [kg/m^3].
         shear: shear modulus [Pa]; Young's modulus / 2.6 unless given.
@@ -425,12 +421,12 @@ def segment_properties(
 
 
 def solve_rest_pose(model: Model) -> Model:
-    """Turn rest rotations that hold the *drawn* shape into slack ones, so that the drawn shape is in equilibrium.
+    """Convert rest rotations that describe the *drawn* shape so that the drawn shape is in equilibrium under gravity.
 
-    Each spring must carry the weight that hangs below its joint, so its slack axes are turned by the theta at which
-    the gradient of theta^T K theta / 2 is the torque, and ``joint_settled`` turns them back: drawn = rest * settled.
-    Writes both fields of the model and returns it. The weight of a bunch with clusters is that of its head and its
-    clusters. :class:`ValueError` if a joint has no stiffness.
+    Each spring must carry the weight that hangs on its joint. So its slack axes are rotated by the theta at which the
+    gradient of theta^T K theta / 2 equals the torque, and ``joint_settled`` rotates them back: drawn = rest * settled.
+    Writes both fields of the model and returns it. The weight of a bunch with clusters is the weight of its head and
+    its clusters. :class:`ValueError` if a joint has no stiffness.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
@@ -456,7 +452,7 @@ def solve_rest_pose(model: Model) -> Model:
     local = frames.rotate(frames.conjugate(world[:, 3:]), moment)
     theta = np.zeros((len(drawn), 3))
     open_joints = np.arange(len(drawn))
-    for _ in range(60):  # the joint's middle axes depend on the answer; the map contracts for theta below ~1 rad
+    for _ in range(60):  # the joint's middle axes depend on theta; the map contracts for theta below about 1 rad
         before = theta[open_joints]
         torque = _without_curvature(before, frames.rotate(frames.exp(0.5 * before), local[open_joints]))
         theta[open_joints] = after = torque / model.joint_stiffness[open_joints]
@@ -471,10 +467,9 @@ def solve_rest_pose(model: Model) -> Model:
 
 
 def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """K theta [n, 3] of springs at rotation vectors theta [n, 3] rad that hold a torque [n, 3] N m in middle axes.
+    """K theta [n, 3] of springs at rotation vectors theta [n, 3] rad whose torque in middle axes is ``torque`` [n, 3].
 
-    The inverse of torque = s K theta + (1 - s) n n^T K theta, see ``spring_torque`` in
-    :mod:`vinesim.kernels.plants.forces`.
+    It solves torque = s K theta + (1 - s) n n^T K theta, see ``spring_torque`` in :mod:`vinesim.kernels.plants.forces`.
     """
     half = 0.5 * np.linalg.norm(theta, axis=1, keepdims=True)
     along = theta / np.maximum(2.0 * half, 1e-12)
@@ -483,8 +478,7 @@ def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
-    """One :class:`Model` of all trees, in their order; ``others`` are arrays of its further fields
-    (``fixed_start=...``)."""
+    """One :class:`Model` of all trees in the given order; ``others`` are its other arrays (``fixed_start=...``)."""
     counts = {
         "tree": len(trees),
         "body": sum(len(t.bodies) + len(t.clusters) for t in trees),

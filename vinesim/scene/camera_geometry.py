@@ -9,9 +9,9 @@ import numpy as np
 from vinesim.scene.values import CameraFrame, CameraInfo
 
 MAX_MILLIMETRES = 65535.5
-"""From this depth [mm] on 16 bits cannot hold it."""
+"""Depths from this value on [mm] overflow 16 bits."""
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
-"""One point: metres in the optical frame, colour packed as 0x00RRGGBB (the PCL's convention)."""
+"""One point of a cloud: metres in the optical frame, colour packed as 0x00RRGGBB (as in the PCL)."""
 
 
 def intrinsic_matrix(info: CameraInfo) -> list[float]:
@@ -20,16 +20,16 @@ def intrinsic_matrix(info: CameraInfo) -> list[float]:
 
 
 def distortion_model(info: CameraInfo) -> tuple[str, tuple[float, ...]]:
-    """Name of the model of distortion and its coefficients D, as sensor_msgs/CameraInfo has them."""
+    """Name of the distortion model and its coefficients D, as in sensor_msgs/CameraInfo."""
     coefficients = info.distortion or NONE
     return MODELS[len(coefficients)], coefficients
 
 
 @functools.lru_cache(maxsize=16)
 def pixel_rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
-    """x per z and y per z of pixels, float32, to be broadcast: [1, width] and [height, 1] of a pinhole.
+    """Ratios x / z and y / z of the ray through each pixel, float32. Pixel centres are whole numbers.
 
-    Of a lens with distortion both are [height, width]. Pixel centres are whole numbers.
+    The shapes are [1, width] and [height, 1] for a pinhole, to be broadcast, and [height, width] for a distorting lens.
     """
     across = (np.arange(info.width, dtype=np.float32)[None] - np.float32(info.cx)) / np.float32(info.fx)
     down = (np.arange(info.height, dtype=np.float32)[:, None] - np.float32(info.cy)) / np.float32(info.fy)
@@ -55,7 +55,7 @@ def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
 def back_project(pixels: np.ndarray, depth: np.ndarray, info: CameraInfo) -> np.ndarray:
     """Points [..., 3] m in the optical frame that appear at pixels [..., 2] (column, row) at depths [...] m.
 
-    The inverse of :func:`project_points`; pixels need not be whole. NaN where the lens shows nothing.
+    The inverse of :func:`project_points`; pixels need not be whole. NaN at pixels that no ray reaches.
     """
     rays = (np.asarray(pixels, float) - [info.cx, info.cy]) / [info.fx, info.fy]
     if info.distortion:
@@ -65,8 +65,7 @@ def back_project(pixels: np.ndarray, depth: np.ndarray, info: CameraInfo) -> np.
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth [height, width] m as the 16UC1 of REP-118: millimetres, 0 where nothing was measured or 16 bits
-    overflow."""
+    """Depth [height, width] m as 16UC1 of REP-118: millimetres, 0 where nothing was measured or 16 bits overflow."""
     millimetres = np.where(np.isfinite(depth), depth * 1000.0, 0.0)
     return np.where(millimetres < MAX_MILLIMETRES, np.round(millimetres), 0.0).astype(np.uint16)
 
@@ -83,16 +82,16 @@ def write_points(frame: CameraFrame, points_out: np.ndarray) -> None:
 
 
 def measured_points(frame: CameraFrame, step: int = 1) -> np.ndarray:
-    """Measured pixels as :data:`POINT_DTYPE` [point], in the optical frame; of every ``step``-th row and column."""
+    """Measured pixels of every ``step``-th row and column as :data:`POINT_DTYPE` [point], in the optical frame."""
     cloud = np.empty(frame.depth.shape, POINT_DTYPE)
     write_points(frame, cloud)
     cloud = cloud[::step, ::step]
     return cloud[np.isfinite(cloud["z"])]
 
 
-# Distortion of lenses as in sensor_msgs/CameraInfo and OpenCV: plumb_bob (Brown 1966) and rational_polynomial.
+# Lens distortion as in sensor_msgs/CameraInfo and OpenCV: plumb_bob (Brown 1966) and rational_polynomial.
 #
-# Coefficients are k1 k2 p1 p2 k3, of the second model k4 k5 k6 as well. A point x, y of the plane at depth 1 appears at
+# The coefficients are k1 k2 p1 p2 k3; the second model adds k4 k5 k6. A point x, y of the plane at depth 1 appears at
 #
 #     x (1 + k1 r2 + k2 r2^2 + k3 r2^3) / (1 + k4 r2 + k5 r2^2 + k6 r2^3) + 2 p1 x y + p2 (r2 + 2 x^2), r2 = x^2 + y^2
 #
@@ -105,11 +104,11 @@ NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
 """No distortion."""
 _STEPS = 20
 _TOLERANCE = 1e-9
-"""Of points of the plane at depth 1; a pixel is a thousandth there."""
+"""Tolerance of Newton's method for points of the plane at depth 1, where a pixel is about 1e-3 wide."""
 
 
 def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """The radial factor and its derivative by r2."""
+    """The radial factor of the distortion and its derivative with respect to r2."""
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
     above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
@@ -119,7 +118,7 @@ def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.nd
 
 
 def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Where points [..., 2] of the plane at depth 1 appear in it [..., 2]."""
+    """Distorted positions [..., 2] of points [..., 2] in the plane at depth 1."""
     x = points[..., 0]
     y = points[..., 1]
     r2 = x * x + y * y
@@ -135,7 +134,7 @@ def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def _jacobian(points: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of :func:`distort`: of x by x, of x by y (and of y by x, which is equal), of y by y."""
+    """Derivatives of :func:`distort`: dx/dx, dx/dy (which equals dy/dx) and dy/dy."""
     x = points[..., 0]
     y = points[..., 1]
     p1, p2 = coefficients[2:4]
@@ -148,10 +147,10 @@ def _jacobian(points: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.n
 
 
 def undistort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """The points [..., 2] of the plane at depth 1 that appear at ``points`` [..., 2]; NaN where there is none.
+    """Inverse of :func:`distort` by Newton's method; NaN for ``points`` [..., 2] without an inverse.
 
-    By Newton's method. A point counts only if the map is one-to-one on the way to it from the axis: beyond, a lens
-    that these coefficients describe would show two directions at one place.
+    A solution counts only if the map is one-to-one from the axis up to it. Further out, a lens with these coefficients
+    would show two directions at one point.
     """
     points = np.asarray(points, float)
     found = points.copy()

@@ -1,10 +1,10 @@
-"""Single canes from a few numbers: length, radius, Young's modulus, tip mass, damping ratio, shape.
+"""Builds single canes from a few numbers: length, radius, Young's modulus, tip mass, damping ratio, shape.
 
     builder = CaneBuilder(length=1.0, radius=(0.006, 0.003), tip_mass=0.2, damping_ratio=0.05)
     model = builder.build()  # one cane
     model = assemble([builder, CaneBuilder()])  # several
 
-Branches and bunches are added through :meth:`CaneBuilder.tree`.
+To add branches and bunches, use :meth:`CaneBuilder.tree`.
 """
 
 from __future__ import annotations
@@ -34,34 +34,35 @@ class CaneBuilder:
     length: float = 1.0
     """[m]"""
     radius: float | tuple[float, float] = 0.004
-    """[m] Of the rod, or at its base and at its tip."""
+    """[m] Radius of the rod, or its radii at the base and at the tip."""
     youngs_modulus: float = 5e9
-    """[Pa] Of bending; the shear modulus is E / 2.6 (Poisson's ratio 0.3)."""
+    """[Pa] Young's modulus E of bending; the shear modulus is E / 2.6 (Poisson's ratio 0.3)."""
     density: float = 800.0
     """[kg/m^3]"""
     segments: int = 16
-    """Rigid bodies that the cane is cut into."""
+    """Number of rigid bodies of the cane."""
     tip_mass: float = 0.0
     """[kg] A point mass at the tip."""
     damping_ratio: float | None = None
-    """[1] Of the first bending mode (see :meth:`first_mode`); sets ``beta`` = 2 ratio / angular frequency."""
+    """[1] Damping ratio of the first bending mode (see :meth:`first_mode`); it sets ``beta`` = 2 ratio / angular
+    frequency."""
     beta: float | None = None
-    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or the ratio is
+    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or ``damping_ratio`` is
     given."""
     pose: np.ndarray | tuple[float, ...] = _HORIZONTAL
-    """[7] m, 1: the base in the world (position, quaternion xyzw); the cane grows along its x axis."""
+    """[7] m, 1, pose of the base in the world (position, quaternion xyzw); the cane grows along its x axis."""
     base: Literal["clamped", "pinned"] = "clamped"
     """``pinned``: the base joint has no spring, so that the cane swings on it as a pendulum."""
     bends: np.ndarray | None = None
-    """[segments, 3] rad: rotation vector of each segment against the one before it, in the drawn shape. Straight
-    unless given."""
+    """[segments, 3] rad, rotation vector of each segment relative to the segment before it, in the drawn shape. By
+    default the cane is straight."""
     shape: Literal["slack", "equilibrium"] = "slack"
-    """What the drawn shape is: where all springs are ``slack`` (released there, the cane sags under its weight), or the
-    ``equilibrium`` under gravity (released there, it stays)."""
+    """State of the drawn shape. In ``slack`` all springs are slack, and a released cane sags under its weight. In
+    ``equilibrium`` the springs balance gravity, and a released cane stays."""
 
     @property
     def angular_stiffness(self) -> np.ndarray:
-        """[segments] N m/rad: bending stiffness of each joint, base first."""
+        """[segments] N m/rad, bending stiffness of each joint, base first."""
         return np.array([body["stiffness"][2] for body in self.tree().bodies])
 
     @functools.cached_property
@@ -84,8 +85,8 @@ class CaneBuilder:
     def first_mode(self) -> float:
         """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
 
-        The mode is that of the chain of segments; for many segments it tends to the Euler-Bernoulli beam's,
-        1.8751^2 sqrt(E I / (rho A L^4)) for a cane without taper or tip mass.
+        It is the mode of the chain of segments. With many segments it converges to the mode of the Euler-Bernoulli
+        beam, 1.8751^2 sqrt(E I / (rho A L^4)) for a cane without taper and tip mass.
         """
         self._check()
         bodies = self._undamped.bodies
@@ -96,7 +97,7 @@ class CaneBuilder:
         com = joint + np.array([body["com"][0] for body in bodies])
         mass = np.array([body["mass"] for body in bodies])
         inertia = np.array([body["inertia"][2] for body in bodies])
-        outer = np.tril(np.ones((self.segments, self.segments)))  # [segment, joint]: the joint lies inside of it
+        outer = np.tril(np.ones((self.segments, self.segments)))  # [segment, joint]: 1 if the joint carries the segment
         way = outer * (com[:, None] - joint)
         matrix = way.T @ (mass[:, None] * way) + outer.T @ (inertia[:, None] * outer)
         root = 1.0 / np.sqrt(stiffness)
@@ -157,7 +158,7 @@ def _is_finite(value: object) -> bool:
 
 
 def _add_point_mass(body: dict, mass: float) -> None:
-    """Add a point mass [kg] at the tip of a segment: mass, centre and moments of inertia of both together."""
+    """Add a point mass [kg] at the tip of a segment to the segment's mass, centre of mass and moments of inertia."""
     own = body["mass"]
     com = body["com"][0]
     tip = body["length"]
@@ -173,5 +174,5 @@ def cane(**fields: object) -> Model:
 
 
 def assemble(canes: Iterable[CaneBuilder | TreeBuilder]) -> Model:
-    """One model of several canes; each is a tree, numbered in the order given."""
+    """One model of several canes. Each cane is a tree; trees are numbered in the given order."""
     return builder.assemble([one.tree() if isinstance(one, CaneBuilder) else one for one in canes])

@@ -1,7 +1,7 @@
 """Names and numbers that stay the same on every client: organs, and ids of objects.
 
-The scene hash and these ids are all that clients share of the vineyard; tree 17 is tree 17 everywhere,
-because generation from (scene file, seed) is deterministic.
+Clients exchange only the scene hash and these ids. Tree 17 is the same tree on every client, because generation from
+(scene file, seed) is deterministic.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import enum
 
 
 class Organ(enum.IntEnum):
-    """What a piece of matter is: the class of label images, COCO categories and the material table."""
+    """What an object is: the class in label images, in COCO categories and in the material table."""
 
     NOTHING = 0
     GROUND = 1
@@ -32,48 +32,48 @@ class ObjectKind(enum.IntEnum):
 
     TREE = 0
     BUNCH = 1
-    """A free bunch; while it hangs it is part of its tree."""
+    """A picked bunch; a hanging bunch is part of its tree."""
     BOX = 2
 
 
 OBJECT_STRIDE = 1 << 24
-"""An object id is ``kind * OBJECT_STRIDE + index``: ids of trees equal their indices."""
+"""An object id is ``kind * OBJECT_STRIDE + index``, so that ids of trees equal their indices."""
 
 
 def object_id(kind: ObjectKind, index: int) -> int:
-    """The id of a tree, a free bunch or a box; index counts each kind from 0."""
+    """The id of a tree, a free bunch or a box. ``index`` counts the objects of each kind from 0."""
     return int(kind) * OBJECT_STRIDE + index
 
 
 def split_object_id(value: int) -> tuple[ObjectKind, int]:
-    """Kind and index of an object; :class:`ValueError` for a number of no kind."""
+    """Kind and index of an object id; :class:`ValueError` for a number that is not an object id."""
     return ObjectKind(value // OBJECT_STRIDE), value % OBJECT_STRIDE
 
 
 def is_tree(value: int) -> bool:
-    """Whether an object is a tree; all others are rigid."""
+    """Whether an object id belongs to a tree; all other objects are rigid."""
     return value < OBJECT_STRIDE
 
 
 def object_name(value: int) -> str:
-    """Name of the link of a box or a free bunch: ``box/3``."""
+    """Link name of a box or a free bunch, such as ``box/3``."""
     kind, index = split_object_id(value)
     return f"{kind.name.lower()}/{index}"
 
 
 def parse_object_name(name: str) -> int | None:
-    """Id of the box or free bunch of a name like ``box/3``; None for other names."""
+    """Object id of the box or free bunch with a name such as ``box/3``; None for other names."""
     kind, _, index = name.partition("/")
     rigid = {"bunch": ObjectKind.BUNCH, "box": ObjectKind.BOX}
     return object_id(rigid[kind], int(index)) if kind in rigid and index.isdecimal() else None
 
 
 LABEL_STRIDE = 1 << 20
-"""Label images hold ``organ * LABEL_STRIDE + index``: organ and instance in one int32."""
+"""A label in label images is ``organ * LABEL_STRIDE + index``, one int32 for organ and instance."""
 
 
 def label(organ: Organ, index: int) -> int:
-    """The label of one object in a label image; index counts bunches, boxes, trees or actors from 0."""
+    """The label of one object in a label image. ``index`` counts bunches, boxes, trees or actors from 0."""
     return int(organ) * LABEL_STRIDE + index
 
 

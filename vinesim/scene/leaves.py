@@ -1,8 +1,8 @@
 """The outline of a vine leaf: five lobes, saw teeth, and a sinus where the petiole joins.
 
-Polar form around the petiole's junction, theta = 0 at the tip. A lobe at angle t with tip at distance L is the wedge
-``r = L / (cos D + kappa |sin D|)``, D = theta - t; the blade is the union of its lobes. All lengths are in units of
-``Model.leaf_size``, half of the blade's greatest width.
+The outline is in polar form around the petiole's junction, with theta = 0 at the tip. A lobe at angle t with its tip at
+distance L is the wedge ``r = L / (cos D + kappa |sin D|)``, D = theta - t; the blade is the union of its lobes. All
+lengths are in units of ``Model.leaf_size``, half of the blade's largest width.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from vinesim.scene.plant_parameters import Leaf
 from vinesim.scene.spec import Scene
 
 SHAPE_COUNT = 4
-"""How many outlines there are, from deeply cut to round."""
+"""Number of different outlines, from deeply cut to round."""
 
 _LOBES = ((0.0, 1.0), (np.radians(54.0), 0.88), (np.radians(112.0), 0.66))
 """Angle [rad] and length of middle, upper and lower lobes."""
 _KAPPA = ((1.15, 1.0, 0.75), (1.45, 1.3, 0.9), (0.95, 0.85, 0.65), (1.3, 1.15, 0.8))
-"""Slenderness of those lobes in each shape."""
+"""Slenderness kappa of the middle, upper and lower lobes in each shape."""
 _TEETH = 0.075
 _TEETH_PER_LOBE = 11.0
 
 
 def _blade(theta: np.ndarray, shape: int) -> np.ndarray:
-    """Radius in units of the middle lobe."""
+    """Radius of the outline in units of the length of the middle lobe."""
     radius = np.full_like(theta, 0.05)
     for (angle, length), kappa in zip(_LOBES, _KAPPA[shape], strict=True):
         for side in (1.0, -1.0) if angle else (1.0,):
@@ -62,36 +62,36 @@ def blade_area(shape: int = 0) -> float:
 
 
 def blade_shape(leaf: np.ndarray) -> np.ndarray:
-    """Which outline a leaf of that number has [leaf]: the same on every client."""
+    """Index of the outline [leaf] of leaves with these numbers; equal on all clients."""
     scrambled = np.asarray(leaf, np.uint32) * np.uint32(2654435761)
     return (scrambled >> np.uint32(16)).astype(np.int32) % SHAPE_COUNT
 
 
-# Leaves at nodes of shoots, from random numbers: petiole, blade, age, and what they weigh and how they drag.
+# Leaves at nodes of shoots, from random numbers: petiole, blade, age, mass and drag.
 
 
 LATERAL_AREA = 0.55
-"""[1] Area of a leaf of a side shoot over one of a main axis. GUESSED."""
+"""[1] Ratio of the leaf area on a side shoot to the leaf area on a main axis. GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LeafNodes:
-    """Where leaves stand on their bodies; all arrays broadcast against [...]."""
+    """Positions of leaves on their bodies; all arrays broadcast against [...]."""
 
     turn: np.ndarray
     """[..., 4] quaternion of the body in the world."""
     along: np.ndarray
-    """[...] m from the body's origin."""
+    """[...] m, distance of the node from the body's origin."""
     thick: np.ndarray
-    """[...] m, radius of the body there."""
+    """[...] m, radius of the body at the node."""
     share: np.ndarray
-    """[...] of the length of the axis, from its base."""
+    """[...] position of the node as a fraction of the axis' length, from its base."""
     up: np.ndarray
-    """[..., 3] across which, and across the axis, leaves stand on either side."""
+    """[..., 3] direction perpendicular to the plane in which leaves stand on both sides of the axis."""
     hand: np.ndarray
-    """[..., 1] 1 or -1: on which side."""
+    """[..., 1] side of the leaf, 1 or -1."""
     grown: np.ndarray
-    """[...] area of a grown leaf there over that of one on a main axis."""
+    """[...] ratio of the area of a grown leaf at this node to the area on a main axis."""
 
 
 def grow_leaves(
@@ -100,14 +100,14 @@ def grow_leaves(
     """Leaves of a scene's season at ``nodes``.
 
     Args:
-        scene: its season and training.
-        leaf: sizes and weights.
-        nodes: where.
-        normal: [8, ...] standard normal numbers.
-        uniform: [4, ...] uniform numbers.
+        scene: gives season and training.
+        leaf: sizes and weights of leaves.
+        nodes: positions of the leaves.
+        normal: [8, ...] standard normal random numbers.
+        uniform: [4, ...] uniform random numbers.
 
     Returns:
-        ``present`` [...] whether it has not fallen; ``base`` [..., 3] m and ``pose`` [..., 7] as in
+        ``present`` [...] is false for fallen leaves; ``base`` [..., 3] m and ``pose`` [..., 7] are as in
         :class:`~vinesim.scene.model.Model`; ``area`` [...] m^2; ``age`` [...]; ``mass`` [...] kg; ``drag`` [...] m^2.
     """
     forward, rise, droop, swing, *lean, ageing = normal[..., None]
@@ -131,7 +131,7 @@ def grow_leaves(
     base = np.stack([along, 0.0 * along, 0.0 * along], -1) + nodes.thick[..., None] * local
     blade = base + petiole[..., None] * local
 
-    # blades lie on the light: flat over the net, hanging and facing outwards in a hedge
+    # blades face the light: flat over the net in a tendone, hanging and facing outwards in a hedge
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
     midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
     upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)
@@ -157,18 +157,18 @@ def add_point_masses(
     weight: np.ndarray,
     where: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Bodies with point masses; products of inertia are dropped.
+    """Add point masses to bodies; products of inertia are dropped.
 
     Args:
         mass: [body...] kg.
         com: [body..., 3] m, in body frames.
         inertia: [body..., 3] kg m^2, principal moments about the centre of mass.
         at: indices [...] of the bodies.
-        weight: [...] kg.
-        where: [..., 3] m, in body frames.
+        weight: [...] kg, the point masses.
+        where: [..., 3] m, their positions in body frames.
 
     Returns:
-        Mass, centre of mass and moments of inertia.
+        New arrays of mass, centre of mass and moments of inertia.
     """
     total = mass.copy()
     first = mass[..., None] * com
@@ -176,11 +176,11 @@ def add_point_masses(
     np.add.at(total, at, weight)
     np.add.at(first, at, weight[..., None] * where)
     np.add.at(second, at, weight[..., None] * _squared_distances(where))
-    com = first / np.where(total > 0.0, total, 1.0)[..., None]  # none in slots that are left out
+    com = first / np.where(total > 0.0, total, 1.0)[..., None]  # masked slots have no mass
     return total, com, second - total[..., None] * _squared_distances(com)
 
 
 def _squared_distances(p: np.ndarray) -> np.ndarray:
-    """Squared distance of points from the three axes."""
+    """Squared distances [..., 3] of points [..., 3] from the three axes."""
     square = p * p
     return square.sum(-1, keepdims=True) - square

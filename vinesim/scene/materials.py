@@ -18,10 +18,10 @@ from vinesim.scene.plant_parameters import Number
 
 
 class Material(enum.IntEnum):
-    """What the surface of a body is made of, as far as contacts depend on it."""
+    """Material of a body's surface, as far as contacts depend on it."""
 
     UNKNOWN = 0
-    """Of no pair in the table."""
+    """Material for which the table lists no pair."""
     BARK = 1
     """Canes, arms and trunks."""
     SHOOT = 2
@@ -33,7 +33,7 @@ class Material(enum.IntEnum):
     RUBBER = 5
     PLASTIC = 6
     STEEL = 7
-    """And other bare metal."""
+    """Steel and other bare metal."""
     SOIL = 8
 
 
@@ -47,7 +47,7 @@ OF_ORGAN = {
     Organ.BUNCH: Material.BERRY,
     Organ.BOX: Material.PLASTIC,
 }
-"""Materials of plants, trellis and crates; a pole is of no known material."""
+"""Materials of plants, trellis and crates; poles are missing, because their material is unknown."""
 
 
 class Quantity(NamedTuple):
@@ -82,8 +82,8 @@ def materials_of_organs(organs: np.ndarray) -> np.ndarray:
 def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarray:
     """One of :data:`QUANTITIES` of each two materials, symmetric [material, material].
 
-    ``default``: of pairs that the file does not list. ``name``: of a file in ``data/materials``, or a path. Raises
-    :class:`DataError` for a pair or a unit that it cannot be.
+    ``default`` is used for pairs that the file does not list. ``name`` is the name of a file in ``data/materials``, or
+    a path. Raises :class:`DataError` for an unknown pair or a wrong unit.
     """
     table = np.full((len(Material), len(Material)), float(default))
     for (a, b), value in _listed(quantity, name).items():

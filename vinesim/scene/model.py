@@ -1,12 +1,13 @@
 """The constants of one generated vineyard: flat arrays, written once, shared by all packages.
 
-Plants are *trees* of rigid *bodies* (Featherstone's word; a body is a piece of cane, of peduncle, or a bunch).
+Plants are *trees* of rigid *bodies* (Featherstone's term). A body is a segment of cane or peduncle, or a bunch.
 The bodies of a tree are contiguous and in topological order: a parent comes before its children.
 Every organ grows along its body's +x axis, from the joint at the body's origin.
 
-Body ``b`` hangs on a ball joint. Its joint frame is fixed in the parent: origin ``body_offset``, axes ``body_rest``;
-``State.joint_q`` turns the body against that frame, and at ``joint_q`` = identity the spring is slack.
-So ``world pose of b = pose of parent * (body_offset, body_rest) * (0, joint_q)``. Roots hang on ``tree_pose``.
+A ball joint connects body ``b`` to its parent. The joint frame is fixed in the parent, with origin ``body_offset`` and
+axes ``body_rest``. ``State.joint_q`` is the rotation of the body relative to the joint frame; the spring is slack at
+``joint_q`` = identity. So ``world pose of b = pose of parent * (body_offset, body_rest) * (0, joint_q)``. For a root,
+``tree_pose`` takes the place of the parent's pose.
 """
 
 from __future__ import annotations
@@ -26,21 +27,22 @@ _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 @dataclasses.dataclass
 class Model(StructOfArrays):
-    """Constants of a vineyard (units in the declarations; frames in the module's text)."""
+    """Constants of a vineyard. The declarations give the units, the module docstring explains the frames."""
 
-    # trees: the smallest unit that wakes, sleeps, is owned and is transmitted
+    # a tree is the smallest unit that wakes, sleeps, is owned and is transmitted
     tree_first: np.ndarray = array("tree", unit="1", dtype=np.int32)
     """Index of the tree's root body."""
     tree_size: np.ndarray = array("tree", unit="1", dtype=np.int32)
-    """How many bodies follow from ``tree_first`` on."""
+    """Number of bodies of the tree, from ``tree_first`` on."""
     tree_pose: np.ndarray = array("tree", 7, unit="m, 1", fill=_UNIT_POSE)
-    """Pose in the world of the frame on which the root's joint sits."""
+    """World pose of the frame in which the root's joint is placed."""
     tree_vine: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
     tree_piece: np.ndarray = array("tree", unit="1", dtype=np.int32, fill=-1)
-    """The piece of wood that the root's joint sits on, an index of ``fixed_start``; -1: on nothing that moves."""
+    """Index (into ``fixed_start``) of the piece of arm that the root's joint sits on; -1: the joint does not move."""
     tree_core: np.ndarray = array("tree", unit="1", dtype=np.int32)
-    """How many of its bodies move while no actor is close; the rest are the berry clusters of its bunches, which are
-    then fused to their bunch as one *compound*. A tree without clusters is all core."""
+    """Number of bodies in the tree's core, which come first. The other bodies are berry clusters: while no actor is
+    close, the clusters of a bunch are fused to it as one *compound*, and only the core is simulated. A tree without
+    clusters is all core."""
 
     # bodies
     body_tree: np.ndarray = array("body", unit="1", dtype=np.int32)
@@ -48,9 +50,9 @@ class Model(StructOfArrays):
     """Index of the parent body in the whole model, -1 for a root."""
     body_organ: np.ndarray = array("body", unit="1", dtype=np.int32, fill=int(Organ.CANE))
     body_offset: np.ndarray = array("body", 3, unit="m")
-    """The joint, in the parent body's frame (in the frame of ``tree_pose`` for a root)."""
+    """Position of the joint in the parent body's frame (for a root in the frame of ``tree_pose``)."""
     body_rest: np.ndarray = array("body", 4, unit="1", fill=_UNIT_QUAT)
-    """Rest rotation: axes of the joint frame in the parent body's frame."""
+    """Rest rotation: orientation of the joint frame in the parent body's frame."""
     body_mass: np.ndarray = array("body", unit="kg")
     body_com: np.ndarray = array("body", 3, unit="m")
     """Centre of mass in the body's frame."""
@@ -60,58 +62,60 @@ class Model(StructOfArrays):
     body_radius: np.ndarray = array("body", 2, unit="m")
     """Radius at the origin and at the tip."""
     body_drag: np.ndarray = array("body", unit="m^2")
-    """Drag area Cd A of leaves and wood in the wind, acting at the centre of mass."""
+    """Drag area Cd A of leaves and wood; the wind force acts at the centre of mass."""
     joint_stiffness: np.ndarray = array("body", 3, unit="N m/rad")
-    """About the joint frame's axes: torsion, bending, bending."""
+    """Joint stiffness about the joint frame's axes: torsion, bending, bending."""
     joint_damping: np.ndarray = array("body", 3, unit="N m s/rad")
     joint_settled: np.ndarray = array("body", 4, unit="1", fill=_UNIT_QUAT)
-    """``joint_q`` of the equilibrium under gravity: the shape the author drew."""
+    """``joint_q`` in equilibrium under gravity, which is the drawn shape."""
 
-    # bunches: bodies of organ BUNCH, the last of their peduncle; one compound each, filled with berries
+    # a bunch is a body of organ BUNCH at the end of its peduncle: one compound, filled with berries
     bunch_body: np.ndarray = array("bunch", unit="1", dtype=np.int32)
     bunch_variety: np.ndarray = array("bunch", unit="1", dtype=np.int32)
     """Index into ``vinesim.scene.berries.VARIETIES``."""
     bunch_seed: np.ndarray = array("bunch", unit="1", dtype=np.uint32)
     bunch_length: np.ndarray = array("bunch", unit="m")
     bunch_radius: np.ndarray = array("bunch", unit="m")
-    """Largest radius of the ellipsoid-like hull; its axis is the body's +x."""
+    """Largest radius of the bunch's hull, which is about an ellipsoid along the body's +x axis."""
     bunch_berries: np.ndarray = array("bunch", unit="1", dtype=np.int32)
     bunch_pull: np.ndarray = array("bunch", unit="N", fill=60.0)
-    """Pulling force that parts the peduncle."""
+    """Pulling force at which the peduncle breaks."""
     bunch_bend: np.ndarray = array("bunch", unit="N m", fill=2.0)
-    """Moment that breaks the peduncle."""
+    """Bending moment at which the peduncle breaks."""
     bunch_cluster: np.ndarray = array("bunch", unit="1", dtype=np.int32, fill=-1)
-    """First body of its berry clusters (Organ.BUNCH, behind the core of the tree), -1 if it has none: then the bunch is
-    always one compound. ``body_mass``, ``body_com`` and ``body_inertia`` of ``bunch_body`` are the compound's."""
+    """First body of the bunch's berry clusters, which have organ BUNCH and follow the core of the tree. -1: the bunch
+    has no clusters and is always one compound. ``body_mass``, ``body_com`` and ``body_inertia`` of ``bunch_body``
+    describe the compound."""
     bunch_clusters: np.ndarray = array("bunch", unit="1", dtype=np.int32)
-    """How many clusters follow from ``bunch_cluster`` on."""
+    """Number of clusters, from ``bunch_cluster`` on."""
     bunch_head_mass: np.ndarray = array("bunch", unit="kg")
-    """What of ``bunch_body`` is no cluster: the head of the rachis. Compound = head + clusters at ``joint_settled``."""
+    """Mass of the head of the rachis, the part of the compound outside the clusters. The compound is the head and the
+    clusters at ``joint_settled``."""
     bunch_head_com: np.ndarray = array("bunch", 3, unit="m")
     bunch_head_inertia: np.ndarray = array("bunch", 3, unit="kg m^2")
 
-    # ties: canes bound to wires; springs between a point of a body and one of the world or of a wire, slack as drawn
+    # ties bind canes to wires: springs between a point of a body and a point of a wire or the world, slack as drawn
     tie_body: np.ndarray = array("tie", unit="1", dtype=np.int32)
-    """Sorted."""
+    """Body that is tied; ties are sorted by it."""
     tie_point: np.ndarray = array("tie", 3, unit="m")
-    """In the body's frame."""
+    """Tied point in the body's frame."""
     tie_anchor: np.ndarray = array("tie", 3, unit="m")
-    """In the world, while the wire is straight."""
+    """Anchor point in the world while the wire is straight."""
     tie_wire: np.ndarray = array("tie", unit="1", dtype=np.int32, fill=-1)
-    """The piece of wire that the tie is bound to, an index of ``fixed_start``; -1: to a point that does not move."""
+    """Index (into ``fixed_start``) of the piece of wire that holds the tie; -1: the anchor does not move."""
     tie_stiffness: np.ndarray = array("tie", unit="N/m")
     tie_damping: np.ndarray = array("tie", unit="N s/m")
 
     # leaves are fixed to bodies; visible to sensors, in physics only as drag and mass
     leaf_body: np.ndarray = array("leaf", unit="1", dtype=np.int32)
     leaf_base: np.ndarray = array("leaf", 3, unit="m")
-    """Where the petiole leaves the cane, in the body's frame."""
+    """Point where the petiole leaves the cane, in the body's frame."""
     leaf_pose: np.ndarray = array("leaf", 7, unit="m, 1", fill=_UNIT_POSE)
     """Blade frame in the body's frame: origin where petiole meets blade, x along the midrib, z the upper side."""
     leaf_size: np.ndarray = array("leaf", unit="m")
-    """Half of the blade's width: the scale of the outline."""
+    """Half of the blade's width; it scales the outline."""
     leaf_age: np.ndarray = array("leaf", unit="1")
-    """0 young and green to 1 yellow."""
+    """Age from 0 (young and green) to 1 (yellow)."""
 
     # fixed wood, posts and wires: round cones from ``fixed_start`` to ``fixed_end``
     fixed_start: np.ndarray = array("fixed", 3, unit="m")
@@ -119,13 +123,13 @@ class Model(StructOfArrays):
     fixed_radius: np.ndarray = array("fixed", 2, unit="m")
     fixed_organ: np.ndarray = array("fixed", unit="1", dtype=np.int32, fill=int(Organ.POLE))
     fixed_index: np.ndarray = array("fixed", unit="1", dtype=np.int32)
-    """Which pole, wire, trunk or arm this piece belongs to."""
+    """Index of the pole, wire, trunk or arm that this piece belongs to."""
     fixed_tension: np.ndarray = array("fixed", unit="N")
-    """With which a piece of wire is taut between its ends; 0: it does not give."""
+    """Tension of a piece of wire between its ends; 0: it does not deflect."""
 
     fixed_shear_modulus: np.ndarray = array("fixed", unit="Pa")
-    """Of the wood of an arm, which its shoots twist; 0: it does not give. An arm is the pieces of organ ARM with one
-    ``fixed_index``, in their order; its start is clamped, its end free."""
+    """Shear modulus of the wood of an arm, which its shoots twist; 0: it does not twist. An arm is the sequence of
+    pieces of organ ARM with one ``fixed_index``; its start is clamped, its end free."""
 
     # picking boxes: open crates, dynamic
     box_pose: np.ndarray = array("box", 7, unit="m, 1", fill=_UNIT_POSE)
@@ -147,7 +151,7 @@ class Model(StructOfArrays):
         return slice(first, first + int(self.tree_size[tree]))
 
     def forward_kinematics(self, joint_q: np.ndarray) -> np.ndarray:
-        """World poses of all bodies [body, 7] for joint rotations [body, 4] (loops over depth: not for the tick)."""
+        """World poses [body, 7] for joint rotations [body, 4]. It loops over depth, too slow for every step."""
         body_q = np.zeros((len(self.body_mass), 7))
         joint = np.concatenate([self.body_offset, frames.multiply(self.body_rest, joint_q)], -1).astype(float)
         depth = self.depth()
@@ -159,7 +163,7 @@ class Model(StructOfArrays):
         return body_q
 
     def bunch_of_body(self) -> np.ndarray:
-        """Which bunch a body belongs to [body]: its own body, its clusters and its peduncle; -1 for all others."""
+        """Index of the bunch of each body [body]: of bunches, their clusters and their peduncles; -1 for all others."""
         owner = np.full(len(self.body_mass), -1, np.int32)
         owner[self.bunch_body] = bunch = np.arange(len(self.bunch_body), dtype=np.int32)
         for k in range(int(self.bunch_clusters.max(initial=0))):
@@ -175,17 +179,17 @@ class Model(StructOfArrays):
         return owner
 
     def is_on_arm(self) -> np.ndarray:
-        """Trees whose root sits on a piece of arm that gives [tree] bool."""
+        """Whether the root of each tree sits on a piece of arm that can twist [tree] bool."""
         return np.append(self.arm_gives(), False)[self.tree_piece]
 
     def arm_gives(self) -> np.ndarray:
-        """Pieces of arms that shoots twist [fixed] bool."""
+        """Whether each piece is a piece of arm that shoots can twist [fixed] bool."""
         return (self.fixed_organ == int(Organ.ARM)) & (self.fixed_shear_modulus > 0.0)
 
     def depth(self) -> np.ndarray:
         """Number of bodies between each body and its root [body].
 
-        :class:`ValueError` if a parent does not stand before its child: parents in a cycle have no root.
+        :class:`ValueError` if a parent does not come before its child, as in a cycle.
         """
         depth = np.zeros(len(self.body_mass), np.int32)
         if (late := self.body_parent >= np.arange(len(depth))).any():

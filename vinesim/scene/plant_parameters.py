@@ -1,4 +1,4 @@
-"""What a grapevine is made of: numbers read from ``data/plants``, each with unit, grade and source."""
+"""Parameters of a grapevine: numbers read from ``data/plants``, each with unit, grade and source."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from vinesim.core.data_files import find_data_file
 from vinesim.core.toml_loader import DataError, load_toml
 
 AXIS_LENGTH = 0.05
-"""[1] By how much the length of a specimen's axis may differ from its measured length."""
+"""[1] Largest relative difference between the length of a specimen's axis and its measured length."""
 Grade = Literal["READ", "DERIVED", "GUESSED", "FITTED"]
-"""Where a number comes from: a publication, what follows from one, a guess, or a fit to a measured plant."""
+"""Origin of a number: a publication, a derivation from one, a guess, or a fit to a measured plant."""
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -31,7 +31,7 @@ class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two sourced numbers: from one to the other."""
+    """A sourced range between two numbers."""
 
     value: tuple[float, float]
     unit: str
@@ -39,7 +39,7 @@ class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     source: str
 
     def at(self, share: typing.Any) -> typing.Any:
-        """The value at ``share`` 0..1 of the way."""
+        """The value at ``share`` of the range: 0 gives its lower end, 1 its upper end."""
         return self.value[0] + (self.value[1] - self.value[0]) * share
 
 
@@ -57,7 +57,7 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Cane(_Part, frozen=True, kw_only=True):
-    """A shoot of this year, woody at its base and green at its tip; and the side shoot that may fork from it."""
+    """A shoot of this year, woody at its base and green at its tip, and the side shoot that may fork from it."""
 
     length: Annotated[Range, "m"]
     nodes: Annotated[Range, "1"]
@@ -99,7 +99,7 @@ class Bunch(_Part, frozen=True, kw_only=True):
 
 
 class Rachis(_Part, frozen=True, kw_only=True):
-    """The stem inside a bunch, from the peduncle down, with the berries that lean on each other around it."""
+    """The stem inside a bunch, which continues the peduncle, and the berries around it, which support each other."""
 
     piece: Annotated[Number, "m"]
     diameter: Annotated[Range, "m"]
@@ -119,7 +119,7 @@ class Leaf(_Part, frozen=True, kw_only=True):
 
 
 class Arm(_Part, frozen=True, kw_only=True):
-    """Permanent wood on the wires, from which shoots spring."""
+    """Permanent wood along the wires, on which shoots grow."""
 
     diameter: Annotated[Range, "m"]
     share: Annotated[Number, "1"]
@@ -130,7 +130,7 @@ class Arm(_Part, frozen=True, kw_only=True):
 
 
 class Trunk(_Part, frozen=True, kw_only=True):
-    """From the ground to the head."""
+    """The trunk from the ground to the head."""
 
     diameter: Annotated[Range, "m"]
     beside_pole: Annotated[Number, "m"]
@@ -152,35 +152,33 @@ class Trellis(_Part, frozen=True, kw_only=True):
 
 
 class Specimen(_Part, frozen=True, kw_only=True):
-    """One cane, or one bunch on its peduncle, that was measured: what :mod:`vinesim.tune` fits.
-
-    Its base is clamped at the origin.
-    """
+    """A measured cane, or a measured bunch on its peduncle, which :mod:`vinesim.tune` fits. Its base is clamped at the
+    origin."""
 
     organ: Literal["cane", "bunch"]
     length: Annotated[Number, "m"]
-    """Of the cane or the peduncle."""
+    """Length of the cane or the peduncle."""
     base_diameter: Annotated[Number, "m"]
     tip_diameter: Annotated[Number, "m"]
     modulus: Annotated[Number, "Pa"]
     """Young's modulus of bending."""
     density: Annotated[Number, "kg/m^3"]
     damping: Annotated[Number, "s"]
-    """Joint damping over joint stiffness."""
+    """Ratio of joint damping to joint stiffness."""
     tip_mass: Annotated[Number, "kg"] | None = None
-    """A point mass at the tip of the cane; the bunch on the peduncle."""
+    """Point mass at the tip of a cane, or mass of the bunch on a peduncle."""
     direction: tuple[float, float, float] | None = None
-    """In which it grows from its base, in the world (z up); a cane along x, a peduncle down unless given."""
+    """Direction of growth at the base, in the world (z up); by default x for a cane, downwards for a peduncle."""
     bow: tuple[float, float] = (0.0, 0.0)
-    """[rad] How much its slack shape bends from base to tip, about its y and its z axis."""
+    """[rad] Bend of the slack shape from base to tip, about the specimen's y and z axes."""
     axis: tuple[tuple[float, float, float], ...] = ()
-    """[m] Points of a cane's axis from its base to its tip, as it hangs at rest under its weight; without any its slack
-    shape is straight but for ``bow``."""
+    """[m] Points of a cane's axis from base to tip, as the cane hangs at rest under its weight. Without points the
+    slack shape is straight except for ``bow``."""
     segments: Annotated[int, msgspec.Meta(ge=2, le=64)] = 8
-    """Rigid bodies that the rod is cut into."""
+    """Number of rigid bodies of the rod."""
     markers: dict[str, float] = {}
-    """[m] Distance of named markers from the base, along the rod. ``tip`` is always known: the cane's tip or the
-    lowest point of the bunch."""
+    """[m] Distance of named markers from the base, along the rod. The marker ``tip`` always exists: the cane's tip or
+    the lowest point of the bunch."""
 
 
 class VineParameters(_Part, frozen=True, kw_only=True):
@@ -195,7 +193,7 @@ class VineParameters(_Part, frozen=True, kw_only=True):
     trunk: Trunk
     trellis: Trellis
     specimen: Specimen | None = None
-    """The measured plant from which numbers of grade FITTED come; not used by scenes."""
+    """The measured plant to which numbers of grade FITTED were fitted; scenes do not use it."""
 
 
 class Berry(_Part, frozen=True, kw_only=True):
@@ -215,7 +213,7 @@ class Varieties(_Part, frozen=True, kw_only=True):
 
 @functools.cache
 def load_plant(name: str) -> VineParameters:
-    """Parameters from a file, or from the one of that name in ``data/plants``; :class:`DataError` if a unit is off."""
+    """Parameters from the file ``name``, or else from ``data/plants``; :class:`DataError` if a unit is wrong."""
     path = find_data_file("plants", name, ".toml")
     vine = load_toml(path, VineParameters)
     _check_units(vine, str(path))
@@ -236,7 +234,7 @@ class _SpecimenFile(_Part, frozen=True):
 
 
 def load_specimen(path: str | pathlib.Path) -> Specimen:
-    """The table ``[specimen]`` of a file that holds it alone, or of a file of plant parameters.
+    """The table ``[specimen]`` of a file, which may also contain plant parameters.
 
     :class:`DataError` with file, place, value and remedy if it cannot be used.
     """
@@ -264,7 +262,7 @@ def _check_specimen(specimen: Specimen, path: str) -> None:
     if specimen.axis:
         _check_axis(specimen, path)
     for name, place in specimen.markers.items():
-        if name.lower() == "base":  # a track's columns of that name say how the base was moved
+        if name.lower() == "base":  # in a track, columns of this name hold the motion of the base
             raise DataError(f"{path}: specimen.markers.{name} is no name for a marker; give it another one")
         if not 0.0 < place <= specimen.length.value:
             raise DataError(

@@ -1,7 +1,7 @@
-"""What a scene file says: a vineyard's layout, season, fruit, boxes, sun, and where robots start.
+"""The content of a scene file: a vineyard's layout, season, fruit, boxes, sun, wind, and start positions of robots.
 
-Lengths in metres, angles in radians, axes as in :mod:`vinesim.core.frames`. The first vine of the first row stands at
-the origin; vines follow along +x, rows along +y, so that a longer row or one row more moves no other vine.
+Lengths are in metres, angles in radians, axes as in :mod:`vinesim.core.frames`. The first vine of the first row stands
+at the origin, vines follow along +x, rows along +y. So a longer row or an additional row moves no other vine.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.plant_import.imported_plant import load_imported_plant
 
 MAX_ROBOTS = 10
-"""Robots that may meet in one vineyard (CANOPIES D6.4 section 2.3)."""
+"""Largest number of robots in one vineyard (CANOPIES D6.4 section 2.3)."""
 
 Length = Annotated[float, msgspec.Meta(gt=0.0)]
-"""[m]"""
+"""A positive length [m]."""
 Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
-"""[1]"""
+"""A fraction from 0 to 1."""
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
@@ -38,35 +38,36 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Layout(_Part, frozen=True, kw_only=True):
-    """Where the vines stand."""
+    """Positions of the vines."""
 
     rows: Count
     vines: Count
-    """Vines in each row."""
+    """Number of vines in each row."""
     row_spacing: Length
     vine_spacing: Length
     height: Length
-    """Of the wire net (tendone) or of the fruiting wire (vsp)."""
+    """Height of the wire net (tendone) or of the fruiting wire (vsp)."""
     missing: tuple[tuple[int, int], ...] = ()
-    """Row and place in the row, from 0, of vines that are not there: room for imported ones. Their poles stand."""
+    """Row and place in the row, from 0, of vines that are left out, for example to make room for imported plants. Their
+    poles remain."""
 
 
 class Season(_Part, frozen=True, kw_only=True):
-    """How the canopy looks on that day."""
+    """State of the canopy on the day of the scene."""
 
     leafiness: Share = 1.0
     """Share of the nodes that still carry their leaf."""
     yellow: Share = 0.05
-    """Share of the leaves that have turned."""
+    """Share of the leaves that are yellow."""
 
 
 class Fruit(_Part, frozen=True, kw_only=True):
-    """What hangs on the vines."""
+    """Bunches on the vines."""
 
     bunches: tuple[int, int]
-    """Fewest and most bunches on a vine."""
+    """Smallest and largest number of bunches on a vine."""
     varieties: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
-    """Names of :data:`vinesim.scene.berries.VARIETIES`; the rows take them in turn."""
+    """Names from :data:`vinesim.scene.berries.VARIETIES`; the rows take them in turn."""
 
 
 class Box(_Part, frozen=True, kw_only=True):
@@ -78,27 +79,28 @@ class Box(_Part, frozen=True, kw_only=True):
     size: tuple[Length, Length, Length] = (0.6, 0.4, 0.24)
     """Outer length, width, height [m]."""
     mass: Annotated[float, msgspec.Meta(gt=0.0)] = 1.6
-    """[kg], empty"""
+    """[kg] Mass of the empty box."""
 
 
 class Sun(_Part, frozen=True, kw_only=True):
-    """Where the sun stands: fixed by two angles, or on its path from an hour on."""
+    """Direction of the sun: either fixed by two angles, or moving from a given hour on."""
 
     azimuth: float = 0.9
-    """[rad] from +x, counter-clockwise seen from above."""
+    """[rad] Azimuth from +x, counter-clockwise seen from above."""
     elevation: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.9
-    """[rad] above the horizon."""
+    """[rad] Elevation above the horizon."""
     hour: Annotated[float, msgspec.Meta(ge=0.0, le=24.0)] | None = None
-    """Solar time at the start [h]; from there the sun moves, x is east and y north, and the angles do not count."""
+    """Solar time at the start [h]. If given, the sun moves from there, with x to the east and y to the north, and
+    azimuth and elevation are ignored."""
     day: Annotated[int, msgspec.Meta(ge=1, le=366)] = 258
-    """Of the year; 258 is the middle of September, the season of table grapes."""
+    """Day of the year; 258 is the middle of September, the season of table grapes."""
     latitude: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.726
-    """[rad] north; 41.6 degrees is Aprilia, Italy, where CANOPIES picks."""
+    """[rad] Latitude, positive to the north; 41.6 degrees is Aprilia, Italy, where CANOPIES picks."""
 
     def direction(self, time: float = 0.0) -> tuple[float, float, float]:
-        """Unit vector from the ground to the sun, world axes, at a simulated time [s]."""
+        """Unit vector from the ground to the sun, world axes, at simulated ``time`` [s]."""
         if self.hour is not None:
-            # Cooper (1969), to 0.4 degrees
+            # Cooper (1969), accurate to 0.4 degrees
             declination = math.radians(23.45) * math.sin(2.0 * math.pi * (284 + self.day) / 365.0)
             return sun_direction(self.hour + time / 3600.0, declination, self.latitude)
         level = math.cos(self.elevation)
@@ -115,18 +117,18 @@ def sun_direction(hour: float, declination: float, latitude: float) -> tuple[flo
 
 
 class Wind(_Part, frozen=True, kw_only=True):
-    """How the air moves; see :class:`vinesim.wind.plant_wind.Wind`. Calm unless said."""
+    """The wind, see :class:`vinesim.scene.wind.Wind`. The default is calm air."""
 
     mean: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """[m/s] World axes, at the top of the canopy before the first row."""
+    """[m/s] Velocity of the steady wind, world axes, at the top of the canopy upwind of the first row."""
     gusts: Annotated[float, msgspec.Meta(ge=0.0)] = 0.0
     """Standard deviation of each component about the mean [m/s]."""
     scale: Length = 4.0
-    """Of the gusts [m]."""
+    """Length scale of the gusts [m]."""
 
 
 class Spawn(_Part, frozen=True, kw_only=True):
-    """A named place where a robot or a person starts, on the ground."""
+    """A named start position on the ground for a robot or a person."""
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     x: float
@@ -135,23 +137,23 @@ class Spawn(_Part, frozen=True, kw_only=True):
 
 
 class Imported(_Part, frozen=True, kw_only=True):
-    """A plant that another program has grown, and where it stands."""
+    """A plant imported from another program, and its position."""
 
     file: str
-    """Written by ``vinesim scene import-plant``; looked for beside the scene file first."""
+    """File written by ``vinesim scene import-plant``; the folder of the scene file is searched first."""
     x: float
     y: float
     z: float = 0.0
-    """[m] Of its base above the ground."""
+    """[m] Height of the plant's base above the ground."""
     yaw: float = 0.0
     leaves: bool = True
-    """Whether its shoots carry leaves as the season says."""
+    """Whether its shoots carry leaves according to the season."""
     tie_gap: Annotated[float, msgspec.Meta(ge=0.0)] = 0.02
-    """[m] Where a shoot passes a wire with at most this gap, it is tied to it; 0: nowhere."""
+    """[m] Largest gap at which a shoot is tied to a wire that it passes; 0: no ties."""
 
 
 class Scene(_Part, frozen=True, kw_only=True):
-    """One vineyard as its file describes it."""
+    """One vineyard as described by a scene file."""
 
     name: Annotated[str, msgspec.Meta(min_length=1)]
     seed: Annotated[int, msgspec.Meta(ge=0)]
@@ -168,13 +170,13 @@ class Scene(_Part, frozen=True, kw_only=True):
     wind: Wind = Wind()
     spawns: tuple[Spawn, ...] = ()
     physics: PhysicsParameters = PhysicsParameters()
-    """Parameters that differ from their defaults; they are not part of the vineyard's digest."""
+    """Physics parameters, by default the usual ones; they are not part of the vineyard's digest."""
 
 
 def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Scene:
-    """The scene in a file, or the one of that name in ``data/scenes``; :class:`SceneError` in one line otherwise.
+    """The scene in a file, or the scene of that name in ``data/scenes``; :class:`SceneError` if it cannot be used.
 
-    ``seed`` replaces the file's: the same layout with other vines.
+    ``seed`` replaces the seed of the file, which gives the same layout with different vines.
     """
     try:
         path = find_data_file("scenes", str(path_or_name), ".toml")
@@ -190,12 +192,12 @@ def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Sce
 
 
 def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
-    """A file that a scene names: beside the scene, or where its path leads from here."""
+    """Path of a file that a scene names: in the scene's folder if it exists there, else as given."""
     return near if (near := scene.parent / file).is_file() else pathlib.Path(file)
 
 
 def _find_error(scene: Scene) -> str:
-    """What the types cannot say: place, finding, remedy; empty if all is well."""
+    """Check rules that the types cannot express. Returns place, finding and remedy; empty if the scene is valid."""
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
@@ -229,7 +231,7 @@ def _find_error(scene: Scene) -> str:
 
 
 def with_seed(scene: Scene, seed: int | None) -> Scene:
-    """The same scene grown from another seed; None keeps its own."""
+    """A copy of the scene with another seed; None keeps the scene's own seed."""
     if seed is None:
         return scene
     if seed < 0:

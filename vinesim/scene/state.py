@@ -1,4 +1,4 @@
-"""The state of the plants: joint rotations and rates, which trees are awake, what is attached; derived poses."""
+"""The state of the plants: joint rotations and rates, poses derived from them, awake trees, cut bodies."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vinesim.scene.model import Model
 
 @dataclasses.dataclass
 class State(StructOfArrays):
-    """State of all plants. Rigid things (robots, boxes, hands) keep theirs in MuJoCo."""
+    """State of all plants. The state of rigid bodies (robots, boxes, hands) is in MuJoCo."""
 
     joint_q: np.ndarray = array("body", 4, unit="1", fill=(0.0, 0.0, 0.0, 1.0))
     """Rotation of the body in its joint frame, xyzw."""
@@ -23,20 +23,20 @@ class State(StructOfArrays):
     body_qd: np.ndarray = array("body", 6, unit="m/s, rad/s")
     """World velocity of the body's origin, then angular velocity, derived from ``joint_qd``."""
     body_cut: np.ndarray = array("body", unit="1", dtype=np.bool_)
-    """Whether the body has been cut off its parent: then it is a floating root of what grows on it, ``joint_q`` its
-    rotation in the world and ``joint_qd`` its angular velocity in world axes."""
+    """Whether the body has been cut off its parent. A cut body is the floating root of everything that grows on it:
+    ``joint_q`` is its rotation in the world and ``joint_qd`` its angular velocity in world axes."""
     joint_x: np.ndarray = array("body", 3, unit="m")
-    """World position of a body that has been cut off; of no meaning for others."""
+    """World position of the origin of a cut body; unused for other bodies."""
     joint_xd: np.ndarray = array("body", 3, unit="m/s")
-    """World velocity of its origin."""
+    """World velocity of the origin of a cut body; unused for other bodies."""
     tree_fine: np.ndarray = array("tree", unit="1", dtype=np.bool_)
-    """Whether the berry clusters of the tree's bunches move, each for itself; else each bunch is one compound."""
+    """Whether the berry clusters of the tree's bunches are separate bodies; otherwise each bunch is one compound."""
     tree_awake: np.ndarray = array("tree", unit="1", dtype=np.bool_)
     bunch_attached: np.ndarray = array("bunch", unit="1", dtype=np.bool_, fill=1)
 
     @classmethod
     def at_rest(cls, model: Model) -> State:
-        """All trees asleep in the authored shape (``Model.joint_settled``), with zero rates."""
+        """State with all trees asleep in the drawn shape (``Model.joint_settled``) and zero rates."""
         counts = model.counts()
         state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
         state.joint_q[:] = model.joint_settled

@@ -6,7 +6,7 @@
     print("\\n".join(fit.lines()))
     fit.write_plant("fitted.toml")
 
-docs/tuning.md shows it at work. It needs scipy: ``pip install 'vinesim[tune]'``.
+docs/tuning.md has examples. This package needs scipy: ``pip install 'vinesim[tune]'``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""How the base of a plant is shaken: in a sine sweep, or as the columns of a track say."""
+"""Motion of a shaken base: a sine sweep, or a curve through the samples of a track."""
 
 from __future__ import annotations
 
@@ -9,39 +9,39 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 FADE = 0.1
-"""[1] Share of a sweep in which its amplitude grows from nothing, and of that in which it falls back."""
+"""[1] Fraction of a sweep in which its amplitude grows from zero, and in which it falls back to zero."""
 SPLINE_DEGREE = 7
-"""Of the curve through samples. At a quarter of their rate its acceleration errs by 0.2 %, that of degree 5 by 1.3 %,
-that of a cubic curve by 20 %."""
+"""Degree of the spline through samples. For motion at a quarter of the sample rate its acceleration has an error of
+0.2 %; degree 5 has 1.3 % and degree 3 has 20 %."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Sweep:
-    """A sine of constant amplitude whose frequency changes evenly in time."""
+    """A sine of constant amplitude whose frequency changes linearly with time."""
 
     direction: np.ndarray
     """[3] Unit vector in the world."""
     amplitude: float
     """[m]"""
     frequencies: tuple[float, float]
-    """[Hz] At the start and at the end."""
+    """[Hz] Frequencies at the start and at the end."""
     start: float
     """[s]"""
     duration: float
     """[s]"""
 
     def position(self, time: np.ndarray) -> np.ndarray:
-        """[k, 3] m in the world at times [k] s."""
+        """Position [k, 3] m in the world at times [k] s."""
         size, _, phase, _ = self._terms(time)
         return (size * np.sin(phase))[:, None] * self.direction
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """[k, 3] m/s."""
+        """Velocity [k, 3] m/s in the world at times [k] s."""
         size, growth, phase, rate = self._terms(time)
         return (growth * np.sin(phase) + size * rate * np.cos(phase))[:, None] * self.direction
 
     def _terms(self, time: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Amplitude [k] m and its derivative m/s, phase rad and its derivative rad/s."""
+        """Amplitude [k] m and its derivative [m/s], phase [k] rad and its derivative [rad/s]."""
         t = np.clip(np.asarray(time, float) - self.start, 0.0, self.duration)
         fade = FADE * self.duration
         edge = np.minimum(np.minimum(t, self.duration - t) / fade, 1.0)
@@ -67,9 +67,9 @@ class SampledMotion:
         self._bend = curve.derivative(2)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """[k] or [k, 3] m/s at times [k] s; outside of the samples that of the nearest one."""
+        """Velocity [k] or [k, 3] m/s at times [k] s; outside the samples it is the velocity of the nearest one."""
         return self._slope(np.clip(time, *self._ends))
 
     def acceleration(self, time: np.ndarray) -> np.ndarray:
-        """[k] or [k, 3] m/s^2, as :meth:`velocity`."""
+        """Acceleration [k] or [k, 3] m/s^2 at times [k] s, as :meth:`velocity`."""
         return self._bend(np.clip(time, *self._ends))

@@ -1,9 +1,9 @@
-"""Many candidates of one specimen at once: trees of one launch, each with its own stiffness, damping, mass and pull.
+"""Simulates many candidates of one specimen at once, each a tree with its own stiffness, damping, mass and pull.
 
-The dynamics are those of :class:`~vinesim.plants.articulation_solver.ArticulationSolver`. A run begins in the
-static equilibrium under a pull at the tip, found by the same solver in long steps, and lets go. A base that is shaken
-is the origin of a frame that moves without turning: in it the base rests, every body has the weight of minus the base's
-acceleration beside its own, and the air streams past.
+:class:`~vinesim.plants.articulation_solver.ArticulationSolver` computes the dynamics. A run begins in static
+equilibrium under a pull at the tip, which the same solver finds in long steps; then the pull ends. A shaken base is the
+origin of a frame that moves without rotation. In this frame the base rests, every body has an inertial force from the
+base's acceleration in addition to its weight, and the air moves.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from vinesim.scene.state import State
 from vinesim.tune.specimen import TIP, base_pose, build_tree, hanging_bends, place_markers, rest_bends
 
 COLUMNS = ("modulus", "damping", "mass", "bow_y", "bow_z", "pull_y", "pull_z")
-"""What a candidate is: the natural logarithms of modulus, damping and mass over the specimen's own, its bow [rad], and
-the pull at its tip [N at the specimen's own modulus; it grows with the modulus] along the base's y and z."""
+"""Columns of a candidate: natural logarithms of the ratios of modulus, damping and mass to the specimen's, bow [rad],
+and pull at the tip along the base's y and z [N at the specimen's modulus; it is scaled with the modulus]."""
 STATIC_STEP = 1.0
-"""[s] In such a step inertia is next to nothing, and the implicit solve a Newton step towards equilibrium."""
+"""[s] Step in which inertia is negligible, so that the implicit solve is a Newton step towards equilibrium."""
 STATIC_STEPS = 8
 _RATE = 1e4
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Motion:
-    """Where markers were at some ticks after the release, and how they moved over the tick that follows."""
+    """Positions of markers at some ticks after the release, with velocity and acceleration over the following tick."""
 
     position: np.ndarray
     """[candidate, tick, marker, 3] m"""
@@ -43,8 +43,10 @@ class Motion:
     """[candidate, tick, marker, 3] m/s^2"""
 
     def at(self, index: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [candidate, sample, marker, 3] at times ``after`` [candidate or 1, sample] s past
-        the ticks of ``index`` [sample]."""
+        """Positions and velocities [candidate, sample, marker, 3] between ticks.
+
+        The times are ``after`` [candidate or 1, sample] s after the ticks ``index`` [sample].
+        """
         t = after[..., None, None]
         x, v, a = (rows[:, index] for rows in (self.position, self.velocity, self.acceleration))
         return x + v * t + 0.5 * a * t * t, v + a * t
@@ -54,11 +56,11 @@ class Candidates:
     """Runs candidates of one specimen.
 
     Args:
-        specimen: what all of them are variations of.
-        markers: names of the points whose motion is wanted.
+        specimen: the specimen of which all candidates are variations.
+        markers: names of the points whose motion is returned.
         dt: step [s].
         device: ``cpu``, ``cuda`` or ``cuda:N``.
-        least: candidates for which there is place from the first run on.
+        least: smallest number of candidates for which solvers are made.
     """
 
     def __init__(
@@ -77,13 +79,13 @@ class Candidates:
         self._own: dict[int, tuple[np.ndarray, ...]] = {}
         self._least = least
         self._sag = np.array([frames.log(body["settled"]) for body in self._tree.bodies]) if specimen.axis else None
-        """[body, 3] rad, by which the weight of a specimen with an axis turns each joint from its slack shape."""
+        """[body, 3] rad, rotation of each joint from its slack shape by the weight of a specimen with an axis."""
         self.runs = 0
-        """Candidates run so far."""
+        """Number of candidates run so far."""
 
     @property
     def size(self) -> int:
-        """Bodies of one candidate."""
+        """Number of bodies of one candidate."""
         return len(self._tree.bodies)
 
     def pull_axes(self) -> np.ndarray:
@@ -93,14 +95,14 @@ class Candidates:
     def run(
         self, candidates: np.ndarray, ticks: np.ndarray, pushed: bool = False, base_velocity: np.ndarray | None = None
     ) -> Motion:
-        """Let candidates [n, 7] (:data:`COLUMNS`) go from under their pull.
+        """Simulate candidates after their release from the pull.
 
         Args:
-            candidates: [n, 7].
-            ticks: [k] whole numbers of steps after the release, increasing, 0 or more.
-            pushed: the other way round: from rest, the force begins to act at tick 0 and stays.
-            base_velocity: [tick, 3] m/s of the base in the world, up to the tick after the last of ``ticks``; none: it
-                rests. The motion that comes back is relative to the base.
+            candidates: [n, 7], see :data:`COLUMNS`.
+            ticks: [k] numbers of steps after the release at which motion is returned, increasing, 0 or more.
+            pushed: start at rest instead; the force begins to act at tick 0 and stays.
+            base_velocity: [tick, 3] m/s, velocity of the base in the world up to the tick after the last of ``ticks``;
+                None: the base rests. The returned motion is relative to the base.
         """
         count = len(candidates)
         candidates = self._padded(candidates)
@@ -148,7 +150,7 @@ class Candidates:
     # ------------------------------------------------------------------
 
     def _padded(self, candidates: np.ndarray) -> np.ndarray:
-        """Candidates [n, 7] and copies of the last up to a number for which there are solvers."""
+        """Candidates [n, 7], padded with copies of the last one to a number for which solvers exist."""
         count = len(candidates)
         sizes = [size for size in self._solvers if count <= size <= 2 * count + 8]
         size = min(sizes, default=max(count, self._least))
@@ -157,7 +159,7 @@ class Candidates:
         return np.concatenate([candidates, np.repeat(candidates[-1:], size - count, 0)])
 
     def _begin(self, plants: ArticulationSolver, count: int) -> None:
-        """Let the first candidates move and no others."""
+        """Wake the first ``count`` candidates and no others."""
         plants.put_to_sleep(np.arange(count, len(plants.model.tree_first)))
         plants.wake(np.arange(count))
 
@@ -166,14 +168,14 @@ class Candidates:
         return np.arange(count)[:, None] * self.size + self._body
 
     def _new_solvers(self, count: int) -> None:
-        """Make solvers of so many candidates: one in long steps for the start, one for the motion."""
+        """Make two solvers for ``count`` candidates: one with long steps for the start, one for the motion."""
         model = assemble([self._tree] * count)
         common = {"fast_rate": _RATE, "max_rate": _RATE, "substeps": False, "device": self.device}
         still, moving = (
             ArticulationSolver(model, State.at_rest(model), dt=dt, phi=phi, **common)
             for dt, phi in ((STATIC_STEP, 1.0), (self.dt, None))
         )
-        if len(self._solvers) > 3:  # each holds its own arrays; a fit needs two or three sizes
+        if len(self._solvers) > 3:  # solvers have large arrays, and a fit needs two or three sizes
             self._solvers.pop(next(iter(self._solvers)))
         self._solvers[count] = (still, moving)
         self._own[count] = tuple(x.copy() for x in (moving.body_mass, moving.body_inertia, moving.body_product))
@@ -192,18 +194,18 @@ class Candidates:
         rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
         if self._sag is None:
             rest[:, : self.specimen.segments] = frames.exp(rest_bends(self.specimen, candidates[:, 3:5]))
-        else:  # it hangs as its axis shows, whatever its modulus is: the stiffer, the less the slack shape differs
+        else:  # it hangs along its axis for any modulus; the stiffer it is, the less the slack shape differs
             hanging = frames.exp(hanging_bends(self.specimen))
             rest[:] = frames.multiply(hanging[None], frames.conjugate(frames.exp(self._sags(candidates))))
         plants.launches.changed = True
 
     def _sags(self, candidates: np.ndarray) -> np.ndarray:
-        """[n, body, 3] rad, by which weight turns the joints of candidates [n, 7] of a specimen with an axis."""
+        """[n, body, 3] rad, rotation of joints by weight, for candidates [n, 7] of a specimen with an axis."""
         assert self._sag is not None
         return self._sag * np.exp(candidates[:, 2] - candidates[:, 0])[:, None, None]
 
     def _settle(self, plants: ArticulationSolver, candidates: np.ndarray, count: int) -> None:
-        """Bring the first trees into equilibrium under their pull."""
+        """Bring the first ``count`` trees into equilibrium under their pull."""
         state = plants.state
         state.joint_q[:] = frames.IDENTITY
         if self._sag is not None:
@@ -219,7 +221,7 @@ class Candidates:
         plants.forward_kinematics()
 
     def _push(self, plants: ArticulationSolver, candidates: np.ndarray) -> None:
-        """Apply the pull at the tip, where it is now."""
+        """Apply the pull at the present position of the tip."""
         body = np.arange(len(candidates)) * self.size + self._pulled
         force = (candidates[:, 5:7] * np.exp(candidates[:, :1])) @ self.pull_axes()
         turn = plants.state.body_q[body, 3:].astype(float)
@@ -229,19 +231,19 @@ class Candidates:
     def _load(
         self, plants: ArticulationSolver, candidates: np.ndarray, pushed: bool, base_velocity: np.ndarray | None
     ) -> Callable[[int], None] | None:
-        """What loads the bodies for the step that begins at a tick; None if nothing changes from step to step."""
+        """A function of a tick that loads the bodies for the step after it; None if the load does not change."""
         plants.body_load[:] = 0.0
         plants.tree_air[:] = 0.0
         if base_velocity is None and not pushed:
             return None
-        plants.forward_kinematics()  # levers of the first step
+        plants.forward_kinematics()  # lever arms of the first step
         if base_velocity is None:
             return lambda _: self._push(plants, candidates)
         return functools.partial(_shake, plants, np.asarray(base_velocity, float))
 
 
 def _advance(plants: ArticulationSolver, first: int, end: int, load: Callable[[int], None] | None) -> None:
-    """Take the steps from one tick to another."""
+    """Take the steps from tick ``first`` to tick ``end``."""
     if load is None:
         plants.upload()
         plants.advance(end - first)
@@ -254,7 +256,10 @@ def _advance(plants: ArticulationSolver, first: int, end: int, load: Callable[[i
 
 
 def _shake(plants: ArticulationSolver, base_velocity: np.ndarray, tick: int) -> None:
-    """Load every body with what the mean acceleration of the base [tick, 3] m/s over the step makes it weigh."""
+    """Load every body with the inertial force of the base's mean acceleration over the step.
+
+    ``base_velocity``: [tick, 3] m/s.
+    """
     now, later = base_velocity[tick : tick + 2]
     force = plants.body_mass[:, None] * ((now - later) / plants.dt).astype(np.float32)
     plants.body_load[:, :3] = force
@@ -265,7 +270,7 @@ def _shake(plants: ArticulationSolver, base_velocity: np.ndarray, tick: int) -> 
 def _marker_motion(
     plants: ArticulationSolver, bodies: np.ndarray, point: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions [n, marker, 3] of markers after a prediction, their velocities, and those at the end of the step."""
+    """Positions [n, marker, 3] of markers after a prediction, their velocities, and velocities at the step's end."""
     pose, now, later = (rows[bodies] for rows in (plants.state.body_q, plants.state.body_qd, plants.velocity_free))
     arm = frames.rotate(pose[..., 3:], point)
     velocity = now[..., :3] + frames.cross(now[..., 3:], arm)

@@ -1,4 +1,4 @@
-"""What a laboratory would measure on a specimen, with its noise, and what a fit would then know: to plan a campaign."""
+"""Simulates laboratory experiments on a specimen with noise, and predicts how uncertain a fit to them would be."""
 
 from __future__ import annotations
 
@@ -18,58 +18,58 @@ from vinesim.tune.trajectory import Trajectory
 from vinesim.tune.tuning import tune
 
 TRUTH_STEP = 1e-3
-"""[s] Step of the simulation that stands for the plant."""
+"""[s] Step of the simulation that represents the real plant."""
 TRUTH_SEGMENTS = 64
-"""Its segments, at least."""
+"""Smallest number of segments in the simulation that represents the real plant."""
 MAX_SHARE = 0.3
-"""[1] Fastest shaking over the pictures a second: samples of a faster one do not tell the acceleration between them."""
+"""[1] Largest ratio of the shaking frequency to the picture rate; beyond it samples do not determine acceleration."""
 KINDS = {
     "pull-release": {"displacement": 0.1, "duration": 3.0},
     "push": {"displacement": 0.1, "duration": 3.0},
     "shake": {"amplitude": 0.005, "from_frequency": 1.0, "to_frequency": 8.0, "duration": 10.0},
 }
-"""The kinds of experiments; the numbers in which they differ, and what these are unless given (m, Hz, s)."""
+"""Kinds of experiments, each with its specific numbers and their default values (m, Hz, s)."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """How a plant is moved and watched; a number that is None is as :data:`KINDS` says, see :meth:`number`."""
+    """Motion and observation of a plant. A number that is None has its default in :data:`KINDS`, see :meth:`number`."""
 
     kind: str = "pull-release"
-    """``pull-release``: held aside, then let go at :attr:`hold`. ``push``: at rest, then a steady force on its tip.
-    ``shake``: at rest, then its base is moved to and fro in a sine sweep."""
+    """``pull-release``: held aside, then released after :attr:`hold`. ``push``: at rest, then a steady force on its
+    tip. ``shake``: at rest, then its base is shaken in a sine sweep."""
     displacement: float | None = None
-    """[m] Of the tip, by the pull; by the push, once it has come to rest."""
+    """[m] Displacement of the tip by the pull, or by the push after it has come to rest."""
     angle: float = 90.0
     """[deg] Direction of the force or of the shaking about the base's x axis: 0 along its y, 90 along its z axis."""
     amplitude: float | None = None
-    """[m] Of the base that is shaken."""
+    """[m] Amplitude of the shaken base."""
     from_frequency: float | None = None
-    """[Hz] At the start of the sweep."""
+    """[Hz] Frequency at the start of the sweep."""
     to_frequency: float | None = None
-    """[Hz] At its end."""
+    """[Hz] Frequency at the end of the sweep."""
     duration: float | None = None
-    """[s] After the force begins or ends; of the sweep."""
+    """[s] Duration of the recording after the force begins or ends, or of the sweep."""
     hold: float = 0.2
-    """[s] Before that."""
+    """[s] Duration of the recording before that."""
     rate: float = 30.0
-    """[1/s] Pictures."""
+    """[1/s] Picture rate."""
     noise: float = 0.002
     """[m] Standard deviation of a tracked position, in each axis."""
     force_noise: float | None = None
-    """[1] Standard deviation of the force gauge over its reading; None: no gauge."""
+    """[1] Standard deviation of the force gauge relative to its reading; None: no gauge."""
     markers: tuple[str, ...] = (TIP,)
     axes: str = "xyz"
-    """Which axes of the world are tracked."""
+    """World axes that are tracked."""
     seed: int = 0
 
     def number(self, name: str) -> float:
-        """One of the numbers that its kind has, given or not."""
+        """The number ``name`` of this kind of experiment, given or default."""
         given = getattr(self, name)
         return KINDS[self.kind][name] if given is None else given
 
     def check(self) -> None:
-        """:class:`UsageError` naming the first number that is out of range, or that another kind has."""
+        """Raise :class:`UsageError` for the first number that is out of range or belongs to another kind."""
         if self.kind not in KINDS:
             raise UsageError(f"no experiment {self.kind!r}; there are: {', '.join(KINDS)}")
         for name in sorted({name for numbers in KINDS.values() for name in numbers} - KINDS[self.kind].keys()):
@@ -128,7 +128,7 @@ def measure(
     if e.force_noise is not None:
         size = float(np.linalg.norm(row[0, 5:]))
         force = np.where(held if e.kind == "pull-release" else ~held, size, 0.0)
-        force = force * (1.0 + (0.0 if exact else e.force_noise) * rng.normal())  # a gauge errs in scale
+        force = force * (1.0 + (0.0 if exact else e.force_noise) * rng.normal())  # a gauge has an error of scale
     if not exact:
         position += rng.normal(0.0, e.noise, position.shape)
     for axis in range(3):
@@ -138,11 +138,11 @@ def measure(
 
 
 def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
-    """How the base is shaken."""
+    """The motion of the shaken base."""
     e = experiment
     angle = math.radians(experiment.angle)
     direction = np.array([math.cos(angle), math.sin(angle)]) @ candidates.pull_axes()
-    direction[np.abs(direction) < 1e-12] = 0.0  # no column of rounding errors
+    direction[np.abs(direction) < 1e-12] = 0.0  # avoids a column of rounding errors
     frequencies = e.number("from_frequency"), e.number("to_frequency")
     return Sweep(direction, e.number("amplitude"), frequencies, e.hold, e.number("duration"))
 
@@ -150,7 +150,7 @@ def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
 def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.ndarray:
     """The pull [2] N along the base's y and z that moves the tip by ``displacement`` [m] at ``angle`` [rad].
 
-    :class:`UsageError` if no pull does.
+    :class:`UsageError` if there is no such pull.
     """
     specimen = candidates.specimen
     tip = Candidates(specimen, (TIP,), dt=candidates.dt)
@@ -173,7 +173,7 @@ def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.nd
 def expected_deviations(
     specimen: Specimen, track: Trajectory, parameters: Sequence[str] = ("modulus", "damping"), *, pushed: bool = False
 ) -> dict[str, float]:
-    """Standard deviation of each parameter's posterior after a fit of a track: relative, or rad for bows."""
+    """Standard deviation of each parameter's posterior after a fit to ``track``: relative, or in rad for bows."""
     fit = tune(specimen, track, parameters, pushed=pushed)
     if not fit.ok:
         raise UsageError(f"this experiment cannot be fitted: {fit.faults[0]}")

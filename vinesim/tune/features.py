@@ -1,8 +1,8 @@
-"""What a track tells without a model and without phase: frequency, logarithmic decrement, rest position, release.
+"""Features of a track without a plant model: frequency, logarithmic decrement, rest position, release.
 
-A damped sinusoid is fitted to all columns at once; for a given frequency and damping ratio its amplitudes follow by
-linear least squares, so gaps and irregular times do no harm. Where the base was shaken it is the response of a damped
-oscillator to the base's acceleration instead.
+A damped sinusoid is fitted to all columns at once. For a given frequency and damping ratio its amplitudes follow from
+linear least squares, so gaps and irregular times do no harm. If the base was shaken, the response of a damped
+oscillator to the base's acceleration is fitted instead.
 """
 
 from __future__ import annotations
@@ -18,48 +18,48 @@ from vinesim.tune.base_motion import SampledMotion
 from vinesim.tune.trajectory import Trajectory
 
 FREQUENCIES_PER_BIN = 4
-"""Trial frequencies within 1 / duration."""
+"""Number of trial frequencies in an interval of 1 / duration."""
 RELATIVE_STEP = 0.03
-"""[1] Between trial frequencies of an oscillator that is shaken, over the frequency."""
+"""[1] Relative spacing of the trial frequencies of a shaken oscillator."""
 SUBSTEPS = 8
-"""Parts of a sample interval in each of which the acceleration of a base is taken for constant."""
+"""Number of parts of a sample interval in each of which the acceleration of a base is taken as constant."""
 STANDS_OUT = 0.1
-"""[1] Share of the whole range by which a sample must be off the first ones to be motion, not noise. A turning point is
-known to a quarter of a period, so an onset that is noticed a little late does no harm, one in the hold does."""
+"""[1] A sample counts as motion, not noise, if it differs from the first samples by this fraction of the whole range. A
+late onset does no harm, because the turning point is known to a quarter of a period. An onset in the hold does."""
 CLEARLY = 5.0
-"""[1] Less loss, in squares of standard deviations, that another release must leave."""
+"""[1] Reduction of the loss, in squared standard deviations, by which another release must be better."""
 DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 """Trial damping ratios."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Features:
-    """A damped sinusoid, or the response of a damped oscillator, through a track."""
+    """A damped sinusoid, or the response of a damped oscillator, fitted to a track."""
 
     frequency: float
     """[Hz]"""
     damping_ratio: float
     """[1]"""
     release: float
-    """[s] When it was let go, on the track's clock: the turning point at or before the onset of motion; when the track
-    begins, if the base is shaken."""
+    """[s] Time of the release on the track's clock: the turning point at or before the onset of motion. For a shaken
+    base it is the start of the track."""
     rest: np.ndarray
-    """[column] m, where it comes to rest."""
+    """[column] m, rest position."""
     displacement: np.ndarray
-    """[column] m, of the sinusoid from there at the release; the largest of the oscillator's response."""
+    """[column] m, displacement of the sinusoid from rest at the release, or largest response of the oscillator."""
     noise: float
-    """[m] What that curve leaves unexplained: robust standard deviation, no less than the noise."""
+    """[m] Robust standard deviation of the residuals of the curve, which is at least the noise."""
     explained: float
-    """[1] Share of the motion after the release, relative to the base, that the curve explains."""
+    """[1] Fraction of the motion after the release, relative to the base, that the curve explains."""
 
     @property
     def log_decrement(self) -> float:
-        """[1] Logarithm of the ratio of two maxima that follow each other."""
+        """[1] Logarithm of the ratio of two successive maxima."""
         return 2.0 * math.pi * self.damping_ratio / math.sqrt(1.0 - self.damping_ratio**2)
 
 
 def columns_of(track: Trajectory) -> np.ndarray:
-    """The tracked columns [sample, column] m, gross outliers as NaN."""
+    """The tracked columns [sample, column] m, with gross outliers replaced by NaN."""
     values = track.position[:, track.tracked].copy()
     for column in values.T:
         column[_gross_outliers(column)] = np.nan
@@ -67,13 +67,13 @@ def columns_of(track: Trajectory) -> np.ndarray:
 
 
 def robust_deviation(values: np.ndarray) -> float:
-    """Standard deviation by the median of absolute deviations."""
+    """Standard deviation from the median of absolute deviations."""
     values = values[np.isfinite(values)]
     return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else math.nan
 
 
 def _gross_outliers(column: np.ndarray) -> np.ndarray:
-    """Samples far off the median of five: swaps of markers, wrong digits [sample] bool."""
+    """Samples far from the median of five neighbours [sample] bool, such as swapped markers and wrong digits."""
     seen = np.flatnonzero(np.isfinite(column))
     if len(seen) < 5:
         return np.zeros(len(column), bool)
@@ -87,7 +87,7 @@ def _gross_outliers(column: np.ndarray) -> np.ndarray:
 
 
 def find_onset(track: Trajectory) -> float:
-    """[s] The last time before the motion: the first sample unless the track begins with a hold."""
+    """Last time [s] before the motion, which is the first sample unless the track begins with a hold."""
     values = columns_of(track)
     time = track.time
     noise = max(_hold_noise(values), 1e-9)
@@ -99,23 +99,23 @@ def find_onset(track: Trajectory) -> float:
 
 
 def _hold_noise(values: np.ndarray) -> float:
-    """Noise of the first samples, if they hold still [m]."""
+    """Noise [m] of the first samples if they hold still."""
     first = values[: max(4, len(values) // 20)]
     return float(np.nanmax([robust_deviation(column) for column in np.diff(first, axis=0).T])) / math.sqrt(2.0)
 
 
 def _basis(time: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """[trial, sample, 3]: one, and the damped cosine and sine."""
+    """Basis curves [trial, sample, 3]: constant one, damped cosine and damped sine."""
     omega = 2.0 * np.pi * frequency[:, None]
     decay = np.exp(-ratio[:, None] / np.sqrt(1.0 - ratio[:, None] ** 2) * omega * time)
     return np.stack([np.ones_like(decay), decay * np.cos(omega * time), decay * np.sin(omega * time)], -1)
 
 
 def _response_basis(time: np.ndarray, motion: SampledMotion, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """[trial, sample, 3]: one, and, each with a mean square of one, the displacement of a damped oscillator whose base
-    is moved so, and the base's acceleration, which higher modes follow without delay.
+    """Basis curves [trial, sample, 3]: constant one, response of a damped oscillator, and acceleration of the base.
 
-    The response is exact for an acceleration that is constant over each of :data:`SUBSTEPS` parts of a sample interval.
+    Higher modes follow the acceleration without delay. The last two curves are scaled to a mean square of one. The
+    response is exact for an acceleration that is constant over each of :data:`SUBSTEPS` parts of a sample interval.
     """
     omega = 2.0 * np.pi * frequency
     pole = omega * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
@@ -135,7 +135,7 @@ def _response_basis(time: np.ndarray, motion: SampledMotion, frequency: np.ndarr
 
 
 def _misfit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted squares left over [trial], and coefficients [trial, 3, column], for bases [trial, sample, 3]."""
+    """Weighted squared residuals [trial] and coefficients [trial, 3, column] for ``basis`` [trial, sample, 3]."""
     clean = np.where(weight > 0.0, values, 0.0)
     normal = np.einsum("tsi,sc,tsj->tcij", basis, weight, basis) + 1e-9 * np.eye(3)
     right = np.einsum("tsi,sc->tci", basis, weight * clean)
@@ -145,9 +145,9 @@ def _misfit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[
 
 
 def extract_features(track: Trajectory, onset: float | None = None) -> Features:
-    """Frequency, damping ratio and the rest from the motion after ``onset`` [s], found unless given.
+    """Features of the motion after ``onset`` [s], which is detected unless given.
 
-    Of a track whose base is shaken all is used, from its first sample, at which the plant must be at rest.
+    A track with a shaken base is used from its first sample on, at which the plant must be at rest.
     """
     if track.base is not None:
         return _shaken_features(track)
@@ -161,7 +161,7 @@ def extract_features(track: Trajectory, onset: float | None = None) -> Features:
 
 
 def _free_features(track: Trajectory, onset: float) -> Features:
-    """Those of the damped sinusoid nearest to the track after ``onset`` [s]."""
+    """Features of the damped sinusoid that fits the track best after ``onset`` [s]."""
     here = track.time >= onset
     time = track.time[here] - onset
     values = columns_of(track)[here]
@@ -173,8 +173,10 @@ def _free_features(track: Trajectory, onset: float) -> Features:
 
 
 def _find_release(track: Trajectory, features: Features) -> float:
-    """[s] The turning point of the sinusoid before which the track holds still best: that of ``features``, unless
-    another half period is clearly better."""
+    """Time of the release [s]: the turning point of the sinusoid before which the track is still.
+
+    It is the release in ``features`` unless a turning point some half periods away fits clearly better.
+    """
     values = columns_of(track)
     time = track.time
     half = 0.5 / features.frequency
@@ -193,7 +195,7 @@ def _find_release(track: Trajectory, features: Features) -> float:
 
 
 def _shaken_features(track: Trajectory) -> Features:
-    """Those of the oscillator whose response to the base's motion is nearest to the track."""
+    """Features of the oscillator whose response to the base's motion fits the track best."""
     assert track.base is not None
     along = _direction(track.base)
     motion = SampledMotion(track.time, track.base @ along)
@@ -215,7 +217,7 @@ def _shaken_features(track: Trajectory) -> Features:
 
 
 def _direction(base: np.ndarray) -> np.ndarray:
-    """Unit vector [3] along which a base [sample, 3] was moved most."""
+    """Unit vector [3] of the largest motion of a base [sample, 3]."""
     return np.linalg.svd(base, full_matrices=False)[2][0]
 
 
@@ -226,22 +228,22 @@ def _search(
     step_at: Callable[[float], float],
     lowest: float,
 ) -> tuple[tuple[float, float], np.ndarray, np.ndarray]:
-    """Frequency and damping ratio whose curves explain values [sample, column] best.
+    """Find the frequency and damping ratio whose curves fit ``values`` [sample, column] best.
 
     Args:
-        basis: curves [trial, sample, 3] of trial frequencies and damping ratios [trial].
-        values: NaN where there are none.
+        basis: function of trial frequencies and damping ratios [trial] that gives curves [trial, sample, 3].
+        values: positions; NaN for missing ones.
         grid: frequencies that are tried first [Hz].
-        step_at: their spacing about a frequency [Hz].
-        lowest: no lower frequency is tried [Hz].
+        step_at: function of a frequency that gives their spacing there [Hz].
+        lowest: lowest frequency that is tried [Hz].
 
-    Returns frequency and ratio, coefficients [3, column], and what is left [sample, column].
+    Returns frequency and damping ratio, coefficients [3, column], and residuals [sample, column].
     """
     weight = np.isfinite(values).astype(float)
     ratio = DAMPING_RATIOS
     best = (0.0, 0.0)
     step = 0.0
-    for turn in range(7):  # each finer; outliers weigh less once something is known
+    for turn in range(7):  # each turn is finer; outliers have less weight after the first
         trials = [x.ravel() for x in np.meshgrid(grid, ratio, indexing="ij")]
         curves = basis(*trials)
         left, found = _misfit(curves, values, weight)
@@ -257,7 +259,7 @@ def _search(
 
 
 def _explained(off: np.ndarray, values: np.ndarray) -> float:
-    """Share [1] of the variance of values [sample, column] that is not left in ``off``."""
+    """Fraction [1] of the variance of ``values`` [sample, column] that is missing in the residuals ``off``."""
     moved = np.nanvar(values, axis=0).sum()
     return float(1.0 - np.nanvar(off, axis=0).sum() / max(moved, 1e-18))
 
@@ -273,10 +275,10 @@ def _describe(
     frequency, ratio = best
     rest, cosine, sine = found
     strong = int(np.argmax(np.hypot(cosine, sine)))
-    phase = math.atan2(sine[strong], cosine[strong])  # the column with the largest swing is at its maximum there
+    phase = math.atan2(sine[strong], cosine[strong])  # phase at which the column with the largest swing has its maximum
     turning = phase - math.pi * round(phase / math.pi)
     shift = turning / (2.0 * math.pi * frequency)
-    if shift > 1.5 * step:  # the track begins within a swing: it was let go before
+    if shift > 1.5 * step:  # the track begins within a swing, after the release
         shift -= 0.5 / frequency
     basis = _basis(np.array([shift]), np.array([frequency]), np.array([ratio]))[0, 0]
     return Features(

@@ -1,4 +1,4 @@
-"""What a fit found, in words, as JSON, and as a file of plant parameters that scenes load."""
+"""The result of a fit: in words, as JSON, and as a file of plant parameters for scenes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Minimum:
     modulus: float
     """[Pa]"""
     loss_ratio: float
-    """[1] Its loss over that of the best."""
+    """[1] Ratio of its loss to the loss of the best minimum."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -46,9 +46,9 @@ class Estimate:
     high: float
     unit: str
     prior: str
-    """90 % of the prior and where it comes from."""
+    """90 % interval of the prior and its source."""
     known: bool
-    """Whether the data, not the prior, decide it."""
+    """Whether the data, and not the prior, determine the number."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -56,29 +56,29 @@ class Fit:
     """The result of :func:`vinesim.tune.tune`."""
 
     specimen: Specimen
-    """As it was given."""
+    """The specimen before the fit."""
     track: Trajectory
     features: Features
-    """Of the track, without a model: frequency and logarithmic decrement to compare with."""
+    """Features of the track without a model, for comparison: frequency and logarithmic decrement."""
     posterior: Posterior
     sample: Sample | None
-    """Draws from the posterior, if they were asked for."""
+    """Draws from the posterior, if requested."""
     noise: float
-    """[m] Robust standard deviation of what the fit leaves of all columns together."""
+    """[m] Robust standard deviation of the residuals of all columns together."""
     column_noise: np.ndarray
-    """[column] m, of each: cameras measure distances less exactly than directions."""
+    """[column] m, robust standard deviation of each column; cameras measure distances less exactly than directions."""
     frequency: float
-    """[Hz] Of the fitted plant."""
+    """[Hz] Frequency of the fitted plant."""
     damping_ratio: float
-    """[1] Of the fitted plant's swing."""
+    """[1] Damping ratio of the fitted plant."""
     model: np.ndarray
-    """[sample, column] m: the fitted track in the columns of ``track.tracked``; NaN where data are."""
+    """[sample, column] m, the fitted track in the columns of ``track.tracked``; NaN where the data are NaN."""
     jacobian: np.ndarray
     """[observation, parameter] Derivatives of the fitted track."""
     minima: tuple[Minimum, ...]
     """Other minima, the best first."""
     faults: tuple[str, ...]
-    """Why the fit is not to be believed; empty if nothing speaks against it."""
+    """Reasons not to trust the fit; empty if there are none."""
     dt: float
     """[s] Step of the simulation."""
     force: tuple[float, float] | None
@@ -87,7 +87,7 @@ class Fit:
 
     @property
     def ok(self) -> bool:
-        """Whether nothing speaks against the fit."""
+        """Whether there is no reason to distrust the fit."""
         return not self.faults
 
     @property
@@ -97,7 +97,7 @@ class Fit:
         return tuple(self._estimate(name, name not in weak) for name in self.posterior.names[: self.posterior.physical])
 
     def estimate(self, name: str) -> Estimate:
-        """One of them."""
+        """The fitted number of this name."""
         return next(estimate for estimate in self.estimates if estimate.name == name)
 
     def _estimate(self, name: str, known: bool) -> Estimate:
@@ -115,7 +115,7 @@ class Fit:
 
     @property
     def outliers(self) -> int:
-        """Samples that weigh less than half, or were left out as gross errors."""
+        """Number of samples with less than half of the full weight, or left out as gross errors."""
         data = self.track.position[:, self.track.tracked]
         off = np.abs(self.model - data) / self.column_noise
         gross = np.isfinite(data) & ~np.isfinite(self.model)
@@ -123,13 +123,13 @@ class Fit:
 
     @property
     def gaps(self) -> int:
-        """Positions that are missing."""
+        """Number of missing positions."""
         return int(np.isnan(self.track.position[:, self.track.tracked]).sum())
 
     # ------------------------------------------------------------------ words
 
     def lines(self) -> list[str]:
-        """The fit in words, one fact a line."""
+        """The fit in words, one fact in each line."""
         f = self.features
         lines = []
         lines.append(f"{'fitted' if self.ok else 'FAILED'}: {self.track.source}, {len(self.track.time)} samples")
@@ -217,10 +217,10 @@ class Fit:
         return msgspec.structs.replace(self.specimen, bow=(bow[0], bow[1]), **changes)
 
     def write_plant(self, path: str | pathlib.Path, plant: str = "vine") -> None:
-        """Write plant parameters that scenes load (``plants = "FILE"``): those of ``plant`` with the fitted numbers,
-        and the table ``[specimen]``.
+        """Write a file of plant parameters for scenes (``plants = "FILE"``).
 
-        A cane's modulus becomes ``woody_modulus``; ``green_modulus`` keeps its ratio to it.
+        It contains the parameters of ``plant`` with the fitted numbers, and the table ``[specimen]``. A cane's modulus
+        becomes ``woody_modulus``, and ``green_modulus`` keeps its ratio to it.
         """
         text = find_data_file("plants", plant, ".toml").read_text("utf-8")
         text = text.split("\n[specimen]")[0].rstrip() + "\n"
@@ -240,7 +240,7 @@ class Fit:
 
 
 def specimen_toml(specimen: Specimen) -> str:
-    """The table ``[specimen]``."""
+    """The table ``[specimen]`` as TOML text."""
     lines = ["[specimen]", f'organ = "{specimen.organ}"']
     for name in ("length", "base_diameter", "tip_diameter", "modulus", "density", "damping", "tip_mass"):
         number = getattr(specimen, name)
@@ -270,14 +270,14 @@ def _replaced(number: Any, value: float, source: str) -> Any:
 
 
 def _replace_line(text: str, table: str, key: str, number: Any) -> str:
-    """The text of a TOML file with the line of one number of one table replaced."""
+    """The text of a TOML file with the line of the number ``key`` in ``table`` replaced."""
     before, head, after = re.split(rf"(^\[{table}\][^\n]*\n)", text, maxsplit=1, flags=re.MULTILINE)
     after = re.sub(rf"^{key} = [^\n]*", lambda _: f"{key} = {_number(number)}", after, count=1, flags=re.MULTILINE)
     return before + head + after
 
 
 def _scale_green(text: str, woody: Any) -> str:
-    """Keep the ratio of a shoot's green to its woody modulus."""
+    """Scale a shoot's green modulus so that its ratio to the woody modulus stays the same."""
     values = [
         float(re.search(rf"^{key} = {{ value = ([^,]+),", text, re.MULTILINE)[1])  # pyright: ignore[reportOptionalSubscript]
         for key in ("woody_modulus", "green_modulus")

@@ -1,4 +1,4 @@
-"""Tracks from RGB-D pictures: a marker ball found by its colour, its centre by the measured depth."""
+"""Tracks from RGB-D pictures: a marker ball is found by its colour, its centre by the measured depth."""
 
 from __future__ import annotations
 
@@ -14,39 +14,39 @@ from vinesim.tune.specimen import TIP
 from vinesim.tune.trajectory import MIN_SAMPLES, Trajectory, TrajectoryError
 
 MAX_TURN = np.radians(30.0)
-"""[rad] Largest difference in hue between a pixel of the marker and its colour, as the angle between their
-chromaticities seen from grey. The side of a ball in the shade is 20 degrees off the side in the sun."""
+"""[rad] Largest difference in hue between a pixel and the colour of its marker, as the angle between their
+chromaticities seen from grey. The shaded side of a ball differs from the sunny side by 20 degrees."""
 LEAST_SATURATION = 0.5
-"""[1] Least distance of its chromaticity from grey over the colour's: a pixel that is half marker has half of it."""
+"""[1] Smallest ratio of a pixel's distance from grey to the colour's distance; a pixel half covered has 0.5."""
 DARKEST = 60
-"""[1] Sum of red, green and blue, of 765, below which a pixel has no colour to speak of."""
+"""[1] Smallest sum of red, green and blue (of 765) with which a pixel has a usable colour."""
 MIN_PIXELS = 12
-"""Fewer do not show where the middle of a ball is."""
+"""Smallest number of pixels that show where the middle of a ball is."""
 MIDDLE_DEPTH = 0.707
-"""[1] Half of a ball's disc is nearer than its centre by more than so many radii: the median of its depth."""
+"""[1] Median over a ball's disc of the distance by which the surface is nearer than the centre, in radii."""
 
 
 Colour = tuple[int, int, int]
-"""[3] red, green and blue, 0..255; only the ratios count."""
+"""[3] Red, green and blue, 0 to 255; only their ratios matter."""
 
 
 def track_marker(
     pictures: Iterable[CameraFrame], colour: Colour | Mapping[str, Colour], *, radius: float, source: str = "pictures"
 ) -> Trajectory:
-    """The track of a ball of one colour at the tip, or of several, each of its own colour.
+    """The track of a coloured ball at the tip, or of several balls with different colours.
 
-    In each picture the largest patch of that colour is the ball. Its place is the centroid of the patch, its distance
-    the median of the depth there and 0.7 of the radius. A picture in which it is too small, touches the edge or has no
-    depth is a gap.
+    In each picture the largest patch of the colour is the ball. The ball's direction is the centroid of the patch, its
+    distance the median depth of the patch plus 0.7 radii. A picture is a gap if the patch is too small, touches the
+    edge or has no depth.
 
     Args:
-        pictures: in the order of time, with colours and measured depth. One at a time is held.
-        colour: of the ball in the pictures, or of each marker by its name. It should be saturated, and of a hue that
-            nothing else has.
-        radius: [m] of the balls.
-        source: a name for messages.
+        pictures: pictures in order of time, with colours and measured depth. Only one at a time is kept in memory.
+        colour: colour of the ball in the pictures, or of each marker by name. It should be saturated, with a hue that
+            nothing else in the pictures has.
+        radius: radius of the balls [m].
+        source: name for messages.
 
-    :class:`~vinesim.tune.trajectory.TrajectoryError` for fewer pictures than a track has samples, or if none shows it.
+    :class:`~vinesim.tune.trajectory.TrajectoryError` for too few pictures, or if no picture shows the ball.
     """
     colours = dict(colour) if isinstance(colour, Mapping) else {TIP: colour}
     time = []
@@ -70,9 +70,9 @@ def track_marker(
 
 
 def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
-    """The pixels [height, width] bool of the largest patch of a colour in ``rgb`` [height, width, 3], holes filled.
+    """Pixels [height, width] bool of the largest patch of a colour in ``rgb`` [height, width, 3], with holes filled.
 
-    None if it is too small or touches the edge.
+    None if the patch is too small or touches the edge.
     """
     wanted = _off_grey(np.array(colour))
     tint = _off_grey(rgb)
@@ -83,7 +83,7 @@ def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
     patches = np.zeros(alike.shape, np.int32)
     ndimage.label(alike, output=patches)
     sizes = np.bincount(patches.ravel())
-    sizes[0] = 0  # what is no patch
+    sizes[0] = 0  # label 0 is the background
     largest = int(np.argmax(sizes))
     if sizes[largest] < MIN_PIXELS:
         return None
@@ -94,12 +94,12 @@ def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
 
 
 def _off_grey(rgb: np.ndarray) -> np.ndarray:
-    """Shares [..., 3] of red, green and blue in their sum, less a third."""
+    """Distance of the chromaticity from grey: shares [..., 3] of red, green and blue in their sum, minus 1/3."""
     return rgb / np.maximum(rgb.sum(-1, dtype=np.int32), 1)[..., None] - 1.0 / 3.0
 
 
 def _centre(picture: CameraFrame, patch: np.ndarray | None, radius: float) -> np.ndarray:
-    """The centre [3] m in the world of the ball that shows as a patch [height, width]; NaN where there is none."""
+    """Centre [3] m in the world of the ball seen as ``patch`` [height, width]; NaN if there is no patch."""
     depth = np.zeros(0) if patch is None else picture.depth[patch]
     depth = depth[np.isfinite(depth)]
     if patch is None or len(depth) < MIN_PIXELS:

@@ -1,4 +1,4 @@
-"""Pictures of a fit: track with band, residuals, held-out release, posterior beside prior."""
+"""Plots of a fit: track with uncertainty band, residuals, held-out release, posterior with prior."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def plot_fit(fit: Fit, path: str | pathlib.Path) -> None:
 
 
 def draw_fit(fit: Fit, figure: Figure) -> None:
-    """Track, residuals, and posterior beside prior: all that a fit shows, in one figure of about :data:`SIZE`."""
+    """Draw track, residuals, and posterior with prior in one figure of about :data:`SIZE`."""
     left, right = figure.subfigures(1, 2, squeeze=False, width_ratios=[1.3, 1.0])[0]
     above, below = left.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
     draw_track(fit, above)
@@ -37,12 +37,12 @@ def draw_fit(fit: Fit, figure: Figure) -> None:
 
 
 def strongest_column(fit: Fit) -> int:
-    """The tracked column that swings furthest."""
+    """Index of the tracked column with the largest swing."""
     return int(np.argmax(np.nanstd(fit.model, axis=0)))
 
 
 def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
-    """One column of the track, the fitted candidate, and the 90 % band of parameters and noise."""
+    """Draw one column of the track, the fitted candidate, and the 90 % band from parameters and noise."""
     column = strongest_column(fit) if column is None else column
     seen = np.isfinite(fit.model)
     spread = np.full(fit.model.shape, np.nan)
@@ -60,7 +60,7 @@ def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
 
 
 def draw_residuals(fit: Fit, axes: Axes) -> None:
-    """What the fit leaves in every column, and the noise."""
+    """Draw the residuals of every column and the noise."""
     off = 1e3 * (fit.track.position[:, fit.track.tracked] - fit.model)
     for column, noise, name in zip(off.T, fit.column_noise, fit.track.column_names, strict=True):
         (dots,) = axes.plot(fit.track.time, column, ".", ms=3.0, label=name)
@@ -72,7 +72,7 @@ def draw_residuals(fit: Fit, axes: Axes) -> None:
 
 
 def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
-    """Posterior of the plant's numbers, one against the other [k, k], with the prior where it fits the picture."""
+    """Draw the posterior of each pair of the plant's numbers into ``grid`` [k, k], with the prior where it fits."""
     posterior = fit.posterior
     count = fit.posterior.physical
     names = posterior.names[:count]
@@ -103,7 +103,7 @@ def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
 
 
 def draw_held_out(fit: Fit, held_out: Fit, axes: Axes) -> None:
-    """Another release of the same plant, and what the fit of the first says of it."""
+    """Draw another release of the same plant, and its prediction by the fit to the first release."""
     column = strongest_column(held_out)
     axes.plot(held_out.track.time, 1e3 * held_out.model[:, column], color="C0", lw=1.0, label="fitted elsewhere")
     data = held_out.track.position[:, held_out.track.tracked][:, column]
@@ -120,7 +120,7 @@ def _normal(x: np.ndarray, mean: float, deviation: float) -> np.ndarray:
 
 
 def _draw_ellipses(axes: Axes, mean: np.ndarray, covariance: np.ndarray, i: int, j: int) -> None:
-    """Half and nine tenths of the probability."""
+    """Draw the ellipses that contain 50 % and 90 % of the probability."""
     part = covariance[np.ix_([i, j], [i, j])]
     values, vectors = np.linalg.eigh(part)
     angle = np.linspace(0.0, 2.0 * np.pi, 100)

@@ -1,7 +1,7 @@
-"""The axis of one cane from a point cloud of it: the shape in which it hangs at rest, for a specimen.
+"""The axis of one cane from its point cloud: the shape in which the cane hangs at rest, for a specimen.
 
-Points are ordered by their way along the cloud from the base (shortest paths between neighbours); slices of that way
-have their centres on the axis. What is not one cane (leaves, a second branch, a gap) is refused.
+Points are ordered by the length of the shortest path along the cloud from the base. The points are cut into slices of
+this length, whose centres form the axis. Clouds that are not one cane (leaves, a second branch, a gap) are refused.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from vinesim.scene.plant_import.ply import read_points
 from vinesim.scene.plant_parameters import AXIS_LENGTH, Specimen
 
 VOXEL = 0.003
-"""[m] Points that are nearer to each other become one."""
+"""[m] Points that are nearer to each other than this are merged."""
 GAP = 0.02
-"""[m] Wider gaps separate two things."""
+"""[m] Wider gaps separate two objects."""
 SLICE = 0.025
-"""[m] Way along the cane of which one point of the axis is made."""
+"""[m] Length along the cane of the slice from which one point of the axis is computed."""
 SPREAD = 0.02
-"""[m] How far the points of a slice may be from its centre: more than half a slice and the radius of any cane."""
+"""[m] Largest distance of a slice's points from its centre: more than half a slice and the radius of any cane."""
 MISSED = 0.05
-"""[1] Share of the points that may be cut off by gaps."""
+"""[1] Largest fraction of the points that may be cut off by gaps."""
 
 
 def with_cloud(specimen: Specimen, cloud: str | pathlib.Path | np.ndarray) -> Specimen:
-    """A cane that hangs as its point cloud shows it.
+    """The specimen with its axis from a point cloud of the hanging cane.
 
     Args:
-        specimen: a cane; its ``direction`` and ``bow`` give way to the cloud.
-        cloud: points [n, 3] m, world axes (z up), of this cane alone, the end that is clamped nearest to the origin;
-            or a file of them: PLY, or text with x, y and z in a line.
+        specimen: a cane; the cloud replaces its ``direction`` and ``bow``.
+        cloud: points [n, 3] m, world axes (z up), of this cane alone, with the clamped end nearest to the origin; or a
+            file of points: PLY, or text with x, y and z in each line.
 
-    :class:`~vinesim.core.errors.UsageError` if the points are not those of one cane of that length.
+    :class:`~vinesim.core.errors.UsageError` if the points are not one cane of the specimen's length.
     """
     if specimen.organ != "cane":
         raise UsageError(f"the specimen is a {specimen.organ}; only a cane takes its shape from a point cloud")
@@ -57,7 +57,7 @@ def with_cloud(specimen: Specimen, cloud: str | pathlib.Path | np.ndarray) -> Sp
 
 
 def trace_axis(points: np.ndarray, source: str = "the point cloud") -> np.ndarray:
-    """The axis [k, 3] m of one cane from points [n, 3] m on or about it; it begins at the origin.
+    """The axis [k, 3] m of one cane from points [n, 3] m on or near it; the axis begins at the origin.
 
     The base is the end nearest to the origin. :class:`~vinesim.core.errors.UsageError` if the points are not one cane.
     """
@@ -86,13 +86,14 @@ def trace_axis(points: np.ndarray, source: str = "the point cloud") -> np.ndarra
     number = np.minimum((count * way / way.max()).astype(int), count - 1)
     centres = np.array([thin[number == i].mean(0) for i in range(count)])
     _check_slices(thin, number, centres, source)
-    first, last = (1.5 * centres[i] - 0.5 * centres[j] for i, j in ((0, 1), (-1, -2)))  # half a slice beyond
+    # the ends are half a slice beyond the outermost centres
+    first, last = (1.5 * centres[i] - 0.5 * centres[j] for i, j in ((0, 1), (-1, -2)))
     axis = np.concatenate([first[None], centres, last[None]])
     return axis - axis[0]
 
 
 def _ways(graph: Any, start: int) -> np.ndarray:
-    """Length [point] m of the shortest path along the cloud from one point to each."""
+    """Length [point] m of the shortest path along the cloud from the point ``start`` to each point."""
     return dijkstra(graph, directed=False, indices=start)
 
 

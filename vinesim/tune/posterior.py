@@ -1,4 +1,4 @@
-"""Laplace's approximation of the posterior, what of it the data decide, and importance resampling beside it."""
+"""Laplace's approximation of the posterior, the directions that the data do not decide, and importance resampling."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from vinesim.tune.problem import SOFT, Evaluation, Problem
 
 Z90 = 1.6448536269514722
-"""Standard deviations from the middle of a normal distribution to either end of its 90 % interval."""
+"""Number of standard deviations from the mean of a normal distribution to either end of its 90 % interval."""
 DECIDED = 3.0
-"""The data decide a direction if they know it so many times better than the prior, as information (1 / variance)."""
+"""[1] The data decide a direction if their information (1 / variance) is at least this multiple of the prior's."""
 _CORRELATED = 3.0
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Ridge:
-    """A direction of the fitted parameters along which data say next to nothing."""
+    """A direction of the fitted parameters that the data hardly determine."""
 
     direction: dict[str, float]
-    """Unit vector: by how much each parameter changes along it (logarithms; rad for bows)."""
+    """Unit vector: change of each parameter along the direction (logarithms; rad for bows)."""
     information: float
-    """[1] Information of the data over the prior's, along it."""
+    """[1] Ratio of the data's information along the direction to the prior's."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -34,14 +34,14 @@ class Posterior:
     mean: np.ndarray
     covariance: np.ndarray
     physical: int
-    """How many of the first belong to the plant; the others to the experiment."""
+    """Number of parameters of the plant, which come first; the others belong to the experiment."""
     ridges: tuple[Ridge, ...]
     correlation_time: float
-    """[sample] Of the residuals, 1 if they are independent; the intervals are widened by its root."""
+    """[sample] Correlation time of the residuals, 1 if they are independent. Its square root widens the intervals."""
 
     @property
     def deviation(self) -> np.ndarray:
-        """[parameter]"""
+        """[parameter] Standard deviation of each parameter."""
         return np.sqrt(np.diag(self.covariance))
 
     def interval(self, name: str) -> tuple[float, float]:
@@ -52,10 +52,10 @@ class Posterior:
 
 
 def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.ndarray) -> Posterior:
-    """The posterior around a minimum ``theta`` that was evaluated, for a ``noise`` [column] m.
+    """The posterior around a minimum ``theta`` with the evaluation ``found``, for a ``noise`` [column] m.
 
-    The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so that outliers and heavy tails widen
-    it; residuals that are correlated count as fewer.
+    The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so outliers and heavy tails widen it.
+    Correlated residuals count as fewer independent ones.
     """
     table = problem.residuals(found.model) / noise
     residual = table[problem.seen]
@@ -67,8 +67,8 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
     correlation_time = _correlation_time(table)
     data = slope**2 / (spread * correlation_time) * weighted.T @ weighted
     readings = sum(math.isfinite(prior.deviation) for prior in problem.priors)
-    data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # the force
-    prior = np.array([1.0 / p.deviation**2 for p in problem.priors])  # 0 where nothing is known
+    data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # force reading
+    prior = np.array([1.0 / p.deviation**2 for p in problem.priors])  # 0 without prior knowledge
     size = 1.0 / np.sqrt(np.maximum(np.diag(data) + prior, 1e-12))
     scaled = (data + np.diag(prior)) * size * size[:, None]
     covariance = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) * size * size[:, None]
@@ -80,7 +80,7 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
 def _correlation_time(residuals: np.ndarray) -> float:
     """Number of correlated samples that carry as much information as one independent sample.
 
-    From residuals [sample, column] in standard deviations. 1 unless neighbours are clearly correlated.
+    ``residuals`` [sample, column] are in standard deviations. The result is 1 unless neighbours are clearly correlated.
     """
     table = np.clip(residuals, -SOFT, SOFT)
     pairs = table[:-1] * table[1:]
@@ -113,19 +113,21 @@ def _ridges(problem: Problem, data: np.ndarray, prior: np.ndarray) -> tuple[Ridg
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Sample:
-    """Draws from the posterior itself, by importance resampling of draws from Laplace's."""
+    """Draws from the exact posterior, by importance resampling of draws from Laplace's approximation."""
 
     draws: np.ndarray
-    """[n, parameter], equally likely."""
+    """[n, parameter] Draws with equal weights."""
     effective: float
-    """How many independent draws they are worth (Kish)."""
+    """Effective number of independent draws (Kish)."""
 
 
 def importance_sample(
     problem: Problem, posterior: Posterior, noise: np.ndarray, count: int, seed: int = 0, batch: int = 64
 ) -> Sample:
-    """Draw ``count`` candidates around the minimum, run them as trees of few launches, and weigh them by posterior over
-    proposal: a Student t with five degrees of freedom and the covariance of ``posterior``."""
+    """Draw ``count`` candidates from a proposal, simulate them, and resample them with weights posterior / proposal.
+
+    The proposal is a Student t distribution with five degrees of freedom and the covariance of ``posterior``.
+    """
     rng = np.random.default_rng(seed)
     size = len(posterior.mean)
     root = np.linalg.cholesky(posterior.covariance + 1e-15 * np.diag(np.diag(posterior.covariance)))

@@ -1,4 +1,4 @@
-"""What is known before the measurement: ``data/plants``, each number as good as its grade."""
+"""Prior knowledge: the numbers in ``data/plants``, each with an uncertainty that depends on its grade."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import math
 from vinesim.scene.plant_parameters import Specimen, load_plant
 
 GRADE_DEVIATIONS = {"READ": 0.5, "DERIVED": 0.7, "GUESSED": 1.0, "FITTED": 0.3}
-"""[1] Standard deviation of the natural logarithm: plants differ, whatever the grade."""
+"""[1] Standard deviation of the natural logarithm by grade; it is large because plants differ."""
 DENSITY_DEVIATION = 0.15
-"""[1] Of the logarithm of wood's density: 800 to 1050 kg/m^3, the range that ``data/plants`` gives."""
+"""[1] Standard deviation of the logarithm of wood density, from the range in ``data/plants``, 800 to 1050 kg/m^3."""
 BOW_DEVIATION = 0.5
-"""[rad]"""
+"""[rad] Standard deviation of a bow."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -21,12 +21,12 @@ class Prior:
 
     mean: float
     deviation: float
-    """``inf``: nothing is known."""
+    """Standard deviation; ``inf``: nothing is known."""
     source: str
 
 
 def physical_priors(specimen: Specimen, plant: str = "vine") -> dict[str, Prior]:
-    """Priors of the columns of a candidate that belong to the plant, by name."""
+    """Priors by name of the columns of a candidate that belong to the plant."""
     known = load_plant(plant)
     part = known.cane if specimen.organ == "cane" else known.peduncle
     modulus = known.cane.woody_modulus if specimen.organ == "cane" else known.peduncle.modulus

@@ -1,7 +1,7 @@
 """The least-squares problem: parameters of a plant and of the experiment, residuals of a track, their derivatives.
 
-The Jacobian is that of the simulator itself: central differences of candidates that run side by side in one launch, so
-that a residual vector and its Jacobian cost one simulation of nine or so trees (docs/decisions/tuning.md).
+The Jacobian is computed by central differences of candidates that run in parallel in one launch. So a residual vector
+and its Jacobian cost one simulation of about nine trees (docs/decisions/tuning.md).
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
 PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
-"""[1] Residuals of so many standard deviations begin to weigh less (soft L1)."""
+"""[standard deviations] Residuals larger than this have reduced weight (soft L1)."""
 FINER = 3
-"""So many times more steps and segments does the run have that tells the bias of the others."""
+"""Factor of the numbers of steps and segments in the finer run that determines the discretisation bias."""
 Noise = float | np.ndarray
-"""[m] Standard deviation of all columns, or of each [column]."""
+"""[m] Standard deviation of all columns together, or of each column [column]."""
 PHASE_STEP = 0.05
-"""[rad] Change of phase at the end of the track by which derivatives of modulus and mass are taken."""
+"""[rad] Change of phase at the end of the track in the finite differences by modulus and mass."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -37,29 +37,29 @@ class Evaluation:
     """Model and derivatives at one point."""
 
     model: np.ndarray
-    """[observation] m"""
+    """[observation] m, positions of the model."""
     jacobian: np.ndarray
-    """[observation, parameter] m"""
+    """[observation, parameter] m, derivatives of ``model``."""
     extra: np.ndarray
-    """[row] standard deviations: force reading and priors."""
+    """[row] Residuals of force reading and priors, in standard deviations."""
     extra_jacobian: np.ndarray
-    """[row, parameter]"""
+    """[row, parameter] Derivatives of ``extra``."""
 
 
 class Problem:
-    """Residuals of a track by parameters.
+    """Residuals of a track as a function of parameters.
 
     Args:
-        specimen: the plant with the user's own numbers.
-        track: what was measured.
-        features: of the track.
-        fitted: which of :data:`PHYSICAL` are fitted.
-        priors: of those, by name.
+        specimen: the plant with the user's numbers.
+        track: the measured track.
+        features: features of the track.
+        fitted: names of the fitted parameters among :data:`PHYSICAL`.
+        priors: priors of the fitted parameters, by name.
         dt: step of the simulation [s].
         device: ``cpu``, ``cuda`` or ``cuda:N``.
-        pushed: from rest, a steady force begins to act at the release.
+        pushed: the plant starts at rest, and a steady force begins to act at the release.
 
-    Where the track says how the base was shaken, there is neither pull nor release: it begins at rest.
+    If the track contains the motion of a shaken base, there is no pull and no release: the plant starts at rest.
     """
 
     def __init__(
@@ -88,7 +88,7 @@ class Problem:
         pulls = tuple(name for name, way in zip(COLUMNS[5:], tips, strict=True) if np.linalg.norm(way) > 0.3)
         self.pulls = pulls if self.shaking is None else ()
         self.begins = ("release",) if self.shaking is None else ()
-        """The parameter that says when the motion begins, if there is one."""
+        """Name of the parameter for the time at which the motion begins, if there is one."""
         free = "bow_y" not in fitted and "bow_z" not in fitted
         self.origins = tuple(f"origin_{'xyz'[axis]}" for axis in self.axes) if free else ()
         self.names = (*fitted, *self.pulls, *self.begins, *self.origins)
@@ -105,7 +105,7 @@ class Problem:
                 "or do not fit the mass"
             )
         self.pull_scale = 1.0
-        """[N] Size of the pull, for the step of its derivative."""
+        """[N] Magnitude of the pull, for the step of its finite difference."""
         self.evaluations = 0
         self.shift = np.zeros(len(self.names))
         """[parameter] Bias of the coarse candidates; see :meth:`correct_discretisation`."""
@@ -113,7 +113,7 @@ class Problem:
     # ------------------------------------------------------------------ parameters
 
     def row(self, theta: np.ndarray) -> np.ndarray:
-        """The candidate [7] of parameters [parameter]."""
+        """The candidate [7] for the parameters ``theta`` [parameter]."""
         theta = theta + self.shift
         candidate = np.zeros(len(COLUMNS))
         candidate[3:5] = self.specimen.bow
@@ -122,10 +122,10 @@ class Problem:
         return candidate
 
     def step(self, name: str) -> float:
-        """Half the difference by which the derivative by a simulated parameter is taken."""
+        """Step of the central difference by the parameter ``name``."""
         if name in ("modulus", "mass"):
             swing = math.pi * self.features.frequency * max(self.track.time[-1] - self.features.release, 0.2)
-            by_weight = 4.0 if self.specimen.organ == "bunch" else 1.0  # then it changes the frequency that much less
+            by_weight = 4.0 if self.specimen.organ == "bunch" else 1.0  # a bunch's modulus changes the frequency less
             return min(0.1, 2.0 * by_weight * PHASE_STEP / swing)
         return {"damping": 0.1, "bow_y": 0.01, "bow_z": 0.01}.get(name, 0.05 * self.pull_scale)
 
@@ -134,8 +134,10 @@ class Problem:
     def samples(
         self, thetas: np.ndarray, candidates: np.ndarray, end: float = math.inf
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [n, sample, column] of candidates [n, 7] whose release and origin ``thetas`` [n,
-        parameter] say, at the samples up to ``end`` [s]."""
+        """Positions and velocities [n, sample, column] of ``candidates`` [n, 7] at the samples up to ``end`` [s].
+
+        ``thetas`` [n, parameter] give the release and the origin of each candidate.
+        """
         thetas = thetas + self.shift
         time = self.track.time[self.track.time <= end]
         release = self._release(thetas)
@@ -153,23 +155,23 @@ class Problem:
         return x + self._origin(thetas)[:, None], v
 
     def _release(self, thetas: np.ndarray) -> np.ndarray:
-        """[n] s, when the motion of each candidate begins."""
+        """[n] s, time at which the motion of each candidate begins."""
         if not self.begins:
             return np.full(len(thetas), self.track.time[0])
         return thetas[:, self.names.index("release")]
 
     def _base_velocity(self, last: int) -> np.ndarray | None:
-        """[tick, 3] m/s of the base up to the tick after the ``last`` one; None if it rests."""
+        """[tick, 3] m/s, velocity of the base up to the tick after the ``last`` one; None if the base rests."""
         if self.shaking is None:
             return None
         return self.shaking.velocity(self.track.time[0] + self.candidates.dt * np.arange(last + 2))
 
     def correct_discretisation(self, theta: np.ndarray, noise: Noise) -> np.ndarray:
-        """Find by how much the coarse chain and step bias a fit near ``theta``; the parameters without that bias.
+        """Determine the bias of a fit near ``theta`` by coarse segments and steps. Returns ``theta`` without the bias.
 
-        The coarse candidates are fitted to the track of one candidate with finer segments and steps at ``theta``: what
-        comes out differs from ``theta`` by the bias, of second order in both. From now on :meth:`row` and
-        :meth:`samples` add it to what they are given.
+        Coarse candidates are fitted to the track of one candidate with finer segments and steps at ``theta``. The
+        difference between the result and ``theta`` is the bias, of second order in segment length and step. From now on
+        :meth:`row` and :meth:`samples` add the bias to their parameters.
         """
         coarse = self.candidates
         observed = self.observed
@@ -195,7 +197,7 @@ class Problem:
         return theta - self.shift
 
     def _origin(self, thetas: np.ndarray) -> np.ndarray:
-        """[n, column] m"""
+        """[n, column] m, origin of the markers for each of the ``thetas``."""
         axis = np.nonzero(self.track.tracked)[1]
         if not self.origins:
             return np.zeros((len(thetas), len(axis)))
@@ -203,7 +205,7 @@ class Problem:
         return thetas[:, first + np.searchsorted(self.axes, axis)]
 
     def evaluate(self, theta: np.ndarray, end: float = math.inf) -> Evaluation:
-        """Model, Jacobian and what is not of the track, at one point, for the samples up to ``end`` [s]."""
+        """Model, Jacobian and extra rows at the parameters ``theta``, for the samples up to ``end`` [s]."""
         self.evaluations += 1
         base = self.row(theta)
         steps = [self.step(name) for name in self.simulated]
@@ -226,7 +228,7 @@ class Problem:
         return Evaluation(x[0][seen], jacobian, *self._extra(theta))
 
     def _extra(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of priors and of the force reading."""
+        """Extra rows of the force reading and the priors, and their derivatives."""
         values = []
         rows = []
         for i, prior in enumerate(self.priors):
@@ -251,7 +253,10 @@ class Problem:
     def minimise(
         self, theta: np.ndarray, noise: Noise, end: float = math.inf, most: int = 30, tolerance: float = 1e-5
     ) -> tuple[np.ndarray, Evaluation]:
-        """The parameters of least loss near ``theta``, evaluated, for a noise [m] and samples up to ``end`` [s]."""
+        """Minimise the loss from ``theta`` on, for a ``noise`` [m] and the samples up to ``end`` [s].
+
+        Returns the parameters and their evaluation.
+        """
         known: dict[bytes, Evaluation] = {}
         table = self.observed[: int((self.track.time <= end).sum())]
         data = table[np.isfinite(table)]
@@ -278,7 +283,7 @@ class Problem:
             rows = np.array([2.0 * (root - 1.0), 1.0 / root, -0.5 / root**3])
             return np.where(soft, rows, np.array([z, np.ones_like(z), np.zeros_like(z)]))
 
-        options: Any = {"jac": jacobian, "loss": loss}  # scipy's stubs know names only
+        options: Any = {"jac": jacobian, "loss": loss}  # scipy's stubs accept only names
         found = least_squares(
             residuals,
             theta,
@@ -294,13 +299,13 @@ class Problem:
         return found.x, at(found.x)
 
     def residuals(self, model: np.ndarray) -> np.ndarray:
-        """Table [sample, column] m of what a model [observation] m is off; NaN where there are no data."""
+        """Residuals [sample, column] m of a model [observation] m; NaN where there are no data."""
         table = np.full(self.observed.shape, np.nan)
         table[self.seen] = model - self.observed[self.seen]
         return table
 
     def loss(self, theta: np.ndarray, positions: np.ndarray, noise: Noise) -> float:
-        """Loss of positions [sample, column], priors and force included: what :meth:`minimise` makes small."""
+        """Loss that :meth:`minimise` minimises, for positions [sample, column], including priors and force."""
         z = ((positions - self.observed) / noise / SOFT)[self.seen] ** 2
         return float(SOFT**2 * (np.sqrt(1.0 + z) - 1.0).sum() + 0.5 * (self._extra(theta)[0] ** 2).sum())
 
@@ -312,7 +317,7 @@ class Problem:
 
 
 def _force_reading(track: Trajectory, release: float, pushed: bool) -> tuple[float, float] | None:
-    """Mean and standard deviation [N] of the pull before the release, or of the push after; at least 1 % of it."""
+    """Mean [N] of the pull before the release, or of the push after it, and its standard deviation, at least 1 %."""
     if track.force is None:
         return None
     held = track.force[((track.time <= release) ^ pushed) & np.isfinite(track.force)]

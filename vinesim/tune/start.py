@@ -1,6 +1,7 @@
-"""Start values without phase: the modulus whose candidate swings at the track's frequency, and the damping.
+"""Start values for least squares: the modulus that gives the track's frequency, and the damping.
 
-Least squares on a long track has a minimum for every cycle that it may miss. Frequencies have one.
+Least squares on a long track has many minima, in which the candidate is whole cycles off. Comparing frequencies has
+only one minimum.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from vinesim.tune.features import Features
 from vinesim.tune.problem import Problem
 
 RATIOS = np.exp(np.linspace(-math.log(40.0), math.log(40.0), 8))
-"""Moduli that are tried, over the specimen's own."""
+"""Ratios of the moduli that are tried to the specimen's own modulus."""
 SCAN_DAMPING_RATIO = 0.04
 
 
@@ -40,7 +41,7 @@ def start_values(problem: Problem) -> np.ndarray:
 
 
 def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None:
-    """The pull that displaces the markers as far as the track begins, and the origin at which they then rest."""
+    """Set the pull that displaces the markers as at the start of the track, and the resulting origin."""
     unit = _unit_pull(problem)
     base = problem.row(theta)
     base[5:] = 0.0
@@ -49,7 +50,7 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
         rows[1 + i, COLUMNS.index(name)] = unit
     shape = problem.candidates.shape(rows)[:, problem.track.tracked]
     response = (shape[1:] - shape[0]) / unit  # [pull, column]
-    way = -1.0 if problem.pushed else 1.0  # a push ends where the swing does
+    way = -1.0 if problem.pushed else 1.0  # a pushed plant starts displaced against the force
     pull = np.zeros(0)
     if problem.pulls:
         pull = np.linalg.lstsq(response.T, way * problem.features.displacement, rcond=None)[0]
@@ -63,16 +64,16 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
 
 
 def _unit_pull(problem: Problem) -> float:
-    """[N] What moves the tip of a cane without taper by a tenth of its length."""
+    """Force [N] that moves the tip of a cane without taper by a tenth of its length."""
     specimen = problem.specimen
     radius = 0.5 * specimen.base_diameter.value
     return 0.1 * 3.0 * specimen.modulus.value * math.pi * radius**4 / 4.0 / specimen.length.value**2
 
 
 def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[float, float]:
-    """Logarithms of modulus and damping, over the specimen's, that give the track's frequency and decay.
+    """Logarithms of the ratios of modulus and damping to the specimen's that give the track's frequency and decay.
 
-    By free swings, from the pull of ``theta`` or, of a base that was shaken, from any.
+    They are found from free swings after the pull of ``theta``, or after any pull if the base was shaken.
     """
     own = problem.specimen.damping.value
     base = problem.row(theta)
@@ -96,7 +97,7 @@ def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[floa
         modulus = float(np.interp(math.log(features.frequency), np.log(frequency[order]), rows[order, 0]))
     near = int(np.argmin(np.abs(rows[:, 0] - modulus)))
     ratio = _decay(swing[near], stride * problem.candidates.dt) / (2.0 * math.pi * frequency[near])
-    # the ratio of a spring's damping grows with frequency; seen at another one, it is brought to the track's
+    # the damping ratio grows with frequency, so it is converted to the track's frequency
     ratio = max(ratio * features.frequency / frequency[near], 0.2 * SCAN_DAMPING_RATIO)
     return modulus, base[1] + math.log(max(features.damping_ratio, 1e-3) / ratio)
 
@@ -114,7 +115,7 @@ def _peak_frequency(swing: np.ndarray, step: float) -> np.ndarray:
 
 
 def _decay(swing: np.ndarray, step: float) -> float:
-    """Rate [1/s] at which the amplitude of a signal [sample] decays, by the energy of its halves."""
+    """Decay rate [1/s] of the amplitude of a signal [sample], from the energies of its two halves."""
     half = len(swing) // 2
     first, second = (float((part**2).sum()) for part in (swing[:half], swing[half : 2 * half]))
     return max(math.log(max(first, 1e-18) / max(second, 1e-18)), 1e-3) / (2.0 * half * step)

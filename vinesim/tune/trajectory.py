@@ -1,4 +1,4 @@
-"""Tracks of markers, as a camera or a tracker gives them: read from CSV with units in the header, checked, written."""
+"""Tracks of markers from a camera or a tracker: reads, checks and writes CSV with units in the header."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vinesim.core.errors import writing
 from vinesim.tune.specimen import TIP
 
 MIN_SAMPLES = 8
-"""Fewer say nothing about a swing."""
+"""Smallest number of samples of a track."""
 MAX_MISSING = 0.6
-"""Share of a column that may be missing."""
+"""[1] Largest fraction of a column that may be missing."""
 _SCALE = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "N": 1.0}
 _UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm"), "base": ("m", "cm", "mm")}
 BASE = "base"
-"""Names the columns that say how the base was moved; no marker is called so."""
+"""Name of the columns with the motion of the base; no marker may have this name."""
 _HEADER = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
 
 
@@ -30,24 +30,24 @@ class TrajectoryError(ValueError):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Where markers were while a plant was pulled, let go and swung, or shaken at its base.
+    """Positions of markers while a plant was pulled, released and swinging, or shaken at its base.
 
     :class:`TrajectoryError` if shapes or numbers contradict each other.
     """
 
     time: np.ndarray
-    """[sample] s, increasing; need not be regular."""
+    """[sample] s, increasing, not necessarily at regular intervals."""
     position: np.ndarray
-    """[sample, marker, 3] m, world axes (z up); NaN where it was not seen. An axis that was not tracked is all NaN."""
+    """[sample, marker, 3] m, world axes (z up); NaN where a marker was not seen. An axis not tracked is all NaN."""
     markers: tuple[str, ...] = (TIP,)
-    """Names; see :attr:`~vinesim.scene.plant_parameters.Specimen.markers`."""
+    """Names of the markers; see :attr:`~vinesim.scene.plant_parameters.Specimen.markers`."""
     force: np.ndarray | None = None
-    """[sample] N: the pull that a gauge showed at the tip; NaN where there is no reading. None without gauge."""
+    """[sample] N, pull measured by a gauge at the tip; NaN without a reading. None without a gauge."""
     source: str = "data"
-    """Where it comes from: the name of the file."""
+    """Name of the file for messages."""
     base: np.ndarray | None = None
-    """[sample, 3] m: how far the base was moved from where it rested at the first sample, without turning; None: not
-    at all."""
+    """[sample, 3] m, displacement of the base from its position at the first sample; the base does not rotate. None:
+    the base did not move."""
 
     def __post_init__(self) -> None:
         count = len(self.time)
@@ -73,7 +73,7 @@ class Trajectory:
 
     @property
     def tracked(self) -> np.ndarray:
-        """[marker, 3] bool: which axes were tracked."""
+        """[marker, 3] bool, whether each axis was tracked."""
         return np.any(np.isfinite(self.position), axis=0)
 
     @property
@@ -83,18 +83,18 @@ class Trajectory:
 
     @property
     def rate(self) -> float:
-        """[1/s] Samples a second, by the median."""
+        """[1/s] Sample rate, from the median interval."""
         return float(1.0 / np.median(np.diff(self.time)))
 
     def between(self, start: float, end: float) -> Trajectory:
-        """The samples from one time to another [s]."""
+        """The samples from time ``start`` to ``end`` [s]."""
         here = (self.time >= start) & (self.time <= end)
         force = None if self.force is None else self.force[here]
         base = None if self.base is None else self.base[here]
         return dataclasses.replace(self, time=self.time[here], position=self.position[here], force=force, base=base)
 
     def write(self, path: str | pathlib.Path) -> None:
-        """Write as CSV that :func:`read_trajectory` reads; positions in mm."""
+        """Write a CSV file for :func:`read_trajectory`, with positions in mm."""
         columns = [("time [s]", self.time)]
         for marker, axis in np.argwhere(self.tracked):
             name = "xyz"[axis] if self.markers[marker] == TIP else f"{self.markers[marker]} {'xyz'[axis]}"
@@ -107,12 +107,12 @@ class Trajectory:
             out = csv.writer(file, lineterminator="\n")
             out.writerow([name for name, _ in columns])
             for row in zip(*(values.tolist() for _, values in columns), strict=True):
-                clock, *values = row  # in microseconds: a time since 1970 keeps its thirtieths of a second
+                clock, *values = row  # microseconds are exact enough for times since 1970
                 out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
 
 
 def _moved_axes(base: np.ndarray) -> list[int]:
-    """Axes along which a base [sample, 3] moved; the first one if it stood still."""
+    """Axes along which a base [sample, 3] moved; the first axis if it stood still."""
     return np.flatnonzero(np.any(base != 0.0, axis=0)).tolist() or [0]
 
 
@@ -125,12 +125,12 @@ class _Column:
 
 
 def read_trajectory(path: str | pathlib.Path) -> Trajectory:
-    """A track from CSV.
+    """A track from a CSV file.
 
     The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker,
-    ``base x [mm]`` for how far the base was moved, ``force [N]``; axes x, y, z of the world, z up; s or ms, m, cm or
-    mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which time and base must not have. Lines that begin
-    with ``#`` are skipped.
+    ``base x [mm]`` for the displacement of the base, ``force [N]``. Axes are x, y and z of the world, z up. Units are s
+    or ms, and m, cm or mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which are not allowed in time and
+    base. Lines that begin with ``#`` are skipped.
 
     :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
     """

@@ -1,4 +1,4 @@
-"""``tune``: from a track and a plant to fitted numbers, their uncertainty, and whether to believe them."""
+"""``tune``: fits a plant to a track; returns fitted numbers, their uncertainty, and reasons to distrust them."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from vinesim.tune.start import start_values
 from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
 STEP_PHASE = 0.1
-"""[rad] By which the first mode turns in a step of the simulation: errs by 0.2 % in modulus before it is corrected."""
+"""[rad] Phase of the first mode in one step of the simulation; the modulus error before correction is then 0.2 %."""
 PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",), "rest": ("bow_y", "bow_z")}
-"""What can be fitted, and which columns of a candidate that are."""
+"""Parameters that can be fitted, and their columns of a candidate."""
 CONTRADICTS = 4.0
-"""[1] Standard deviations of its prior by which a fitted mass is no mass of wood."""
+"""[standard deviations] A fitted mass further than this from its prior cannot be a mass of wood."""
 WIDE = 0.5
-"""[1] A swing over the plant's length that is rather a wrong unit."""
+"""[1] A swing larger than this fraction of the plant's length suggests a wrong unit."""
 UNEXPLAINED = 1.3
-"""A fit that leaves so many times more than a damped sinusoid does has failed."""
+"""[1] A fit has failed if its residuals exceed those of a damped sinusoid by this factor."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
-"""[period] After the release, when the whole track at once fails."""
+"""[period] Growing durations after the release that are fitted if fitting the whole track at once fails."""
 MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
-"""Moduli over the best one at which other minima are looked for."""
+"""Ratios to the best modulus at which other minima are searched."""
 
 
 def tune(
@@ -47,22 +47,24 @@ def tune(
     device: str = "cpu",
     pushed: bool = False,
 ) -> Fit:
-    """Fit a specimen to a track of a pull and release, or of a base that is shaken.
+    """Fit a specimen to a track of a pull and release, of a push, or of a shaken base.
 
     Args:
-        specimen: the plant as far as it is known; modulus and damping may be off by any factor up to 40.
-        track: of one or more markers, from before or after the release on; from rest on, if it says how the base was
-            moved.
-        parameters: of :data:`PARAMETERS`; none to test the plant as it is on another release. ``mass`` scales all
-            masses alike and needs a force reading; ``rest`` is the slack shape and needs positions from the base.
-        release: when it was let go [s]; found unless given.
-        samples: so many draws of the posterior beside Laplace's approximation.
-        seed: of those draws.
+        specimen: the plant as far as it is known; modulus and damping may be wrong by a factor of up to 40.
+        track: track of one or more markers. It may start before or after the release. With motion of the base it must
+            start at rest.
+        parameters: names from :data:`PARAMETERS`; empty to test the plant unchanged on another release. ``mass`` scales
+            all masses equally and needs a force reading; ``rest`` is the slack shape and needs positions relative to
+            the base.
+        release: time of the release [s]; detected unless given.
+        samples: number of draws from the posterior in addition to Laplace's approximation.
+        seed: seed of those draws.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
-        pushed: the track is one of a push: from rest, a steady force begins to act at ``release``.
+        pushed: the track shows a push: from rest, a steady force begins to act at ``release``.
 
     :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen,
-    :class:`~vinesim.core.errors.UsageError` for other parameters. A fit that has failed is returned and says so.
+    :class:`~vinesim.core.errors.UsageError` for invalid parameters. A failed fit is returned, with the reasons in
+    :attr:`Fit.faults`.
     """
     fitted = _columns(parameters)
     if specimen.axis and "rest" in parameters:
@@ -77,7 +79,7 @@ def tune(
     dt = float(np.clip(STEP_PHASE / (2.0 * math.pi * features.frequency), 5e-4, 0.01))
     chain = specimen
     coarse = "modulus" in fitted
-    if not coarse:  # a coarse chain swings up to 1 % too slowly, which only a fitted modulus can make good
+    if not coarse:  # a coarse chain swings up to 1 % too slowly; only a fitted modulus can compensate this
         chain = msgspec.structs.replace(specimen, segments=FINER * specimen.segments)
         dt = dt / FINER
     problem = Problem(chain, track, features, fitted, physical_priors(specimen), dt, device, pushed)
@@ -121,7 +123,7 @@ def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
 
 
 def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> None:
-    """Refuse what cannot be a track of this plant."""
+    """Raise an error for a track that cannot belong to this plant."""
     duration = float(track.time[-1] - features.release)
     shaken = track.base is not None
     if duration * features.frequency < 1.0 and not shaken:
@@ -152,7 +154,7 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
 
 
 def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluation, np.ndarray]:
-    """The minimum near some start and the noise there; by growing horizons where the whole track at once fails."""
+    """The minimum near ``theta``, its evaluation and noise. Uses growing horizons if the whole track at once fails."""
     features = problem.features
     best = _settle(problem, theta, features.noise)
     if _left(problem, best[1]) <= UNEXPLAINED * features.noise:
@@ -167,7 +169,7 @@ def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluati
 
 
 def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarray, Evaluation, np.ndarray]:
-    """Minimise, estimate the noise [column] m from what is left, and once more if that changes the weights."""
+    """Minimise, estimate the noise [column] m from the residuals, and repeat if the weights change."""
     for _ in range(2):
         theta, found = problem.minimise(theta, noise)
         left = np.array([max(robust_deviation(column), 1e-7) for column in problem.residuals(found.model).T])
@@ -178,14 +180,14 @@ def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarr
 
 
 def _left(problem: Problem, found: Evaluation) -> float:
-    """[m] Robust standard deviation of what a fit leaves of all columns together."""
+    """Robust standard deviation [m] of the residuals of all columns together."""
     return max(robust_deviation(found.model - problem.observed[problem.seen]), 1e-7)
 
 
 def _look_for_minima(
     problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.ndarray
 ) -> tuple[np.ndarray, Evaluation, np.ndarray, tuple[Minimum, ...]]:
-    """Scan the modulus for other minima of the loss; go to one that is better."""
+    """Scan the modulus for other minima of the loss, and move to a better one if there is one."""
     at = problem.names.index("modulus")
     thetas = np.repeat(theta[None], len(MINIMA) + 1, 0)
     thetas[1:, at] += np.log(MINIMA)
@@ -206,7 +208,7 @@ def _look_for_minima(
 
 
 def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> Features:
-    """Frequency and damping ratio of the fitted candidate, noise-free, at the track's own times."""
+    """Features of the fitted candidate without noise, at the times of the track."""
     position = np.full(problem.track.position.shape, np.nan)
     position[:, problem.track.tracked] = model
     release = float(theta[problem.names.index("release")]) if problem.begins else None
@@ -214,7 +216,7 @@ def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> 
 
 
 def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, ...]:
-    """Why the fit is not to be believed; empty if nothing speaks against it."""
+    """Reasons not to trust the fit; empty if there are none."""
     faults = []
     features = problem.features
     curve = "sinusoid" if problem.shaking is None else "oscillator"
@@ -236,7 +238,7 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
 
 
 def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> list[str]:
-    """What the user gave beside the track and the fit denies."""
+    """Numbers given by the user, other than the track, that contradict the fit, in words."""
     faults = []
     features = problem.features
     specimen = problem.specimen

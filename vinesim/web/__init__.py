@@ -1,1 +1,1 @@
-"""The page on which people and spectators see the vineyard: its server, and its messages."""
+"""Server and messages of the page on which people and spectators see the vineyard."""

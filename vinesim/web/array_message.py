@@ -1,8 +1,8 @@
-"""Named arrays and a few values in one binary message: what the page loads, and what it receives.
+"""Binary messages to the page with named arrays and a few values.
 
-Layout, little-endian: length of the header [u32]; the header, JSON in ASCII, padded by spaces; the arrays, each from a
-multiple of 8 bytes on. The header holds the values, and under ``arrays`` for each array its NumPy type, its shape and
-where it begins, counted from the header's end.
+Layout, little-endian: length of the header [u32]; the header, JSON in ASCII, padded with spaces; the arrays, each
+aligned to 8 bytes. The header contains the values, and under ``arrays`` the NumPy type, shape and offset of each array,
+counted from the end of the header.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LENGTH = struct.Struct("<I")
 
 
 def encode(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """One message. Raises ValueError for an array type that browsers lack (64-bit integers, objects)."""
+    """Encode one message. Raises ValueError for an array type that browsers lack (64-bit integers, objects)."""
     blocks = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
     for name, block in blocks.items():
         if block.dtype.kind not in "iuf" or (block.dtype.kind != "f" and block.dtype.itemsize == 8):
@@ -40,7 +40,7 @@ def encode(values: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes
 
 
 def decode(message: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Values and arrays of a message, as the page reads it."""
+    """Decode the values and arrays of a message, as the page does."""
     (length,) = _LENGTH.unpack_from(message)
     start = _LENGTH.size + length
     header = json.loads(message[_LENGTH.size : start])

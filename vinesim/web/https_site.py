@@ -1,4 +1,4 @@
-"""A listener for https that answers plain http on its port with a sentence, instead of dropping it."""
+"""A listener for https that answers plain http on its port with a sentence instead of dropping the connection."""
 
 from __future__ import annotations
 
@@ -15,20 +15,22 @@ from aiohttp import web
 log = logging.getLogger(__name__)
 
 _HANDSHAKE = b"\x16"
-"""First byte of every connection by TLS (RFC 8446, section 5.1)."""
+"""First byte of every TLS connection (RFC 8446, section 5.1)."""
 _FIRST_BYTE = 10.0
+"""[s] Time in which a connection must send its first byte."""
 _REQUEST = 2.0
+"""[s] Time in which a plain request must be read and answered."""
 _POLL = 0.01
-"""[s] In which a connection has to begin, and in which a plain request is read; between two looks for the former."""
+"""[s] Period of polling for the first byte."""
 _MAX_OPENING = 256
-"""Connections that have not begun yet; further ones are closed."""
+"""Largest number of connections that have not sent their first byte; further ones are closed."""
 
 
 class HttpsSite:
-    """Accepts connections; those by TLS go to a server of aiohttp."""
+    """Accepts connections and passes TLS connections on to an aiohttp server."""
 
     def __init__(self, server: web.Server, tls: ssl.SSLContext, sentence: str) -> None:
-        """``sentence`` is the answer to plain http."""
+        """``sentence``: the answer to plain http."""
         self._server = server
         self._tls = tls
         self._sentence = sentence
@@ -37,14 +39,14 @@ class HttpsSite:
         self._opening: set[asyncio.Task[None]] = set()
 
     def listen(self, host: str, port: int) -> int:
-        """Begin; returns the port. OSError if it is taken."""
+        """Start listening. Returns the port. Raises OSError if it is taken."""
         self._listener = socket.create_server((host, port))
         self._listener.setblocking(False)
         self._accepting = asyncio.ensure_future(self._accept(self._listener))
         return int(self._listener.getsockname()[1])
 
     async def close(self) -> None:
-        """Accept nothing any more."""
+        """Stop accepting connections."""
         tasks = [*self._opening, *([self._accepting] if self._accepting else [])]
         for task in tasks:
             task.cancel()
@@ -70,7 +72,7 @@ class HttpsSite:
             task.add_done_callback(self._opening.discard)
 
     async def _open(self, connection: socket.socket) -> None:
-        """One connection until it is handed over or answered."""
+        """Serve one connection until it is passed on or answered."""
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         loop = asyncio.get_running_loop()
@@ -79,7 +81,7 @@ class HttpsSite:
                 await loop.connect_accepted_socket(self._server, connection, ssl=self._tls)
                 return
             await asyncio.wait_for(self._answer(connection), _REQUEST)
-        except (OSError, TimeoutError):  # it said nothing, or no handshake
+        except (OSError, TimeoutError):  # no first byte, or no valid handshake
             pass
         except asyncio.CancelledError:
             connection.close()
@@ -87,7 +89,7 @@ class HttpsSite:
         connection.close()
 
     async def _answer(self, connection: socket.socket) -> None:
-        """Read a plain request, as closing before it is read would take the answer back, and answer."""
+        """Answer a plain request. It must be read first, or closing the connection would discard the answer."""
         loop = asyncio.get_running_loop()
         body = f"{self._sentence}\n".encode()
         await loop.sock_recv(connection, 1 << 16)
@@ -102,8 +104,8 @@ class HttpsSite:
 
 
 async def _peek(connection: socket.socket) -> bytes:
-    """The first byte that comes, which stays to be read; empty if the peer has closed."""
-    while True:  # no event loop tells of this on every system
+    """Wait for the first byte without consuming it; empty if the peer has closed."""
+    while True:  # polling, because not every event loop can wait for this
         with contextlib.suppress(BlockingIOError):
             return connection.recv(1, socket.MSG_PEEK)
         await asyncio.sleep(_POLL)

@@ -1,4 +1,4 @@
-"""Where the page's files are, and whether all that the page needs is there."""
+"""Location of the page's files, and a check that none is missing."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from vinesim.core.errors import UsageError
 
 PAGE = pathlib.Path(__file__).parent / "page"
 THREE = PAGE / "vendor" / "three.module.js"
-"""From the npm packages, by ``tools/build_page``."""
+"""Copied from the npm packages by ``tools/build_page``."""
 
 
 def missing() -> str | None:
-    """What the page lacks and how to mend that, in one line; None: nothing."""
+    """Missing files of the page and the remedy in one line; None if nothing is missing."""
     if importlib.util.find_spec("aiohttp") is None:
         return "the page needs aiohttp: pip install 'vinesim[web]'"
     if not THREE.is_file():
@@ -22,6 +22,6 @@ def missing() -> str | None:
 
 
 def check() -> None:
-    """Raise :class:`UsageError` if the page lacks anything."""
+    """Raise :class:`UsageError` if files of the page are missing."""
     if (text := missing()) is not None:
         raise UsageError(text)

@@ -1,4 +1,4 @@
-"""What a page sends: which state it has drawn, where it looks from, and where its person's head and hands are."""
+"""Messages of a page: the state that it has drawn, its viewpoint, and poses of its person's head and hands."""
 
 from __future__ import annotations
 
@@ -20,31 +20,31 @@ class TrackedHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One hand of a person."""
 
     pose: Pose
-    """Middle of the palm: x along the fingers, z out of the back of the hand."""
+    """Pose of the middle of the palm: x along the fingers, z out of the back of the hand."""
     closed: bool = False
     fingers: tuple[_Share, _Share, _Share, _Share, _Share] = (0.0, 0.0, 0.0, 0.0, 0.0)
-    """How far thumb, index, middle, ring and little finger are bent."""
+    """Bend of thumb, index, middle, ring and little finger, from 0 to 1."""
 
 
 class TrackedPerson(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a headset, or a desktop with mouse and keys, knows of a person. A hand that is None hangs down."""
+    """State of a person from a headset, or from mouse and keys. A hand that is None hangs down."""
 
     head: Pose
     left: TrackedHand | None = None
     right: TrackedHand | None = None
     intention: Annotated[str, msgspec.Meta(max_length=32)] = ""
-    """What the person indicates to do; empty: nothing."""
+    """Intention that the person indicates; empty: none."""
     shears: tuple[bool, bool] = (False, False)
     """Whether the left and the right hand have shears."""
 
 
 class ReplayCommand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How a page wants a recording to be played."""
+    """A page's command to the player of a recording."""
 
     paused: bool
     speed: Annotated[float, msgspec.Meta(ge=0.05, le=20.0)]
     seek: Annotated[float, msgspec.Meta(ge=0.0, le=1e7)] | None = None
-    """[s] since its beginning; None: go on where it is."""
+    """[s] Time since the beginning of the recording; None: continue at the present time."""
 
 
 class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -55,12 +55,12 @@ class PageInput(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     view: Pose
     person: TrackedPerson | None = None
     overlays: bool = False
-    """Whether it shows contact forces or owners."""
+    """Whether the page shows contact forces or owners."""
     replay: ReplayCommand | None = None
-    """Only in pages of a recording, when the user has asked for something."""
+    """Command of the user, only in pages of a recording."""
 
     def poses(self) -> list[Pose]:
-        """All poses in it."""
+        """All poses in the message."""
         person = self.person
         hands = () if person is None else (person.left, person.right)
         return [self.view, *(() if person is None else (person.head,)), *(hand.pose for hand in hands if hand)]
@@ -70,7 +70,7 @@ _decoder = msgspec.json.Decoder(PageInput)
 
 
 def decode_input(text: str) -> PageInput | None:
-    """A page's message; None if it is none, or a rotation in it is not of unit length within 1 %."""
+    """Decode a page's message; None if it is invalid, or a quaternion in it is not of unit length within 1 %."""
     try:
         found = _decoder.decode(text)
     except (msgspec.MsgspecError, RecursionError, UnicodeError):
@@ -86,7 +86,7 @@ class _Place(msgspec.Struct, frozen=True):
 
 
 def decode_place(query: Mapping[str, str]) -> np.ndarray | None:
-    """The place [3] m that the query of an address gives by x, y and z; None if it gives none."""
+    """The position [3] m in x, y and z of a URL's query; None if they are missing or invalid."""
     try:
         found = msgspec.convert(dict(query), _Place, strict=False)
     except msgspec.ValidationError:

@@ -1,7 +1,7 @@
-"""Serves the page and, on a socket, the world: an HTTP server with an event loop in a thread of its own.
+"""Serves the page and, on a socket, the world: an HTTP server with an event loop in its own thread.
 
-A connection never has more than :data:`WINDOW` states that the page has not drawn yet; then it waits, and the next
-state is the newest one. A page that stalls is late by as many states, however long it stalls.
+At most :data:`WINDOW` states that the page has not drawn yet are on their way to it. Then the server waits, and the
+next state is the newest one. So after a stall of any duration a page is at most :data:`WINDOW` states late.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from vinesim.web.voice_socket import Sound, VoiceSocket
 log = logging.getLogger(__name__)
 
 WINDOW = 2
-"""States in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s behind."""
+"""Largest number of states in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s late."""
 _MAX_INPUT = 8192
 """Longest message of a page [B]."""
 _NEEDS_HTTPS = "this page needs https: open the address that the client has printed, with https:// and its token"
-"""For who opens it by plain http."""
+"""Answer to requests by plain http."""
 _THIS_MACHINE = ("localhost", "127.0.0.1", "::1")
 _POLICY = "; ".join(
     (
@@ -45,39 +45,42 @@ _POLICY = "; ".join(
         "base-uri 'none'",
     )
 )
-"""Content Security Policy: browsers load nothing from other hosts for the page, whatever its scripts ask for."""
+"""Content Security Policy: the page can load nothing from other hosts, whatever its scripts request."""
 
 
 class World(Protocol):
-    """What a page is told of the world; every method is called in the server's thread."""
+    """Interface of the world to pages. All methods are called in the server's thread.
+
+    Messages are encoded by :mod:`vinesim.web.array_message`.
+    """
 
     def scene(self) -> bytes:
-        """All that does not change (:mod:`vinesim.web.array_message`)."""
+        """Message with everything that does not change."""
         ...
 
     def plants(self, place: np.ndarray) -> bytes:
-        """Of a vineyard that is not loaded as a whole the part around a ``place`` [3] m."""
+        """Message with the plants around ``place`` [3] m, for a vineyard that is too large to be loaded as a whole."""
         ...
 
     def rigid(self) -> bytes:
-        """Shapes of the rigid bodies that there are now."""
+        """Message with the shapes of the present rigid bodies."""
         ...
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Tick and message of the newest state: what has moved after the tick ``since``; None: nothing is new."""
+        """Tick and message of the newest state, with everything moved after tick ``since``; None without changes."""
         ...
 
     def take(self, page: int, said: PageInput) -> None:
-        """What a page has sent; pages are counted from 0."""
+        """Handle a message of a page; pages are counted from 0."""
         ...
 
     def leave(self, page: int) -> None:
-        """A page is gone."""
+        """Called when a page has disconnected."""
         ...
 
 
 class PageServer:
-    """A context: the page is served until it is left."""
+    """A context manager that serves the page until it is left."""
 
     def __init__(
         self,
@@ -89,10 +92,17 @@ class PageServer:
         token: str | None = None,
         sound: Sound | None = None,
     ) -> None:
-        """``port`` 0: any that is free; ``tls``: by https; ``token``: only who has it in the address is let in;
-        ``sound``: what pages hear and say.
+        """Prepare to serve a world.
 
-        Raises :class:`UsageError` if the page lacks anything or the port is taken.
+        Args:
+            world: the world to show.
+            port: port to listen on; 0: any free port.
+            host: address to listen on.
+            tls: serve by https with this context.
+            token: secret that browsers must have in the address; None: no secret is needed.
+            sound: sound from and to pages; None: no sound.
+
+        Raises :class:`UsageError` if files of the page are missing or the port is taken.
         """
         page_files.check()
         self._world = world
@@ -106,7 +116,7 @@ class PageServer:
         self._pages = 0
         self.states_sent = 0
         self.refused = 0
-        """Messages of pages that were not understood."""
+        """Number of invalid messages of pages."""
         self._loop = asyncio.new_event_loop()
         self._fresh: set[asyncio.Event] = set()
         self._stopping: asyncio.Event | None = None
@@ -116,7 +126,7 @@ class PageServer:
 
     @property
     def address(self) -> str:
-        """What to type into a browser."""
+        """Address of the page for a browser."""
         scheme = "http" if self._tls is None else "https"
         token = "" if self._token is None else f"?token={self._token}"
         return f"{scheme}://{self._host}:{self.port}/{token}"
@@ -128,11 +138,11 @@ class PageServer:
 
     @property
     def refused_messages(self) -> int:
-        """Messages of pages, and frames of their sound, that were none or too many."""
+        """Number of refused messages and sound frames of pages: invalid ones, or too many."""
         return self.refused + (0 if self.voice is None else self.voice.refused)
 
     def notify(self) -> None:
-        """A new state is there. Called in the loop of the client; does not wait."""
+        """Announce a new state. Called in the loop of the client; does not wait."""
         if self._fresh:
             self._loop.call_soon_threadsafe(self._wake)
 
@@ -199,8 +209,11 @@ class PageServer:
 
     @web.middleware
     async def _refuse_strangers(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
-        """With a token: who does not have it in the address, or as a cookie from then on. Without one: who calls this
-        machine by a name that it does not have, since any site can give a name of its own this address."""
+        """Refuse requests without permission.
+
+        With a token, a request must have it in the address, or in the cookie that is set then. Without a token, the
+        request must use a host name of this machine, because any site can make its own name point to this address.
+        """
         given = request.query.get("token", request.cookies.get("token", ""))
         if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
             raise web.HTTPForbidden(text="open the address with its token, as the client has printed it")
@@ -227,7 +240,7 @@ class PageServer:
         return _binary(self._world.rigid())
 
     async def _state(self, request: web.Request) -> web.WebSocketResponse:
-        """One page: sends states while it draws them, and takes where it looks from."""
+        """Serve the socket of one page: send states as fast as the page draws them, and handle its messages."""
         socket = web.WebSocketResponse(heartbeat=10.0, compress=False, max_msg_size=_MAX_INPUT)
         await socket.prepare(request)
         fresh = asyncio.Event()
@@ -260,7 +273,7 @@ class PageServer:
     async def _read(
         self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
     ) -> None:
-        """Take what a page sends; ``flight`` are the ticks of the states that it has not drawn yet."""
+        """Handle the messages of a page; ``flight`` has the ticks of the states that it has not drawn yet."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 if self.refused == 0:
@@ -280,7 +293,7 @@ def _binary(body: bytes) -> web.Response:
 
 @web.middleware
 async def _refuse_other_origins(request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
-    """Another site that is open in the same browser may not read the world."""
+    """Refuse requests of other sites that are open in the same browser."""
     origin = request.headers.get("Origin")
     if origin is not None and origin.split("://")[-1] != request.host:
         raise web.HTTPForbidden(text=f"pages of {origin} may not connect; open {request.url.origin()} itself")

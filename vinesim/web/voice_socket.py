@@ -1,9 +1,9 @@
-"""The second socket of a page: sound, both ways, so that no picture waits for a voice and no voice for a picture.
+"""The second socket of a page, for sound in both directions, so that pictures and voices do not wait for each other.
 
-From the page: one text, what it can (:class:`PageEars`); then frames, each one byte for the codec (:class:`Codec`, and
-:data:`EXTRA` if it is the same sound once more, for those without Opus) and the coded sound. To the page: texts, JSON
-with ``may_speak``, ``send`` (the kinds of frames that are wanted), ``tones``; and frames, :data:`FRAME_HEADER`, the
-speaker's name, and the coded sound.
+The page sends one text with its abilities (:class:`PageEars`), then frames. A frame has one byte for the codec
+(:class:`Codec`, plus :data:`EXTRA` if the frame repeats a sound for hearers without Opus), and the coded sound. The
+page receives texts (JSON with ``may_speak``, ``send``, which lists the requested kinds of frames, and ``tones``) and
+frames. A frame consists of :data:`FRAME_HEADER`, the speaker's name, and the coded sound.
 """
 
 from __future__ import annotations
@@ -23,42 +23,42 @@ from vinesim.audio.frame import FRAME, MAX_OPUS, Codec, find_fault
 log = logging.getLogger(__name__)
 
 EXTRA = 128
-"""Added to the codec of a frame whose sound has come in another codec, too."""
+"""Added to the codec of a frame whose sound was also sent in another codec."""
 
 FRAME_HEADER = struct.Struct("<BBH3f")
-"""Codec, length of the speaker's name, number of the frame, place [m]."""
+"""Header of a frame to the page: codec, length of the speaker's name, frame number, position [m] of the speaker."""
 
 MAX_WAITING = 64
-"""Frames that wait for a page; older ones are dropped, and counted: a page that stalls hears the present when it is
-back."""
+"""Largest number of frames that wait for a page. Older frames are dropped and counted, so after a stall a page hears
+the present sound."""
 
 _MAX_MESSAGE = 1 + max(MAX_OPUS, 1000)
 _BURST = 250.0
 _PACE = 2.5 / FRAME
-"""Frames a second that a page may send: both codecs, a quarter faster than sound."""
+"""[1/s] Largest frame rate that a page may send: both codecs, 25 % faster than sound."""
 
 
 class PageEars(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a page can."""
+    """Abilities of a page."""
 
     opus: bool
-    """Decode Opus."""
+    """Whether the page can decode Opus."""
 
 
 _ears = msgspec.json.Decoder(PageEars)
 
 
 class PageVoice:
-    """The connection to one page, as the client sees it; may be used from any thread."""
+    """The connection to one page; may be used from any thread."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._fresh = asyncio.Event()
         self._waiting: collections.deque[bytes | str] = collections.deque()
         self.ears: PageEars | None = None
-        """None until the page has said what it can."""
+        """Abilities of the page; None until it has sent them."""
         self.dropped = 0
-        """Frames for a page that took none."""
+        """Number of frames dropped because the page did not receive them in time."""
 
     def send(self, message: bytes | str) -> None:
         """Send a frame or a text; does not wait."""
@@ -69,7 +69,7 @@ class PageVoice:
         self._loop.call_soon_threadsafe(self._fresh.set)
 
     async def pump(self, socket: web.WebSocketResponse) -> None:
-        """Send what waits, until the socket is closed."""
+        """Send waiting messages until the socket is closed."""
         while not socket.closed:
             await self._fresh.wait()
             self._fresh.clear()
@@ -79,18 +79,18 @@ class PageVoice:
 
 
 class Sound(Protocol):
-    """What the socket needs of the client; every method is called in the server's thread."""
+    """Interface of the client to the socket. All methods are called in the server's thread."""
 
     def join(self, page: PageVoice) -> None:
-        """A page listens from now on."""
+        """Called when a page begins to listen."""
         ...
 
     def leave(self, page: PageVoice) -> None:
-        """A page is gone."""
+        """Called when a page has disconnected."""
         ...
 
     def speak(self, page: PageVoice, codec: Codec, data: bytes, is_main: bool) -> None:
-        """A page has said a frame."""
+        """Called with every frame of sound from a page."""
         ...
 
 
@@ -100,11 +100,11 @@ class VoiceSocket:
     def __init__(self, sound: Sound) -> None:
         self._sound = sound
         self.refused = 0
-        """Messages of pages that are none, or too many."""
+        """Number of refused messages of pages: invalid ones, or too many."""
         self._sockets: set[web.WebSocketResponse] = set()
 
     async def serve(self, request: web.Request) -> web.WebSocketResponse:
-        """One page, from its connection to its end."""
+        """Serve one page until it disconnects."""
         socket = web.WebSocketResponse(heartbeat=10.0, compress=False, max_msg_size=_MAX_MESSAGE)
         await socket.prepare(request)
         self._sockets.add(socket)
@@ -139,7 +139,7 @@ class VoiceSocket:
             await socket.close()
 
     def _take(self, page: PageVoice, kind: WSMsgType, data: bytes | str) -> bool:
-        """Take a message of a page; whether it is one."""
+        """Handle a message of a page. Returns whether the message is valid."""
         if kind is WSMsgType.TEXT:
             try:
                 ears = _ears.decode(data)
@@ -162,6 +162,6 @@ class VoiceSocket:
 
 
 def encode_frame(speaker: str, number: int, codec: Codec, data: bytes, place: tuple[float, float, float]) -> bytes:
-    """A frame for a page; ``place`` [m] is where the speaker is."""
+    """Encode a frame for a page; ``place`` [m] is the position of the speaker."""
     name = speaker.encode()[:255]
     return FRAME_HEADER.pack(codec, len(name), number, *place) + name + data

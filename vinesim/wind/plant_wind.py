@@ -1,12 +1,12 @@
-"""Wind on the plants: which trees feel it in the simulation, and what is left for cameras to draw.
+"""Wind on the plants: simulates it on trees near observers, and leaves the motion of other trees to sensors.
 
-Gusts let nothing rest, and ten thousand awake trees fit in no step. So only trees near somebody who is there to see are
-simulated in the wind. All others sleep where they last rested; how far the wind moves them is a function of place and
-time that sensors compute for what they look at (:mod:`vinesim.wind.sway`).
+Trees in gusts never sleep, and a step has no time for ten thousand awake trees. So wind is simulated only on trees near
+a robot or a person. All other trees sleep where they last rested. Their motion in the wind is a function of position
+and time, which sensors compute for the trees that they see (:mod:`vinesim.wind.sway`).
 
-Each tree has a phase from 0, its motion is drawn, to 1, it is simulated. It rises while the tree is awake and near: in
-its first half the air of the simulated tree grows to that of the wind, in its second half the drawn motion fades out.
-It falls otherwise, and the tree keeps the air that it felt last. So nothing that is seen jumps.
+Each tree has a phase from 0 (its motion is drawn) to 1 (its motion is simulated). The phase rises while the tree is
+awake and near: in its first half the air velocity at the simulated tree grows to the wind's, in its second half the
+drawn motion fades out. Otherwise the phase falls, and the tree keeps its last air velocity. So no visible motion jumps.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from vinesim.scene.wind import Wind
 from vinesim.wind.shelter import TreeDrag
 
 FADE_DURATION = 2.0
-"""[s] Half of a change between drawn and simulated, and the time in which wind begins and ends. TUNED: twice the
-period of a slow shoot, so that a simulated tree follows its growing load."""
+"""[s] Half of the duration of a change between drawn and simulated motion, and the duration in which wind begins or
+ends. TUNED: twice the period of a slow shoot, so that a simulated tree follows its growing load."""
 
 Observers = tuple[np.ndarray, float]
-"""Points [n, 3] m and a distance [m]: trees whose foot is so near to one of them are simulated in the wind."""
+"""Points [n, 3] m and a distance [m]: wind is simulated on trees whose foot is within the distance of a point."""
 
 
 class WindOnPlants:
-    """Sets ``plants.tree_air`` before each step, and wakes sleepers near actors that the wind moves."""
+    """Sets ``plants.tree_air`` before each step, and wakes sleeping trees near observers if the wind has changed."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         self.plants = plants
@@ -39,11 +39,11 @@ class WindOnPlants:
         model = plants.model
         first = plants.model.tree_first
         number = np.arange(len(model.body_mass)) - first[model.body_tree]
-        core = number < model.tree_core[model.body_tree]  # a bunch's mass has its clusters in it
+        core = number < model.tree_core[model.body_tree]  # the mass of a bunch includes its clusters
         self._foot = model.tree_pose[:, :3].astype(float)
         self._weight = np.add.reduceat(model.body_mass * core, first) * -GRAVITY[2] if len(first) else np.zeros(0)
         self.phase = np.zeros(len(first), np.float32)
-        """0: the motion of a tree in the wind is drawn, 1: it is simulated [tree]."""
+        """[tree] 0: the motion of the tree in the wind is drawn; 1: it is simulated."""
         self._drag: TreeDrag | None = None
         self._wind: Wind | None = None
         self._strength = 0.0
@@ -52,9 +52,10 @@ class WindOnPlants:
         self._steps = 0
 
     def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
-        """Before a step at a ``time`` [s] of the wind; None for calm. Without ``observers`` all trees are simulated.
+        """Before a step: apply ``wind`` (None: calm air) at world ``time`` [s].
 
-        A wind that is there in the first step has always blown; a later one grows, and one that ends dies away.
+        Without ``observers`` wind is simulated on all awake trees. A wind given in the first step has full strength at
+        once; a later one grows, and one that ends fades out.
         """
         self._follow(wind)
         self._time = time
@@ -81,7 +82,7 @@ class WindOnPlants:
 
     @property
     def state(self) -> WindState | None:
-        """The wind as sensors need it, None in calm air."""
+        """The wind for sensors, None in calm air."""
         if self._wind is None:
             return None
         fade = np.clip(2.0 - 2.0 * self.phase, 0.0, 1.0)
@@ -89,7 +90,7 @@ class WindOnPlants:
         return WindState(self._wind, self._time, self._strength, self.plants.tree_air.copy(), drawn)
 
     def _follow(self, wind: Wind | None) -> None:
-        """Let the wind that blows end before another begins."""
+        """Change the strength of the present wind; it ends before another wind begins."""
         step = self.parameters.dt / FADE_DURATION
         if wind is self._wind:
             self._strength = min(self._strength + step, 1.0)
@@ -105,13 +106,13 @@ class WindOnPlants:
                 self._strength = 1.0 if self._steps == 0 else step
 
     def _air(self, trees: np.ndarray) -> np.ndarray:
-        """Velocity [k, 3] m/s of the wind at some trees [k]."""
+        """Velocity [k, 3] m/s of the wind at ``trees`` [k]."""
         assert self._wind is not None
         velocity = self._wind.velocity_at(self._foot[trees], self._time)
         return self._strength * self._share[trees, None] * velocity
 
     def _calm(self, trees: np.ndarray) -> None:
-        """While a wind dies away: let sleepers that still feel their last air come to rest without it."""
+        """While a wind fades out, wake trees [tree] bool that keep an air velocity, and reduce it."""
         felt = np.flatnonzero(trees & (self.plants.tree_air != 0.0).any(1))
         if len(felt):
             self.plants.wake(felt)
@@ -119,7 +120,7 @@ class WindOnPlants:
             self.plants.tree_air[felt] *= self._strength / ago
 
     def _wake_stirred(self, observers: Observers | None) -> None:
-        """All sleepers are looked at once in a period, an equal number in each step."""
+        """Wake sleeping trees on which the drag has changed; each step checks an equal number of them."""
         plants = self.plants
         parameters = self.parameters
         rounds = parameters.steps(parameters.wind_check_period)
@@ -135,7 +136,7 @@ class WindOnPlants:
         plants.wake(some[force > parameters.wind_wake_load * self._weight[some]])
 
     def _near(self, trees: np.ndarray, observers: Observers | None) -> np.ndarray:
-        """Those of some trees whose foot is near one of the points."""
+        """The subset of ``trees`` whose foot is near an observer."""
         if observers is None:
             return trees
         points = np.atleast_2d(np.asarray(observers[0], float))

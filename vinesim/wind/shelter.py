@@ -1,12 +1,12 @@
-"""How much of the wind reaches each tree: a profile with height, and shelter by the leaves upwind.
+"""Wind speed at each tree: a profile over height, and shelter by leaves upwind.
 
-Above the canopy the mean follows the logarithmic law, below its top it falls off exponentially (Inoue, J. Meteorol.
-Soc. Japan 41, 1963). Along the wind leaves take momentum from the air, and mixing from above gives it back. With q the
-square of the speed as a share of that before the first row, and a the drag area in a volume of canopy [1/m],
+Above the canopy the mean wind follows the logarithmic law, below its top it falls off exponentially (Inoue, J.
+Meteorol. Soc. Japan 41, 1963). Leaves take momentum from the air, and mixing from above restores it. Let q be the ratio
+of the squared speed to its value upwind of the first row, and a the drag area per volume of canopy [1/m]. Then
 
     dq/dx = -a q + (1 - q) / L
 
-is solved cell by cell on a grid that lies along the wind, once for a model and a wind.
+along the wind. It is solved cell by cell on a grid aligned with the wind, once for each model and wind.
 """
 
 from __future__ import annotations
@@ -19,21 +19,22 @@ from vinesim.core import frames
 from vinesim.scene.model import Model
 
 ATTENUATION = 0.4
-"""[1] Of the exponential profile below the top of the canopy. GUESSED: in use for orchards; cereals have 2 to 3."""
+"""[1] Attenuation coefficient of the exponential profile in the canopy. GUESSED: used for orchards; cereals have 2 to
+3."""
 DISPLACEMENT = 0.65
 ROUGHNESS = 0.1
-"""[1] Zero-plane displacement and roughness length as shares of the canopy's height. READ: usual for tall crops."""
+"""[1] Zero-plane displacement and roughness length as fractions of the canopy's height. READ: usual for tall crops."""
 RECOVERY_DEPTHS = 10.0
-"""[1] Length L in which mixing restores the wind, in depths of the canopy. GUESSED: wakes of windbreaks are 10 to 20
-heights long."""
+"""[1] Length L over which mixing restores the wind, divided by the depth of the canopy. GUESSED: wakes of windbreaks
+are 10 to 20 heights long."""
 CELL = 0.5
 """[m] Edge of the cells of the grid."""
 MIN_DEPTH = 0.3
-"""[m] Least depth of a canopy."""
+"""[m] Smallest depth of a canopy that is assumed."""
 
 
 def height_profile(height: np.ndarray, top: float) -> np.ndarray:
-    """Mean wind at heights [...] m above the ground as a share of that at the ``top`` [m] of the canopy [...]."""
+    """Ratio [...] of the mean wind at ``height`` [...] m above ground to the wind at the ``top`` [m] of the canopy."""
     z = np.maximum(np.asarray(height, float) / top, 0.0)
     above = np.log((np.maximum(z, 1.0) - DISPLACEMENT) / ROUGHNESS) / np.log((1.0 - DISPLACEMENT) / ROUGHNESS)
     return np.where(z < 1.0, np.exp(-ATTENUATION * (1.0 - z)), above)
@@ -41,20 +42,20 @@ def height_profile(height: np.ndarray, top: float) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class TreeDrag:
-    """Where the air takes hold of the trees of a model at rest."""
+    """Drag areas of the trees of a model at rest."""
 
     area: np.ndarray
-    """Drag area Cd A [tree] m^2."""
+    """[tree] m^2, drag area Cd A."""
     centre: np.ndarray
-    """Its centre [tree, 3] m; the foot of a tree without drag."""
+    """[tree, 3] m, centre of the drag area; for a tree without drag, its foot."""
     profile: np.ndarray
-    """Uniform wind that drags as hard as the profile does, as a share of the wind at the top of the canopy [tree]."""
+    """[tree] Ratio of the uniform wind with the drag of the height profile to the wind at the top of the canopy."""
     depth: float
-    """Of the canopy [m]: between the heights that a twentieth of the area lies below, and above."""
+    """Depth of the canopy [m]: between the 5 % and 95 % quantiles of the drag area over height."""
 
     @classmethod
     def of(cls, model: Model, body_q: np.ndarray) -> TreeDrag:
-        """``body_q`` [body, 7]: poses at rest."""
+        """The drag areas of ``model`` with its bodies at the rest poses ``body_q`` [body, 7]."""
         first = model.tree_first
         area = model.body_drag.astype(float)
         point = body_q[:, :3] + frames.rotate(body_q[:, 3:].astype(float), model.body_com.astype(float))
@@ -72,12 +73,14 @@ class TreeDrag:
         return cls(total, centre, profile, max(top - low, MIN_DEPTH))
 
     def air_share(self, mean: np.ndarray) -> np.ndarray:
-        """Speed of the air at each tree [tree] as a share of the undisturbed one at the top of the canopy, in a mean
-        wind [3] m/s."""
+        """Ratio [tree] of the air speed at each tree to the undisturbed speed at the top of the canopy.
+
+        ``mean`` [3] m/s is the mean wind.
+        """
         return self.profile * np.sqrt(self._sheltered_pressure(np.asarray(mean, float)[:2]))
 
     def _sheltered_pressure(self, wind: np.ndarray) -> np.ndarray:
-        """Share q [tree] of the square of the speed that the leaves upwind leave to each tree."""
+        """Ratio q [tree] of the squared wind speed behind the leaves upwind to the undisturbed squared speed."""
         speed = float(np.hypot(*wind))
         if speed == 0.0 or not len(self.area):
             return np.ones(len(self.area))
@@ -89,7 +92,7 @@ class TreeDrag:
         rate = density + 1.0 / (RECOVERY_DEPTHS * self.depth)
         balance = 1.0 / (RECOVERY_DEPTHS * self.depth) / rate
         left = np.exp(-CELL * rate)
-        q = np.ones_like(density)  # where a cell begins
+        q = np.ones_like(density)  # at the upwind face of each cell
         for i in range(len(q) - 1):
             q[i + 1] = balance[i] + (q[i] - balance[i]) * left[i]
         return q[column, row]

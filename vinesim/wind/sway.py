@@ -1,10 +1,10 @@
-"""Sway: poses of the trees that wind moves while they are not simulated, for cameras and lidars.
+"""Sway: poses of trees that wind moves while they are not simulated, for cameras and lidars.
 
-A tree is taken as three oscillators, one for wind along each axis of the world. The shape of each is the tree's own
-static deflection in that wind, found by the solver with weight, ties, wires and all; its frequency is the Rayleigh
-quotient of that shape, its damping that of the joints and of the air. A steady wind is answered by the equilibrium in
-it, gusts by linear answers about that. All of it is a function of place and time, without a state: the same for all
-clients, and at any instant that a sensor asks for. The physics of sleeping trees does not know of it.
+A tree is modelled as three oscillators, one for wind along each world axis. The shape of each oscillator is the static
+deflection of the tree in that wind, which the solver finds with weight, ties and wires. Its frequency is the Rayleigh
+quotient of the shape, its damping comes from joints and air. The response to a steady wind is the equilibrium in it;
+the response to gusts is linear about that equilibrium. So the pose is a function of position and time without a state:
+all clients compute the same pose, at any instant. The physics of sleeping trees is not affected.
 """
 
 from __future__ import annotations
@@ -29,21 +29,21 @@ from vinesim.wind.shelter import TreeDrag
 from vinesim.wires.elastic_supports import ElasticSupports
 
 MAX_TREES = 120
-"""Trees that are posed for one frame where there is no time for all. TUNED: within 0.5 ms."""
+"""Largest number of trees posed for one frame if there is no time for all. TUNED: it takes up to 0.5 ms."""
 _LOAD_STEPS = 4
 _NEWTON_STEPS = 80
 _CONVERGED = 1e-4
-"""[m] Distance from equilibrium at which a tree is in it; where it is not found, a tree does not sway."""
+"""[m] Distance from equilibrium below which a tree has converged; trees that do not converge do not sway."""
 _ENOUGH = 0.99
-"""[1] Share of the trees that must be well within it: rounding keeps a few far from the origin at its edge."""
+"""[1] Share of the trees that must be well converged; rounding errors delay a few trees far from the origin."""
 _MIN_DISTANCE = 1.0
-"""[m] Nearer trees are not more urgent than those at this distance."""
+"""[m] Trees nearer than this are treated as if they were at this distance."""
 
 
 class Sway:
-    """Moves the trees of snapshots as the wind does.
+    """Moves the trees in snapshots according to the wind.
 
-    It keeps the poses that it drew last, so that snapshots of one world must come in the order of time.
+    It keeps the poses that it computed last, so the snapshots of a world must come in order of time.
     """
 
     def __init__(self, model: Model) -> None:
@@ -51,18 +51,18 @@ class Sway:
         self._wind: Wind | None = None
         self._table: _Table | None = None
         self._is_drawn = np.zeros(len(model.tree_first), bool)
-        """Whether each tree stands elsewhere than where it is simulated."""
+        """[tree] Whether the drawn pose of each tree differs from its simulated pose."""
         self._drawn_at = np.full(len(model.tree_first), -1e6)
-        """Time of the wind at which each tree was drawn last [s]."""
+        """[tree] World time of the last pose computed for each tree [s]."""
         self._foot = np.ascontiguousarray(model.tree_pose[:, :3].T, np.float32)
         self._body_q = np.zeros((0, 7), np.float32)
 
     def apply(self, snapshot: Snapshot, moved: np.ndarray | None = None, eye: np.ndarray | None = None) -> Snapshot:
-        """The snapshot with all trees where they are to be drawn; the one that is given if the air is calm.
+        """The snapshot with all trees where they are to be drawn; ``snapshot`` itself if the air is calm.
 
-        ``moved``: the trees whose simulated pose may have changed since the last call, unless those of the snapshot.
-        With an ``eye`` [3] m only :data:`MAX_TREES` trees are posed anew, those first whose picture from there is most
-        out of date. The poses are good until the next call.
+        ``moved`` lists the trees whose simulated pose may have changed since the last call; by default those of the
+        snapshot. With an ``eye`` [3] m at most :data:`MAX_TREES` trees get new poses, first the trees whose picture
+        from the eye is most out of date. The poses are valid until the next call.
         """
         state = snapshot.wind
         if state is None and self._wind is None:
@@ -80,7 +80,7 @@ class Sway:
         if not self._is_drawn.any() or self._body_q.shape != snapshot.body_q.shape:
             self._body_q = np.array(snapshot.body_q, np.float32)
         drawn = (state.tree_drawn > 0.0) & self._table.sways
-        changed |= self._is_drawn & ~drawn  # these stand as they are simulated from now on
+        changed |= self._is_drawn & ~drawn  # these return to their simulated poses
         is_limited = eye is not None and len(drawn) > MAX_TREES
         changed[self._most_urgent(drawn, state.time, np.asarray(eye, np.float32)) if is_limited else drawn] = True
         trees = np.flatnonzero(changed)
@@ -90,8 +90,10 @@ class Sway:
         return dataclasses.replace(snapshot, body_q=self._body_q, moved_trees=trees)
 
     def _most_urgent(self, drawn: np.ndarray, time: float, eye: np.ndarray) -> np.ndarray:
-        """Of the trees that are drawn [tree] bool those whose picture from ``eye`` is out of date by the largest
-        angles: reach times age by distance."""
+        """The :data:`MAX_TREES` trees among ``drawn`` [tree] bool whose picture from ``eye`` is most out of date.
+
+        The measure is an angle: reach of the tree times age of its pose, divided by distance.
+        """
         assert self._table is not None
         away = self._foot - eye[:, None]
         away *= away
@@ -104,8 +106,7 @@ class Sway:
 
 
 def windblown(model: Model, snapshot: Snapshot, wind: Wind | None, time: float) -> Snapshot:
-    """A snapshot of plants at rest as the wind would have moved them at its ``time`` [s]; for pictures without
-    physics."""
+    """A snapshot of plants at rest, moved by the wind as at ``time`` [s]; for pictures without physics."""
     if wind is None:
         return snapshot
     trees = len(model.tree_first)
@@ -115,13 +116,13 @@ def windblown(model: Model, snapshot: Snapshot, wind: Wind | None, time: float) 
 
 @dataclasses.dataclass(slots=True)
 class _Table:
-    """What a model does in a wind; see the kernel for the arrays."""
+    """Response of a model's trees to a wind; see the kernel for the arrays."""
 
     wind: Wind
     tree_reach: np.ndarray
-    """[tree] m, how far the mean wind moves the point that it moves most; 0 for trees that do not sway."""
+    """[tree] m, largest displacement of any point of the tree by the mean wind; 0 for trees that do not sway."""
     sways: np.ndarray
-    """[tree] bool"""
+    """[tree] bool, whether the tree sways."""
     tree_air: np.ndarray
     tree_drawn: np.ndarray
     trees: np.ndarray
@@ -130,7 +131,7 @@ class _Table:
 
     @classmethod
     def load(cls, model: Model, wind: Wind) -> _Table:
-        """From the cache on disk, or made anew: 0.1 s for two hundred trees, three seconds for ten thousand."""
+        """Load the table from the disk cache or compute it, which takes 0.1 s for 200 trees and 3 s for 10,000."""
         here = pathlib.Path(__file__)
         code = [
             here,
@@ -171,7 +172,7 @@ class _Table:
         return table
 
     def pose(self, trees: np.ndarray, state: WindState, body_q: np.ndarray, body_q_out: np.ndarray) -> None:
-        """Pose trees [k] at the time of ``state``, from their simulated poses ``body_q`` [body, 7]."""
+        """Compute poses of ``trees`` [k] at the time of ``state`` from their simulated poses ``body_q`` [body, 7]."""
         if not len(trees):
             return
         self.tree_air[trees] = state.tree_air[trees]
@@ -201,7 +202,7 @@ class _Table:
 
 
 class _Response:
-    """Computes what the trees of a model do in a wind, all trees at once."""
+    """Computes the response of a model's trees to a wind, all trees at once."""
 
     def __init__(self, model: Model, wind: Wind) -> None:
         self.model = model
@@ -220,10 +221,10 @@ class _Response:
         parent = model.body_parent
         base = np.where((parent < 0)[:, None], model.tree_pose[tree], self.state.body_q[parent])[:, 3:]
         self._joint_axes = frames.multiply(base.astype(float), model.body_rest.astype(float))
-        """World axes of each joint at rest [body, 4]."""
+        """[body, 4] orientation of each joint's axes in the world at rest."""
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Arrays of the table, see the kernel."""
+        """The arrays of the table, see the kernel."""
         model = self.model
         trees = np.arange(len(self.model.tree_first), dtype=np.int32)
         at_rest = self.state.body_q.copy()
@@ -257,7 +258,7 @@ class _Response:
         return {name: np.ascontiguousarray(values, np.float32) for name, values in made.items()}
 
     def _load(self, pressure: np.ndarray) -> None:
-        """Drag of a pressure v |v| [tree, 3] m^2/s^2 on each body, as it stands."""
+        """Load each body with the drag of a pressure v |v| [tree, 3] m^2/s^2 in its present pose."""
         force = self._area[:, None] * pressure[self.model.body_tree]
         arm = frames.rotate(self.state.body_q[:, 3:].astype(float), self.model.body_com.astype(float))
         self.plants.body_load[:] = np.concatenate([force, np.cross(arm, force)], 1)
@@ -266,10 +267,11 @@ class _Response:
         return np.linalg.norm(velocity, axis=-1, keepdims=True) * velocity
 
     def _move_to_equilibrium(self, trees: np.ndarray) -> np.ndarray:
-        """Move trees to where the steady wind holds them; whether each is there [tree] bool.
+        """Move trees to their equilibrium in the steady wind. Returns whether each tree has converged [tree] bool.
 
-        Newton's method for each tree, its supports held, then these to where the trees hold them, and again: it comes
-        nearer to where all rest from one side only. With springs as soft as supports make them it would overshoot.
+        The iteration alternates Newton's method for trees on fixed supports with moving the supports to where the trees
+        hold them. It approaches equilibrium from one side. With the softer springs of moving supports, Newton's method
+        would overshoot.
         """
         good = np.ones(len(trees), bool)
         for step in range(_LOAD_STEPS + _NEWTON_STEPS):
@@ -286,7 +288,7 @@ class _Response:
         return good & (distance < _CONVERGED)
 
     def _residual_turn(self, trees: np.ndarray, velocity: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-        """Turn of each joint [body, 3] rad, in its own axes, that a drag would still cause."""
+        """Remaining rotation [body, 3] rad of each joint, in its own axes, under the drag of a wind ``velocity``."""
         pressure = self._pressure(velocity)
         self._load(pressure if extra is None else pressure + extra)
         self._finder.residual_motion(trees)
@@ -295,8 +297,10 @@ class _Response:
         return 0.25 * REST_STEP * np.where(self._core[:, None], self.plants.joint_qd_free, 0.0).astype(float)
 
     def _oscillator(self, axis: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angular frequency [tree] rad/s and damping ratio [tree] of the shape into which wind along an axis turns the
-        joints [body, 3]."""
+        """Angular frequency [tree] rad/s and damping ratio [tree] of the oscillator for wind along a world ``axis``.
+
+        ``turn`` [body, 3] rad are the rotations of the joints by that wind, which give the shape.
+        """
         model = self.model
         first = self.model.tree_first
         body_q = self.state.body_q.astype(float)
@@ -326,13 +330,15 @@ class _Response:
         return rate, np.where(ok, damping / (2.0 * rate * np.where(ok, modal_mass, 1.0)), 1.0)
 
     def _filtered_gusts(self, rate: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-        """Factors [tree, 2 waves, 3] m/s of the cosines and sines of the waves of oscillators with rates [tree, 3]
-        rad/s and damping ratios [tree, 3]."""
+        """Responses to the gusts: factors [tree, 2 waves, 3] m/s of the cosines and sines of the waves.
+
+        The oscillators have angular frequencies ``rate`` [tree, 3] rad/s and damping ratios ``ratio`` [tree, 3].
+        """
         wind = self.wind
         turning = wind.wave_number @ wind.mean
         place = self.model.tree_pose[:, :3].astype(float) @ wind.wave_number.T + wind.wave_phase
         share = (turning / rate[..., None]).transpose(0, 2, 1)  # [tree, wave, 3]
         answer = 1.0 / (1.0 - share**2 + 2j * ratio[:, None] * share)
-        shifted = answer * np.exp(-1j * place)[..., None]  # of exp(i turning t)
+        shifted = answer * np.exp(-1j * place)[..., None]  # factor of exp(i turning t)
         size = self.share[:, None, None] * wind.wave_amplitude
         return np.concatenate([shifted.real * size, -shifted.imag * size], 1)

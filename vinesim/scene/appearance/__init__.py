@@ -1,8 +1,7 @@
-"""What people, shears and crates look like: shapes read from ``data/figures``, in the frames of links that carry them.
+"""Appearance of people, shears and crates: shapes read from ``data/figures``, in the frames of their links.
 
-An appearance does not depend on the renderer: a part is a few round cones, ellipsoids, boxes, cylinders and lofts
-(meshes
-through rings), each with a colour and a surface by name. The bodies that touch are others, and belong to the physics.
+An appearance does not depend on the renderer. A part consists of a few round cones, ellipsoids, boxes, cylinders and
+lofts (meshes through rings), each with a colour and a named surface. Collision shapes are separate, in the physics.
 """
 
 from vinesim.scene.appearance.crates import crate_shapes

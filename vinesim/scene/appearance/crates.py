@@ -1,4 +1,4 @@
-"""Harvest crates: slatted boxes from a few measures in ``data/figures``."""
+"""Harvest crates: slatted boxes built from a few dimensions in ``data/figures``."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from vinesim.scene.values import Shape
 
 
 class Crate(Table, frozen=True):
-    """How a harvest crate is made [m]; its outer size is the scene's."""
+    """Dimensions [m] and paints of a harvest crate; the scene gives its outer size."""
 
     source: str
     paints: Annotated[tuple[Paint, ...], msgspec.Meta(min_length=1)]
-    """Crate by crate, in turn."""
+    """Paints, which the crates take in turn."""
     wall: float
     """Thickness of walls and bottom."""
     slat: float
     """Height of a slat."""
     gap: float
-    """Between two slats."""
+    """Gap between two slats."""
     post: float
     """Width of the corner posts."""
     rib: float
@@ -37,7 +37,7 @@ class Crate(Table, frozen=True):
     rim: float
     """Height of the rim."""
     grip: tuple[float, float]
-    """Width and height of the hole for a hand below the rim of either end."""
+    """Width and height of the handle hole below the rim at either end."""
     grid: float
     """Distance between bars of the bottom."""
     bar: float
@@ -46,7 +46,7 @@ class Crate(Table, frozen=True):
 
 @functools.lru_cache(256)
 def crate_shapes(size: tuple[float, float, float], number: int, name: str = "crate") -> tuple[Shape, ...]:
-    """A slatted crate of this outer ``size`` [m], origin in the middle of its underside; its inside is free."""
+    """Shapes of a slatted, open crate of outer ``size`` [m]; its origin is in the middle of the underside."""
     one = load_toml(find_data_file("figures", name, ".toml"), Crate, AppearanceError)
     t = one.wall
     look = surface_fields(one.paints[number % len(one.paints)])
@@ -61,7 +61,7 @@ def crate_shapes(size: tuple[float, float, float], number: int, name: str = "cra
 
     x = 0.5 * length
     y = 0.5 * width
-    for half, side, along in ((x, y, 0), (y, x, 1)):  # bars one way, and the other way on top of them
+    for half, side, along in ((x, y, 0), (y, x, 1)):  # bars along x, and bars along y on top of them
         count = max(round(2.0 * side / one.grid), 1) + 1
         for at in np.linspace(0.5 * one.bar - side, side - 0.5 * one.bar, count):
             order = [1, 0, 2] if along else [0, 1, 2]
@@ -70,14 +70,14 @@ def crate_shapes(size: tuple[float, float, float], number: int, name: str = "cra
             add([low[k] for k in order], [high[k] for k in order])
     shelf = height - one.rim
 
-    for half, side, along in ((x, y, 0), (y, x, 1)):  # two long walls, two ends between them
+    for half, side, along in ((x, y, 0), (y, x, 1)):  # the two end walls stand between the long walls
         for sign in (-1.0, 1.0):
             outer = sign * side
             inner = sign * (side - t)
             thin = sign * (side - 0.45 * t)
 
             def wall(a: float, b: float, low: float, high: float, depth: float, outer=outer, along=along) -> None:
-                """From a to b along the wall and from ``low`` to ``high``, out to the outer face."""
+                """Add a box from ``a`` to ``b`` along the wall, ``low`` to ``high``, ``depth`` to the outer face."""
                 first = (a, min(outer, depth), low)
                 second = (b, max(outer, depth), high)
                 order = [1, 0, 2] if along else [0, 1, 2]

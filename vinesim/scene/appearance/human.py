@@ -19,42 +19,42 @@ from vinesim.scene.appearance.shapes import AppearanceError, Paint, Point, Shape
 from vinesim.scene.values import Shape
 
 FINGERS = ("thumb", "index", "middle", "ring", "little")
-"""In the order of ``HumanPose.left_fingers``."""
+"""Names of the fingers in the order of ``HumanPose.left_fingers``."""
 PHALANGES = 3
 
 
 class Finger(Table, frozen=True):
-    """A finger of the left hand, straight."""
+    """Dimensions of a straight finger of the left hand."""
 
     root: Point
-    """[m] in the palm's frame."""
+    """[m] Position of the knuckle in the palm's frame."""
     spread: float
-    """Turn about the palm's normal [rad], to the left."""
+    """Rotation of the finger about the palm's normal [rad], positive to the left."""
     roll: float
-    """Turn of the hinges about the finger [rad]."""
+    """Rotation of the hinge axes about the finger [rad]."""
     lengths: Point
-    """Of the phalanges [m]."""
+    """Lengths of the phalanges [m]."""
     radii: tuple[float, float, float, float]
-    """At the knuckle, both joints and the tip [m]."""
+    """Radii at the knuckle, both joints and the tip [m]."""
     bent: Point
     """Angle of each hinge when the finger is bent all the way [rad]."""
 
 
 class Limbs(Table, frozen=True):
-    """What hangs between tracked parts [m]."""
+    """Joints and lengths of the limbs between tracked parts [m]."""
 
     shoulder: Point
-    """Left, in the chest's frame."""
+    """Left shoulder in the chest's frame."""
     upper_arm: float
     forearm: float
     wrist: Point
-    """Left, in the palm's frame."""
+    """Left wrist in the palm's frame."""
     elbow: Point
-    """Where the left elbow would rather go, chest's axes."""
+    """Preferred direction of the left elbow, in the chest's axes."""
     neck: float
-    """Height of its lower end in the chest's frame."""
+    """Height of the lower end of the neck in the chest's frame."""
     nape: Point
-    """Its upper end in the head's frame."""
+    """Upper end of the neck in the head's frame."""
 
 
 class HumanFile(Table, frozen=True):
@@ -62,7 +62,7 @@ class HumanFile(Table, frozen=True):
     height: float
     paints: dict[str, Paint]
     outfits: dict[str, dict[str, Point]]
-    """Colours [sRGB, 0 to 1] of paints by name, of each outfit."""
+    """By outfit: the colour [sRGB, 0 to 1] of each paint by name."""
     parts: dict[str, tuple[ShapeSpec, ...]]
     limbs: Limbs
     fingers: dict[str, Finger]
@@ -74,14 +74,14 @@ class HumanModel:
     """Shapes of a person of one height [m], by part, and the joints between the tracked parts."""
 
     parts: dict[str, tuple[Shape, ...]]
-    """By link: head, chest, ..., ``left_hand``, ``neck``, ``left_upper_arm``, ..., ``left_index_1`` to ``_3``, ..."""
+    """Shapes by link: head, chest, ``left_hand``, ``neck``, ``left_upper_arm``, ``left_index_1`` to ``_3``, others."""
     limbs: Limbs
     root: np.ndarray
-    """[finger, 7] of the first phalanx in the palm; left hand, then right."""
+    """[finger, 7] pose of the first phalanx in the palm's frame; fingers of the left hand, then of the right."""
     length: np.ndarray
-    """[finger, phalanx] m"""
+    """[finger, phalanx] m, length of each phalanx."""
     bent: np.ndarray
-    """[finger, phalanx] rad, all the way."""
+    """[finger, phalanx] rad, angle of each hinge when the finger is fully bent."""
 
 
 def outfit_names(name: str = "worker") -> tuple[str, ...]:
@@ -90,16 +90,16 @@ def outfit_names(name: str = "worker") -> tuple[str, ...]:
 
 
 def outfit_of(actor: str, name: str = "worker") -> str:
-    """The outfit of an actor that has chosen none: the same on every client, from the actor's name alone."""
+    """The outfit of an actor that has chosen none. It follows from the actor's name and is equal on all clients."""
     outfits = outfit_names(name)
     return outfits[zlib.crc32(actor.encode()) % len(outfits)]
 
 
 @functools.lru_cache(64)
 def load_human_model(height: float, name: str = "worker", outfit: str = "") -> HumanModel:
-    """The human model of this height [m] in an outfit (empty: the first one), from ``data/figures``.
+    """The human model of ``height`` [m] in an outfit (empty: the first one), from ``data/figures``.
 
-    :class:`AppearanceError` if it cannot be read or has no such outfit.
+    Raises :class:`AppearanceError` if the file cannot be read or has no such outfit.
     """
     outfits = _load_file(find_data_file("figures", name, ".toml")).outfits
     if outfit and outfit not in outfits:
@@ -118,7 +118,7 @@ def load_human_model(height: float, name: str = "worker", outfit: str = "") -> H
 
 @functools.lru_cache(16)
 def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[str]]]:
-    """The human model of this height [m], and the name of the paint of every shape, by part.
+    """The human model of ``height`` [m], and by part the paint name of every shape.
 
     All outfits share the meshes of this model; :func:`load_human_model` gives them their colours.
     """
@@ -160,15 +160,17 @@ def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[s
 
 
 def _paints_of(spec: ShapeSpec, shapes: list[Shape]) -> list[str]:
-    """The paint of each of the ``shapes`` that were built from a description: of a loft there is one for each paint,
-    and all of them twice if it has a twin."""
+    """The paint name of each of the ``shapes`` that were built from ``spec``.
+
+    A loft gives one shape for each paint, and a spec with a twin gives all shapes twice.
+    """
     names = [spec.paint] if isinstance(spec.paint, str) else list(dict.fromkeys(spec.paint))
     return names * (len(shapes) // len(names))
 
 
 @functools.cache
 def _load_file(path: pathlib.Path) -> HumanFile:
-    """The checked content of a file; one for people of all heights."""
+    """The checked content of a file, which serves people of all heights."""
     file = load_toml(path, HumanFile, AppearanceError)
     for part, specs in file.parts.items():
         for i, spec in enumerate(specs):

@@ -1,4 +1,4 @@
-"""Lofts: meshes through rings, and smooth normals of meshes; and every kind of shape from its description."""
+"""Builds shapes from their descriptions: lofts (meshes through rings), other kinds of shape, smooth normals."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from vinesim.scene.values import Mesh, Shape
 
 
 def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
-    """Shapes of one description: one, or two that mirror each other, or a mesh for each paint of a loft.
+    """Shapes of one description: one shape, or a mesh for each paint of a loft; with ``twin`` also the mirrored ones.
 
-    ``scale`` [1] multiplies all lengths; ``mirror``: to the other side (y).
+    ``scale`` [1] multiplies all lengths. ``mirror`` mirrors the shapes to the other side (y).
     """
     sides = (False, True) if spec.twin else (mirror,)
     if spec.kind == "loft":
@@ -33,7 +33,7 @@ def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror
 
 
 def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
-    """Meshes through the rings of a loft, one for each paint; a whole ring is closed by a lid at either end."""
+    """Meshes through the rings of a loft, one for each paint. If the rings are whole, lids close both ends."""
     place, rear, front, wide, aside = np.array([(*ring, 0.0)[:5] for ring in spec.rings]).T
     whole = spec.arc[1] - spec.arc[0] >= 360.0
     first, last = (np.radians(arc) for arc in (spec.arc, spec.arc_end or spec.arc))
@@ -49,7 +49,7 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
     ahead = 0.5 * (front + rear)[:, None] + deep[:, None] * bow[0]
     left = aside[:, None] + (wide + spec.swell)[:, None] * bow[1]
     axis = np.broadcast_to(place[:, None], ahead.shape)
-    # x ahead, y left, z along; for a limb, whose axis is x, the front is z and the ring runs the other way
+    # x ahead, y left, z along; for a limb, whose axis is x, the front is z and the ring order is reversed
     points = np.stack([ahead, left, axis] if spec.along == "z" else [axis, left, ahead], -1)
     reverse = spec.along == "x"
     if mirror:
@@ -82,11 +82,11 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
 
 
 CREASE_ANGLE = np.radians(50.0)
-"""Faces that meet at a sharper angle than this [rad] meet at an edge; others are one smooth surface."""
+"""Faces that meet at a larger angle [rad] form an edge; other faces form one smooth surface."""
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE_ANGLE)) -> np.ndarray:
-    """Unit normals [face, 3, 3] at the corners of a mesh: the area-weighted mean of the faces around it.
+    """Unit normals [face, 3, 3] at the corners of a mesh: the area-weighted mean over the faces around each corner.
 
     Args:
         vertices: [vertex, 3] m.

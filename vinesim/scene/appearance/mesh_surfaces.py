@@ -1,4 +1,4 @@
-"""Meshes as sensors see them: few enough triangles, with smooth normals, from a file or from received triangles."""
+"""Meshes for sensors: simplified, with smooth normals, from a file or from received triangles."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from vinesim.scene.triangles import TrianglesError
 from vinesim.scene.values import Mesh
 
 MAX_SURFACE_FACES = 4000
-"""Most triangles of one mesh; finer ones are simplified."""
+"""Largest number of triangles of one mesh; finer meshes are simplified."""
 
 _MAX_NEIGHBOURS = 10_000_000
-"""Pairs of corners of received triangles at one point, which smooth normals are computed from: memory grows with them.
-Meshes of robots have a tenth of it."""
+"""Largest number of pairs of corners that share a point, for received triangles. The memory for smooth normals grows
+with it; meshes of robots have a tenth of this number."""
 
 
 def smooth_surface(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> Mesh:
-    """A mesh [m] of ``vertices`` [vertex, 3], scaled and simplified by merging near vertices until it has few enough
-    ``faces`` [face, 3]."""
+    """A mesh [m] of ``vertices`` [vertex, 3] and ``faces`` [face, 3], scaled, with smooth normals.
+
+    Near vertices are merged until the mesh has at most :data:`MAX_SURFACE_FACES`.
+    """
     return _with_normals(*_simplify(vertices, faces, scale))
 
 
 def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
-    """The same of received triangles with ``corners`` [face, 3, 3]: exactly what a file with these would give.
+    """As :func:`read_surface`, from received triangles with ``corners`` [face, 3, 3] instead of a file.
 
-    Raises :class:`TrianglesError` for triangles that cannot be simplified, or too many of which meet at one point.
+    Raises :class:`TrianglesError` if the triangles cannot be simplified or too many of them meet at one point.
     """
     import trimesh
 
@@ -41,7 +43,7 @@ def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
 
 
 def read_surface(file: str, scale: tuple[float, ...]) -> Mesh:
-    """The same of a mesh ``file``."""
+    """As :func:`smooth_surface`, for the mesh in ``file``."""
     import trimesh
 
     mesh = cast("trimesh.Trimesh", trimesh.load(file, force="mesh", process=True))

@@ -1,4 +1,4 @@
-"""Postures of people by name: where head, hands, hips and feet are, from ``data/figures/postures.toml``."""
+"""Named postures of people from ``data/figures/postures.toml``: positions of head, hands, hips and feet."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from vinesim.scene.values import HumanPose
 
 
 class Palm(Table, frozen=True):
-    """Where a hand is."""
+    """Pose of a hand and its fingers."""
 
     at: Point
-    """[m]"""
+    """[m] Position of the palm."""
     along: Point
-    """Where the fingers point."""
+    """Direction in which the fingers point."""
     back: Point
-    """Where the back of the hand faces."""
+    """Direction in which the back of the hand faces."""
     bent: tuple[float, float, float, float, float]
-    """Thumb, index, middle, ring and little finger, 0 to 1."""
+    """Bend of thumb, index, middle, ring and little finger, 0 to 1."""
 
 
 class Posture(Table, frozen=True):
-    """Positions of a person's tracked points [m], feet about the origin, facing along x."""
+    """Positions [m] of a person's tracked points; the person faces along x, with the feet around the origin."""
 
     head: Point | None = None
     tilt: float = 0.0
-    """Of the head [rad], positive looks down."""
+    """Tilt of the head [rad], positive looking down."""
     hips: Point | None = None
     left: Palm | None = None
     right: Palm | None = None
@@ -58,7 +58,8 @@ def posture_names() -> tuple[str, ...]:
 def apply_posture(standing: HumanPose, name: str, height: float) -> HumanPose:
     """The pose of a person of this height [m] in a posture of ``data/figures/postures.toml``.
 
-    ``standing`` is the same person upright: it gives the place and all points that the posture leaves out.
+    ``standing`` is the pose of the same person standing upright; it gives the place and the points that the posture
+    leaves out.
     :class:`AppearanceError` if there is no posture of that name.
     """
     file = _load_postures()

@@ -13,7 +13,7 @@ from vinesim.core.toml_loader import DataError
 from vinesim.scene.values import Shape
 
 SURFACES = ("paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp")
-"""What a shape can be made of, beside its colour."""
+"""Surfaces that a shape can have in addition to its colour."""
 Surface = Literal["paint", "plastic", "cloth", "skin", "rubber", "metal", "straw", "reflex", "glass", "lamp"]
 Point = tuple[float, float, float]
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
@@ -31,46 +31,48 @@ class Paint(Table, frozen=True):
     """Colour and surface of a shape."""
 
     rgb: Point
-    """sRGB, 0 to 1."""
+    """Colour in sRGB, 0 to 1."""
     surface: Surface
 
 
 class ShapeSpec(Table, frozen=True, kw_only=True):
-    """One shape of a part [m, rad]; which fields count follows from ``kind``."""
+    """Description of one shape of a part [m, rad]. ``kind`` determines which fields are used."""
 
     kind: Literal["cone", "cylinder", "ellipsoid", "box", "loft"]
     paint: str | tuple[str, ...]
-    """Name of a :class:`Paint`; of a loft, one for each strip between two rings."""
+    """Name of a :class:`Paint`; a loft may have one name for each strip between two rings."""
     start: Point = (0.0, 0.0, 0.0)
-    """Of a cone or a cylinder."""
+    """Start of the axis of a cone or a cylinder."""
     end: Point = (0.0, 0.0, 0.0)
+    """End of the axis of a cone or a cylinder."""
     radius: tuple[float, float] = (0.0, 0.0)
-    """At both ends; the first alone counts for a cylinder."""
+    """Radii at both ends of a cone; a cylinder has the first one."""
     at: Point = (0.0, 0.0, 0.0)
+    """Centre of an ellipsoid or a box."""
     half: Point = (0.0, 0.0, 0.0)
     """Half axes of an ellipsoid, half edges of a box."""
     turn: Point = (0.0, 0.0, 0.0)
     """Rotation vector of an ellipsoid or a box [rad]."""
     twin: bool = False
-    """There is a second one, mirrored to the other side."""
+    """Whether there is a second shape, mirrored to the other side."""
     along: Literal["x", "z"] = "z"
     """Axis of a loft: z (front is x) or x (front is z); left is y."""
     rings: tuple[tuple[float, ...], ...] = ()
-    """Of a loft: place on the axis, rear, front, half width, and how far it lies to the left (0 unless given)."""
+    """Rings of a loft: position on the axis, rear, front, half width, and offset to the left (0 unless given)."""
     arc: tuple[float, float] = (-180.0, 180.0)
-    """Which part of its rings a loft covers, counter-clockwise about its axis from the front [degrees]."""
+    """Range of angles that a loft covers [degrees], counter-clockwise about its axis from the front."""
     arc_end: tuple[float, float] | None = None
-    """The same at its last ring, if it narrows or widens from the first to there."""
+    """Range of angles at the last ring, if it differs from ``arc`` at the first; between them it changes linearly."""
     swell: float = 0.0
-    """By how much a loft's rings are wider than written: a patch on another loft."""
+    """Distance by which a loft's rings are widened, for a patch on top of another loft."""
     sides: int = 20
-    """Edges of a whole ring."""
+    """Number of edges of a whole ring."""
     square: float = 2.0
-    """Exponent of the rings: 2 an ellipse, more a rounded rectangle."""
+    """Exponent of the rings: 2 gives an ellipse, a larger one a rounded rectangle."""
 
 
 def check_spec(paints: dict[str, Paint], spec: ShapeSpec, place: str) -> None:
-    """:class:`AppearanceError` naming ``place`` if paints are unknown or the rings of a loft do not fit."""
+    """Raise :class:`AppearanceError` naming ``place`` if paints are unknown or the rings of a loft are wrong."""
     names = (spec.paint,) if isinstance(spec.paint, str) else spec.paint
     if missing := [name for name in names if name not in paints]:
         raise AppearanceError(f"{place}.paint is {missing[0]!r}; give one of: {', '.join(paints)}")
@@ -85,7 +87,7 @@ def check_spec(paints: dict[str, Paint], spec: ShapeSpec, place: str) -> None:
 
 
 def surface_fields(paint: Paint) -> tuple[tuple[float, float, float, float], str, str]:
-    """Colour, file and surface of a shape."""
+    """The fields ``rgba``, ``file`` and ``surface`` of a :class:`Shape` with this paint."""
     return (*paint.rgb, 1.0), "", paint.surface
 
 

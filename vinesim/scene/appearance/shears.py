@@ -1,4 +1,4 @@
-"""Pruning shears for a person's hand: shapes of both halves, where they turn, and where and how strongly they cut."""
+"""Pruning shears for a person's hand: shapes of both halves, their hinge, and the region and force of cutting."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from vinesim.scene.appearance.shapes import AppearanceError, Paint, Point, Shape
 from vinesim.scene.values import Shape
 
 SHEARS_PARTS = ("shears_blade", "shears_hook")
-"""Links of shears, after the side of the hand that holds them: ``left_shears_blade``."""
+"""Link names of the halves of shears; the full name begins with the side of the hand: ``left_shears_blade``."""
 
 
 class ShearsFile(Table, frozen=True):
     source: str
     bolt: Point
-    """[m] in the palm's frame: both halves turn about it."""
+    """[m] Position of the hinge of both halves, in the palm's frame."""
     opening: float
-    """Angle by which either half turns when the shears are open [rad]."""
+    """Angle of either half from its closed position when the shears are open [rad]."""
     mouth: Point
     """[m] Middle of the space between the open blades, in the palm's frame."""
     mouth_half: Point
-    """[m] Half edges of that space: along the blades, from one to the other, across their plane."""
+    """[m] Half edges of the space between the blades: along them, from one to the other, across their plane."""
     force: float
     """Largest force of the closing blades [N]."""
     paints: dict[str, Paint]
@@ -37,17 +37,18 @@ class ShearsFile(Table, frozen=True):
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ShearsModel:
-    """Shapes of shears and what they cut; palms carry them."""
+    """Shapes, poses and cutting region of shears, in the frame of the palm that holds them."""
 
     parts: dict[str, tuple[Shape, ...]]
-    """By name, :data:`SHEARS_PARTS`."""
+    """Shapes by part name, see :data:`SHEARS_PARTS`."""
     open: np.ndarray
-    """Poses [2, 7] of the parts in the palm's frame when the shears are open."""
+    """Poses [2, 7] of the parts when the shears are open."""
     closed: np.ndarray
+    """Poses [2, 7] of the parts when the shears are closed."""
     mouth: np.ndarray
-    """Pose [7] of the mouth in the palm's frame: x along the blades, y from one to the other, z across their plane."""
+    """Pose [7] of the box between the open blades: x along them, y from one to the other, z across their plane."""
     mouth_half: np.ndarray
-    """[3] m, half edges of the mouth."""
+    """[3] m, half edges of that box."""
     force: float
     """Largest force of the closing blades [N]."""
 

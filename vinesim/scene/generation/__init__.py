@@ -1,1 +1,1 @@
-"""From a scene file to a model: old wood, wires, shoots, leaves and bunches."""
+"""Generates models from scene files: old wood, wires, shoots, leaves and bunches."""

@@ -1,4 +1,4 @@
-"""What stands still: poles, wires, trunks and arms, as round cones; and the random stream of each vine."""
+"""Fixed structure as round cones: poles, wires, trunks and arms; and the random stream of each vine."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from vinesim.scene.spec import Scene
 
 @dataclasses.dataclass
 class FixedStructure:
-    """Vines with the numbers each has drawn, their arms, and everything that stands still."""
+    """Vines with their random streams, their trunks and arms, and all fixed parts."""
 
     foot: np.ndarray
-    """[vine, 3] m"""
+    """[vine, 3] m, where the trunk meets the ground."""
     row: np.ndarray
-    """[vine]"""
+    """[vine] index of the vine's row."""
     rngs: list[np.random.Generator]
     arms: np.ndarray
     """[vine, arm, point, 3] m"""
@@ -118,7 +118,7 @@ def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarra
     deep = (layout.rows - 1) * layout.row_spacing
     over_x = 0.5 * layout.vine_spacing
     over_y = 0.5 * layout.row_spacing
-    # a wire runs from pole to pole: points half a field before the first and behind the last one
+    # wires run from pole to pole, and half a vine spacing beyond the first and the last vine
     xs = np.unique([-over_x, *(np.arange(layout.vines) * layout.vine_spacing), wide + over_x])
     ys = np.unique([-over_y, *(np.arange(layout.rows) * layout.row_spacing), deep + over_y])
     radius = 0.5 * trellis.wire_diameter.value

@@ -1,4 +1,4 @@
-"""Bunches: their mass, berries and peduncles, and which of them a vine keeps."""
+"""Bunches: draws their mass, berries and peduncles, and chooses which of them a vine keeps."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from vinesim.scene.plant_parameters import Range, VineParameters
 from vinesim.scene.spec import Scene
 
 Sampler = Callable[..., np.ndarray]
-"""Random numbers [shoot, ...] of the shape asked for, each shoot's from the stream of its vine."""
+"""Function of a shape that draws random numbers [shoot, *shape]; each shoot uses the stream of its vine."""
 
 MIN_GAP = 0.02
-"""Least gap between a bunch and its neighbours, poles and trunks [m]."""
+"""Smallest gap between a bunch and neighbouring bunches, poles and trunks [m]."""
 MAX_BUCKLING_LOAD = 0.6
-"""Most m g a^2 / EI of bunches at height a above the base of their shoot; a uniform column buckles at 2.47."""
+"""Largest m g a^2 / EI of bunches at height a above the base of their shoot; a uniform column buckles at 2.47."""
 
 
 def sample_fruit(
@@ -32,7 +32,12 @@ def sample_fruit(
     uniform: Sampler,
     normal: Sampler,
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Two bunches for every shoot, of which :func:`choose_bunches` keeps some: fruit, at, peduncle, axis, roll."""
+    """Draw two bunches for every shoot; :func:`choose_bunches` keeps some of them.
+
+    Returns:
+        ``fruit``, ``bunch_at``, ``peduncle`` and ``bunch_axis`` as in :class:`~vinesim.scene.generation.shoots.Shoots`,
+        and the horizontal direction [shoot, MAX_BUNCHES, 3] to which the peduncle tilts.
+    """
     fruit = parameters.bunch
     peduncle = parameters.peduncle
     sigma = math.sqrt(math.log(1.0 + fruit.mass_variation.value**2))
@@ -59,7 +64,7 @@ def sample_fruit(
         "thick": 0.5 * peduncle.diameter.at(_fraction(mass, fruit.mass_range)),
     }
 
-    # opposite the third to sixth leaf and one or two nodes further on, never both on one piece's tip
+    # the second bunch grows about two nodes above the first one, never at the tip of the same segment
     low, high = parameters.cane.first_bunch_node.value
     node = low + (high - low) * uniform()
     node = np.stack([node, node + 2.2], -1)
@@ -71,7 +76,7 @@ def sample_fruit(
     angle = 2.0 * np.pi * uniform(MAX_BUNCHES)
     level = np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], -1)
     tilt = np.clip(0.10 + 0.04 * normal(MAX_BUNCHES), 0.02, 0.18)[..., None]
-    if scene.training == "vsp":  # beside its upright shoot, out of the hedge
+    if scene.training == "vsp":  # the bunch hangs beside its upright shoot, outside the hedge
         level = frames.normalize(level * [0.4, 1.0, 0.0])
         tilt = tilt + 0.10
     first = frames.normalize(level * tilt - [0.0, 0.0, 1.0])
@@ -83,7 +88,7 @@ def sample_fruit(
 
 
 def _fraction(value: np.ndarray, within: Range) -> np.ndarray:
-    """How far ``value`` lies between the ends of a range, 0..1."""
+    """Position of ``value`` between the ends of a range, from 0 to 1."""
     low, high = within.value
     return (value - low) / (high - low)
 
@@ -98,7 +103,7 @@ def choose_bunches(
 ) -> np.ndarray:
     """Thin each vine to its number of bunches.
 
-    None is kept that touches a pole, a trunk or a bunch already kept, or under which an upright shoot would buckle.
+    A bunch is not kept if it touches a pole, a trunk or a bunch already kept, or if its upright shoot would buckle.
     """
     layout = scene.layout
     low, high = scene.fruit.bunches
@@ -110,14 +115,14 @@ def choose_bunches(
     inside = (
         np.abs(level) + radius[..., None] + 0.5 * MIN_GAP < 0.5 * np.array([layout.vine_spacing, layout.row_spacing])
     ).all(-1)
-    # the pole and the trunk, whose head lies 5-15 cm beside it
+    # the pole stands at the foot, the trunk's head 5-15 cm beside it
     trunk = structure.trunk[:, :, None, :2] - top[:, None, :, :2]
     beside = np.sqrt((trunk * trunk).sum(-1)).min(1)
     clear = (np.linalg.norm(level, axis=-1) > radius + 0.05 + MIN_GAP) & (beside > radius + 0.06 + MIN_GAP)
     kept = np.zeros((len(top), slots), bool)
     for number, g in enumerate(structure.rngs):
         wanted = int(g.integers(low, high + 1))
-        # the first bunch of a shoot is likelier kept than its second
+        # the first bunch of a shoot is more likely to be kept than the second
         order = np.argsort(g.random(slots) + 0.45 * (np.arange(slots) % MAX_BUNCHES), kind="stable")
         order = order[(inside & clear)[number, order]]
         t = top[number, order]

@@ -33,7 +33,7 @@ from vinesim.scene.spec import Scene
 
 @dataclasses.dataclass
 class Bodies:
-    """The table of bodies [shoot, slot] that becomes the model's, poses in the world as drawn."""
+    """Table of bodies [shoot, slot] from which the model is built; poses are in the world, as drawn."""
 
     present: np.ndarray
     """[shoot, slot] bool: the shoot has this body."""
@@ -58,13 +58,13 @@ class Bodies:
     stiffness: np.ndarray
     """[shoot, slot, 3] N m/rad"""
     half: np.ndarray
-    """[shoot, slot, 3] N m/rad: spring of the half of a segment beyond its middle."""
+    """[shoot, slot, 3] N m/rad, spring of the half of a segment beyond its middle."""
     damping: np.ndarray
     """[shoot, slot, 3] N m s/rad"""
     drag: np.ndarray
     """[shoot, slot] m^2, drag area Cd A."""
     head: dict[str, np.ndarray]
-    """[shoot, MAX_BUNCHES, ...] mass, com, inertia of the head of each bunch: what is no cluster."""
+    """[shoot, MAX_BUNCHES, ...] mass, com and inertia of the head of each bunch, the part outside its clusters."""
 
 
 def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
@@ -103,14 +103,14 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
 
         _fill_bunch(parameters, shoots, bodies, k)
         bodies.present[:, slots] = shoots.has_bunch[:, k, None]
-    across = bodies.radius.sum(-1) * bodies.length  # of wood seen from the side
+    across = bodies.radius.sum(-1) * bodies.length  # area of the wood seen from the side
     wood = np.where(bodies.organ == int(Organ.BUNCH), 0.0, cane.drag.value * across)
     bodies.drag[:, :CORE_SLOTS] += wood[:, :CORE_SLOTS]
     return bodies
 
 
 def _allocate(count: int) -> Bodies:
-    """The table of ``count`` shoots, all of whose bodies are present, with zeros."""
+    """A table of zeros for ``count`` shoots, with all bodies present."""
     shape = (count, SLOT_COUNT)
     return Bodies(
         present=np.ones(shape, bool),
@@ -136,8 +136,10 @@ def _allocate(count: int) -> Bodies:
 
 
 def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """Parents [shoot, segment] of a rod that grows on slot ``first`` [shoot]; ``chain`` [segment - 1] are its own
-    slots."""
+    """Parent slots [shoot, segment] of a rod that grows on slot ``first`` [shoot].
+
+    ``chain`` [segment - 1] are the rod's own slots.
+    """
     return np.concatenate([first[:, None], np.broadcast_to(chain, (len(first), len(chain)))], 1)
 
 
@@ -166,7 +168,7 @@ def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: i
     bodies.radius[has, bunch] = wide[:, None]
     bodies.stiffness[:, bunch] = bodies.stiffness[:, bunch - 1]
     bodies.damping[:, bunch] = bodies.damping[:, bunch - 1]
-    # the wind takes hold of the bunch as a whole
+    # wind acts on the bunch as a whole, not on its clusters
     bodies.drag[has, bunch] = parameters.bunch.drag.value * 0.5 * np.pi * wide * long
 
     most = pieces.mass.shape[1] - 1
@@ -194,17 +196,17 @@ def _fill_rod(
     up: np.ndarray,
     parent: np.ndarray,
 ) -> None:
-    """Fill the slots of one axis of every shoot. It is a root, or grows on the tip of its parent.
+    """Fill the slots of one rod of every shoot, which is either a root or grows on the tip of its parent.
 
     Args:
         bodies: the table.
-        slots: of its segments.
-        points: [shoot, segment + 1, 3] m.
-        radius: [shoot, segment + 1] m.
-        modulus: [segment] Pa.
+        slots: slots of the segments.
+        points: [shoot, segment + 1, 3] m, ends of the segments.
+        radius: [shoot, segment + 1] m, radii at these points.
+        modulus: [segment] Pa, Young's modulus.
         wood: gives density and damping.
         up: [shoot, 3] direction that the z axes lean to.
-        parent: [shoot, segment] slots.
+        parent: [shoot, segment] slots of the parents.
     """
     along = np.diff(points, axis=1)
     length = np.linalg.norm(along, axis=-1)
@@ -232,11 +234,11 @@ def _fill_rod(
     bodies.damping[:, slots] = wood.damping.value * stiffness
 
 
-# Leaves at the nodes of shoots: which node stands where, and the leaves' weight on the bodies that carry them.
+# Leaves at the nodes of shoots: positions of the nodes, and the leaves' weight on the bodies that carry them.
 
 
 def place_leaves(scene: Scene, parameters: VineParameters, shoots: Shoots, bodies: Bodies) -> dict[str, np.ndarray]:
-    """Leaves at the nodes, left and right in turn, and their weight on the bodies that carry them."""
+    """Place leaves at the nodes, alternately left and right, and add their weight to the bodies that carry them."""
     node = np.arange(MAX_NODES + LATERAL_NODES)
     main = node < MAX_NODES
     many = np.where(main, shoots.nodes[:, None], LATERAL_NODES)

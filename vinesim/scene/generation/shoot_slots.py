@@ -1,6 +1,6 @@
-"""Slots of the table of shoots: which column holds which segment, bunch or cluster.
+"""Slots (columns) of the table of shoots, one for each segment, bunch or cluster.
 
-Every shoot has the same slots: main axis, lateral, and for each of two bunches its peduncle, the bunch and its
+Every shoot has the same slots: main axis, lateral, and for each of two bunches the peduncle, the bunch and its
 clusters.
 """
 
@@ -9,17 +9,17 @@ from __future__ import annotations
 from vinesim.scene.builder import MAX_CLUSTERS
 
 AXIS_SEGMENTS = 14
-"""Bodies of a shoot's main axis."""
+"""Number of bodies of a shoot's main axis."""
 LATERAL_SEGMENTS = 4
-"""Bodies of a lateral (side shoot)."""
+"""Number of bodies of a lateral (side shoot)."""
 PEDUNCLE_SEGMENTS = 2
-"""Bodies of a peduncle."""
+"""Number of bodies of a peduncle."""
 MAX_BUNCHES = 2
-"""Most bunches on a shoot."""
+"""Largest number of bunches on a shoot."""
 MAX_NODES = 25
-"""Most leaves on a shoot's main axis."""
+"""Largest number of leaves on a shoot's main axis."""
 LATERAL_NODES = 6
-"""Leaves of a lateral."""
+"""Number of leaves of a lateral."""
 ARM_SEGMENTS = 5
 TRUNK_SEGMENTS = 7
 
@@ -29,7 +29,7 @@ SLOT_COUNT = CORE_SLOTS + MAX_BUNCHES * MAX_CLUSTERS
 
 
 def peduncle_slots(which: int) -> slice:
-    """Slots of one peduncle and, last, its bunch."""
+    """Slots of one peduncle, followed by the slot of its bunch."""
     first = AXIS_SEGMENTS + LATERAL_SEGMENTS + which * (PEDUNCLE_SEGMENTS + 1)
     return slice(first, first + PEDUNCLE_SEGMENTS + 1)
 

@@ -1,4 +1,4 @@
-"""Shoots as random numbers shape them: main axis, lateral, nodes; their points in the world."""
+"""Draws the shapes of shoots at random: points of main axes and laterals in the world, numbers of nodes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from vinesim.scene.spec import Scene
 
 @dataclasses.dataclass
 class Shoots:
-    """What is drawn of each shoot, first axis: shoot."""
+    """Random numbers and shapes of all shoots; the first axis of each array is the shoot unless noted."""
 
     vine: np.ndarray
     piece: np.ndarray
-    """[shoot] piece of an arm that it springs from, counted over all arms"""
+    """[shoot] piece of an arm that the shoot grows on, counted over all arms"""
     up: np.ndarray
-    """[shoot, 3] direction that a body's z axis leans to."""
+    """[shoot, 3] direction that the bodies' z axes lean to."""
     points: np.ndarray
     """[shoot, AXIS_SEGMENTS + 1, 3] m, main axis."""
     length: np.ndarray
@@ -38,13 +38,13 @@ class Shoots:
     has_lateral: np.ndarray
     """[shoot] bool: has a side shoot"""
     lateral_at: np.ndarray
-    """[shoot] piece of the main axis whose tip carries it"""
+    """[shoot] segment of the main axis whose tip carries the lateral"""
     lateral_points: np.ndarray
     """[shoot, LATERAL_SEGMENTS + 1, 3] m"""
     has_bunch: np.ndarray
     """[shoot, MAX_BUNCHES] bool"""
     bunch_at: np.ndarray
-    """[shoot, MAX_BUNCHES] piece of the main axis whose tip carries the peduncle"""
+    """[shoot, MAX_BUNCHES] segment of the main axis whose tip carries the peduncle"""
     peduncle: np.ndarray
     """[shoot, MAX_BUNCHES, PEDUNCLE_SEGMENTS + 1, 3] m, the last point is the bunch's origin"""
     bunch_axis: np.ndarray
@@ -54,7 +54,7 @@ class Shoots:
     fruit: dict[str, np.ndarray]
     """[shoot, MAX_BUNCHES] mass, count, length, radius, seed, variety, pull, thick"""
     nodes: np.ndarray
-    """[shoot] nodes of the main axis"""
+    """[shoot] number of nodes of the main axis"""
     leaf_normal: np.ndarray
     """[8, shoot, MAX_NODES + LATERAL_NODES] standard normal numbers"""
     leaf_uniform: np.ndarray
@@ -76,7 +76,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
     def normal(*shape: int) -> np.ndarray:
         return np.stack([g.standard_normal((per_vine, *shape)) for g in structure.rngs]).reshape(count, *shape)
 
-    # where a shoot springs from its arm: evenly, a little shuffled, alternating sides
+    # bases of shoots on their arm: evenly spaced with a small random offset, on alternating sides
     number = np.tile(np.arange(each), arm_count * vines)
     share = 0.17 + 0.81 * (number + 0.2 + 0.6 * uniform()) / each
     where = share * ARM_SEGMENTS
@@ -143,7 +143,7 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
 def _grow_main_axis(
     scene: Scene, start: np.ndarray, heading: np.ndarray, length: np.ndarray, noise: np.ndarray, foot: np.ndarray
 ) -> np.ndarray:
-    """Points of the shoots: over the net they are held between its wires, in a hedge between the catch wires."""
+    """Points of the main axes. Shoots in a tendone are held by the net, shoots in a hedge between its catch wires."""
     layout = scene.layout
     tendone = scene.training == "tendone"
     points = np.empty((len(start), AXIS_SEGMENTS + 1, 3))
@@ -155,7 +155,7 @@ def _grow_main_axis(
         share = i / AXIS_SEGMENTS
         heading = heading + noise[:, i] * ([0.10, 0.10, 0.06] if tendone else [0.07, 0.05, 0.03])
         if tendone:
-            # the bearing part droops below the net, the rest climbs over it
+            # the part with bunches droops below the net, the rest climbs over it
             low = layout.height - 0.28 + 0.44 * min(2.0 * share, 1.0)
             heading[:, 2] += np.clip(2.2 * (low - at[:, 2]), -0.2, 0.28) * (0.5 + share)
             heading[:, 2] = np.clip(heading[:, 2], -0.42, 0.5)
@@ -170,7 +170,7 @@ def _grow_main_axis(
 def _grow_lateral(
     points: np.ndarray, at: np.ndarray, up: np.ndarray, length: np.ndarray, sign: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
-    """Points of the side shoots: 45 degrees off the main axis, then on with a little wander."""
+    """Points of the laterals, which leave the main axis at 45 degrees and wander a little."""
     rows = np.arange(len(points))
     start = points[rows, at + 1]
     axis = frames.normalize(points[rows, at + 1] - points[rows, at])

@@ -1,4 +1,4 @@
-"""Ties: where shoots are bound to wires or held between them."""
+"""Ties of shoots to wires."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene
 
 TIED_SEGMENT = 10
-"""The piece of a shoot at whose beginning a string binds it to the net."""
+"""Segment of a shoot at whose beginning a string binds the shoot to the net."""
 
 
 def find_ties(
     scene: Scene, parameters: VineParameters, structure: FixedStructure, shoots: Shoots, bodies: Bodies
 ) -> dict[str, np.ndarray]:
-    """Where shoots pass wires closely: over the net they are tied to it or lie on it, in a hedge wires hold them.
+    """Tie shoots to the wires that they pass closely: to the net in a tendone, to the catch wires in a hedge.
 
-    Each tie is bound to the piece of wire that is nearest; of two catch wires that hold a shoot, to one.
+    Each tie is bound to the nearest piece of wire. A shoot between two catch wires is bound to one of them.
     """
     layout = scene.layout
     trellis = parameters.trellis
@@ -50,7 +50,7 @@ def find_ties(
         crossings.append((share, np.where(found, np.abs(apart), np.inf)))
     share, apart = (np.stack(values, -1) for values in zip(*crossings, strict=True))
     tied = apart < trellis.tie_reach.value
-    if tendone:  # strings bind the end to the net: a long shoot that is free beyond its middle falls over
+    if tendone:  # a string binds each shoot beyond its middle, or a long one would fall over
         share[:, TIED_SEGMENT, 0] = 0.0
         tied[:, TIED_SEGMENT, 0] = np.abs(start[:, TIED_SEGMENT, 2] - layout.height) < trellis.tie_string.value
     shoot, slot, which = np.nonzero(tied)
@@ -89,7 +89,10 @@ def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarra
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where pieces from ``start`` to ``end`` [...] cross one of parallel lines: share of their length, and whether."""
+    """Crossings of the pieces from ``start`` to ``end`` [...] with lines at ``first`` + n ``step``.
+
+    Returns the share of the piece's length at the crossing, and whether it crosses a line [...] bool.
+    """
     low = (start - first) / step
     high = (end - first) / step
     line = np.maximum(np.floor(low), np.floor(high))

@@ -1,9 +1,8 @@
-"""From a scene to a model: poles, wires and old wood stand fixed; every shoot is a tree with leaves and bunches.
+"""Generates the model of a scene: poles, wires and old wood are fixed, every shoot is a tree with leaves and bunches.
 
-Shoots are rows of a table with the same slots each (:mod:`~vinesim.scene.generation.shoot_slots`); what a shoot does
-not have
-is masked out at the end, so nothing loops over plants except the drawing of random numbers. Each vine rngs from its own
-stream, named by (seed, row, place): the numbers of a vine do not depend on how many others there are.
+Shoots are rows of a table, all with the same slots (:mod:`~vinesim.scene.generation.shoot_slots`). Slots that a shoot
+does not use are masked out at the end, so that only the drawing of random numbers loops over plants. Each vine draws
+from its own random stream, named by (seed, row, place), so its numbers do not depend on the number of vines.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ def generate(scene: Scene) -> Model:
         model = _generate(scene, parameters)
         return {name: getattr(model, name) for name in Model.array_fields()}
 
-    # what no plant depends on does not name another model
+    # settings that no plant depends on must not change the digest
     plants = msgspec.structs.replace(
         scene, name="", sun=Sun(), wind=Wind(), spawns=(), physics=PhysicsParameters(), plants="", imported=()
     )
@@ -54,13 +53,13 @@ def generate(scene: Scene) -> Model:
 
 
 def generate_uncached(scene: Scene) -> Model:
-    """As :func:`generate`, for a scene that is needed once."""
+    """The model of a scene as from :func:`generate`, but without the cache, for scenes that are needed only once."""
     return _generate(scene, plant_parameters.load_plant(scene.plants))
 
 
 @functools.cache
 def _code_digest() -> str:
-    """Of the code that generates models, and of the varieties of grapes."""
+    """Digest of the code that generates models and of the grape varieties."""
     package = pathlib.Path(builder.__file__).parent
     others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))
@@ -77,7 +76,7 @@ def _generate(scene: Scene, parameters: VineParameters) -> Model:
     variety = [v.name for v in berries.VARIETIES].index(scene.fruit.varieties[0])
     for number, one in enumerate(scene.imported):
         pose = frames.pose(np.array([one.x, one.y, one.z]), frames.from_yaw(one.yaw))
-        # vines have streams of two numbers
+        # spawn keys of length 3, because those of vines have length 2
         rng = np.random.default_rng(np.random.SeedSequence(scene.seed, spawn_key=(0, 0, number)))
         plant = build_model(
             load_imported_plant(one.file),
@@ -100,14 +99,14 @@ def _assemble_model(
     leaf: dict[str, np.ndarray],
     ties: dict[str, np.ndarray],
 ) -> Model:
-    """Leave out what is masked, number the rest, and make drawn world poses relative."""
+    """Build the model: drop masked slots, number the rest, and turn world poses into poses relative to parents."""
     size = bodies.present.sum(1)
     first = np.cumsum(size) - size
     number = first[:, None] + np.cumsum(bodies.present, 1) - 1
     has = bodies.present
     tree = np.broadcast_to(np.arange(len(size))[:, None], has.shape)[has]
     bunch = np.stack([number[:, peduncle_slots(k).stop - 1] for k in range(MAX_BUNCHES)], 1)
-    order = np.argsort(leaf["slot"], axis=1, kind="stable")  # leaves lie in the order of their bodies
+    order = np.argsort(leaf["slot"], axis=1, kind="stable")  # the model lists leaves in the order of their bodies
     pick = np.arange(len(order))[:, None]
     leaf = {name: value[pick, order] for name, value in leaf.items()}
     shown = leaf["present"]

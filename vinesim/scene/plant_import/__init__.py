@@ -1,1 +1,1 @@
-"""Plants that others grow: virtual plants of OpenAlea, Helios or a scanner become trees with wood."""
+"""Imports plants from OpenAlea, Helios or a scanner as trees with wood."""

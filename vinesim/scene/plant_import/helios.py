@@ -1,9 +1,9 @@
-"""Plants of Helios (Bailey 2019, Front. Plant Sci. 10:1185): cylinder files, and the XML of a plant's structure.
+"""Reads plants of Helios (Bailey 2019, Front. Plant Sci. 10:1185): cylinder files, and the XML of a plant's structure.
 
-``writeQSMCylinderFile`` writes every internode as a cylinder, with tabs between 17 columns, as TreeQSM does. Its parent
-column names the row above also where a new branch begins, which then does not start there: such a cylinder is joined
-to the one that it starts on. ``writePlantStructureXML`` tells points only of shoots whose nodes were prescribed; of the
-others it tells the angles from which Helios grows them, which cannot be followed here.
+``writeQSMCylinderFile`` writes every internode as a cylinder, in 17 columns separated by tabs, as TreeQSM does. Where a
+new branch begins, its parent column still names the row above, although the branch starts elsewhere. The reader joins
+such a cylinder to the one on which it starts. ``writePlantStructureXML`` contains points only for shoots whose nodes
+were prescribed; for other shoots it contains angles for Helios to grow them, which this reader cannot use.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ import numpy as np
 from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_nodes
 
 _COLUMNS = 9
-"""Columns that are read: radius, length, start (3), axis (3), parent."""
+"""Number of columns that are read: radius, length, start (3), axis (3), parent."""
 _NEAR = 0.01
-"""[m] A cylinder may start this far off the surface of what bears it."""
+"""[m] Largest distance between the start of a cylinder and the surface of its parent."""
 
 
 def read_cylinders(path: pathlib.Path) -> Skeleton:
     """The skeleton of a plant from a cylinder file (TreeQSM, or Helios' ``writeQSMCylinderFile``), lengths in metres.
 
-    :class:`PlantFileError` for a row that is no cylinder, or starts on none.
+    :class:`PlantFileError` for a row that is not a cylinder or does not start on one.
     """
     rows = []
     for number, line in enumerate(path.read_text("utf-8", "replace").splitlines()[1:], 2):
@@ -69,7 +69,7 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
 
 
 def _bearer(path: pathlib.Path, table: np.ndarray, start: np.ndarray, way: np.ndarray, i: int) -> int:
-    """The cylinder before ``i`` on whose surface or axis it starts."""
+    """The cylinder before ``i`` on whose surface or axis cylinder ``i`` starts."""
     share = np.clip(((start[i] - start[:i]) * way[:i]).sum(1) / (way[:i] ** 2).sum(1), 0.0, 1.0)
     off = np.linalg.norm(start[:i] + share[:, None] * way[:i] - start[i], axis=1) - table[:i, 0]
     nearest = int(np.argmin(off))
@@ -81,7 +81,7 @@ def _bearer(path: pathlib.Path, table: np.ndarray, start: np.ndarray, way: np.nd
 
 
 def read_helios_xml(path: pathlib.Path) -> Skeleton:
-    """The skeleton of a plant from Helios' ``writePlantStructureXML``, if it tells where every shoot is."""
+    """The skeleton of a plant from Helios' ``writePlantStructureXML``, if it contains the points of every shoot."""
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as bad:
@@ -112,7 +112,7 @@ def read_helios_xml(path: pathlib.Path) -> Skeleton:
             if at < 0:
                 raise PlantFileError(f"{name}: grows on node of shoot {bearer} that is not before it; reorder")
         for i, (node, radius) in enumerate(zip(nodes, radii, strict=True)):
-            if i or bearer < 0:  # the first node of a branch lies on what bears it
+            if i or bearer < 0:  # the first node of a branch lies on its parent
                 position.append(base + node)
                 parent.append(at)
                 diameter.append(2.0 * radius)

@@ -1,4 +1,4 @@
-"""An imported plant: skeleton and wood as one TOML file that scenes name; what was missing is filled and marked.
+"""An imported plant: skeleton and wood in one TOML file for scenes; missing numbers are filled in and marked.
 
 plant = import_plant("vine.mtg", unit="cm")
 plant.write("vine.toml")  # in a scene: [[imported]] file = "vine.toml"
@@ -24,23 +24,23 @@ from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, check_
 from vinesim.scene.plant_parameters import Number
 
 UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001}
-"""Units of length that a plant file may have [m]."""
+"""Units of length that a plant file may use [m]."""
 SUFFIXES = (".mtg", ".ply", ".txt", ".xml")
 
 
 class Wood(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """What the wood is made of; the files of other programs do not tell."""
+    """Properties of the wood, which the files of other programs do not contain."""
 
     woody_modulus: Annotated[Number, "Pa"]
     """Young's modulus of bending at the base of a shoot."""
     green_modulus: Annotated[Number, "Pa"]
-    """At its tip, and of side shoots."""
+    """Young's modulus of bending at the tip of a shoot, and of side shoots."""
     woody_share: Annotated[Number, "1"]
     density: Annotated[Number, "kg/m^3"]
     damping: Annotated[Number, "s"]
     drag: Annotated[Number, "1"]
     old_wood: Annotated[Number, "m"]
-    """Wood thicker than this stands still."""
+    """Wood thicker than this is fixed."""
 
 
 class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -49,13 +49,13 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     source: str
     """Name and format of the file that it was read from."""
     shape: Literal["drawn", "slack"] = "drawn"
-    """What the points show: the plant as it hangs under its weight (``drawn``), or without it (``slack``)."""
+    """Shape given by the points: the plant as it hangs under its weight (``drawn``) or without weight (``slack``)."""
     piece: Annotated[float, msgspec.Meta(gt=0.0)] = 0.06
-    """[m] Length of the rigid bodies that wood is cut into, about."""
+    """[m] Approximate length of the rigid bodies of the wood."""
     notes: tuple[str, ...] = ()
-    """What of the file was mended or left out."""
+    """What was repaired or left out when the file was read."""
     filled: tuple[int, ...] = ()
-    """Nodes whose diameter the file does not tell: it was filled in."""
+    """Nodes whose diameter is missing in the file and was filled in."""
     nodes: tuple[tuple[int, float, float, float, float], ...]
     """Parent (-1: the base), x, y, z [m] and diameter [m] of each node, parents first."""
     bunches: tuple[tuple[int, float], ...] = ()
@@ -63,7 +63,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     wood: Wood
 
     def skeleton(self) -> Skeleton:
-        """The plant's points as arrays."""
+        """The plant's skeleton as arrays."""
         table = np.array(self.nodes, float).reshape(-1, 5)
         bunch = np.zeros(len(table))
         for node, mass in self.bunches:
@@ -106,16 +106,16 @@ def import_plant(
     piece: float = 0.06,
     old_wood: float | None = None,
 ) -> ImportedPlant:
-    """Read a plant that another program has grown; what the file does not tell is filled from plant parameters.
+    """Read a plant from a file of another program; missing numbers are filled in from plant parameters.
 
     Args:
         path: an MTG (``.mtg``), a PLY skeleton (``.ply``), cylinders of TreeQSM or Helios (``.txt``), or Helios' XML.
-        unit: of the coordinates, ``m``, ``cm`` or ``mm``; cylinders and XML are in metres.
-        diameter_unit: of diameters and radii; as ``unit`` unless given.
-        plants: file of plant parameters, or its name in ``data/plants``, from which the wood is filled.
-        shape: what the points show: the plant under its weight (``drawn``), or without it (``slack``).
-        piece: length of the rigid bodies that wood is cut into, about [m].
-        old_wood: wood thicker than this stands still [m]; half more than the thickest cane unless given.
+        unit: unit of the coordinates, ``m``, ``cm`` or ``mm``; cylinders and XML are in metres.
+        diameter_unit: unit of diameters and radii; ``unit`` unless given.
+        plants: file of plant parameters, or its name in ``data/plants``, with the properties of the wood.
+        shape: shape given by the points: the plant under its weight (``drawn``) or without weight (``slack``).
+        piece: approximate length of the rigid bodies of the wood [m].
+        old_wood: wood thicker than this is fixed [m]; 1.5 times the thickest cane unless given.
 
     Raises:
         PlantFileError: with file, place, finding and remedy.
@@ -161,7 +161,7 @@ def import_plant(
 
 
 def _fill_wood(plants: str, old_wood: float | None) -> Wood:
-    """Moduli, density, damping and drag of plant parameters, marked as filled."""
+    """Moduli, density, damping and drag from plant parameters, marked as filled in."""
     cane = plant_parameters.load_plant(plants).cane
     numbers = {}
     for name in ("woody_modulus", "green_modulus", "woody_share", "density", "damping", "drag"):
@@ -176,9 +176,9 @@ def _fill_wood(plants: str, old_wood: float | None) -> Wood:
 
 
 def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.ndarray]:
-    """Diameters [node] m without gaps, and which were filled [node].
+    """Diameters [node] m without gaps, and which of them were filled in [node] bool.
 
-    Between two that are known by the way between them, elsewhere by the taper of a cane over the whole plant.
+    Between two known diameters it interpolates over the length of the wood; elsewhere it uses a cane's taper.
     """
     parent = skeleton.parent
     diameter = skeleton.diameter.copy()
@@ -191,7 +191,8 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
     cane = plant_parameters.load_plant(plants).cane
     base = cane.base_diameter.at(0.5)
     tip = cane.tip_diameter.value
-    above = np.full(len(parent), -1)  # the nearest known node towards a tip, of the first child that has one
+    # nearest node towards a tip with a known diameter, along the first child that has one
+    above = np.full(len(parent), -1)
     for node in range(len(parent) - 1, 0, -1):
         known = above[node] if filled[node] else node
         if known >= 0:
@@ -212,7 +213,7 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
 
 @functools.cache
 def load_imported_plant(path: str) -> ImportedPlant:
-    """The imported plant in a TOML file; :class:`PlantFileError` in one line if it cannot be used."""
+    """The imported plant in a TOML file; :class:`PlantFileError` if the file cannot be used."""
     file = pathlib.Path(path)
     if not file.is_file():
         raise PlantFileError(f"{file}: no such file; write it with: vinesim scene import-plant")

@@ -1,9 +1,9 @@
-"""Multiscale tree graphs, the text files of OpenAlea's MTG (FORM-A): topology by columns, features by name.
+"""Reads multiscale tree graphs, the text files of OpenAlea's MTG (FORM-A): topology by columns, features by name.
 
-Read are entities with coordinates (XX, YY, ZZ), whatever their class; a point is where its entity ends. The wood of an
-entity leads there from the point of the entity that bears it, or of the nearest one below that has coordinates. Left
-out are classes, scales and all other features. The grammar: Godin et al. 1997, AMAPmod; OpenAlea's own reader takes
-``+`` for a branch that ends with its columns, and so does this one.
+The reader takes every entity with coordinates (XX, YY, ZZ), whatever its class; the point is the end of the entity. The
+wood of an entity runs to this point from the point of its parent, or of the nearest ancestor with coordinates. Classes,
+scales and all other features are ignored. Grammar: Godin et al. 1997, AMAPmod. As in OpenAlea's own reader, ``+`` is a
+branch that ends with its columns.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_n
 _SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
 _STEP = re.compile(r"(\^|/|<<|<|\+\+|\+)([A-Za-z]+)?(\d+)?")
 _DIAMETERS = {"diameter": 1.0, "diam": 1.0, "topdia": 1.0, "radius": 2.0}
-"""Names of features that tell how thick the wood is, in small letters, and what makes a diameter of them."""
+"""Factor to a diameter, by the name of a feature for the thickness of wood, in lower case."""
 _BUNCH = "bunch"
-"""Name of the feature that tells the mass [kg] of a bunch that hangs from an entity."""
+"""Name of the feature with the mass [kg] of a bunch that hangs from an entity."""
 
 
 @dataclasses.dataclass
 class _Entity:
     below: int
-    """The entity that bears it or that it is part of, -1 for none."""
+    """The entity on which this one grows or of which it is a part, -1 for none."""
     values: dict[str, float]
 
 
@@ -36,8 +36,8 @@ def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
     Args:
         path: the file.
-        unit: of its coordinates [m].
-        diameter_unit: of its diameters [m].
+        unit: unit of its coordinates [m].
+        diameter_unit: unit of its diameters [m].
 
     Raises:
         PlantFileError: for a line that cannot be read, no coordinates, or several plants.
@@ -71,7 +71,7 @@ def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
 
 def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
-    """Names of the features, and the numbered lines of the section MTG."""
+    """Names of the features, and the lines of the section MTG with their numbers."""
     section = ""
     features = []
     lines = []
@@ -94,7 +94,7 @@ def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
 def _table_head(
     path: pathlib.Path, features: list[str], lines: list[tuple[int, str]]
 ) -> tuple[list[tuple[int, str]], dict[int, str]]:
-    """The lines below the head of the table, and the feature of each column behind the topology's."""
+    """The lines below the head of the table, and the feature of each column that follows the topology."""
     number, head = lines[0]
     cells = head.split("\t")
     if cells[0].strip() not in ("ENTITY-CODE", "TOPO"):
@@ -107,7 +107,7 @@ def _table_head(
 
 
 def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[int, str]) -> list[_Entity]:
-    """All entities, each with the one that it grows on or is part of."""
+    """All entities, each with the entity on which it grows or of which it is a part."""
     entities: list[_Entity] = []
     first_feature = min(columns, default=1 << 30)
     last: list[int] = []  # by column, the entity that the next line continues
@@ -124,7 +124,7 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
             raise PlantFileError(f"{place}: {code!r} has nothing above it to continue; give it fewer tabs")
         below = last[column] if same else last[column - 1] if column else -1
         steps = steps[same:]
-        branch = same and steps[0][0].startswith("+")  # its own lines stand one column further right
+        branch = same and steps[0][0].startswith("+")  # the lines of a branch begin one column further right
         for operator, index in steps:
             repeat = index - entities[below].values["index"] if len(operator) == 2 and below >= 0 else 1
             if not 1 <= repeat <= 10_000:
@@ -140,7 +140,7 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
 
 
 def _steps(place: str, code: str) -> list[tuple[str, int]]:
-    """Operators and indices of one code: ``^<E2+U1`` gives ^, <2, +1."""
+    """Operators and indices of one code: ``^<E2+U1`` gives ``^``, ``<2`` and ``+1``."""
     found = []
     at = 0
     while at < len(code):
@@ -159,7 +159,7 @@ def _steps(place: str, code: str) -> list[tuple[str, int]]:
 
 
 def _features(place: str, cells: list[str], columns: dict[int, str]) -> dict[str, float]:
-    """Those features of one line that are read."""
+    """The features of one line that this reader uses."""
     values = {}
     for i, name in columns.items():
         if i < len(cells) and cells[i].strip() and (name in ("xx", "yy", "zz", _BUNCH) or name in _DIAMETERS):

@@ -1,8 +1,8 @@
-"""Skeletons in PLY files: vertices with a radius, joined by edges or by the number of their parent.
+"""Reads skeletons in PLY files: vertices with a radius, joined by edges or by the number of their parent.
 
-ASCII and little-endian PLY (Turk 1994) with an element ``vertex`` (x, y, z; radius or diameter, parent, bunch if they
-are there) and, unless vertices name their parents, an element ``edge`` (vertex1, vertex2). The base is the lowest
-vertex, or the one whose parent is negative.
+The files are ASCII or little-endian PLY (Turk 1994). The element ``vertex`` has x, y, z and optionally radius or
+diameter, parent and bunch. Unless vertices name their parents, there is an element ``edge`` (vertex1, vertex2). The
+base is the lowest vertex, or the vertex whose parent is negative.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
 
 def read_points(path: pathlib.Path) -> np.ndarray:
-    """Points [n, 3] of a PLY file's vertices, or of a text file with x, y and z in a line; :class:`PlantFileError`."""
+    """Points [n, 3] of a PLY file's vertices, or of a text file with x, y and z in each line.
+
+    :class:`PlantFileError` if the file cannot be read.
+    """
     if not path.is_file():
         raise PlantFileError(f"{path}: no such file; give points as PLY, or as text with x, y and z in a line")
     if path.suffix.lower() == ".ply":
@@ -78,7 +81,7 @@ def read_points(path: pathlib.Path) -> np.ndarray:
 
 
 def _vertices(path: pathlib.Path, elements: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The table of vertices, and where they are [vertex, 3] in the file's unit."""
+    """The table of vertices, and their positions [vertex, 3] in the file's unit."""
     vertex = elements.get("vertex")
     if vertex is None or not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
         raise PlantFileError(f"{path}: has no element 'vertex' with x, y and z; give them")
@@ -86,7 +89,7 @@ def _vertices(path: pathlib.Path, elements: dict[str, np.ndarray]) -> tuple[np.n
 
 
 def _parents(path: pathlib.Path, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Parents [vertex] of a tree of edges [k, 2] that grows from its lowest vertex."""
+    """Parents [vertex] in the tree of the edges ``pairs`` [k, 2]; its root is the lowest vertex."""
     count = len(position)
     if len(pairs) != count - 1 or pairs.min(initial=0) < 0 or pairs.max(initial=0) >= count:
         raise PlantFileError(
@@ -109,7 +112,7 @@ def _parents(path: pathlib.Path, position: np.ndarray, pairs: np.ndarray) -> np.
 
 
 def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Elements of a PLY file as tables; those behind the first one with lists are left out."""
+    """Elements of a PLY file as tables, up to the first element with lists."""
     data = path.read_bytes()
     head, found, body = data.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
@@ -130,7 +133,7 @@ def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
     row = 0
     for name, count, properties in elements:
         if not properties or any(not kind for _, kind in properties):
-            break  # lists have no fixed size; what is read stands before them
+            break  # lists have no fixed size, and everything needed comes before them
         kind = np.dtype(properties)
         try:
             if format == "ascii":

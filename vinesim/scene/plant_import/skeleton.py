@@ -1,4 +1,4 @@
-"""Skeletons: what the readers of plant files have in common, a tree of points with diameters, checked."""
+"""The skeleton that all readers of plant files return: a checked tree of points with diameters."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from vinesim.core.toml_loader import DataError
 MAX_NODES = 20_000
 """Largest number of points of one plant."""
 MAX_HEIGHT = 30.0
-"""[m] A plant that reaches further from its base has the wrong unit."""
+"""[m] A plant that reaches further from its base is refused, because its unit must be wrong."""
 
 
 class PlantFileError(DataError):
@@ -21,23 +21,23 @@ class PlantFileError(DataError):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Skeleton:
-    """The wood of one plant as points that are joined to their parents; a parent comes before its children."""
+    """The wood of one plant as points joined to their parents; a parent comes before its children."""
 
     position: np.ndarray
     """[node, 3] m, z up."""
     parent: np.ndarray
-    """[node] index of the node below; -1 for the base, which is the first."""
+    """[node] index of the node below; -1 for the base, which is the first node."""
     diameter: np.ndarray
-    """[node] m, of the wood that ends there; NaN where the file does not tell."""
+    """[node] m, diameter of the wood that ends at the node; NaN if the file does not contain it."""
     bunch: np.ndarray
-    """[node] kg, mass of the bunch that hangs there; 0 for none."""
+    """[node] kg, mass of the bunch that hangs at the node; 0 for none."""
     format: str
     notes: tuple[str, ...] = ()
-    """What of the file was mended or left out, one fact each."""
+    """What was repaired or left out when the file was read, one fact each."""
 
 
 def check_skeleton(path: pathlib.Path, skeleton: Skeleton) -> Skeleton:
-    """The skeleton itself; :class:`PlantFileError` if it is no plant of one piece."""
+    """Return ``skeleton``; raises :class:`PlantFileError` if it is not one connected plant."""
     nodes = np.arange(len(skeleton.parent))
     if len(nodes) < 2:
         raise PlantFileError(f"{path}: has {len(nodes)} points with coordinates; give a plant of at least 2")
@@ -82,7 +82,7 @@ def sort_nodes(
     format: str,
     notes: tuple[str, ...] = (),
 ) -> Skeleton:
-    """A checked skeleton of nodes in any order: those of each parent after it, the base first."""
+    """A checked skeleton from nodes in any order, sorted so that the base is first and parents precede children."""
     count = len(parent)
     if ((parent < -1) | (parent >= count)).any():
         node = _first((parent < -1) | (parent >= count))

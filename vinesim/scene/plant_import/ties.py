@@ -1,4 +1,4 @@
-"""Ties of imported shoots: where one passes a wire closely, a spring binds it to the wire."""
+"""Ties of imported shoots: where a shoot passes a wire closely, a spring binds it to the wire."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from vinesim.scene.model import Model
 from vinesim.scene.plant_parameters import Trellis
 
 TIE_SPACING = 0.2
-"""[m] Ties of one tree to one wire are at least this far apart. GUESSED: as a cane is bound along its wire."""
+"""[m] Smallest distance between ties of one tree to one wire. GUESSED from how canes are bound along wires."""
 
 
 def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) -> Model:
-    """The plant, which has no ties yet, with ties to wires of the vineyard that its shoots pass as drawn.
+    """Add ties to a plant without ties, where its shoots in the drawn shape pass wires of the vineyard.
 
-    A piece that grows on old wood is not tied: it hardly moves there.
+    A piece that grows directly on old wood is not tied, because it hardly moves.
 
     Args:
-        plant: in the world.
-        vineyard: :attr:`Model.tie_wire` counts its pieces.
+        plant: the plant, in world coordinates.
+        vineyard: model with the wires; :attr:`Model.tie_wire` of the result indexes its pieces.
         gap: largest gap between the surfaces of shoot and wire [m].
         trellis: stiffness and damping of a tie.
     """
@@ -42,7 +42,7 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
     near, wire = np.nonzero(apart <= gap)
     tied: dict[tuple[int, int], list[np.ndarray]] = {}
     rows = []
-    # the closest first; to 0.1 mm, so that no rounding error chooses among pieces that run along a wire
+    # closest first, rounded to 0.1 mm, so that rounding errors do not choose among pieces that run along a wire
     for i in np.argsort(apart[near, wire].round(4), kind="stable").tolist():
         cane = near[i]
         line = wires[wire[i]]
@@ -64,7 +64,7 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
 
 
 def _wires_near(vineyard: Model, points: np.ndarray, reach: float) -> np.ndarray:
-    """Pieces of wire [k] whose box is within ``reach`` [m] of the box around ``points`` [p, 3]."""
+    """Pieces of wire [k] whose bounding box is within ``reach`` [m] of the bounding box of ``points`` [p, 3]."""
     ends = np.stack([vineyard.fixed_start, vineyard.fixed_end]).astype(float)
     thick = reach + vineyard.fixed_radius.max(1, initial=0.0)[:, None]
     near = (ends.min(0) <= points.max(0) + thick) & (ends.max(0) >= points.min(0) - thick)
@@ -74,7 +74,7 @@ def _wires_near(vineyard: Model, points: np.ndarray, reach: float) -> np.ndarray
 def _nearest(
     start: np.ndarray, way: np.ndarray, wire_start: np.ndarray, wire_way: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where pieces [k] are nearest to wires [w]: share of the piece [k, w], and the distance there [k, w] m.
+    """Nearest points of pieces [k] to wires [w]: position as a fraction of the piece [k, w], and distance [k, w] m.
 
     Segments from ``start`` [k, 3] along ``way`` [k, 3], and from ``wire_start`` [w, 3] along ``wire_way`` [w, 3]
     (Ericson 2005, Real-Time Collision Detection, 5.1.9).

@@ -1,4 +1,4 @@
-"""Imported plants as wood: what is thick stands still, every thinner part that grows on it is a tree of bodies."""
+"""Builds models of imported plants: thick wood is fixed, every thinner part that grows on it is a tree of bodies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vinesim.scene.plant_parameters import Cane, Leaf, VineParameters
 from vinesim.scene.spec import Scene
 
 _SHORT = 0.3
-"""[piece] Wood between two forks that is shorter than this becomes part of the fork."""
+"""Wood between two forks that is shorter than this becomes part of the fork [piece lengths]."""
 _PEDUNCLE_SEGMENTS = 2
 _OFFSETS = {
     "tree_first": "body",
@@ -30,7 +30,7 @@ _OFFSETS = {
     "tie_body": "body",
     "leaf_body": "body",
 }
-"""Fields of a model that count something, and what; negative ones mean none."""
+"""Fields of a model that hold indices, and the axis that they index; negative values mean none."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -53,10 +53,10 @@ def build_model(
     variety: int,
     leaves: tuple[Scene, np.random.Generator] | None = None,
 ) -> Model:
-    """The plant at a pose [7]: its trees, and the old wood that they stand on.
+    """The plant at a ``pose`` [7]: its trees, and the old wood on which they grow.
 
-    ``parameters`` give peduncles and bunches, which are of ``variety``; bare unless ``leaves`` gives the scene whose
-    season and training its leaves have, and their random numbers.
+    ``parameters`` describe its peduncles and its bunches, which are of ``variety``. ``leaves`` gives the scene, whose
+    season and training determine the leaves, and their random numbers; without it the plant has no leaves.
     """
     points = _cut(plant)
     old = _old_wood(points, plant.wood)
@@ -78,8 +78,10 @@ def build_model(
 
 
 def join_models(first: Model, second: Model) -> Model:
-    """Both as one; trees, bodies and bunches of the second are numbered behind those of the first, to whose wires its
-    ties are bound."""
+    """Join two models; trees, bodies and bunches of ``second`` are numbered after those of ``first``.
+
+    The ties of ``second`` are bound to wires of ``first``.
+    """
     counts = first.counts()
     joined = {}
     for name in Model.array_fields():
@@ -97,12 +99,12 @@ def join_models(first: Model, second: Model) -> Model:
 
 
 def _on(old: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """Nodes that grow on old wood, or on the base [node]."""
+    """Whether each node grows on old wood or on the base [node] bool."""
     return old[parent] | (parent == 0)
 
 
 def _old_wood(points: _Points, wood: Wood) -> np.ndarray:
-    """Nodes that stand still [node]: thick ones below which all is thick."""
+    """Whether each node is fixed [node] bool: it and all wood below it are thick."""
     old = 2.0 * points.radius > wood.old_wood.value
     for node in range(1, len(old)):
         old[node] &= old[points.parent[node]]
@@ -110,7 +112,7 @@ def _old_wood(points: _Points, wood: Wood) -> np.ndarray:
 
 
 def _main_axis(points: _Points, members: np.ndarray) -> np.ndarray:
-    """Of nodes [node] bool that hang together, those on the way to the furthest one [node]."""
+    """The nodes on the way to the furthest of the connected nodes ``members`` [node] bool."""
     on = np.zeros(len(members), bool)
     node = int(np.argmax(np.where(members, points.way, -1.0)))
     while node >= 0 and members[node]:
@@ -120,7 +122,7 @@ def _main_axis(points: _Points, members: np.ndarray) -> np.ndarray:
 
 
 def _cut(plant: ImportedPlant) -> _Points:
-    """The skeleton with nodes about one piece apart: wood between forks is cut evenly, too short wood left out."""
+    """The skeleton with nodes about one piece apart: wood between forks is cut evenly, very short wood is dropped."""
     skeleton = plant.skeleton()
     parent = skeleton.parent
     position = skeleton.position
@@ -145,7 +147,7 @@ def _cut(plant: ImportedPlant) -> _Points:
         for share in np.arange(1, (count := max(1, round(along[-1] / plant.piece))) + 1) / count:
             at = share * along[-1]
             point = np.array([np.interp(at, along, axis) for axis in path.T])
-            # the first node's diameter is that of what bears the run
+            # the first node belongs to the parent of the run, and has the parent's diameter
             known = np.interp(at, along[1:], 0.5 * skeleton.diameter[run[1:]])
             rows.append((point, below, float(known), 0.0))
             below = len(rows) - 1
@@ -187,7 +189,7 @@ def _tree(
         share = (0.5 * (way[node] + way[before]) - way[below]) / longest
         green = np.clip((share - wood.woody_share.value) / 0.2 + 0.5, 0.0, 1.0) if main[node] else 1.0
         modulus = float(wood.woody_modulus.value ** (1.0 - green) * wood.green_modulus.value**green)
-        # a side shoot is as thick at its base as where its first piece ends
+        # at its base a side shoot has the radius of the end of its first piece
         grown = main[before] == main[node] and before != below
         radius = (float(points.radius[before] if grown else points.radius[node]), float(points.radius[node]))
         turns[node] = turn
@@ -211,7 +213,7 @@ def _tree(
 
 
 def _turned(turn: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """The orientation [4] of a piece along a direction: that of the piece before, turned the shortest way."""
+    """Orientation [4] of a piece along a direction: that of the piece before, rotated by the smallest angle."""
     along = along / np.linalg.norm(along)
     x = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
     axis = np.cross(x, along)
@@ -245,7 +247,7 @@ def _hang(
     )
 
 
-# Leaves on imported shoots: at nodes as far apart as those of a cane, left and right in turn.
+# Leaves on imported shoots: at nodes spaced as on a cane, alternately left and right.
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -253,28 +255,28 @@ class Nodes:
     """Nodes of the shoots of one tree."""
 
     piece: np.ndarray
-    """[k] piece of wood that carries the leaf, by the point at its end."""
+    """[k] piece of wood that carries the leaf, named by the point at its end."""
     share: np.ndarray
-    """[k] of that piece's length."""
+    """[k] position of the node as a fraction of the piece's length."""
     axis_share: np.ndarray
-    """[k] of its axis' length."""
+    """[k] position of the node as a fraction of its axis' length."""
     rank: np.ndarray
-    """[k] number along its axis."""
+    """[k] number of the node along its axis."""
     lateral: np.ndarray
-    """[k] bool: on a side shoot."""
+    """[k] bool, whether the node is on a side shoot."""
 
 
 def find_nodes(parent: np.ndarray, radius: np.ndarray, way: np.ndarray, members: np.ndarray, cane: Cane) -> Nodes:
     """Nodes of the pieces ``members`` [point] bool, on wood as thin as a cane; thicker wood is older and bare.
 
-    At a fork the branch that reaches furthest is the same axis; the others are side shoots, if what bears them is thin.
+    At a fork the branch that reaches furthest continues the axis. The others are side shoots if their parent is thin.
 
     Args:
-        parent: [point], parents first.
-        radius: [point] m, where a piece ends.
+        parent: [point] index of the point below; parents come first.
+        radius: [point] m, radius at the end of the piece.
         way: [point] m, length of the wood from the base.
         members: [point] bool, the pieces of one tree.
-        cane: parameters.
+        cane: parameters of canes.
     """
     apart = sum(cane.length.value) / sum(cane.nodes.value)
     thin = members & (2.0 * radius <= cane.base_diameter.value[1])
@@ -300,7 +302,7 @@ def find_nodes(parent: np.ndarray, radius: np.ndarray, way: np.ndarray, members:
             k = int(np.searchsorted(ends, at * ends[-1]))
             begin = ends[k - 1] if k else 0.0
             rows.append((axis[k], (at * ends[-1] - begin) / (ends[k] - begin), at, rank, thin[bearer]))
-    rows.sort()  # leaves lie in the order of their bodies
+    rows.sort()  # the model lists leaves in the order of their bodies
     piece, share, axis_share, rank, lateral = np.array(rows, float).reshape(-1, 5).T
     return Nodes(piece.astype(int), share, axis_share, rank.astype(int), lateral > 0.0)
 
@@ -317,13 +319,13 @@ def add_leaves(
     """Grow leaves of a scene's season at the nodes of a tree, with their mass and drag on its bodies.
 
     Args:
-        tree: without leaves yet.
-        nodes: where.
-        body: [k] the body of each node's piece.
-        turn: [k, 4] its orientation in the world.
-        scene: season and training.
-        leaf: parameters.
-        rng: of the leaves of this tree.
+        tree: the tree, which has no leaves yet.
+        nodes: nodes at which leaves grow.
+        body: [k] body of each node's piece.
+        turn: [k, 4] orientation of that body in the world.
+        scene: gives season and training.
+        leaf: parameters of leaves.
+        rng: random numbers for the leaves of this tree.
     """
     count = len(nodes.piece)
     normal = rng.standard_normal((8, count))
@@ -332,7 +334,7 @@ def add_leaves(
         return
     parts = tree.bodies
     length, thick = (np.array([parts[b][name] for b in body], float) for name in ("length", "radius"))
-    # across the axis and the row in a hedge, level over a net; where that is along the axis, the other way round
+    # leaves stand across the axis and across the row in a hedge, level in a tendone; swapped where that is the axis
     level = np.array([0.0, 0.0, 1.0])
     row = np.array([1.0, 0.0, 0.0])
     up, other = (level, row) if scene.training == "tendone" else (row, level)

@@ -1,7 +1,7 @@
-"""Values that packages exchange: small frozen dataclasses, so that sibling packages never import each other.
+"""Values that packages exchange: small frozen dataclasses, so that sibling packages need not import each other.
 
 Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.core.frames`.
-A value that leaves the physics thread owns its arrays: they are never written afterwards.
+The arrays of a value that leaves the physics thread are never written afterwards.
 """
 
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec

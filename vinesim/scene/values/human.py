@@ -9,84 +9,84 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HumanPose:
-    """Where a person's tracked points are at one instant: all that crosses the network (CANOPIES D6.4, section 5.3).
+    """Poses of a person's tracked points at one instant, as sent over the network (CANOPIES D6.4, section 5.3).
 
-    All poses [7] in the world, x forward, z up for a person who stands upright.
+    All poses [7] are in the world; x is forward and z up for a person who stands upright.
     """
 
     root: np.ndarray
-    """Floor of the tracked space."""
+    """Origin of the tracked space, on the floor."""
     head: np.ndarray
-    """Head-mounted display: between the eyes."""
+    """Head-mounted display, between the eyes."""
     left: np.ndarray
     """Controller of the left hand, in the middle of the palm: x along the fingers, z out of the back of the hand."""
     right: np.ndarray
     hips: np.ndarray
-    """Middle between the hip joints."""
+    """Midpoint between the hip joints."""
     left_foot: np.ndarray
-    """Ankle, x to the toes."""
+    """Left ankle, x to the toes."""
     right_foot: np.ndarray
     left_closed: bool = False
-    """Whether the hand closes on what it touches; what it holds it keeps until this is false again."""
+    """Whether the left hand is closed: it grasps what it touches and holds it until this is false again."""
     right_closed: bool = False
     left_fingers: tuple[float, ...] = (0.0,) * 5
-    """How far thumb, index, middle, ring and little finger are bent: 0 straight, 1 all the way. To be seen only."""
+    """Bend of thumb, index, middle, ring and little finger: 0 straight, 1 fully bent. It affects only the looks."""
     right_fingers: tuple[float, ...] = (0.0,) * 5
     left_busy: bool = False
     """The human's own client reports that the hand pushes a robot or holds an object: ``left`` is then the palm, not
     the controller, and the remote copy is placed there without contacts. Unused on the human's own client."""
     right_busy: bool = False
     left_shears: bool = False
-    """Whether the hand has shears: when it closes, they cut what is between their blades, and it holds nothing."""
+    """Whether the left hand has shears: when the hand closes, the shears cut, and the hand grasps nothing."""
     right_shears: bool = False
 
     @property
     def points(self) -> np.ndarray:
-        """[7, 7] all poses, in the order of :data:`POINT_NAMES`."""
+        """[7, 7] all poses in the order of :data:`POINT_NAMES`."""
         return np.stack([getattr(self, name) for name in POINT_NAMES])
 
     def with_points(self, points: np.ndarray) -> HumanPose:
-        """The same hands and fingers with all poses [7, 7] elsewhere."""
+        """A copy with the poses ``points`` [7, 7]; the states of hands and fingers stay."""
         return dataclasses.replace(self, **dict(zip(POINT_NAMES, points, strict=True)))
 
 
 POINT_NAMES = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
-"""Poses of a :class:`HumanPose`."""
+"""Names of the poses of a :class:`HumanPose`."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HumanSpec:
-    """A person as physics needs one."""
+    """Description of a person for the physics."""
 
     name: str
-    """The actor's name: prefix of everything it owns."""
+    """The actor's name, which prefixes the names of everything it owns."""
     index: int
-    """Index of its label."""
+    """Index of the person in its label."""
     pose: HumanPose
-    """At the start."""
+    """Pose at the start."""
     height: float = 1.75
-    """[m] It gives the limbs their lengths."""
+    """[m] Height, which determines the lengths of the limbs."""
     stiffness: float | None = None
-    """Force of a hand in contact per offset from its controller [N/m]; None: ``PhysicsParameters.hand_stiffness``."""
+    """Force of a hand in contact per distance from its controller [N/m]; None: ``PhysicsParameters.hand_stiffness``."""
     force: float | None = None
     """Largest force of a hand [N]; None: ``PhysicsParameters.hand_force``."""
     outfit: str = ""
-    """What it wears, one of :func:`vinesim.scene.appearance.outfit_names`; empty: what follows from its name."""
+    """Outfit, one of :func:`vinesim.scene.appearance.outfit_names`; empty: it follows from the person's name."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HandSample:
-    """One hand at the end of a tick."""
+    """State of one hand at the end of a tick."""
 
     pose: np.ndarray
-    """[7] of the palm in the world."""
+    """[7] pose of the palm in the world."""
     controller: np.ndarray
-    """[7] where the person holds the controller."""
+    """[7] pose of the controller in the world."""
     force: np.ndarray
-    """[3] N with which the hand pushes or pulls the world in this tick, world axes."""
+    """[3] N, force of the hand on its surroundings in this tick, world axes."""
     touching: bool
     held: tuple[str, str] | None
-    """Actor and link of what it holds, named as in :class:`Contact`."""
+    """Actor and link of the object that the hand holds, named as in :class:`Contact`; None if it holds nothing."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -97,8 +97,8 @@ class Haptic:
     hand: str
     """``"left"`` or ``"right"``."""
     onset: bool
-    """The contact has just begun; otherwise it lasts."""
+    """Whether the contact has just begun; otherwise it lasts."""
     amplitude: float
-    """0 to 1, the share of the hand's greatest force; an onset is never weaker than can be felt."""
+    """0 to 1, force as a fraction of the hand's largest force; an onset is always strong enough to be felt."""
     duration: float
     """[s]"""

@@ -7,7 +7,7 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Measurement:
-    """One line of ``vinesim bench``: ours beside a peer that ran in the same process on the same scene."""
+    """One line of ``vinesim bench``: a figure of vinesim, and of a peer run in the same process on the same scene."""
 
     bench: str
     case: str
@@ -16,4 +16,4 @@ class Measurement:
     peer: str = ""
     peer_value: float | None = None
     ratio: float | None = None
-    """How many times better than the peer (above 1 is better), whatever the unit."""
+    """Ratio by which vinesim is better than the peer: above 1 is better, whatever the unit."""

@@ -12,14 +12,14 @@ from vinesim.scene.values.signals import LIGHTS_OFF, Lights
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RobotUpdate:
-    """Pose of one robot as it crosses the network: actual joints, never commands (D6.4 section 5.2)."""
+    """State of one robot as sent over the network: actual joints, never commands (D6.4 section 5.2)."""
 
     actor: str
     time: float
     base_q: np.ndarray
-    """[7]"""
+    """[7] pose of the base in the world."""
     base_qd: np.ndarray
-    """[6]"""
+    """[6] velocity of the base, world axes."""
     position: np.ndarray
     """[joint] rad or m"""
     velocity: np.ndarray
@@ -29,47 +29,47 @@ class RobotUpdate:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HumanUpdate:
-    """Pose of one person as it crosses the network (D6.4 section 5.3)."""
+    """Pose of one person as sent over the network (D6.4 section 5.3)."""
 
     actor: str
     time: float
     pose: HumanPose
     velocity: np.ndarray
-    """[7, 6] of all points, m/s and rad/s in world axes, for extrapolation."""
+    """[7, 6] velocities of all points, m/s and rad/s in world axes, for extrapolation."""
     intention: str = ""
-    """One of :data:`INTENTIONS`: what the person indicates to do."""
+    """Intention that the person indicates, one of :data:`INTENTIONS`."""
 
     @property
     def base_q(self) -> np.ndarray:
-        """[7] where others take the person to be: the hips."""
+        """[7] pose of the hips, which other clients use as the position of the person."""
         return self.pose.hips
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class TreeUpdate:
-    """State of one touched tree as it crosses the network."""
+    """State of one touched tree as sent over the network."""
 
     tree: int
     owner: str
     ownership: int
-    """Ownership sequence, u16 with wraparound: +1 by grab, pick, cut."""
+    """Ownership sequence number, u16 with wraparound; every grab, pick and cut increments it."""
     authority: int
-    """Authority sequence, u16 with wraparound: +1 by touch."""
+    """Authority sequence number, u16 with wraparound; every touch increments it."""
     time: float
     resting: bool
-    """True in the last, reliable record: silence follows."""
+    """True in the last record, which is sent reliably; no further records follow."""
     touched: bool
-    """Whether its owner, or an object of its owner's, is in contact with it."""
+    """Whether the owner of the tree, or an object of the owner, is in contact with the tree."""
     joint_q: np.ndarray
     """[body of the tree, 4]"""
     joint_qd: np.ndarray
     """[body of the tree, 3] rad/s"""
     root: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-    """[k] numbers in the tree of the bodies that were cut off their parents, in increasing order."""
+    """[k] indices within the tree of the bodies that were cut off their parents, ascending."""
     root_x: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] m, where their origins are in the world."""
+    """[k, 3] m, positions of the origins of these bodies in the world."""
     root_xd: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] m/s"""
+    """[k, 3] m/s, velocities of these origins."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -83,6 +83,6 @@ class ObjectUpdate:
     authority: int
     time: float
     pose: np.ndarray
-    """[7] in the world"""
+    """[7] pose in the world"""
     velocity: np.ndarray
     """[6] m/s and rad/s, of its origin, world axes."""

@@ -11,12 +11,12 @@ from vinesim.scene.ids import Organ
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles, seen from where their corners run counter-clockwise."""
+    """Triangles; they face the side from which their corners run counter-clockwise."""
 
     corners: np.ndarray
     """[face, 3, 3] m"""
     normals: np.ndarray
-    """[face, 3, 3] of the smooth surface at each corner."""
+    """[face, 3, 3] unit normals of the smooth surface at each corner."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -36,18 +36,18 @@ class Shape:
     """sRGB"""
     file: str = ""
     surface: str = ""
-    """What it is made of (:data:`vinesim.scene.appearance.SURFACES`); empty: what such things are usually made of."""
+    """Surface, one of :data:`vinesim.scene.appearance.SURFACES`; empty: the usual surface of such an object."""
     mesh: Mesh | None = None
     is_indicator: bool = False
-    """Whether it is one of a robot's indicator lights."""
+    """Whether the shape is one of a robot's indicator lights."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class RigidBox:
-    """An open box that can be moved, as it is when it comes into the world."""
+    """An open, movable box in its initial state."""
 
     pose: np.ndarray
-    """[7] m, 1 of the middle of its underside."""
+    """[7] m, 1, pose of the middle of its underside."""
     size: np.ndarray
     """[3] m, outer length, width, height."""
     mass: float
@@ -56,11 +56,11 @@ class RigidBox:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RigidVisual:
-    """One rigid body as sensors see it: its name, what it is, and its shapes."""
+    """One rigid body as sensors see it: name, organ, index and shapes."""
 
     name: str
     """Full name, ``actor/link`` or ``box/3``."""
     organ: Organ
     index: int
-    """Which robot, human or box: the index of its label."""
+    """Index of the robot, human or box in its label."""
     shapes: tuple[Shape, ...]

@@ -1,4 +1,4 @@
-"""Robots: what physics needs of them, and what they measure of themselves."""
+"""Robots: their description for the physics, and their own measurements."""
 
 from __future__ import annotations
 
@@ -25,27 +25,28 @@ class Drive:
     velocity: float
     """Largest speed [rad/s or m/s]."""
     lower: float
+    """Lower limit of the joint [rad or m]."""
     upper: float
-    """Limits of the joint [rad or m]."""
+    """Upper limit of the joint [rad or m]."""
     armature: float = 0.0
-    """Inertia of motor and gear seen from the joint [kg m2 or kg]: the gear ratio squared makes it the larger part.
+    """Inertia of motor and gear at the joint [kg m2 or kg]. It grows with the square of the gear ratio.
 
-    A stiff servo at its effort limit needs it: a bare hand of 0.02 kg m2 under 40 N m gains 20 rad/s in a tick.
+    A stiff servo at its effort limit needs it: a hand of 0.02 kg m2 alone under 40 N m gains 20 rad/s in a tick.
     """
     series_stiffness: float = 0.0
-    """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain stands for it."""
+    """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain is used instead."""
     series_damping: float = 0.0
-    """Damping of that spring [N m s/rad or N s/m]; of no meaning if ``series_stiffness`` is 0."""
+    """Damping of the spring between gear and joint [N m s/rad or N s/m]; unused if ``series_stiffness`` is 0."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RobotSpec:
-    """A robot as physics needs it. ``robot/description/description.py`` makes one from a URDF."""
+    """Description of a robot for the physics. ``robot/description/description.py`` makes one from a URDF."""
 
     name: str
-    """The actor's name: prefix of everything it owns."""
+    """The actor's name, which prefixes the names of everything it owns."""
     index: int
-    """Index of its label."""
+    """Index of the robot in its label."""
     urdf: str
     """URDF as text, every mesh by absolute path."""
     base: str
@@ -53,16 +54,16 @@ class RobotSpec:
     pose: np.ndarray
     """[7] start pose of the base in the world."""
     drives: tuple[Drive, ...]
-    """In the order of joint arrays everywhere else (commands, samples, updates)."""
+    """Drives, in the order of all joint arrays (commands, samples, updates)."""
     home: np.ndarray
     """[joint] start position."""
     base_effort: tuple[float, float] = (800.0, 400.0)
     """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Corners [face, 3, 3] m of meshes that are in no file, by the file name that the URDF gives them."""
+    """Corners [face, 3, 3] m of meshes that were received instead of read, by the file name in the URDF."""
     is_copy: bool = False
-    """Whether another client simulates the robot. A copy follows received states, in which contacts of its links with
-    each other and the ground are counted already; boxes that stand for its meshes would touch where those do not."""
+    """Whether another client simulates the robot. The links of a copy do not collide with each other and the ground:
+    the received states already include these contacts, and boxes in place of meshes would collide wrongly."""
 
 
 class ControllerKind(enum.StrEnum):
@@ -78,12 +79,12 @@ class ControllerKind(enum.StrEnum):
 
 
 FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
-"""Controllers that pass on one value for each joint."""
+"""Kinds of controllers that pass on one value for each joint."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ControllerSpec:
-    """One controller of a robot: prefix of its topics and actions, and the joints that it moves."""
+    """One controller of a robot: prefix of its topics and actions, kind, and the joints that it moves."""
 
     name: str
     kind: ControllerKind
@@ -106,14 +107,14 @@ class JointSample:
     velocity: np.ndarray
     """[joint] rad/s or m/s"""
     effort: np.ndarray
-    """[joint] N m or N: what the drive transmits; at rest gravity load minus J^T f of the contacts."""
+    """[joint] N m or N, effort of the drive; at rest it is the gravity load minus J^T f of the contacts."""
     contact: np.ndarray
-    """[joint] N m or N: J^T f of the contacts alone."""
+    """[joint] N m or N, J^T f of the contacts alone."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointReference:
-    """What the controllers of a robot ask of its joints in one step, in the order of joint arrays."""
+    """References of a robot's controllers for its joints in one step, in the order of joint arrays."""
 
     position: np.ndarray
     """[joint] rad or m"""
@@ -142,46 +143,46 @@ class GripperState:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ElasticSample:
-    """The series elastic element of every joint at one instant (D6.4 section 3.1): a spring between motor and link."""
+    """Series elastic elements of all joints at one instant (D6.4 section 3.1): springs between motor and link."""
 
     time: float
     names: tuple[str, ...]
     stiffness: np.ndarray
     """[joint] N m/rad or N/m"""
     motor: np.ndarray
-    """[joint] rad or m: the motor, seen from behind its gear; the link is at ``motor - deflection``."""
+    """[joint] rad or m, position of the motor after its gear; the link is at ``motor - deflection``."""
     deflection: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, deflection of the spring."""
     torque: np.ndarray
-    """[joint] N m or N: stiffness times deflection, all that the joint carries."""
+    """[joint] N m or N, stiffness times deflection: the whole load of the joint."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Wrench:
-    """Reading of a force-torque sensor: the wrench of all bodies beyond it, with weight and inertia."""
+    """Reading of a force-torque sensor: the wrench of all bodies beyond it, including weight and inertia."""
 
     time: float
     name: str
     frame: str
     force: np.ndarray
-    """[3] N on the sensor, in its frame: a hand at rest weighs down."""
+    """[3] N, force on the sensor, in its frame; a hand at rest pulls downwards."""
     torque: np.ndarray
-    """[3] N m about the frame's origin."""
+    """[3] N m, torque about the frame's origin."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Imu:
-    """What an inertial measurement unit measures (sensor_msgs/Imu), without noise."""
+    """Reading of an inertial measurement unit (sensor_msgs/Imu), without noise."""
 
     time: float
     name: str
     frame: str
     orientation: np.ndarray
-    """[4] of the frame in the world."""
+    """[4] orientation of the frame in the world."""
     angular_velocity: np.ndarray
     """[3] rad/s in the frame."""
     linear_acceleration: np.ndarray
-    """[3] m/s2 in the frame; at rest it reads 9.81 upwards (REP-145)."""
+    """[3] m/s2 in the frame; at rest it is 9.81 upwards (REP-145)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -191,19 +192,19 @@ class RobotSample:
     actor: str
     joints: JointSample
     base_q: np.ndarray
-    """[7] base_footprint in the world (= ``map``)."""
+    """[7] pose of base_footprint in the world (= ``map``)."""
     base_qd: np.ndarray
-    """[6] its velocity, world axes."""
+    """[6] velocity of base_footprint, world axes."""
     odom_q: np.ndarray
-    """[7] base_footprint by odometry, in ``odom``."""
+    """[7] pose of base_footprint by odometry, in ``odom``."""
     odom_qd: np.ndarray
-    """[6] velocity by odometry, in the axes of base_footprint; 0 along what odometry does not measure."""
+    """[6] velocity by odometry, in the axes of base_footprint; 0 along axes that odometry does not measure."""
     odom_covariance: np.ndarray
-    """[2, 3, 3] covariances of odometry in x, y and yaw: of ``odom_q`` in ``odom``, of ``odom_qd``; m and rad."""
+    """[2, 3, 3] covariances of x, y and yaw by odometry, m and rad: first of ``odom_q``, then of ``odom_qd``."""
     transforms: tuple[tuple[str, str], ...]
-    """(parent frame, child frame) of every moving joint, the same tuple object every tick."""
+    """(parent frame, child frame) of every moving joint; the same tuple object in every tick."""
     transform_q: np.ndarray
-    """[transform, 7] child in parent."""
+    """[transform, 7] pose of the child frame in the parent frame."""
     contacts: tuple[Contact, ...] = ()
     elements: ElasticSample | None = None
     wrenches: tuple[Wrench, ...] = ()

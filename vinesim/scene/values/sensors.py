@@ -12,7 +12,7 @@ import numpy as np
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 
 MIN_BERRY_PIXELS = 4
-"""A berry is seen if at least so many pixels show it."""
+"""Smallest number of visible pixels with which a berry counts as seen."""
 
 Box = tuple[int, int, int, int]
 """First column, first row, last column, last row (inclusive)."""
@@ -90,28 +90,29 @@ class CameraInfo:
     frame_id: str
     """Optical frame: z forward, x right, y down."""
     distortion: tuple[float, ...] = ()
-    """Coefficients of the lens (:mod:`vinesim.scene.camera_geometry`), 5 or 8; none: a pinhole."""
+    """5 or 8 distortion coefficients of the lens (:mod:`vinesim.scene.camera_geometry`); empty for a pinhole."""
 
 
 class SensorMode(enum.StrEnum):
     """Whether simulated time waits for cameras and lidars."""
 
     LIVE = "live"
-    """They give what they can up to their rates, and time waits only below a least rate."""
+    """Sensors deliver frames as fast as they can, up to their rates. Time waits only if they fall below a least
+    rate."""
     PACED = "paced"
-    """Every frame comes at its rate in simulated time, as in Gazebo."""
+    """Every sensor delivers all frames of its rate in simulated time, as in Gazebo."""
     LOCKSTEP = "lockstep"
-    """Every frame is of exactly its step: time waits until it is rendered and sent, and two runs are equal to the
-    bit. All sensors render always."""
+    """Every frame shows exactly its step. Time waits until the frame is rendered and sent, so two runs are equal to
+    the bit. All sensors always render."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SensorPacing:
-    """How cameras and lidars of one robot and simulated time wait for each other."""
+    """How simulated time waits for the cameras and lidars of one robot."""
 
     mode: SensorMode = SensorMode.LIVE
     least_rate: float = 5.0
-    """Of live sensors [Hz] of simulated time; a sensor whose own rate is lower keeps that."""
+    """Least rate of live sensors [Hz of simulated time]; a sensor whose own rate is lower keeps its own rate."""
 
 
 class CameraOutput(enum.Flag):
@@ -119,22 +120,22 @@ class CameraOutput(enum.Flag):
 
     RGB = enum.auto()
     DEPTH = enum.auto()
-    """Depth as the sensor measures it."""
+    """Depth with the sensor's errors."""
     EXACT_DEPTH = enum.auto()
     LABELS = enum.auto()
     BUNCHES = enum.auto()
-    """What is true of the bunches that are seen; a camera alone does not make it
-    (:class:`vinesim.sensors.scheduler.SensorScheduler`)."""
+    """Ground truth about the visible bunches, made by :class:`vinesim.sensors.scheduler.SensorScheduler`, not by a
+    camera alone."""
     NONE = 0
     ALL = RGB | DEPTH | EXACT_DEPTH | LABELS
-    """All that a camera makes."""
+    """All parts that a camera makes alone."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BunchTruth:
-    """One bunch in one picture, be it seen or hidden. Berries, rachis and pedicels belong to it, the peduncle not.
+    """Ground truth about one bunch in one picture: its berries, rachis and pedicels, but not its peduncle.
 
-    What lies outside the picture counts nowhere but in ``berries``, ``frame`` and ``size``.
+    Parts outside the picture count only in ``berries``, ``frame`` and ``size``.
     """
 
     bunch: int
@@ -142,54 +143,54 @@ class BunchTruth:
     variety: int
     """Index into :data:`vinesim.scene.berries.VARIETIES`."""
     tree: int
-    """The tree on which it grew."""
+    """The tree on which the bunch grew."""
     attached: bool
-    """Whether it still hangs there."""
+    """Whether the bunch still hangs on its tree."""
     amodal_box: Box
-    """Of the pixels that would show it if there were nothing else."""
+    """Box of the pixels that would show the bunch if nothing hid it."""
     amodal: np.ndarray
-    """Those pixels, bool [rows, columns] of ``amodal_box``."""
+    """Pixels that would show the bunch if nothing hid it, bool [rows, columns] of ``amodal_box``."""
     visible: np.ndarray
-    """The pixels that do show it, bool, in the same window."""
+    """Pixels that show the bunch, bool [rows, columns] of ``amodal_box``."""
     visible_box: Box | None
-    """Of the pixels that show it; None if none does."""
+    """Box of the pixels that show the bunch; None if there are none."""
     berries_seen: int
-    """Berries of which at least :data:`MIN_BERRY_PIXELS` pixels are seen."""
+    """Number of berries with at least :data:`MIN_BERRY_PIXELS` visible pixels."""
     berries: int
-    """All its berries."""
+    """Number of all berries of the bunch."""
     frame: np.ndarray
-    """[7] pose of the 3D box's middle in the world; x runs down the rachis."""
+    """[7] pose of the centre of the 3D box in the world; x runs down the rachis."""
     size: np.ndarray
-    """[3] m, edges of the 3D box around all its parts, in that frame."""
+    """[3] m, edges of the 3D box around all parts of the bunch, in ``frame``."""
     cut: np.ndarray | None
-    """[3] m, where to cut: the middle of the peduncle, in the world; None for a bunch that has been picked."""
+    """[3] m, cut point in the world, which is the middle of the peduncle; None for a picked bunch."""
     cut_pixel: np.ndarray | None
-    """[2] column and row of that point, whether inside the picture or not; None behind the camera."""
+    """[2] column and row of the cut point, also outside the picture; None behind the camera."""
     cut_seen: bool
-    """Whether the point is in the picture and the ray to it meets its own peduncle first."""
+    """Whether the cut point is in the picture and the ray to it first meets the bunch's own peduncle."""
 
     @property
     def label(self) -> int:
-        """Its value in label images."""
+        """Label of the bunch in label images."""
         return label(Organ.BUNCH, self.bunch)
 
     @property
     def pixels(self) -> int:
-        """How many pixels show it."""
+        """Number of pixels that show the bunch."""
         return int(self.visible.sum())
 
     @property
     def amodal_pixels(self) -> int:
-        """How many pixels would show it if there were nothing else."""
+        """Number of pixels that would show the bunch if nothing hid it."""
         return int(self.amodal.sum())
 
     @property
     def occlusion(self) -> float:
-        """Share of its amodal pixels that show something else, 0..1."""
+        """Share of the amodal pixels that show something else, 0 to 1."""
         return 1.0 - self.pixels / self.amodal_pixels
 
     def mask(self, window: np.ndarray, info: CameraInfo) -> np.ndarray:
-        """``visible`` or ``amodal`` as a mask [height, width] of the whole picture."""
+        """Expand ``window`` (``visible`` or ``amodal``) to a mask [height, width] of the whole picture."""
         whole = np.zeros((info.height, info.width), bool)
         left, top, right, bottom = self.amodal_box
         whole[top : bottom + 1, left : right + 1] = window
@@ -198,23 +199,23 @@ class BunchTruth:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """One RGB-D picture. Arrays that were not asked for (:class:`CameraOutput`) have the size 0."""
+    """One RGB-D picture. Arrays that were not requested (:class:`CameraOutput`) have size 0."""
 
     time: float
     name: str
     info: CameraInfo
     pose: np.ndarray
-    """[7] optical frame in the world when the picture was taken."""
+    """[7] pose of the optical frame in the world when the picture was taken."""
     rgb: np.ndarray
     """[height, width, 3] uint8"""
     depth: np.ndarray
-    """[height, width] float32 m along z; NaN no return, -Inf too near, +Inf too far (REP-118)."""
+    """[height, width] float32 m along z; NaN: no return, -Inf: too near, +Inf: too far (REP-118)."""
     labels: np.ndarray
     """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
     exact_depth: np.ndarray | None = None
-    """[height, width] float32 m along z, whatever the sensor can measure: no noise, no gaps; +Inf for the sky."""
+    """[height, width] float32 m along z, without noise, gaps or range limits; +Inf for the sky."""
     bunches: tuple[BunchTruth, ...] | None = None
-    """Of every bunch of which at least one pixel is seen, by index."""
+    """Ground truth of every bunch with at least one visible pixel, sorted by index."""
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
@@ -248,25 +249,25 @@ class CameraFrame:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LevelLaser:
-    """The laser of a spinning lidar that looks least up or down, and its shots of one revolution.
+    """The most horizontal laser of a spinning lidar, and its shots of one revolution.
 
-    The head turns clockwise seen from above: shot k looks at ``azimuth - 2 pi k / count``.
+    The head turns clockwise seen from above: the azimuth of shot k is ``azimuth - 2 pi k / count``.
     """
 
     ring: int
-    """Its number in :attr:`LidarScan.ring`."""
+    """Number of the laser in :attr:`LidarScan.ring`."""
     count: int
-    """Shots of a revolution."""
+    """Number of shots in one revolution."""
     delay: float
-    """Time of its first shot after the first firing [s]."""
+    """Time from the first firing of the scan to the laser's first shot [s]."""
     period: float
-    """Between two shots [s]."""
+    """Time between two shots of the laser [s]."""
     azimuth: float
-    """Of its first shot, counter-clockwise from ahead [rad]."""
+    """Azimuth of the laser's first shot, counter-clockwise from ahead [rad]."""
     nearest: float
-    """Ranges that the lidar can measure [m]: least."""
+    """Smallest range that the lidar can measure [m]."""
     farthest: float
-    """Greatest [m]."""
+    """Largest range that the lidar can measure [m]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -278,7 +279,7 @@ class LidarScan:
     name: str
     frame_id: str
     pose: np.ndarray
-    """[7] of the lidar in the world at ``time``."""
+    """[7] pose of the lidar in the world at ``time``."""
     xyz: np.ndarray
     """[point, 3] float32 m, in the lidar's frame (x forward, z up) at the firing of each point."""
     intensity: np.ndarray
@@ -286,13 +287,13 @@ class LidarScan:
     ring: np.ndarray
     """[point] uint16"""
     offset: np.ndarray
-    """[point] float32 s after ``time``."""
+    """[point] float32 s, time of each point's firing after ``time``."""
     labels: np.ndarray
     """[point] int32"""
     level: LevelLaser | None = None
     """The laser nearest to the horizontal, None if unknown."""
     returned: np.ndarray | None = None
-    """[point] uint8: 1 the strongest echo of its shot, 2 another; None if each shot reports one at most."""
+    """[point] uint8: 1 for the strongest echo of a shot, 2 for another echo; None if a shot reports one at most."""
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:

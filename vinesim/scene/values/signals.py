@@ -1,4 +1,4 @@
-"""Signals of robots and people: indicator lights, and what a person intends to do."""
+"""Signals of robots and people: indicator lights, and intentions of people."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ UNLIT: Color = (0, 0, 0)
 """Colour of a lamp between two flashes."""
 
 INTENTIONS = ("", "walk", "pick", "cut", "carry", "hand over", "put down", "point", "wait", "ask for help")
-"""What a person may indicate to do, and nothing; the place in this list crosses the network."""
+"""Intentions that a person may indicate, empty for none. Messages contain the index into this list."""
 
 
 class LightPattern(enum.IntEnum):
-    """What indicator lights say (CANOPIES D6.4, section 3.3)."""
+    """Meanings of indicator lights (CANOPIES D6.4, section 3.3)."""
 
     OFF = 0
     NOTIFICATION = 1
@@ -25,13 +25,13 @@ class LightPattern(enum.IntEnum):
 
 
 FREQUENCY = {LightPattern.NOTIFICATION: 0.4, LightPattern.WARNING: 0.8, LightPattern.ALARM: 2.0}
-"""[Hz] Flashes; slow ones are 0.4 to 0.8 Hz, normal ones 1.4 to 2.8 Hz (IEC 60073)."""
+"""[Hz] Flash rate; slow flashing is 0.4 to 0.8 Hz, normal flashing 1.4 to 2.8 Hz (IEC 60073)."""
 
 TONE = {LightPattern.NOTIFICATION: 600.0, LightPattern.WARNING: 900.0, LightPattern.ALARM: 1500.0}
-"""[Hz] What is heard while a lamp is lit, if it sounds: within the 500 to 2500 Hz of danger signals (ISO 7731)."""
+"""[Hz] Tone while a lamp with sound is lit, within the 500 to 2500 Hz of danger signals (ISO 7731)."""
 
 TONE_LEVEL = 0.5
-"""Amplitude of that tone within 1 m. GUESSED."""
+"""Amplitude of the tone of a lamp within 1 m. GUESSED."""
 
 USUAL_COLOR: dict[LightPattern, Color] = {
     LightPattern.OFF: UNLIT,
@@ -39,7 +39,7 @@ USUAL_COLOR: dict[LightPattern, Color] = {
     LightPattern.WARNING: (255, 150, 0),
     LightPattern.ALARM: (255, 0, 0),
 }
-"""Colours unless others are asked for (IEC 60073)."""
+"""Default colours (IEC 60073)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -49,19 +49,19 @@ class Lights:
     pattern: LightPattern = LightPattern.OFF
     color: Color = UNLIT
     has_sound: bool = False
-    """Whether a tone is heard while the lamps are lit; hearers make it, no sound crosses the network."""
+    """Whether a tone is heard while the lamps are lit. The hearers generate the tone; no sound crosses the network."""
 
     def shown(self, time: float) -> Color | None:
-        """The colour at a time of the world [s], :data:`UNLIT` between flashes; None: off, as the URDF has them.
+        """The colour at world ``time`` [s], :data:`UNLIT` between flashes; None: lights are off, as in the URDF.
 
-        All clients show the same: the flashes follow from the time.
+        All clients show the same flashes, because these depend only on the time.
         """
         if self.pattern is LightPattern.OFF:
             return None
         return self.color if time * FREQUENCY[self.pattern] % 1.0 < 0.5 else UNLIT
 
     def tone(self, time: float) -> float:
-        """Frequency of the tone that is heard at a time of the world [s] [Hz]; 0: none."""
+        """Frequency [Hz] of the tone at world ``time`` [s]; 0: no tone."""
         return TONE.get(self.pattern, 0.0) if self.has_sound and self.shown(time) != UNLIT else 0.0
 
 
@@ -70,20 +70,20 @@ LIGHTS_OFF = Lights()
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Intention:
-    """What a person indicates to do (CANOPIES D6.4, section 3.5)."""
+    """An intention that a person indicates (CANOPIES D6.4, section 3.5)."""
 
     person: str
     what: str
     """One of :data:`INTENTIONS`."""
     start: float
-    """[s] of the world"""
+    """[s] World time at which it began."""
     end: float | None = None
-    """[s] of the world; None: it goes on."""
+    """[s] World time at which it ended; None while it lasts."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HandGestures:
-    """What the hands of a person show (CANOPIES D6.4, section 3.4): names of finger poses, empty for any other."""
+    """Gestures of a person's hands (CANOPIES D6.4, section 3.4): names of finger poses, empty for other poses."""
 
     person: str
     left: str

@@ -12,27 +12,27 @@ from vinesim.scene.wind import Wind
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class WindState:
-    """The wind at one instant, and how much of what it does to each tree is drawn because it is not simulated."""
+    """The wind at one instant, and how much of each tree's sway is drawn instead of simulated."""
 
     wind: Wind
     time: float
-    """[s] Of the wind: that of the world."""
+    """[s] World time."""
     strength: float
-    """[1] From 0 when a wind begins to 1, and back to 0 when it ends."""
+    """[1] Strength that rises from 0 to 1 when a wind begins and falls back to 0 when it ends."""
     tree_air: np.ndarray
-    """[tree, 3] m/s Air in which the simulated pose of each tree is."""
+    """[tree, 3] m/s, air velocity that acts on the simulated pose of each tree."""
     tree_drawn: np.ndarray
-    """[tree] 1: the tree is drawn where the wind would hold it, 0: where it is simulated."""
+    """[tree] 1: the tree is drawn where the wind would hold it; 0: it is drawn where it is simulated."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SegmentPoses:
-    """Where segments of wires are that are away from where they were drawn, see :mod:`vinesim.wires.wire_segments`."""
+    """Poses of the displaced segments of wires, see :mod:`vinesim.wires.wire_segments`."""
 
     segment: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-    """[k] Their numbers, ascending."""
+    """[k] Numbers of the segments, ascending."""
     q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 7), np.float32))
-    """[k, 7] m, 1"""
+    """[k, 7] m, 1, poses in the world."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -40,23 +40,23 @@ class Snapshot:
     """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
 
     time: float
-    """[s]"""
+    """[s] World time."""
     tick: int
     body_q: np.ndarray
-    """Plant bodies [body, 7] m, 1."""
+    """[body, 7] m, 1, poses of plant bodies."""
     bunch_attached: np.ndarray
-    """[bunch] bool"""
+    """[bunch] bool, whether the bunch hangs on its plant."""
     visuals: tuple[RigidVisual, ...]
-    """Rigid bodies; the same tuple object as long as no actor comes or goes."""
+    """Rigid bodies; the same tuple object as long as no actor joins or leaves."""
     visual_q: np.ndarray
-    """Their poses [link, 7] m, 1."""
+    """[link, 7] m, 1, poses of ``visuals``."""
     moved_trees: np.ndarray
-    """Indices of the trees that are awake [k]: only these have moved since they fell asleep."""
+    """[k] Indices of the trees that are awake; all other trees stand still."""
     wind: WindState | None = None
-    """None: the air is calm. Else ``body_q`` lacks the sway of trees on which wind is not simulated; see
+    """None: the air is calm. Otherwise ``body_q`` lacks the sway of trees on which wind is not simulated; see
     :mod:`vinesim.wind.sway`."""
     wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
-    """All other segments of wires are where they were drawn."""
+    """Poses of displaced segments of wires; all other segments are where they were drawn."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -66,30 +66,30 @@ class Contact:
     actor: str
     link: str
     body: int
-    """Plant body in the model."""
+    """Index of the plant body in the model."""
     position: np.ndarray
     """[3] m, world"""
     force: np.ndarray
-    """[3] N on the rigid body, world axes; the plant feels the opposite."""
+    """[3] N on the rigid body, world axes; the plant feels the opposite force."""
     distance: float
-    """Gap [m], negative when they overlap."""
+    """Gap [m], negative if the bodies overlap."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Detachment:
-    """Something left its plant: a bunch its peduncle, or a cane the rest of its tree."""
+    """A part came off its plant: a bunch off its peduncle, or a cane off its tree."""
 
     tick: int
     tree: int
     body: int
-    """The body that left; what grows on it went with it."""
+    """Body that came off, together with everything that grows on it."""
     bunch: int
-    """Which bunch, -1 for a cane."""
+    """Index of the bunch, -1 for a cane."""
     cause: str
     """``"pull"`` (too much force), ``"bend"`` (too much moment), ``"blade"`` (a cutter closed on it), ``"command"``."""
     actor: str
-    """Whose doing it was, as far as is known; empty otherwise."""
+    """Actor who caused it; empty if unknown."""
     force: np.ndarray
-    """[3] N that the joint carried at the end, world axes, on what left."""
+    """[3] N, last force of the joint on the part that came off, world axes."""
     moment: np.ndarray
-    """[3] N m about the joint."""
+    """[3] N m, last moment about the joint on that part."""
