@@ -24,26 +24,27 @@ from vinesim.scene.spec import load_scene, with_seed
 from vinesim.web import page_files
 
 CAMERA_TOPICS = ("rgb/image_raw", "rgb/camera_info", "depth/image_raw", "depth/camera_info")
+"""Topics of a camera to which the listener stays subscribed."""
 COSTLY_TOPICS = ("depth/points", "labels")
-"""Topics of a camera that the listener leaves after the first message: no user looks at so much all the time."""
+"""Topics of a camera that the listener unsubscribes after the first message, because few users need all this data."""
 VISITOR_SENSOR_HZ = "1"
-"""The visitor has come to see a bunch move; its own sensors only have to be there."""
+"""Rate of the visitor's sensors [Hz]. It is low, because the demo only needs them to exist."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ListenedTopics:
-    """What the ROS listener of a demo subscribes to."""
+    """Topics to which the ROS listener of a demo subscribes."""
 
     always: tuple[str, ...]
     once: tuple[str, ...]
-    """Only until their first message."""
+    """Topics that are unsubscribed after their first message."""
     events: tuple[str, ...]
-    """The start does not wait for these: they may stay silent."""
+    """Topics that may stay silent, so that the start does not wait for them."""
     owners: Mapping[str, str]
-    """Topic: the sensor that it comes from, in words."""
+    """By topic: the sensor that publishes it, in words."""
 
     def describe(self, topic: str) -> str:
-        """What is waited for while a topic has had no message."""
+        """Text for what is missing while a topic has had no message."""
         return self.owners.get(topic, topic)
 
 
@@ -58,12 +59,12 @@ def run_push(
     headless: bool,
     out: pathlib.Path,
 ) -> int:
-    """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
+    """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``. Returns the exit code."""
     console = Console(stderr=True)
     begin = time.time()
     check_device(device)
     plan = with_seed(load_scene(scene), seed)
-    description = load_description(robot)  # refused once, and before any process starts
+    description = load_description(robot)  # raises errors before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -113,7 +114,7 @@ def run_push(
 
 
 class _RunTimer:
-    """Measures from now until the picker's simulated time ``end`` [s], and then ends the demo."""
+    """Measures from now until the picker's simulated time ``end`` [s], which ends the demo."""
 
     def __init__(self, end: float, listener: RosListener | None) -> None:
         self._end = end
@@ -123,7 +124,7 @@ class _RunTimer:
             listener.restart()
 
     def is_over(self, newest: Statuses) -> bool:
-        """Whether the run has lasted long enough, by the newest statuses; the measurement ends with it."""
+        """Whether the run has reached its end according to the newest statuses; then the measurement ends too."""
         if newest[PICKER]["time"] < self._end:
             return False
         if self.window.is_open:
@@ -141,8 +142,10 @@ def _start_clients(
     page: int | None,
     out: pathlib.Path,
 ) -> dict[str, Process]:
-    """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it and shows all
-    of it on the port ``page``."""
+    """Start both clients with the ``common`` options and return them by name.
+
+    One pushes the ``bunch``; the other drives up to it and serves a page on the port ``page``.
+    """
     common = ["-m", "vinesim", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],
@@ -165,7 +168,7 @@ def _start_clients(
 
 
 def listened_topics(robot: RobotDescription) -> ListenedTopics:
-    """All topics of the picker; of the visitor its joints, its first picture and its first scan."""
+    """All topics of the picker, and the visitor's joints, first picture and first scan."""
     always = [
         "/clock",
         "/robot_description",
