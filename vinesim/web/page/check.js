@@ -1,4 +1,4 @@
-// Runs before the page's modules, in browsers of any age: a sentence for what is missing, instead of a blank page.
+// Runs before the page's modules, in browsers of any age, and names missing features instead of leaving a blank page.
 (function () {
   var started = false;
 
@@ -22,7 +22,7 @@
     return "";
   }
 
-  /** Called by main.js when the vineyard is there; from then on it reports failures itself. */
+  /** Called by main.js when the vineyard is loaded; from then on main.js reports failures itself. */
   window.pageStarted = function () { started = true; };
   window.addEventListener("error", function (event) {
     if (started) return;
