@@ -102,7 +102,7 @@ class MeshExchange:
             self._robots.pop(name, None)
 
     def changed(self) -> list[str]:
-        """Robots whose meshes have arrived since the last call, at least those that the server has."""
+        """Robots that have received, since the last call, all their meshes that the server has."""
         names = []
         while self._changed:
             names.append(self._changed.popleft())

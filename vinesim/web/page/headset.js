@@ -15,7 +15,7 @@ const FINGERS = ["thumb", "index-finger", "middle-finger", "ring-finger", "pinky
 const FULL_BEND = [1.6, 3.8, 3.8, 3.8, 3.8];
 const AIM = 0.7, FARTHEST = 8, FLATTEST = 0.1; // share of a stick's way; m; how steep a ray to the floor is at least
 const CLICK = [0.3, 30]; // amplitude and ms of the pulse for a choice
-const RATE = 72; // Hz, of a display that does not tell
+const RATE = 72; // Hz, for a display that does not report its rate
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025, CLOSED = 0.5; // m between the tips, mean bend of the fingers
 /** Range of distances below the eyes, and distance beside them, at which a palm is at the hip [m]. GUESSED. */

@@ -26,7 +26,8 @@ const FINGER = 22; // px: a tap within this distance of a thing selects it
  * of view, this rotation, and the angle of one pixel of the finest displays [rad]. */
 const TURN = 0.35, IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
-const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
+// sizes of the names of distant and near actors [px], distance of near ones and gap above heads [m]
+const NAME = { far: 11, near: 16, from: 2, gap: 0.04 };
 /** A browser whose first pictures have a median rate below SLOW [Hz] draws less from then on: FEW triangles (as a share
  * of a phone's) and FEW_PIXELS. A browser without a graphics card does so from the start. */
 const SLOW = 5, FIRST_PICTURES = 12, FEW = 0.3, FEW_PIXELS = 250_000;

@@ -23,9 +23,9 @@ export function say(text, { stays = false } = {}) {
 export class Absence {
   constructor() {
     this.known = null; // before the newest picture: time, picked bunches, actors
-    this.before = null; // before a gap that was not told of yet
+    this.before = null; // the world before a gap that was not reported yet
     this.told = []; // sentences so far
-    this.long = 3; // a longer time of the world between two pictures is told of, if that is not usual here [s]
+    this.long = 3; // a longer world time between two pictures is reported unless it is usual here [s]
     this.usual = 0; // time of the world between two pictures, smoothed [s]
     this.pictures = 0;
   }

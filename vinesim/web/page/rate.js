@@ -20,7 +20,7 @@ export class FirstPictures {
 const WINDOW = 36; // pictures by which the detail is judged
 const LATE = 1.4; // periods: a picture that takes longer has missed one
 const MOST_LATE = 0.25; // share of a window
-const STRAY = 1; // late pictures of a window that mean nothing: a collector ran, a list was made anew
+const STRAY = 1; // late pictures of a window that are ignored: a garbage collector ran, or a list was rebuilt
 const LONGEST_CALM = 16; // times the calm at first
 
 /**

@@ -4,7 +4,7 @@ const FRAME = 960; // samples of 20 ms at 48 kHz
 /** Initial and largest delay of a voice after the beginning of its first frame: one frame and a reserve. */
 const START = 1.5 * FRAME, LARGEST = 12 * FRAME; // samples
 const RESERVE = FRAME / 2; // samples by which frames may come too early
-const EASE = 8; // of what was too early, the share 1/so much is waited for no more
+const EASE = 8; // the delay is reduced by 1 / EASE of the time by which frames were early
 const SPARE = 4 * FRAME; // samples that may wait beyond these
 const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
 const RAMP = 96; // samples of a fade, 2 ms
