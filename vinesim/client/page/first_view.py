@@ -63,7 +63,10 @@ def first_view(root: np.ndarray, model: Model, bodies: np.ndarray) -> np.ndarray
 
 
 def _behind(root: np.ndarray, heading: float, target: np.ndarray) -> np.ndarray:
-    """Pose [7] of eyes behind an actor at ``root`` [7], seen from the direction ``heading``, looking at ``target``."""
+    """Pose [7] of eyes behind an actor at ``root`` [7], looking at ``target`` [2] m.
+
+    ``heading`` [rad]: direction from the eyes to the actor.
+    """
     return _looking(root[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)]), target)
 
 
