@@ -1,1 +1,1 @@
-"""``vinesim demo``: a server, robot clients and a stock ROS subscriber, each a process of its own."""
+"""``vinesim demo``: a server, robot clients and a stock ROS subscriber, each in its own process."""

@@ -1,4 +1,4 @@
-"""Where the robots of a demo start, as options of ``vinesim client``."""
+"""Start poses of the robots of a demo, as options of ``vinesim client``; and checks of the demo's options."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 
 APPROACH_DISTANCE = 14
-"""Distance from which the visitor drives up [m]: beyond the interest radius at first."""
+"""Distance from which the visitor drives up [m], beyond the interest radius."""
 VISITOR_DISTANCE = 3.0
 """Distance from which a visitor watches a job [m]."""
 
@@ -28,7 +28,7 @@ def choose_poses(scene: Scene, model: Model) -> tuple[int, tuple[list[str], list
 
 
 def visitor_pose(scene: Scene) -> list[str] | None:
-    """Where a visitor watches a job: beside the picker's start, on the way to the second start pose; None if none."""
+    """Pose of a visitor that watches a job, beside the picker towards the second start place; None without that."""
     if len(scene.spawns) < 2:
         return None
     here, there = (start_poses.spawn_pose(scene, i)[:2] for i in (0, 1))
@@ -45,7 +45,7 @@ def _pose_option(pose: np.ndarray) -> list[str]:
 
 
 def check_device(device: str) -> None:
-    """Refuse a device that is not there: DeviceUnavailable. For the CPU nothing is imported, which takes a second."""
+    """Raise DeviceUnavailable for a missing device. For the CPU it skips the imports, which take a second."""
     if device != "cpu":
         from vinesim.plants.device_buffers import find_device
 

@@ -1,4 +1,4 @@
-"""What a demo shows while it runs: a live table, or one line a second."""
+"""Progress display of a running demo: a live table, or one line in each second."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from vinesim.client.processes.child_process import REPORT_TIMEOUT, Process
 from vinesim.net.pace import describe
 
 PICKER = "picker"
+"""Name of the robot that touches a bunch or works."""
 VISITOR = "visitor"
-"""The actors of a demo: the robot that touches or works, and the one that comes near."""
+"""Name of the robot that comes near and watches."""
 
 Statuses = dict[str, dict[str, Any]]
 """The newest status of each client, by name."""
@@ -33,7 +34,7 @@ def show_progress(
     headless: bool,
     is_over: Callable[[Statuses], bool] = lambda _: False,
 ) -> None:
-    """Show the status of both clients until the picker ends, or ``is_over`` and then the picker is interrupted.
+    """Show the status of both clients until the picker ends, or until ``is_over``, which interrupts the picker.
 
     :class:`ProcessFailed` if any process ends too early or the picker fails.
     """
@@ -81,7 +82,7 @@ def status_line(status: dict[str, Any]) -> str:
 
 
 def pace(status: dict[str, Any]) -> str:
-    """How fast time passes and what limits it, with two blanks behind; empty in real time."""
+    """Text about how fast time passes and what limits it, followed by two blanks; empty in real time."""
     text = describe(status["target_real_time_factor"], status["pace_cause"])
     return f"{text}  " if text else ""
 

@@ -25,23 +25,23 @@ from vinesim.scene.values import SENSOR_KINDS
 from vinesim.web import page_files
 
 VISITOR_SENSOR_HZ = "1"
-"""The visitor has come to see a bunch move; its own sensors only have to be there."""
+"""Rate of the visitor's sensors [Hz]. It is low, because the demo only needs them to exist."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ListenedTopics:
-    """What the ROS listener of a demo subscribes to."""
+    """Topics to which the ROS listener of a demo subscribes."""
 
     always: tuple[str, ...]
     once: tuple[str, ...]
-    """Only until their first message: no user looks at so much all the time."""
+    """Topics that are unsubscribed after their first message."""
     events: tuple[str, ...]
-    """The start does not wait for these: they may stay silent."""
+    """Topics that may stay silent, so that the start does not wait for them."""
     owners: Mapping[str, str]
-    """Topic: the sensor that it comes from, in words."""
+    """By topic: the sensor that publishes it, in words."""
 
     def describe(self, topic: str) -> str:
-        """What is waited for while a topic has had no message."""
+        """Text for what is missing while a topic has had no message."""
         return self.owners.get(topic, topic)
 
 
@@ -56,12 +56,12 @@ def run_push(
     headless: bool,
     out: pathlib.Path,
 ) -> int:
-    """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``; the exit code."""
+    """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``. Returns the exit code."""
     console = Console(stderr=True)
     begin = time.time()
     check_device(device)
     plan = with_seed(load_scene(scene), seed)
-    description = load_description(robot)  # refused once, and before any process starts
+    description = load_description(robot)  # raises errors before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -111,7 +111,7 @@ def run_push(
 
 
 class _RunTimer:
-    """Measures from now until the picker's simulated time ``end`` [s], and then ends the demo."""
+    """Measures from now until the picker's simulated time ``end`` [s], which ends the demo."""
 
     def __init__(self, end: float, listener: RosListener | None) -> None:
         self._end = end
@@ -121,7 +121,7 @@ class _RunTimer:
             listener.restart()
 
     def is_over(self, newest: Statuses) -> bool:
-        """Whether the run has lasted long enough, by the newest statuses; the measurement ends with it."""
+        """Whether the run has reached its end according to the newest statuses; then the measurement ends too."""
         if newest[PICKER]["time"] < self._end:
             return False
         if self.window.is_open:
@@ -139,8 +139,10 @@ def _start_clients(
     page: int | None,
     out: pathlib.Path,
 ) -> dict[str, Process]:
-    """The clients by name, with ``common`` options: one pushes the ``bunch``, the other drives up to it and shows all
-    of it on the port ``page``."""
+    """Start both clients with the ``common`` options and return them by name.
+
+    One pushes the ``bunch``; the other drives up to it and serves a page on the port ``page``.
+    """
     common = ["-m", "vinesim", "client", "--role", "robot", *common, "--status", "json", "--watch", str(bunch)]
     own = {
         PICKER: [*poses[0], "--push", str(bunch)],

@@ -1,4 +1,4 @@
-"""Waiting until server, clients, sensors and listener of a demo are all ready, and saying what is still missing."""
+"""Waits until server, clients, sensors and listener of a demo are ready, and shows what is still missing."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vinesim.client.processes.child_process import Process, ProcessFailed
 from vinesim.client.processes.ros_listener import RosListener
 
 POLL_PERIOD = 0.05
-"""Wall time between two looks at what is still missing [s]."""
+"""Wall time between two checks of what is still missing [s]."""
 PROGRESS_MARK = "vinesim: "
-"""Before what a process says of its progress."""
+"""Prefix of the lines in which a process reports its progress."""
 LINE_PERIOD = 5.0
-"""Wall time between two lines where no line can be updated [s]."""
+"""Wall time between two lines where a line cannot be updated, as in a log file [s]."""
 
 
 def wait_until_ready(
@@ -32,8 +32,8 @@ def wait_until_ready(
 ) -> dict[str, float]:
     """Wait until every client steps and every topic of the listener had a message.
 
-    Returns the wall time of each of these first events [s since the epoch], clients by name and topics by theirs.
-    ``describe`` names what a topic belongs to. :class:`ProcessFailed` if a process ends, or after ``timeout`` [s].
+    Returns the wall time of each first event [s since the epoch] by name of the client or topic. ``describe`` gives a
+    text for a missing topic. :class:`ProcessFailed` if a process ends, or after ``timeout`` [s].
     """
     ready: dict[str, float] = {}
     with _waiting_line(console) as show:
@@ -48,7 +48,7 @@ def wait_until_ready(
                     raise process.failure()
             topics = [] if listener is None else listener.missing()
             missing = [name for name in clients if name not in ready]
-            # a client that does not step yet stands for its sensors
+            # while a client does not step yet, its sensors are not listed
             missing += [] if missing else dict.fromkeys(describe(topic) for topic in topics)
             if not missing:
                 return ready | ({} if listener is None else listener.first)
@@ -61,12 +61,12 @@ def wait_until_ready(
 
 
 def progress_of(clients: Mapping[str, Process], newest: Statuses) -> str:
-    """What the first client that waits for something says of it, such as how many kernels are compiled.
+    """Progress text of the first client that waits for something, such as the number of compiled kernels.
 
-    All clients wait for the same kernels. What else they print, such as warnings, is not for one who waits.
+    All clients wait for the same kernels. Other output of clients, such as warnings, is left out.
     """
     for name, process in clients.items():
-        if name in newest:  # it steps, and its sensors are to join
+        if name in newest:  # it steps, but its sensors are not ready yet
             awaited = newest[name].get("sensors_awaited", [])
             lines = [text for text in awaited if "compiling" in text]
         else:
@@ -78,7 +78,7 @@ def progress_of(clients: Mapping[str, Process], newest: Statuses) -> str:
 
 @contextlib.contextmanager
 def _waiting_line(console: Console) -> Iterator[Callable[[str], None]]:
-    """A function that shows a text: on a terminal in one line that it updates, else every few seconds."""
+    """Context with a function that shows a text: in one updated line on a terminal, otherwise every few seconds."""
     if console.is_terminal:
         with console.status("") as status:
             yield status.update

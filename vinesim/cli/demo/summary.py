@@ -1,4 +1,4 @@
-"""``summary.json`` of a demo, from the reports of its clients."""
+"""Writes ``summary.json`` of a demo from the reports of its clients."""
 
 from __future__ import annotations
 
@@ -20,38 +20,38 @@ from vinesim.client.recording.bunch_trace import Rows, remote_error
 from vinesim.core.errors import writing
 
 SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
-"""Topics that every step publishes, and every ROS program needs."""
+"""Topics that are published in every step and that every ROS program needs."""
 PICTURES = r"(?!/visitor/).*/(rgb|depth)/image_raw"
-"""Topics of the picker's pictures with depth, as a regular expression."""
+"""Regular expression for the topics of the picker's colour and depth pictures."""
 SCANS = r"(?!/visitor/).*(?<!/depth)/points"
-"""The same of its scans."""
+"""Regular expression for the topics of the picker's scans."""
 LOOP_KEYS = ("tick_hz", "tick_p50_ms", "tick_p99_ms", "overruns", "real_time_factor")
 
 
 @dataclasses.dataclass(frozen=True)
 class Window:
-    """The part of a run that is measured, by ``time.monotonic`` [s]."""
+    """The measured part of a run, in times of ``time.monotonic`` [s]."""
 
     since: float
     until: float = float("inf")
 
     @property
     def is_open(self) -> bool:
-        """Whether it has no end yet."""
+        """Whether the window has no end yet."""
         return self.until == float("inf")
 
     @classmethod
     def begin(cls) -> Self:
-        """From now on."""
+        """A window that begins now."""
         return cls(time.monotonic())
 
     def end(self) -> Window:
-        """Until now."""
+        """The window with its end at the present time."""
         return dataclasses.replace(self, until=time.monotonic())
 
 
 def write_summary(out: pathlib.Path, summary: dict[str, Any]) -> None:
-    """Write ``summary.json``, whole or not at all, and copy the picker's pictures beside it."""
+    """Write ``summary.json`` atomically, and copy the picker's pictures next to it."""
     with writing(out):
         partial = out / "summary.json.part"
         partial.write_text(json.dumps(summary, indent=2) + "\n")
@@ -77,7 +77,7 @@ def push_summary(
     window: Window,
     starts: Mapping[str, float],
 ) -> dict[str, Any]:
-    """What was measured of a push; draws ``touch.png``.
+    """Measurements of a push. It also draws ``touch.png``.
 
     ``received``: statistics of the listener, by topic; ``starts``: times from the demo's start to the first event of
     each client and topic [s].
@@ -121,9 +121,10 @@ def push_summary(
 
 
 def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str, Any]) -> dict[str, Any]:
-    """Messages of :data:`SMALL_TOPICS` that were lost: on the way, by the listener's count, and before they were sent.
+    """Lost messages of :data:`SMALL_TOPICS`: lost on the way according to the listener, and lost before sending.
 
-    The latter are of the whole run of the robot whose ``report`` it is; the share is of all that should have come.
+    Messages lost before sending are counted over the whole run of the robot with this ``report``. ``share`` is the
+    fraction of lost messages among all expected messages.
     """
     dropped = report.get("ros_dropped", {})
     topics = [topic for topic in SMALL_TOPICS if topic in received]
@@ -140,14 +141,16 @@ def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str
 
 
 def least_rate(received: Mapping[str, Mapping[str, Any]], pattern: str, simulated: float) -> float | None:
-    """Messages in each second of ``simulated`` time [Hz] on the topic that matches ``pattern`` and had the fewest; None
-    without such a topic."""
+    """Lowest message rate among the topics that match ``pattern`` [Hz of simulated time]; None without such topics.
+
+    ``simulated``: duration of the run in simulated time [s].
+    """
     counts = [entry["count"] for topic, entry in received.items() if re.fullmatch(pattern, topic)]
     return min(counts) / simulated if counts else None
 
 
 def push_table(summary: dict[str, Any]) -> Table:
-    """The most important values of :func:`push_summary`, to print."""
+    """The most important values of :func:`push_summary` as a table to print."""
     error = summary["remote_displacement_error_mm"]
     lost = summary["ros_lost"]["share"]
     pictures, scans = (summary[f"{kind}_per_simulated_second"] for kind in ("pictures", "scans"))
@@ -176,7 +179,7 @@ def push_table(summary: dict[str, Any]) -> Table:
         ("largest force", f"{summary['force_peak_n']:.1f} N"),
         (
             "error of the remote copy",
-            # it starts beyond the interest radius, and comes near after some ten seconds
+            # the visitor starts beyond the interest radius and comes near after about ten seconds
             f"the visitor was not near in {summary['seconds']:.0f} s, give more --seconds"
             if error is None
             else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95",
@@ -200,7 +203,7 @@ def job_summary(
     no_ros: str | None,
     with_visitor: bool,
 ) -> dict[str, Any]:
-    """What was measured of a job; ``done_key`` names the boolean that tells whether it was done."""
+    """Measurements of a job; ``done_key``: name of the boolean that says whether the job was done."""
     report = report_of(out, PICKER)
     done = bool(report["job"]["succeeded"])
     reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")

@@ -25,9 +25,9 @@ JOBS = {
     "exchange": ("logistic", "exchanged"),
     "meet": ("logistic", "handed_over"),
 }
-"""Jobs: the robot that does them unless another is named, and the key of ``summary.json`` for whether it was done."""
+"""By job: the default robot, and the key in ``summary.json`` that says whether the job was done."""
 TIME_LIMIT = 120.0
-"""Simulated time that a job may take unless given [s]."""
+"""Default limit of the simulated time of a job [s]."""
 
 
 def run_job(
@@ -42,7 +42,7 @@ def run_job(
     headless: bool,
     out: pathlib.Path,
 ) -> int:
-    """Let one robot do a job and write ``out``; 0 if it was done, 5 if not."""
+    """Let one robot do a job, and write results into ``out``. Returns 0 if the job was done, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
     console = Console(stderr=True)
@@ -51,7 +51,7 @@ def run_job(
     robot = robot or default_robot
     scene = scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
-    load_description(robot)  # refused once, and before any process starts
+    load_description(robot)  # raises errors before any process starts
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
@@ -124,7 +124,7 @@ def run_job(
 
 
 def _person_options(scene: Scene) -> list[str]:
-    """Of the person of a meeting: where it begins, which bunch it picks, and into which box it lays it."""
+    """Options of a meeting's person: its start, the bunch that it picks, and the box into which it puts the bunch."""
     model = generate(scene)
     meeting = plan_meeting(model, start_pose(scene, 0))
     bunch = bunch_centres(model)[meeting.bunch]

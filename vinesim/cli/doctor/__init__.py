@@ -1,1 +1,1 @@
-"""``vinesim doctor``: what vinesim needs of this machine, each thing in one line with its remedy."""
+"""``vinesim doctor``: checks the requirements of vinesim on this machine; one line for each, with a remedy."""

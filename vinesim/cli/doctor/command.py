@@ -1,4 +1,4 @@
-"""All checks of ``vinesim doctor``, and how they are printed."""
+"""Runs all checks of ``vinesim doctor`` and prints the findings."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
 
 
 def diagnose(checks: Sequence[Callable[[], Finding]] = CHECKS) -> list[Finding]:
-    """The findings of all checks; a check that fails is an error of its own, and the others go on."""
+    """The findings of all checks. A check that raises an exception gives an error, and the other checks still run."""
     found = []
     for check in checks:
         try:
@@ -39,7 +39,7 @@ def diagnose(checks: Sequence[Callable[[], Finding]] = CHECKS) -> list[Finding]:
 
 
 def run(as_json: bool, checks: Sequence[Callable[[], Finding]] = CHECKS) -> int:
-    """Print one line for each check, or all as one JSON object; the exit code."""
+    """Print one line for each check, or all findings as one JSON object. Returns the exit code."""
     findings = diagnose(checks)
     is_ready = all(each.state != ERROR for each in findings)
     if as_json:

@@ -1,4 +1,4 @@
-"""What one check of ``vinesim doctor`` has found."""
+"""The result of one check of ``vinesim doctor``."""
 
 from __future__ import annotations
 
@@ -8,9 +8,11 @@ import os
 import pathlib
 
 OK = "ok"
+"""State of a check without findings."""
 WARNING = "warning"
+"""State of a finding that does not prevent an ordinary client (a robot on this machine, on the CPU)."""
 ERROR = "error"
-"""States of a finding. An error is what an ordinary client (a robot on this machine, on the CPU) cannot do without."""
+"""State of a finding with which an ordinary client cannot run."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -18,13 +20,13 @@ class Finding:
     """The result of one check."""
 
     check: str
-    """What was looked at, one or two words."""
+    """Subject of the check, one or two words."""
     state: str
     """:data:`OK`, :data:`WARNING` or :data:`ERROR`."""
     found: str
-    """What is there, in one line."""
+    """Result of the check in one line."""
     remedy: str = ""
-    """What to do about it; empty if all is well."""
+    """What to do; empty if nothing is wrong."""
 
     @property
     def line(self) -> str:
@@ -33,7 +35,7 @@ class Finding:
 
 
 def size_of(folder: pathlib.Path) -> int:
-    """Size [B] of all files below a folder; 0 if it is not there."""
+    """Size [B] of all files below a folder; 0 if it does not exist."""
     total = 0
     for parent, _, names in os.walk(folder):
         for name in names:
@@ -43,5 +45,5 @@ def size_of(folder: pathlib.Path) -> int:
 
 
 def amount(size: float) -> str:
-    """A number of bytes in words."""
+    """A number of bytes as text with a unit."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

@@ -15,28 +15,28 @@ import time
 from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding, amount
 
 CORES = 2
-"""With fewer, cameras and the step take turns on one core."""
+"""Smallest number of cores with which cameras and steps run in parallel."""
 PORT = 7447
-"""Where a server listens unless told otherwise."""
+"""Default port of a server."""
 SHARED_MEMORY = pathlib.Path("/dev/shm")
 LEAST_SHARED_MEMORY = 64 << 20
-"""[B] One robot: a segment of 24 MiB for its sensors, and the state of the world."""
+"""[B] Shared memory needed by one robot: a segment of 24 MiB for its sensors, and the state of the world."""
 ADVISED_SHARED_MEMORY = 256 << 20
-"""[B] Several robots with cameras."""
+"""[B] Shared memory for several robots with cameras."""
 NETWORK = pathlib.Path("/proc")
-"""Where Linux tells what its network does."""
+"""Folder with Linux' statistics of the network."""
 MOST_DROPPED = 1e-3
-"""Share of all datagrams that found their socket full; ROS subscribers miss messages of every step then."""
+"""[1] Largest fraction of datagrams dropped because a socket was full; beyond it ROS subscribers miss messages."""
 ADVISED_BUFFER = 4 << 20
-"""[B] Of a socket: holds the messages of a robot for some seconds, where the default holds a fifth of one."""
+"""[B] Advised buffer of a socket. It holds a robot's messages for some seconds; the default holds them for 0.2 s."""
 RESOLUTION = 1e-3
-"""[s] Of the clock: a step takes ten times as long."""
+"""[s] Coarsest resolution of the clock that is enough, a tenth of a step."""
 _UNSYNCHRONISED = 0x0040
-"""STA_UNSYNC of adjtimex(2)."""
+"""Bit STA_UNSYNC of adjtimex(2)."""
 
 
 def cpu(description: pathlib.Path = pathlib.Path("/proc/cpuinfo"), cgroup: pathlib.Path | None = None) -> Finding:
-    """Cores that this process may use, the share that a container leaves of them, vector instructions."""
+    """Check the cores that this process may use, the CPU limit of a container, and vector instructions."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     share = _quota(cgroup or pathlib.Path("/sys/fs/cgroup"))
     flags = _cpu_flags(description)
@@ -57,7 +57,7 @@ def cpu(description: pathlib.Path = pathlib.Path("/proc/cpuinfo"), cgroup: pathl
 
 
 def _cpu_flags(description: pathlib.Path) -> set[str]:
-    """Features of the first processor as Linux names them; empty on other systems."""
+    """Features of the first processor in Linux' names; empty on other systems."""
     with contextlib.suppress(OSError):
         for line in description.read_text(errors="replace").splitlines():
             key, _, value = line.partition(":")
@@ -67,7 +67,7 @@ def _cpu_flags(description: pathlib.Path) -> set[str]:
 
 
 def _quota(cgroup: pathlib.Path) -> float | None:
-    """Cores' worth of time that a control group allows; None without a limit."""
+    """CPU limit of a control group as a number of cores; None without a limit."""
     with contextlib.suppress(OSError, ValueError):
         quota, period = (cgroup / "cpu.max").read_text().split()
         return float(quota) / float(period)
@@ -78,7 +78,7 @@ def _quota(cgroup: pathlib.Path) -> float | None:
 
 
 def gpu(driver: pathlib.Path = pathlib.Path("/proc/driver/nvidia/version")) -> Finding:
-    """NVIDIA GPUs: seen by the system, seen by Warp, and able to compute."""
+    """Check NVIDIA GPUs: whether the system and Warp find them, and whether they can compute."""
     import warp as wp
 
     from vinesim.plants.device_buffers import device_fault
@@ -105,7 +105,7 @@ def gpu(driver: pathlib.Path = pathlib.Path("/proc/driver/nvidia/version")) -> F
 
 
 def shared_memory(folder: pathlib.Path = SHARED_MEMORY) -> Finding:
-    """Room in shared memory, and what killed processes have left there."""
+    """Check the free space in shared memory, and files left there by killed processes."""
     from vinesim.ros.dead_segments import dead_segments
 
     if sys.platform != "linux":
@@ -133,11 +133,11 @@ def shared_memory(folder: pathlib.Path = SHARED_MEMORY) -> Finding:
 
 
 def ports(port: int = PORT) -> Finding:
-    """Whether a server can listen on its usual port."""
+    """Check whether a server can listen on its default port."""
     busy = []
     for kind, name in ((socket.SOCK_STREAM, "tcp"), (socket.SOCK_DGRAM, "udp")):
         with socket.socket(socket.AF_INET, kind) as probe:
-            if kind == socket.SOCK_STREAM:  # connections that have ended do not keep a server from listening
+            if kind == socket.SOCK_STREAM:  # closed connections do not prevent a server from listening
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
                 probe.bind(("127.0.0.1", port))
@@ -154,7 +154,7 @@ def ports(port: int = PORT) -> Finding:
 
 
 def datagrams(proc: pathlib.Path = NETWORK) -> Finding:
-    """Datagrams that the system dropped as their program read too slowly: by them ROS sends what is small."""
+    """Check for datagrams dropped because a program read too slowly. ROS sends small messages as datagrams."""
     try:
         names, values = (
             line.split()[1:] for line in (proc / "net/snmp").read_text().splitlines() if line.startswith("Udp:")
@@ -175,7 +175,7 @@ def datagrams(proc: pathlib.Path = NETWORK) -> Finding:
 
 
 def clock() -> Finding:
-    """Resolution of the clock that paces steps, and whether the time of day is synchronised."""
+    """Check the resolution of the clock that paces steps, and whether the time of day is synchronised."""
     resolution = time.get_clock_info("monotonic").resolution
     found = f"monotonic to {resolution * 1e9:.0f} ns"
     if resolution > RESOLUTION:
@@ -194,7 +194,7 @@ def clock() -> Finding:
 
 
 def _clock_status() -> int | None:
-    """Status bits of the kernel's clock (adjtimex(2)); None where they cannot be read."""
+    """Status bits of the kernel's clock (adjtimex(2)); None if they cannot be read."""
     if sys.platform != "linux":
         return None
     # struct timex: modes (int), offset, freq, maxerror, esterror (long), status (int), and others; 208 bytes

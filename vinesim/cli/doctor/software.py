@@ -1,4 +1,4 @@
-"""Checks of what is installed and kept: Python, packages, ROS 2, the page, certificates, caches."""
+"""Checks of installed software and stored files: Python, packages, ROS 2, the page, certificates, caches."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vinesim.core import disk_cache
 from vinesim.core.version import __version__
 
 FREE_SPACE = 1 << 30
-"""[B] Compiled kernels and tables take up to this."""
+"""[B] Disk space needed by compiled kernels and tables."""
 EXTRAS = {
     "ros": "ROS 2",
     "web": "the page in a browser",
@@ -26,11 +26,11 @@ EXTRAS = {
     "perception": "point clouds from depth",
     "voice": "voices",
 }
-"""Extras of the package that users install, and what for."""
+"""Extras of the package for users, with their purpose."""
 
 
 def python(version: tuple[int, ...] = sys.version_info[:3]) -> Finding:
-    """The interpreter's version, as the package demands it."""
+    """Check the version of the interpreter against the package's requirement."""
     found = f"{'.'.join(map(str, version))} ({sys.executable})"
     try:
         from packaging.specifiers import SpecifierSet
@@ -46,7 +46,7 @@ def python(version: tuple[int, ...] = sys.version_info[:3]) -> Finding:
 
 
 def packages(requirements: Iterable[str] | None = None) -> Finding:
-    """Versions of all packages that vinesim cannot do without, and which extras are complete."""
+    """Check the versions of all required packages, and which extras are complete."""
     from packaging.requirements import Requirement
 
     given = importlib.metadata.requires("vinesim") if requirements is None else requirements
@@ -66,7 +66,7 @@ def packages(requirements: Iterable[str] | None = None) -> Finding:
 
 
 def _fault(wanted) -> str:  # a packaging.requirements.Requirement
-    """Why an installed package does not fit; empty if it does."""
+    """Reason why an installed package does not fit; empty if it does."""
     try:
         version = importlib.metadata.version(wanted.name)
     except importlib.metadata.PackageNotFoundError:
@@ -79,7 +79,7 @@ def _fault(wanted) -> str:  # a packaging.requirements.Requirement
 
 
 def ros() -> Finding:
-    """Whether this process could use ROS 2, and with which message packages."""
+    """Check whether this process can use ROS 2, and with which message packages."""
     from vinesim.ros import middleware
 
     if (reason := middleware.unavailable_reason()) is not None:
@@ -111,7 +111,7 @@ def _wheels() -> bool:
 
 
 def page() -> Finding:
-    """Whether people and spectators get their page."""
+    """Check whether the page for people and spectators can be served."""
     from vinesim.web import page_files
 
     if (text := page_files.missing()) is not None:
@@ -121,7 +121,7 @@ def page() -> Finding:
 
 
 def certificates(folders: Iterable[pathlib.Path] | None = None) -> Finding:
-    """Certificates of the page and of ``certs/``: whether they are readable, and until when they are valid."""
+    """Check whether the certificates of the page and in ``certs/`` are readable, and until when they are valid."""
     from vinesim.net.transport import certificates as certs
     from vinesim.net.transport.access_control import CertificateError
 
@@ -148,7 +148,7 @@ def certificates(folders: Iterable[pathlib.Path] | None = None) -> Finding:
 
 
 def caches() -> Finding:
-    """Folders of compiled kernels and of tables: size, whether they can be written, whether there is room."""
+    """Check the folders of compiled kernels and of tables: size, write permission, free space."""
     tables = disk_cache.folder()
     kernels = kernel_folder()
     sizes = [f"kernels {amount(size_of(kernels))} in {kernels}", f"tables {amount(size_of(tables))} in {tables}"]
@@ -165,13 +165,13 @@ def caches() -> Finding:
 
 
 def kernel_folder() -> pathlib.Path:
-    """Where Warp keeps compiled kernels of all its versions; Warp itself would make the folder."""
+    """Folder in which Warp stores compiled kernels of all its versions. This function does not create it."""
     chosen = os.environ.get("WARP_CACHE_PATH")
     return pathlib.Path(chosen) if chosen else disk_cache.user_folder() / "warp"
 
 
 def _write_fault(folder: pathlib.Path) -> str | None:
-    """Why a file cannot be written in a folder, which need not exist yet; None if it can."""
+    """Reason why a file cannot be written in a folder, which need not exist yet; None if it can be written."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     try:

@@ -1,1 +1,1 @@
-"""Scenes composed for pictures: robots, people and crates placed in a vineyard."""
+"""Composes scenes for pictures: places robots, people and crates in a vineyard."""

@@ -1,6 +1,6 @@
-"""Random scenes for the images of a data set: wind, people, robots and crates where there is space for them.
+"""Random scenes for the images of a data set: wind, and people, robots and crates where there is space for them.
 
-A scene follows from the random numbers of its image alone; nothing is kept from one image to the next.
+A scene depends only on the random numbers of its image; nothing is kept from one image to the next.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ from vinesim.world import Physics
 
 ROBOT_NAMES = ("vinebot", "logistic")
 FOOTPRINT_RADIUS = {"vinebot": 0.70, "logistic": 0.95, "person": 0.40, "crate": 0.38}
-"""Radius of the ground that each covers [m], arms and hands included: GUESSED."""
+"""Radius of the ground that each kind covers, including arms and hands [m]. GUESSED."""
 MIN_DISTANCE = 0.5
+"""Smallest horizontal distance of an actor or crate from the bunch in view [m]."""
 MAX_DISTANCE = 3.5
-"""Distance on the ground from the bunch in view to an actor or crate [m]."""
+"""Largest horizontal distance of an actor or crate from the bunch in view [m]."""
 CRATE_HEIGHTS = (0.15, 0.20, 0.24, 0.30)
 """Heights of crates [m]."""
 WIND_SHARE = 0.6
-"""Share of the images with actors in which wind blows."""
+"""Fraction of the images with actors in which wind blows."""
 WIND_SPEED = (0.5, 3.5)
-"""Mean wind at the top of the canopy [m/s]: GUESSED, calm to a gentle breeze."""
+"""Range of the mean wind at the top of the canopy [m/s]. GUESSED: calm to a gentle breeze."""
 WIND_STEPS = (50, 130)
-"""Steps of wind before the picture, lowest and highest."""
+"""Range of the number of steps with wind before the picture."""
 _MAX_TRIES = 40
 
 
@@ -48,16 +49,16 @@ class SceneRandomizer:
     """Composes random scenes; implements :class:`vinesim.sensors.export.dataset.SnapshotSource`."""
 
     share: float = 0.4
-    """Share of the images with actors or wind."""
+    """Fraction of the images with actors or wind."""
     parameters: PhysicsParameters = dataclasses.field(default_factory=PhysicsParameters)
-    """Numbers of the physics, those of the models' scene."""
+    """Physics parameters of the models' scene."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides the scenes, as JSON."""
+        """All settings that determine the scenes, as JSON values."""
         return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """See :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
+        """Snapshot of a random scene, see :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
         if rng.uniform() >= self.share:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))
@@ -107,7 +108,7 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
 def _free_place(
     middle: np.ndarray, taken: list[tuple[np.ndarray, float]], radius: float, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """A place [2] m for a disc that overlaps no other; None if none is found."""
+    """A random place [2] m for a disc that overlaps no other disc; None if none is found."""
     for _ in range(_MAX_TRIES):
         away = rng.uniform(MIN_DISTANCE, MAX_DISTANCE)
         around = rng.uniform(0.0, 2.0 * np.pi)
@@ -118,7 +119,7 @@ def _free_place(
 
 
 def _simulate_wind(physics: Physics, rng: np.random.Generator) -> dict[str, Any]:
-    """Step physics with a random wind; returns its parameters, as JSON."""
+    """Step physics with a random wind. Returns the wind's parameters as JSON values."""
     speed = float(rng.uniform(*WIND_SPEED))
     heading = float(rng.uniform(-np.pi, np.pi))
     ticks = int(rng.integers(*WIND_STEPS))

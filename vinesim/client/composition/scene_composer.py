@@ -1,11 +1,11 @@
-"""Robots, people and crates placed in a vineyard for a picture, as the simulation would show them at that instant.
+"""Places robots, people and crates in a vineyard for a picture, as in a simulation at that instant.
 
     composer = SceneComposer(
         robots=(RobotPlacement("vinebot", 1.5, 0.8),), crates=(CratePlacement(3.0, 0.5, fill=0.6),)
     )
     snapshot = composer.compose(model, scene.physics)
 
-Bunches in a crate are picked from the nearest vines and fall in one after another, simulated by the rigid world.
+Bunches in a crate are picked from the nearest vines. They fall in one after another, simulated by the rigid world.
 """
 
 from __future__ import annotations
@@ -31,25 +31,28 @@ if TYPE_CHECKING:
     from vinesim.world import Physics
 
 HEAP_DENSITY = 330.0
-"""Bulk density of a heap of bunches [kg/m3]: GUESSED; six tenths of a crate of 50 l are 10 kg."""
+"""Bulk density of a heap of bunches [kg/m3]. GUESSED: a crate of 50 l filled to 60 % has 10 kg."""
 CRATE_WALL = 0.012
+"""Thickness of a crate's walls [m]. GUESSED."""
 CRATE_MASS = 1.6
-"""Thickness of the walls [m] and mass of an empty crate [kg]: GUESSED."""
+"""Mass of an empty crate [kg]. GUESSED."""
 MAX_PENETRATION = 0.01
-"""Actors must not penetrate anything deeper than this [m]."""
+"""Largest depth to which an actor may penetrate anything [m]."""
 FALL_STEPS = 25
+"""Steps between two bunches that fall into a crate."""
 SETTLE_STEPS = 100
+"""Steps in which the heap settles."""
 MAX_REFILLS = 3
-"""Steps between bunches that fall into a crate; steps for the heap to settle; tries to put back what rolled out."""
+"""Largest number of attempts to put back bunches that rolled out."""
 
 
 class PlacementError(ValueError):
-    """An actor or crate does not fit where it is placed. The text is one line."""
+    """An actor or crate does not fit at its place. The message is one line."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RobotPlacement:
-    """A robot, by the name of its description, at ``x``, ``y`` [m], ``yaw`` [rad]."""
+    """A robot, given by the name of its description, at ``x``, ``y`` [m], ``yaw`` [rad]."""
 
     robot: str
     x: float
@@ -71,7 +74,7 @@ class PersonPlacement:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CratePlacement:
-    """A crate on the ground, ``fill`` of its inside heaped with bunches."""
+    """A crate on the ground; ``fill`` is the fraction of its inside that is filled with bunches."""
 
     x: float
     y: float
@@ -82,35 +85,36 @@ class CratePlacement:
 
     @property
     def pose(self) -> np.ndarray:
-        """[7] in the world."""
+        """Pose [7] of the crate in the world."""
         return _ground_pose(self.x, self.y, self.yaw)
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SceneComposer:
-    """The actors and crates of a picture; labels count from 0 in the order given here."""
+    """The actors and crates of a picture. Labels count from 0 in the given order."""
 
     robots: tuple[RobotPlacement, ...] = ()
     people: tuple[PersonPlacement, ...] = ()
     crates: tuple[CratePlacement, ...] = ()
-    """After those of the scene."""
+    """Crates in addition to the boxes of the scene, numbered after them."""
 
     def compose(self, model: Model, parameters: PhysicsParameters = PhysicsParameters()) -> Snapshot:
-        """Snapshot of the vineyard with all of them at rest; :class:`PlacementError` if two would overlap.
+        """Snapshot of the vineyard with actors and crates at rest; :class:`PlacementError` if two would overlap.
 
-        ``parameters``: numbers of the physics, those of the model's scene.
+        ``parameters``: physics parameters of the model's scene.
         """
         furnished = self.with_crates(model)
         if any(crate.fill > 0.0 for crate in self.crates):
-            from vinesim.world import Physics  # the kernels of plants: half a second that few pictures need
+            # imported here, because the kernels of plants take half a second to load and few pictures need them
+            from vinesim.world import Physics
 
             return self.populate(Physics(furnished, parameters=parameters))
-        rigid = RigidWorld(furnished, parameters=parameters)  # no robot picks: the plants need not move
+        rigid = RigidWorld(furnished, parameters=parameters)  # no robot picks, so the plants need not move
         self._add_actors(rigid)
         return rest_snapshot(model, rigid.visuals(), rigid.visual_q())
 
     def with_crates(self, model: Model) -> Model:
-        """The model with the crates after its own boxes."""
+        """The model with the crates added after its own boxes."""
         count = len(self.crates)
         pose = np.array([c.pose for c in self.crates])
         size = np.array([c.size for c in self.crates])
@@ -122,7 +126,7 @@ class SceneComposer:
         )
 
     def populate(self, physics: Physics) -> Snapshot:
-        """Fill the crates, then add the actors, to physics of :meth:`with_crates`; returns the snapshot."""
+        """Fill the crates and add the actors in ``physics`` of a model from :meth:`with_crates`. Returns a snapshot."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             fill_crate(physics, number, crate)
         self._add_actors(physics.rigid)
@@ -141,7 +145,7 @@ class SceneComposer:
         _check_clearance(rigid)
 
     def actor_records(self, model: Model) -> list[dict]:
-        """All robots, people and boxes, as JSON: kind, label, placement."""
+        """All robots, people and boxes as JSON values: kind, label, placement."""
         records = []
         for organ, things, start in (
             (Organ.ROBOT, self.robots, 0),
@@ -163,8 +167,7 @@ def bunch_masses(model: Model) -> np.ndarray:
 
 
 def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int]:
-    """Let the bunches that hang nearest to a crate fall into it until its ``fill`` is reached; returns their
-    indices."""
+    """Let the bunches nearest to a crate fall into it until its ``fill`` is reached. Returns their indices."""
     model = physics.model
     rigid = physics.rigid
     inside = np.array(crate.size) - [2.0 * CRATE_WALL, 2.0 * CRATE_WALL, CRATE_WALL]
@@ -220,7 +223,7 @@ def _rachis_ends(physics: Physics, bunch: int) -> np.ndarray:
 
 
 def _top_height(physics: Physics, bunch: int) -> float:
-    """Height [m] of the highest point that a bunch may reach."""
+    """Upper bound of the height [m] of a bunch's highest point."""
     return float(_rachis_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 

@@ -1,1 +1,1 @@
-"""What the pages of a client show and hear, who may open them, and recordings on a page."""
+"""Pages of a client: picture, sound, access from other machines, and recordings."""

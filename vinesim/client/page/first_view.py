@@ -1,4 +1,4 @@
-"""Where a page looks from at first: its actor and vines are in the picture, and nothing hides the actor."""
+"""The first viewpoint of a page: it shows the actor and vines, and nothing hides the actor."""
 
 from __future__ import annotations
 
@@ -9,38 +9,42 @@ from vinesim.core import frames
 from vinesim.scene.model import Model
 
 NEAR = 3.0
-"""An actor that is nearer than this to a tree looks where it works [m]. GUESSED."""
+"""An actor nearer than this to a tree is viewed over its shoulder [m]. GUESSED."""
 BESIDE = 0.25
-"""Angle of the eyes beside the line straight behind an actor [rad], where more is hidden; a phone held upright sees an
-actor so far from the middle."""
+"""Angle of the viewpoint to the side of the line behind an actor, used where plants hide more [rad]. A phone held
+upright still shows an actor at this angle from the middle."""
 YAWS = (FOLLOW_YAW, -FOLLOW_YAW, 0.45, -0.45, BESIDE, -BESIDE)
-"""Angles of the eyes beside the line straight behind an actor among vines that are tried, the best ones first [rad]."""
+"""Angles of the viewpoint to the side of the line behind an actor among vines, in order of preference [rad]."""
 HEAD = 1.3
-"""Height above the ground to which nothing may hide an actor from the eyes [m]."""
+"""Height of the point of an actor that must be visible [m]."""
 HIDING = 0.3
-"""Parts of plants nearer than this to the line from the eyes to there hide the actor, by their leaves [m]. GUESSED."""
+"""Parts of plants nearer than this to the line of sight hide the actor with their leaves [m]. GUESSED."""
 AROUND = 2.5
-"""Trees as far as this from the one nearest to an actor far away are what it comes to [m]. GUESSED."""
+"""Radius of the group of trees around the tree nearest to a distant actor [m]. GUESSED."""
 BEFORE_VINES = (2.5, 3.5, 4.5, 5.5, 6.5)
-"""Distances of the eyes from these [m]. GUESSED."""
+"""Distances of the viewpoint from the centre of this group that are tried [m]. GUESSED."""
 BEARINGS = 32
-"""Directions around these that are tried."""
+"""Number of directions around this centre that are tried."""
 AWAY = (0.15, 0.55)
-"""Angles from the middle of the picture at which an actor far away may be [rad]: a desktop shows 0.8."""
+"""Range of angles of a distant actor from the middle of the picture [rad]; a desktop shows 0.8."""
 FREE = 0.7
-"""No part of a plant is nearer than this to such eyes [m]: leaves would fill the picture. GUESSED."""
+"""Smallest distance of any part of a plant from the viewpoint [m], because near leaves fill the picture. GUESSED."""
 MOST_HIDING = 3
-"""So many parts of plants may hide an actor far away. GUESSED."""
+"""Largest number of parts of plants that may hide a distant actor. GUESSED."""
 LARGE = 8.0
-"""Vines count for a picture up to this distance [m]. GUESSED."""
+"""Vines beyond this distance from the viewpoint are ignored when a picture is rated [m]. GUESSED."""
 FIELD = 0.78
+"""Half of the horizontal field of view of a rated picture [rad]."""
 COLUMNS = 24
-"""Of a picture that is judged: half of its horizontal angle [rad], and parts side by side."""
+"""Number of columns into which a rated picture is divided."""
 
 
 def first_view(root: np.ndarray, model: Model, bodies: np.ndarray) -> np.ndarray:
-    """Pose [7] m, 1 of eyes that see an actor with its base at ``root`` [7]: over its shoulder where it works if it is
-    among vines, else from the vines that are nearest to it. ``bodies`` [body, 3] m: places of the plants' parts."""
+    """Pose [7] m, 1 of a viewpoint for an actor with its base at ``root`` [7].
+
+    It is behind the shoulder of an actor among vines; for a distant actor it shows the nearest vines and the actor.
+    ``bodies`` [body, 3] m are the positions of plant bodies.
+    """
     distances = np.linalg.norm(model.tree_pose[:, :2] - root[:2], axis=1)
     if not len(distances) or distances.min() < NEAR:
         ahead = frames.rotate(root[3:], np.array([1.0, 0.0, 0.0]))
@@ -59,12 +63,15 @@ def first_view(root: np.ndarray, model: Model, bodies: np.ndarray) -> np.ndarray
 
 
 def _behind(root: np.ndarray, heading: float, target: np.ndarray) -> np.ndarray:
-    """Pose [7] of eyes that have an actor at ``root`` [7] before them in a direction, looking at a ``target`` [2] m."""
+    """Pose [7] of eyes behind an actor at ``root`` [7], looking at ``target`` [2] m.
+
+    ``heading`` [rad]: direction from the eyes to the actor.
+    """
     return _looking(root[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)]), target)
 
 
 def _before(vines: np.ndarray) -> list[np.ndarray]:
-    """Poses [7] of eyes all around a place [2] m, to which they look."""
+    """Poses [7] of eyes in all directions around the point ``vines`` [2] m, looking at it."""
     return [
         _looking(vines + distance * np.array([np.cos(angle), np.sin(angle)]), vines)
         for distance in BEFORE_VINES
@@ -73,7 +80,7 @@ def _before(vines: np.ndarray) -> list[np.ndarray]:
 
 
 def _within(points: np.ndarray, place: np.ndarray, distance: float) -> np.ndarray:
-    """Those of the points [n, 3] m that are at most so far from a ``place`` [2] m, seen from above."""
+    """The subset of ``points`` [n, 3] m within the horizontal ``distance`` of ``place`` [2] m."""
     return points[np.linalg.norm(points[:, :2] - place, axis=1) < distance]
 
 
@@ -83,7 +90,7 @@ def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _shows(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> bool:
-    """Whether eyes see an actor at ``root`` [7] that is far away, at the side of the picture, and no leaf fills it."""
+    """Whether a view shows a distant actor at ``root`` [7] at the side of the picture, without a leaf that fills it."""
     x, y, _ = frames.rotate(frames.conjugate(view[3:]), root[:3] - view[:3])
     if not AWAY[0] < abs(np.arctan2(y, x)) < AWAY[1]:
         return False
@@ -92,14 +99,14 @@ def _shows(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> bool:
 
 
 def _hiding(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> int:
-    """How many of the ``bodies`` [body, 3] m are before an actor at ``root`` [7], or around the eyes."""
+    """Number of ``bodies`` [body, 3] m that hide an actor at ``root`` [7], or are around the eyes."""
     way = root[:3] + np.array([0.0, 0.0, HEAD]) - view[:3]
     along = np.clip((bodies - view[:3]) @ way / (way @ way), 0.0, 1.0)
     return int((np.linalg.norm(bodies - view[:3] - along[:, None] * way, axis=1) < HIDING).sum())
 
 
 def _columns_with_vines(view: np.ndarray, bodies: np.ndarray) -> int:
-    """In how many columns of the picture there are vines that are near."""
+    """Number of columns of the picture that contain near vines."""
     local = frames.rotate(frames.conjugate(view[3:]), bodies - view[:3])
     angles = np.arctan2(local[:, 1], local[:, 0])[np.hypot(local[:, 0], local[:, 1]) < LARGE]
     return int(np.count_nonzero(np.histogram(angles, COLUMNS, (-FIELD, FIELD))[0]))

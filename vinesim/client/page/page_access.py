@@ -1,5 +1,8 @@
-"""How other machines of the network open a page: by https, since browsers allow headsets and microphones nowhere else,
-and with a token, since who opens the page may move the person."""
+"""Access to a page from other machines of the network: by https and with a token.
+
+Browsers allow headsets and microphones only on https pages. The token is needed because whoever opens the page can move
+the person.
+"""
 
 from __future__ import annotations
 
@@ -14,25 +17,25 @@ from vinesim.net.transport import certificates
 from vinesim.net.transport.access_control import SERVER, Role
 
 _ELSEWHERE = ("192.0.2.1", 9)
-"""An address that no machine has (RFC 5737): which of our own addresses leads out; nothing is sent."""
+"""An address that no machine has (RFC 5737), to find the own address of the route to it; nothing is sent."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class NetworkAccess:
-    """What a page's server needs for other machines."""
+    """Settings of a page's server for access from other machines."""
 
     host: str
     """Address of this machine in its network."""
     tls: ssl.SSLContext
     token: str
-    """In the address that one opens; a new one for every run."""
+    """Secret in the address of the page; it is new in every run."""
 
 
 def network_access() -> NetworkAccess:
-    """Access by the address under which the network reaches this machine.
+    """Access at the address under which the network reaches this machine.
 
-    The certificate is signed by an authority of this machine's own, kept in the folder for caches: browsers warn of it
-    once, or never where its ``ca.pem`` is installed. Raises :class:`certificates.CryptographyMissing`.
+    The certificate is signed by this machine's own authority, which is stored in the folder for caches. Browsers warn
+    once about it, or never if its ``ca.pem`` is installed. Raises :class:`certificates.CryptographyMissing`.
     """
     host = own_address()
     folder = disk_cache.folder() / "page-certificate"

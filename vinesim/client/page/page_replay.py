@@ -1,4 +1,4 @@
-"""A recording for pages: it plays, pauses, and goes to any of its times, as the timeline of a page asks."""
+"""A recording for pages: it plays, pauses and seeks on request of a page's timeline."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from vinesim.web.page_input import ReplayCommand
 from vinesim.web.page_server import PageServer
 
 LEAD = 1.0
-"""A time that was asked for is reached by playing from so much earlier [s]: actors and clocks are known then."""
+"""To seek a time, playing begins this much earlier [s], so that actors and clocks are known at that time."""
 REPEAT = 50
-"""While nothing plays, a state is sent every so many steps, for pages that come meanwhile."""
+"""Number of steps between two states while playing is paused, for pages that connect meanwhile."""
 
 
 class PageReplay:
-    """A spectator in a recording, and its pages. One loop calls :meth:`step`; pages ask in the server's thread."""
+    """A spectator in a recording, and its pages. One loop calls :meth:`step`; pages call from the server's thread."""
 
     def __init__(
         self,
@@ -29,8 +29,10 @@ class PageReplay:
         start: float = 0.0,
         speed: float = 1.0,
     ) -> None:
-        """``make(start, eyes)`` gives a spectator at a time [s] of a recording of a ``length`` [s], which looks from
-        ``eyes`` [7], or, None, from where it begins."""
+        """``make(start, eyes)`` makes a spectator at a time [s] of the recording, which is ``length`` [s] long.
+
+        The spectator looks from ``eyes`` [7], or from its own start position if that is None.
+        """
         self._make = make
         self._length = length
         self._lock = threading.Lock()
@@ -53,7 +55,7 @@ class PageReplay:
         return self._bus.time - self._bus.start
 
     def status(self) -> dict[str, float | bool]:
-        """What pages are told with every state."""
+        """Status that pages receive with every state."""
         return {
             "position": round(self.position, 3),
             "length": round(self._length, 3),
@@ -63,14 +65,14 @@ class PageReplay:
         }
 
     def take(self, command: ReplayCommand) -> None:
-        """What a page asks for; it replaces what was asked for since the last step. From any thread."""
+        """Set the command of a page, replacing earlier commands since the last step. Safe from any thread."""
         with self._lock:
             before = None if self._command is None else self._command.seek
             seek = before if command.seek is None else command.seek
             self._command = ReplayCommand(command.paused, command.speed, seek)
 
     def step(self, server: PageServer) -> bool:
-        """Do what was asked for, and play one step once the first page is there; whether it plays."""
+        """Execute the last command, and play one step if a page has connected. Returns whether it is playing."""
         self._has_begun |= server.has_viewers
         with self._lock:
             command = self._command
@@ -91,7 +93,7 @@ class PageReplay:
     def _obey(self, command: ReplayCommand) -> None:
         goal = command.seek
         if goal is None and self._bus.ended and not command.paused:
-            goal = 0.0  # again from the beginning
+            goal = 0.0  # at the end: restart from the beginning
         self._speed = command.speed
         self.is_paused = command.paused
         if goal is None:

@@ -1,6 +1,6 @@
-"""Sound of one client for its pages: what its actor hears goes to all pages, the first that speaks is its voice.
+"""Sound of one client for its pages: all pages hear what the actor hears; the first page that speaks is its voice.
 
-A page that only watches a robot hears what the robot hears and says nothing.
+A page that only watches a robot hears what the robot hears, and cannot speak.
 """
 
 from __future__ import annotations
@@ -16,8 +16,11 @@ from vinesim.web.voice_socket import PageVoice, encode_frame
 
 
 class PageSound:
-    """See :class:`vinesim.web.voice_socket.Sound`, which the server's thread calls; the client's loop calls the
-    listener of each page."""
+    """Sound of a client's pages.
+
+    The server's thread calls the methods of :class:`vinesim.web.voice_socket.Sound`; the client's loop calls the
+    listener of each page.
+    """
 
     def __init__(self, client: Client) -> None:
         self._client = client
@@ -28,26 +31,26 @@ class PageSound:
         """The page that is the actor's voice."""
 
     def join(self, page: PageVoice) -> None:
-        """A page listens from now on."""
+        """Let a page listen from now on."""
         self._pages[page] = listener = _Page(self, page)
         self._client.sound.voice_of(self._name)
         self._client.sound.listen(self._name, listener)
 
     def leave(self, page: PageVoice) -> None:
-        """A page is gone."""
+        """A page has disconnected."""
         self._client.sound.stop_listening(self._pages.pop(page))
         if self._speaker is page:
             self._speaker = None
 
     def speak(self, page: PageVoice, codec: Codec, data: bytes, is_main: bool) -> None:
-        """A page has said a frame."""
+        """Handle a frame of sound from a page."""
         if self.objection(page):
             return
         self._speaker = page
         self._client.sound.speak(self._name, codec, data, is_main=is_main)
 
     def objection(self, page: PageVoice) -> str:
-        """Why a page may not speak, for its user; empty: it may."""
+        """Reason why a page may not speak, for its user; empty if it may."""
         if self._kind == "robot":
             return "this page shows a robot, which speaks by the ROS topic speaker/audio"
         if self._speaker not in (None, page):
@@ -57,7 +60,7 @@ class PageSound:
         return ""
 
     def status(self, page: PageVoice, tones: dict[str, list[float]]) -> str:
-        """What a page is told when it changes."""
+        """Status text for a page, sent when it changes."""
         voice = self._client.sound.voice_of(self._name)
         objection = self.objection(page)
         send = [] if objection else ["main"] * voice.is_heard + ["pcm"] * voice.is_heard_plain
@@ -72,7 +75,7 @@ class PageSound:
 
 
 class _Page:
-    """Sends one page what the actor hears."""
+    """Listener that sends one page what the actor hears."""
 
     is_open = True
 
@@ -83,11 +86,11 @@ class _Page:
 
     @property
     def decodes_opus(self) -> bool:
-        """Whether the page does."""
+        """Whether the page can decode Opus."""
         return self._page.ears is not None and self._page.ears.opus
 
     def hear(self, step: SoundStep) -> None:
-        """Send it on; the page itself makes it as loud as it is there, and tones from their frequency."""
+        """Send the sound of one step to the page, which computes loudness and generates tones itself."""
         for speaker, frame, place in step.frames:
             x, y, z = place.tolist()
             self._page.send(encode_frame(speaker, frame.number, frame.codec, frame.data, (x, y, z)))

@@ -1,4 +1,4 @@
-"""What pages are shown: the primitives of the cameras once, then the poses of what has moved."""
+"""The world as sent to pages: first all primitives of the cameras, then the poses of moved bodies."""
 
 from __future__ import annotations
 
@@ -32,41 +32,42 @@ from vinesim.wind.sway import Sway
 from vinesim.wires.wire_segments import wire_segments
 
 GRASS = 25.0
-"""Tufts a square metre: a browser draws fewer than the cameras."""
+"""Grass tufts for each square metre; a browser draws fewer than the cameras."""
 MAX_PRIMITIVES = 400_000
-"""Of plants and ground that a page has at a time: 32 MB."""
+"""Largest number of primitives of plants and ground in a page at a time: 32 MB."""
 LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BERRY): 1.0}
-"""How far things are loaded by their material, berries being 1: about as far as a page draws them. GUESSED."""
+"""Loading distance by material, relative to berries: about the distance up to which a page draws them. GUESSED."""
 ELSE_LOADED = 2.0
-"""The same for leaves and wood."""
+"""Loading distance of leaves and wood, relative to berries. GUESSED."""
 AMONG_VINES = 1.08
-"""Exposure of a page beside the usual one of the daylight: what cameras come to by themselves among vines, 1.06 to 1.12
-times it in the pictures of docs/web.md."""
+"""Ratio of a page's exposure to the usual daylight exposure. Automatic exposure of cameras among vines gives 1.06 to
+1.12 in the pictures of docs/web.md."""
 MAX_SENTENCES = 4
-"""Closures of shears that a state tells of: pages learn of both hands, and of those between two states."""
+"""Number of the last closures of shears in a state, enough for both hands between two states."""
 BLADE_STEPS = 5
-"""Pages are told every so many steps what is between the blades of shears."""
+"""Number of steps between two reports of what is between the blades of shears."""
 _TURN_STEPS = 32767
-"""Steps of a component of a quaternion from 0 to 1."""
+"""Integer that encodes 1 in a component of a quaternion."""
 
 
 class Replay(Protocol):
-    """A recording that is played for pages."""
+    """Interface of a recording that is played for pages."""
 
     def status(self) -> dict[str, float | bool]:
-        """What pages are told with every state."""
+        """Status that pages receive with every state."""
         ...
 
     def take(self, command: ReplayCommand) -> None:
-        """What a page asks for; called in the server's thread."""
+        """Handle a command of a page; called in the server's thread."""
         ...
 
 
 class PageWorld:
-    """The world of one client as its pages see it. The client's loop writes it, the server's thread reads it.
+    """The world of one client for its pages. The client's loop writes it, the server's thread reads it.
 
-    Nothing is laid out before the first page asks. A page knows the poses of all trees at rest. It is kept in which
-    tick each tree has last moved; a page is sent the trees that have moved since the last state that was sent to it.
+    Primitives are built when the first page requests them. A page starts with all trees at their rest poses. This
+    object keeps the tick in which each tree last moved, and sends a page the trees that have moved since the last state
+    sent to that page.
     """
 
     def __init__(
@@ -76,58 +77,63 @@ class PageWorld:
         most: int = MAX_PRIMITIVES,
         replay: Replay | None = None,
     ) -> None:
-        """``person``: the source of the client's own human, whom the first page moves; ``most``: primitives of plants
-        and ground that a page has at a time, those nearest to where it looks from; ``replay``: the recording that the
-        client is in, if it is in one."""
+        """Show a client to pages.
+
+        Args:
+            client: the client.
+            person: source of the client's own human, whom the first page moves.
+            most: largest number of primitives of plants and ground in a page; the nearest to its viewpoint are sent.
+            replay: the recording in which the client is, if any.
+        """
         self._client = client
         self._person = person
         self._most = most
         self._replay = replay
         self._ticks_before = 0
-        """Of earlier clients, so that ticks of states rise: see :meth:`show`."""
+        """Sum of the ticks of earlier clients, so that ticks of states always increase; see :meth:`show`."""
         self._at_rest = client.physics.snapshot().body_q.copy()
         self._moved_at = np.full(len(client.model.tree_first), -1)
-        """[tree] tick"""
+        """[tree] Tick in which each tree last moved."""
         self._wires = wire_segments(client.model)
-        """For pages their segments are bodies, numbered behind those of plants."""
+        """Segments of wires. Pages treat them as bodies, numbered after the plant bodies."""
         self._wire_q, self._wire_moved_at = self._wires.rest_q.astype(np.float32), np.full(len(self._wires), -1)
-        """[segment, 7] m, 1 as last seen, and [segment] the tick."""
+        """[segment, 7] m, 1, last pose of each segment, and [segment] the tick in which it last moved."""
         self._wires_away = self._wires.piece[:0].astype(int)
-        """[k] Segments that were away from where they were drawn."""
+        """[k] Segments that were displaced in the last step."""
         self._sway: Sway | None = None
         self._primitives: Primitives | None = None
-        """None until a page asks."""
+        """Primitives of the world; None until a page requests them."""
         self._lock = threading.Lock()
         self._snapshot: tuple[int, Snapshot] | None = None
         self._rigid_version = 0
         self._rigid = b""
         self._lamps: dict[str, np.ndarray] = {}
-        """Rows of primitives that have shone, counted from those of the rigid bodies; their surfaces and materials."""
+        """Rows (within the rigid primitives), surfaces and materials of primitives whose lights have changed."""
         self._laid_out: dict[str, np.ndarray] = {}
-        """Values of the rigid primitives as pages load them."""
+        """Values of the rigid primitives that pages load first."""
         self._has_shone = np.zeros(0, bool)
-        """[row] Whether it was ever other than that."""
+        """[row] Whether the row has ever differed from ``_laid_out``."""
         self._visuals: tuple[Any, ...] | None = None
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
-        """The page that moves the spectator's eyes or the person: the first that sends anything."""
+        """Page that moves the spectator's eyes or the person: the first page that sends a message."""
         self._eyes: np.ndarray | None = None
         self._intention = ""
         self._overlay_pages: set[int] = set()
         """Pages that show contacts and owners."""
         self._contacts: tuple[Contact, ...] = ()
         self._hands: dict[str, np.ndarray] = {}
-        """Of the person's left and right hand [2, 7]: as simulated, and the controllers that they followed."""
+        """Poses [2, 7] of the person's left and right hand: simulated palms, and the controllers that they followed."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
         self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
-        """How often the person's shears have closed, what they cut the last times, and what is between the open blades
-        of both hands; replaced, never changed."""
+        """Number of closures of the person's shears, their last results, and what is between the open blades of both
+        hands. The dictionary is replaced, never changed."""
 
     # ------------------------------------------------------------------ in the client's loop
 
     def show(self, client: Client) -> None:
-        """From now on show another client of the same vineyard, at another time of it: all trees are told anew."""
+        """Show another client of the same vineyard from now on. All moved trees are sent again."""
         with self._lock:
             self._ticks_before += self._client.physics.tick + 1
             self._client = client
@@ -145,8 +151,10 @@ class PageWorld:
         return self._client.physics.tick + self._ticks_before
 
     def collect(self, server: PageServer, *, again: bool = False) -> None:
-        """After a step: note what has moved, take a snapshot if a page looks, and lead a spectator's eyes there.
-        ``again``: there was no step, but something else that pages are told of."""
+        """After a step: record what has moved, take a snapshot if a page is connected, and move a spectator's eyes.
+
+        ``again``: there was no step, but pages must be informed of another change.
+        """
         physics = self._client.physics
         self._ticks_before += again
         self._moved_at[physics.plants.awake] = self._tick
@@ -184,7 +192,7 @@ class PageWorld:
         server.notify()
 
     def _follow_wires(self, wires: SegmentPoses) -> None:
-        """Note which segments have moved."""
+        """Record which segments of wires have moved."""
         which = np.union1d(self._wires_away, wires.segment).astype(int)
         now = self._wires.poses(which, wires)
         moved = which[(now != self._wire_q[which]).any(1)]
@@ -193,7 +201,7 @@ class PageWorld:
         self._wires_away = wires.segment
 
     def _follow_reset(self) -> None:
-        """All trees are at rest again: pages are told of those that had moved."""
+        """After a reset: all trees are at rest, so send pages the trees that had moved."""
         self._moved_at[self._moved_at >= 0] = self._tick + 1
         self._wire_moved_at[self._wire_moved_at >= 0] = self._tick + 1
         if self._sway is not None:
@@ -202,11 +210,11 @@ class PageWorld:
     # ------------------------------------------------------------------ in the server's thread
 
     def scene(self) -> bytes:
-        """Everything that stands or grows, at rest; tables of leaves' outlines; light of the ground."""
+        """Message with fixed things and plants at rest, the tables of leaf outlines, and the light of the ground."""
         primitives = self._lay_out()
         scene = self._client.scene
         outline, hull = textures.leaf_outlines()
-        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes have both signs
+        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes are signed
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
@@ -248,7 +256,7 @@ class PageWorld:
         )
 
     def plants(self, place: np.ndarray) -> bytes:
-        """Of a vineyard that is too large for a page the part around a ``place`` [3] m, as in :meth:`scene`."""
+        """As :meth:`scene` for the part around ``place`` [3] m of a vineyard that is too large for a page."""
         reach, plants = _nearest(self._lay_out(), place, self._most)
         return array_message.encode({"reach": reach, "place": place.tolist()}, plants)
 
@@ -261,11 +269,11 @@ class PageWorld:
         return self._primitives
 
     def rigid(self) -> bytes:
-        """Robots, people, boxes and picked bunches that there are now."""
+        """Message with the present robots, people, boxes and picked bunches."""
         return self._rigid
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Bodies of the trees that have moved after the tick ``since``, all rigid bodies, and what was picked."""
+        """Message with bodies of trees that moved after tick ``since``, all rigid bodies, and the picked bunches."""
         with self._lock:
             newest = self._snapshot
         if newest is None or self._primitives is None or newest[0] <= since:
@@ -309,7 +317,7 @@ class PageWorld:
         return tick, state
 
     def _follow_visuals(self, primitives: Primitives, snapshot: Snapshot) -> None:
-        """Lay the rigid bodies out for pages, unless only lights have changed: those are part of every state."""
+        """Prepare the rigid bodies for pages, unless only lights have changed, which are part of every state."""
         primitives.update(snapshot)
         before = self._visuals
         self._visuals = snapshot.visuals
@@ -337,7 +345,7 @@ class PageWorld:
         )
 
     def take(self, page: int, said: PageInput) -> None:
-        """Take over where a page looks from and what its person does; only the first page's."""
+        """Use the viewpoint and the person's state from a page's message, only for the first page."""
         (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
         if said.replay is not None and self._replay is not None:
             self._replay.take(said.replay)
@@ -352,20 +360,20 @@ class PageWorld:
                 self._intention = said.person.intention
 
     def leave(self, page: int) -> None:
-        """A page is gone: another one may move the person."""
+        """A page has disconnected, so another one may move the person."""
         self._overlay_pages.discard(page)
         if page == self._driver:
             self._driver = None
 
     def _bodies(self, trees: np.ndarray) -> np.ndarray:
-        """Bodies of some trees, one tree after the other."""
+        """Bodies of ``trees``, tree by tree."""
         model = self._client.model
         first = model.tree_first[trees]
         size = model.tree_size[trees]
         return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum())
 
     def _start_view(self) -> np.ndarray:
-        """Where the page looks from at first: a spectator's eyes, else over the shoulder of the client's own actor."""
+        """First viewpoint of a page: a spectator's eyes, or the view of the client's own actor."""
         client = self._client
         if isinstance(client, Spectator):
             return client.pose
@@ -377,19 +385,19 @@ class PageWorld:
 
 
 def _light(height: float) -> dict[str, Any]:
-    """Light as cameras see it, by the sine of the sun's elevation; linear RGB."""
+    """Light as for cameras, by the sine of the sun's elevation; linear RGB."""
     light = OutdoorLight.of(height)
     colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
     return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
-    """Values from 0 to 1 in bytes."""
+    """Values from 0 to 1 as bytes."""
     return np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
 
 
 def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisual, ...]) -> bool:
-    """Whether two lists of rigid bodies have the same shapes but for the colours of indicator lights."""
+    """Whether two lists of rigid bodies differ only in the colours of indicator lights."""
     return len(before) == len(now) and all(
         one is other
         or (
@@ -404,7 +412,7 @@ def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisu
 
 
 def _tracked(person: TrackedPerson) -> TrackedPoints:
-    """A page's person as its avatar takes it."""
+    """Convert a page's person to tracked points for its avatar."""
     hands = person.left, person.right
     left, right = (None if hand is None else np.array(hand.pose) for hand in hands)
     return TrackedPoints(
@@ -418,8 +426,11 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
 
 
 def _within_reach(model: Model) -> dict[str, np.ndarray]:
-    """What a person may reach for: bodies of wood and their lengths [m]; of each bunch its body, length and radius [m],
-    and the last piece of its stalk."""
+    """Objects that a person can reach for.
+
+    Bodies of wood with their lengths [m], and for each bunch its body, length and radius [m], and the last segment of
+    its peduncle.
+    """
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
     stalk = model.body_parent[model.bunch_body]
     return {
@@ -434,12 +445,12 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:
-    """Quaternions of poses [k, 7] in steps, [k, 4] int16."""
+    """Quaternions of poses [k, 7] as integers [k, 4] int16; :data:`_TURN_STEPS` encodes 1."""
     return np.round(pose[:, 3:] * _TURN_STEPS).astype(np.int16)
 
 
 def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
-    """Values of primitives as a page needs them."""
+    """Values of primitives in the format of pages."""
     columns = primitives.local_columns(rows)
     shape = np.concatenate([columns[name] for name in "abcd"], 1).astype(np.float32)
     colour = np.round(255.0 * np.clip(columns["tint"], 0.0, 1.0) ** (1.0 / 2.2))
@@ -454,9 +465,11 @@ def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.n
 
 
 def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> tuple[float | None, dict[str, np.ndarray]]:
-    """Primitives of the clusters of plants and ground nearest to a ``place`` [3] m, at most ``most``, and the clusters;
-    before them how far from there no berry is missing [m], None: nothing is missing anywhere. :data:`LOADED` says how
-    far other things are loaded."""
+    """The clusters of plants and ground nearest to ``place`` [3] m, with at most ``most`` primitives.
+
+    Returns the distance [m] up to which all berries are included (None: nothing is missing), and the primitives with
+    their clusters. :data:`LOADED` gives the distances of other materials.
+    """
     count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
     clusters = _clusters(primitives, slice(0, count))
     if primitives.plant_count <= most:
@@ -477,7 +490,7 @@ def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> tuple[floa
 
 
 def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:
-    """Clusters as a page needs them: runs of primitives, counted from ``row``, and balls around them in the world."""
+    """Clusters in the format of pages: runs of primitives, counted from ``row``, and their bounding spheres."""
     return {
         "first": (primitives.cluster_first[which] - row).astype(np.uint32),
         "size": primitives.cluster_size[which].astype(np.uint32),
@@ -487,15 +500,15 @@ def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, n
     }
 
 
-# What pages draw over the picture on demand: contact forces, and who owns which tree, bunch or box.
+# Overlays that pages draw on demand: contact forces, and owners of trees, bunches and boxes.
 
 
 MAX_CONTACTS = 300
-"""Contacts of which a page is told, those with the largest forces."""
+"""Largest number of contacts sent to a page; those with the largest forces are sent."""
 
 
 def owners(client: Client) -> dict[str, str]:
-    """Names of the actors that own something now, by the name of the object."""
+    """Names of the owners of all owned objects, by the name of the object."""
     found = {}
     for replicator in client.replicators.values():
         for number in sorted(replicator.known):
@@ -505,7 +518,7 @@ def owners(client: Client) -> dict[str, str]:
 
 
 def contact_arrays(contacts: Sequence[Contact]) -> dict[str, np.ndarray]:
-    """Places [k, 3] m of contacts with plants, and the forces [k, 3] N on the plants there."""
+    """Positions [k, 3] m of contacts with plants, and the forces [k, 3] N on the plants."""
     force = -np.array([contact.force for contact in contacts], np.float32).reshape(-1, 3)
     place = np.array([contact.position for contact in contacts], np.float32).reshape(-1, 3)
     strongest = np.argsort(-np.linalg.norm(force, axis=1), kind="stable")[:MAX_CONTACTS]

@@ -1,4 +1,4 @@
-"""Force on one bunch and its displacement, step by step, on one client: the evidence of a contact."""
+"""Records force on one bunch and its displacement in every step on one client, as evidence of a contact."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ class Trace:
         self.body = int(model.bunch_body[bunch])
         clusters = int(model.bunch_cluster[bunch]) + np.arange(model.bunch_clusters[bunch])
         self.bodies = frozenset([self.body, *clusters.tolist()])
-        """The body of the bunch and those of its berry clusters, which are what a hand touches."""
+        """The bodies of the bunch and of its berry clusters, which hands touch."""
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
-        # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
+        # filled instead of np.zeros, so that all memory pages exist from the start and a run's memory does not grow
         self._clock = np.full(capacity, 0.0)
         self._time = np.full(capacity, 0.0)
         self._force = np.full((capacity, 3), 0.0)
@@ -33,13 +33,14 @@ class Trace:
 
     def _centre(self, pose: np.ndarray) -> np.ndarray:
         x, y, z, w = pose[3:]
-        # the body's x axis, third of a rotation matrix: cheaper in the tick than a general rotation
+        # only the body's x axis, which is cheaper than a general rotation
         axis = np.array([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)])
         return pose[:3] + axis * self._com[0]
 
     def add(self, sim_time: float, pose: np.ndarray, force: np.ndarray, is_remote: bool = False) -> None:
-        """Note the pose [7] after a tick, the force [3] N that acted on the bunch during it, and whether another
-        client owned it, and its states were applied.
+        """Add a row: pose [7] after a tick, and force [3] N on the bunch during the tick.
+
+        ``is_remote``: another client owned the bunch, and its states were applied.
         """
         if self.length == len(self._clock):
             return
@@ -52,7 +53,7 @@ class Trace:
         self.length += 1
 
     def centre(self) -> np.ndarray:
-        """Position of the bunch's centre in the newest row, or at rest [3] m."""
+        """Position [3] m of the bunch's centre in the newest row, or at rest without rows."""
         return self._position[self.length - 1].copy() if self.length else self._rest.copy()
 
     @property
@@ -70,36 +71,36 @@ class Trace:
 
 @dataclasses.dataclass(frozen=True)
 class Rows:
-    """A trace as arrays, one row a step."""
+    """A trace as arrays with one row for each step."""
 
     clock: np.ndarray
-    """[tick] s, the host's monotonic clock: comparable between processes of one host."""
+    """[tick] s, the host's monotonic clock, which is comparable between processes of one host."""
     time: np.ndarray
     """[tick] s, simulation time of the client."""
     displacement: np.ndarray
-    """[tick, 3] m from rest, of the bunch's centre."""
+    """[tick, 3] m, displacement of the bunch's centre from rest."""
     force: np.ndarray
-    """[tick, 3] N on the bunch."""
+    """[tick, 3] N, force on the bunch."""
     is_remote: np.ndarray
-    """[tick] bool: another client owned the bunch, and its states were applied."""
+    """[tick] bool, whether another client owned the bunch and its states were applied."""
 
     def save(self, path: pathlib.Path) -> None:
-        """Write as .npz."""
+        """Write the rows as an .npz file."""
         np.savez_compressed(path, **dataclasses.asdict(self))
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Rows:
-        """Read what :meth:`save` wrote."""
+        """Read a file written by :meth:`save`."""
         with np.load(path) as data:
             return cls(**{field.name: data[field.name] for field in dataclasses.fields(cls)})
 
 
 MOVED = 1e-6
-"""A bunch has moved when its centre is this far from where it was before the touch [m]."""
+"""A bunch has moved when its centre is further than this from its position before the touch [m]."""
 
 
 def touch_to_motion(rows: Rows) -> int | None:
-    """Ticks from the first tick with a force to the first in which the bunch moved; 0 is the same tick.
+    """Number of ticks from the first tick with a force to the first tick with motion; 0 if they are the same tick.
 
     None if it was not touched, or it never moved (D6.4 section 2.1 asks for a direct response; F03).
     """
@@ -113,10 +114,10 @@ def touch_to_motion(rows: Rows) -> int | None:
 
 
 def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[str, float] | None:
-    """How far the remote copy of the bunch was from the owner's, at the same instant of the host's clock [mm].
+    """Distance of the remote copy of a bunch from the owner's bunch at equal times of the host's clock [mm].
 
-    Judged while the owner's bunch was displaced by more than ``threshold`` [m] and the other client received it.
-    The network's delay is in it. None if there is no such time.
+    It is evaluated while the owner's bunch was displaced by more than ``threshold`` [m] and the other client received
+    its states. It includes the delay of the network. None if there is no such time.
     """
     if len(remote.clock) < 2:
         return None
@@ -142,9 +143,9 @@ def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[st
 
 
 def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
-    """Draw force [N] above and displacement [mm] below against the host's clock; one line a client. Writes a PNG.
+    """Plot force [N] and displacement [mm] against the host's clock into a PNG file, with one line for each client.
 
-    Shaded is the time from when a client received the bunch from its owner until it did so for the last time.
+    Shading shows the time from the first to the last state that a client received from the owner of the bunch.
     """
     import matplotlib
 

@@ -1,8 +1,9 @@
-"""Records the messages of a world without changing what is sent in it, unless it is asked for more.
+"""Records the messages of a world, by default without changing what is sent.
 
-What it subscribes to is explained in ``docs/decisions/recording.md``. Of the environment: everything, because a client
-publishes that only when another *actor* is near, and a recorder is none. Poses at the full rate: only while an actor
-receives them, which the recorder knows from a publisher on the same key, that matches and never sends.
+``docs/decisions/recording.md`` explains the subscriptions. The recorder subscribes to all messages about the
+environment; a client sends these only when another *actor* is near, and a recorder is not an actor. It subscribes to
+poses at the full rate only while an actor receives them. It knows this from a publisher on the same key, which never
+sends but reports whether there is a subscriber.
 """
 
 from __future__ import annotations
@@ -35,17 +36,17 @@ CHOICES = tuple(dict.fromkeys(family.recorded_with for family in FAMILIES.values
 """Choices of ``--only``. Presence and hellos are always recorded."""
 
 OBSERVER_SPACING = 7.0
-"""Distance between observers in an area [m]: every point between is within 5 m of one, the interest radius."""
+"""Distance between observers in an area [m]. Every point is then within the interest radius (5 m) of an observer."""
 
 MAX_OBSERVERS = 16
-"""Observers in one area."""
+"""Largest number of observers in one area."""
 
 COMPANY_MARGIN = 1.0
-"""An actor this much beyond the distance where the full rate ends does not count as a subscriber [m]."""
+"""Actors may subscribe up to this distance beyond the end of the full rate [m]; actors further away do not count."""
 
 
 class AreaTooLarge(ValueError):
-    """The area cannot be observed; the text says which can."""
+    """The area is too large to be observed; the message gives the largest one."""
 
 
 class Recorder:
@@ -61,15 +62,15 @@ class Recorder:
         digest: str = "",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``everything``: record each actor at its full rate even if no actor receives it; that changes what is sent.
+        """``everything``: record each actor at its full rate even if no actor receives it, which changes what is sent.
 
-        ``digest``: of the scene to record; without one that of the first actor. ``clock``: own clock [s].
+        ``digest``: digest of the scene to record; by default that of the first actor. ``clock``: the own clock [s].
         """
         self.bus = bus
         self.recording = recording
         self.digest = digest
         self.observers: set[str] = set()
-        """Names of the own observers: they are no part of the recording."""
+        """Names of the own observers, which are not recorded."""
         self.greetings: dict[str, Hello] = {}
         """Hellos of the actors, by name."""
         self.malformed = 0
@@ -86,7 +87,8 @@ class Recorder:
         self._positions: dict[str, np.ndarray] = {}
         self._far_poses: Subscription | None = None
         self._faster: dict[tuple[str, PoseLayer], tuple[Publisher, Subscription | None]] = {}
-        """Faster layers of the poses of each actor: a publisher that shows whether they are received."""
+        """By actor and faster pose layer: a publisher that reports whether the layer has subscribers, and the own
+        subscription."""
         self._log_time = 0
 
     @property
@@ -137,7 +139,7 @@ class Recorder:
         self.recording.put(self._log_time, key, payload)
 
     def _poll_liveliness(self, now: float) -> None:
-        """Record who joined and left, and query actors whose hello is missing."""
+        """Record which actors joined and left, and query actors whose hello is missing."""
         alive = self.bus.alive() - self.observers - {self.bus.name}
         for name in sorted(self._live - alive):
             self._live.discard(name)
@@ -168,7 +170,7 @@ class Recorder:
                 self.malformed += 1
 
     def _admit(self, name: str, payload: bytes) -> None:
-        """Record the hello of an actor; one of another scene is ignored, as other actors ignore it."""
+        """Record the hello of an actor. An actor of another scene is ignored, as by all actors."""
         try:
             hello = decode_hello(payload)
         except WrongVersion as error:
@@ -208,7 +210,7 @@ class Recorder:
     # ------------------------------------------------------------ who is heard by whom
 
     def _update_pose_subscriptions(self) -> None:
-        """Subscribe to the poses that another actor receives: slow ones of all, fast ones of those with company."""
+        """Subscribe to poses that another actor receives: slow layers of all, fast layers of actors with company."""
         has_company = self._everything or len(self._live) >= 2
         if has_company and self._far_poses is None:
             self._far_poses = self.bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_ALL)
@@ -237,7 +239,7 @@ class Recorder:
     def _has_company(self, name: str, layer: PoseLayer) -> bool:
         """Whether another actor may be the subscriber of a layer.
 
-        If not, it is a recorder, and two of them would never end.
+        Otherwise the subscriber is a recorder, and two recorders would keep each other subscribed for ever.
         """
         if name not in self._positions:
             return False
@@ -248,8 +250,10 @@ class Recorder:
 
 
 def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, float]]:
-    """Positions of observers [m] so that every point of an area (x0, y0, x1, y1) [m] is within 5 m of one;
-    :class:`AreaTooLarge`."""
+    """Positions of observers [m] such that every point of an area (x0, y0, x1, y1) [m] is within 5 m of one.
+
+    Raises :class:`AreaTooLarge`.
+    """
     x0, y0, x1, y1 = area
     if not (all(map(math.isfinite, area)) and x0 < x1 and y0 < y1):
         raise AreaTooLarge(f"area {x0:g} {y0:g} {x1:g} {y1:g}: give X0 Y0 X1 Y1 [m] with X0 < X1 and Y0 < Y1")
@@ -268,10 +272,10 @@ def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, 
 
 
 class Observer:
-    """A spectator without a simulation: it is only present, so that actors publish what happens around it."""
+    """A spectator without a simulation. Its presence makes actors publish what happens around it."""
 
     def __init__(self, bus: Bus, place: tuple[float, float], scene: str, digest: str, now: float) -> None:
-        """At ``place`` [m], through a live bus of its own, from own time ``now`` [s] on."""
+        """Join at ``place`` [m] through its own live bus; ``now``: time of the own clock [s]."""
         self.bus = bus
         hello = encode_hello(Hello(bus.name, kind="spectator", scene=scene, digest=digest, joints=0))
         bus.join(hello)

@@ -1,4 +1,4 @@
-"""Replays a recording: on a bus of its own, or on a network, by actors of the recorded names.
+"""Replays a recording, either on its own bus or on a network, where actors with the recorded names appear.
 
     recording = read_recording(path)
     bus = ReplayBus(recording, "viewer")
@@ -7,8 +7,8 @@
         bus.play(0.01)
         client.tick()
 
-On the bus, network time is the time of the recording and advances only by :meth:`ReplayBus.play`: a client receives the
-same in the same step, every time. On a network, messages get new time stamps, as if they had just been sampled.
+On the bus, network time is the time of the recording and advances only by :meth:`ReplayBus.play`. So a client receives
+the same messages in the same step in every replay. On a network, messages get new time stamps, as if they were new.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ from vinesim.net.transport.bus import KEEP_LAST_1, Bus, NameTaken, Publisher, Re
 log = logging.getLogger(__name__)
 
 MAX_REPLY = 4096
-"""A reply with retained records is split beyond this size [B]."""
+"""Largest size of a reply with retained records [B]; larger replies are split."""
 
 
 class Playhead:
-    """A position in a recording, with the actors and the retained state at that time."""
+    """A position in a recording, with the actors and the retained state at that position."""
 
     def __init__(self, recording: Recording, start: float = 0.0, end: float | None = None) -> None:
         """From ``start`` to ``end`` [s] after the first message, with the retained state at ``start``."""
@@ -54,7 +54,7 @@ class Playhead:
         self.live: set[str] = set()
         """Names of the actors that are present."""
         self.greetings: dict[str, bytes] = {}
-        """Encoded hello of each actor, even before it was recorded: the recorder had to query it."""
+        """Encoded hello of each actor, also before the time at which it was recorded, because it had to be queried."""
         self.records = RetainedState()
         """The retained state."""
         for entry in reversed(recording.messages):
@@ -82,7 +82,7 @@ class Playhead:
         return self.recording.messages[first : self._next]
 
     def _load_initial_records(self) -> None:
-        """The server's state when the recording began: its replies without records that were published later."""
+        """Load the server's state at the beginning of the recording: its replies without records published later."""
         said = {
             record
             for entry in self.recording.messages
@@ -129,7 +129,7 @@ def _cell(key: str) -> tuple[int, int] | None:
 
 
 class ReplayBus:
-    """A member of a recorded world; see :class:`vinesim.net.transport.bus.Bus`. What it publishes is discarded."""
+    """A bus in a recorded world, see :class:`vinesim.net.transport.bus.Bus`. Published messages are discarded."""
 
     bytes_out = failures = foreign = 0
     status_message = ""
@@ -137,7 +137,7 @@ class ReplayBus:
     def __init__(
         self, recording: Recording, name: str = "viewer", *, start: float = 0.0, end: float | None = None
     ) -> None:
-        """``start``, ``end`` [s] after the first message; :class:`NameTaken` if a recorded actor has the name."""
+        """``start``, ``end``: [s] after the first message. :class:`NameTaken` if a recorded actor has ``name``."""
         if name in recording.actors:
             raise NameTaken(name, str(recording.path))
         self.name = name
@@ -201,7 +201,7 @@ class ReplayBus:
             self._reply(key, self._playhead.greetings[rest])
         elif family == "snap":
             records = self._playhead.records
-            asked = _cell(key)  # of one cell even that there is nothing is an answer
+            asked = _cell(key)  # for a single cell, an empty state is also a reply
             cells = {cell for cell, _ in records if matches(key, f"snap/{cell[0]}/{cell[1]}")}
             for x, y in sorted(cells if asked is None else {asked}):
                 for part in _split_records(records.in_cell((x, y))):
@@ -237,7 +237,7 @@ class ReplayBus:
 
 
 class _Subscription:
-    """See :class:`vinesim.net.transport.bus.Subscription`."""
+    """Subscription on a :class:`ReplayBus`, see :class:`vinesim.net.transport.bus.Subscription`."""
 
     def __init__(self, among: list[_Subscription], pattern: str, depth: int) -> None:
         self.pattern = pattern
@@ -250,7 +250,7 @@ class _Subscription:
 
 
 class _NullPublisher:
-    """See :class:`vinesim.net.transport.bus.Publisher`."""
+    """Publisher that discards all messages, see :class:`vinesim.net.transport.bus.Publisher`."""
 
     matching = False
 
@@ -280,7 +280,7 @@ def _split_records(records: list[RetainedRecord]) -> Iterable[list[RetainedRecor
 
 
 class Replay:
-    """Replays a recording to a network; each actor has a live bus of its own. Call :meth:`step` often."""
+    """Replays a recording to a network; each actor has its own live bus. Call :meth:`step` often."""
 
     def __init__(
         self,
@@ -293,11 +293,21 @@ class Replay:
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
-        """``bus`` is not live: it queries the clock. ``live_bus(name)`` opens the bus of an actor, also of an absent
-        one while its retained records are published. ``now`` is any clock [s], as in :meth:`step`."""
+        """Prepare a replay.
+
+        Args:
+            recording: the recording.
+            bus: a bus that is not live, to query the network clock.
+            live_bus: function that opens the bus of the actor of this name, also of an absent actor while its retained
+                records are published.
+            now: time of any clock [s], the same as in :meth:`step`.
+            speed: speed of playing relative to real time.
+            start: beginning [s] after the first message.
+            end: end [s] after the first message; None: end of the recording.
+        """
         self.playhead = Playhead(recording, start, end)
         self.sent = 0
-        """Messages that had a subscriber."""
+        """Number of messages that had a subscriber."""
         self._bus = bus
         self._live_bus = live_bus
         self._speed = speed
@@ -334,7 +344,7 @@ class Replay:
             self._begun, self._begun_at = now, self._network_clock.time
         entries = self.playhead.play(self._start + (now - self._begun) * self._speed)
         self._update_actors()
-        if self._buses:  # what was true before is said once there is a world and a server that keeps it
+        if self._buses:  # earlier retained records are sent once there is a world with a server that keeps them
             self._initial_messages = [
                 (key, payload) for key, payload in self._initial_messages if not self._publish(key, payload)
             ]
@@ -354,7 +364,7 @@ class Replay:
         self._close_absent(set(self._absent))
 
     def _update_actors(self) -> None:
-        """Let actors join and leave."""
+        """Let actors join and leave as recorded."""
         for name in sorted(self._buses.keys() - self.playhead.live):
             self._buses.pop(name).close()
             self._publishers = {k: p for k, p in self._publishers.items() if sender_of(k) != name}
@@ -369,7 +379,7 @@ class Replay:
                     self._publishers[key] = bus.publisher(key, family_of(key).is_reliable)
 
     def _publish(self, key: str, payload: bytes) -> bool:
-        """Whether there was a subscriber."""
+        """Publish a message. Returns whether it had a subscriber."""
         if key not in self._publishers:
             name = sender_of(key)
             bus = self._buses.get(name) or self._absent.get(name) or self._join_absent(name)
@@ -379,7 +389,7 @@ class Replay:
         return was_sent
 
     def _join_absent(self, name: str) -> Bus:
-        """Join with the name of an actor that is not present, for records count only from who has joined."""
+        """Join as an actor that is not present, because the server accepts records only from joined actors."""
         bus = self._absent[name] = self._live_bus(name)
         greeting = self.playhead.greetings.get(name)
         if greeting is None:

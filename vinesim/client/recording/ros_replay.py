@@ -1,4 +1,4 @@
-"""A replayed world as ROS topics: what a spectator of it has after every step."""
+"""A replayed world as ROS topics: publishes the state of a spectator after every step."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from vinesim.ros.world_node import WorldNode
 from vinesim.scene.ids import Organ
 
 ENVIRONMENT_PERIOD = 0.1
-"""Of true poses [s]."""
+"""Period of the true poses of the environment [s]."""
 
 
 class RosReplay:
-    """Publishes after every step of a client; ``time`` gives that of the recording [s]."""
+    """Publishes after every step of a client; ``time()`` gives the time of the recording [s]."""
 
     def __init__(self, client: Client, node: WorldNode, time: Callable[[], float]) -> None:
         self._node = node

@@ -1,4 +1,4 @@
-"""A digest of all states that a client has stepped through: equal digests mean equal runs, to the bit."""
+"""A digest of all states of a client's run. Equal digests mean runs that are equal to the bit."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from vinesim.client.client import Client
 
 
 class StateDigest:
-    """Joints of plants and of rigid bodies after every step; call it after each."""
+    """Digest of the joints of plants and rigid bodies. Call it after every step."""
 
     def __init__(self) -> None:
         self._digest = hashlib.blake2b(digest_size=16)

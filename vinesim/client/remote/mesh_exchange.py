@@ -1,8 +1,8 @@
-"""Meshes of robots between clients, through the server: offers those of local robots, fetches those of remote ones.
+"""Exchanges meshes of robots through the server: offers the meshes of local robots, fetches those of remote robots.
 
-All of it happens in a thread of its own, over queries of the bus, never in a tick. A mesh is asked for by its digest
-and believed only if it has that digest; it goes into the cache on disk, so that it crosses the network once. The name
-that a URDF of another client gives to a mesh is never used.
+It runs in its own thread, with queries on the bus, never in a tick. A mesh is requested by its digest and accepted only
+with this digest. It is stored in the disk cache, so it is transferred only once. File names of meshes in a URDF of
+another client are never used.
 """
 
 from __future__ import annotations
@@ -34,20 +34,20 @@ from vinesim.scene import triangles
 log = logging.getLogger(__name__)
 
 RETRY_PERIOD = 1.0
-"""Time between two rounds of questions for what is missing [s]; doubled after each round that brings nothing."""
+"""Time between two rounds of requests for missing meshes [s]; it doubles after each round without success."""
 
 MAX_RETRY_PERIOD = 32.0
-"""Its limit [s]."""
+"""Largest time between two rounds of requests [s]."""
 
 MAX_HELD_BYTES = 256 << 20
-"""Size of the received meshes of all robots that are here [B]; further ones stay boxes."""
+"""Largest total size of received meshes of all present robots [B]; boxes replace further meshes."""
 
 CACHE_NAME = "mesh"
-"""First part of the name of a received mesh in the cache on disk."""
+"""First part of the name of a received mesh in the disk cache."""
 
 
 class _Missing(Exception):
-    """The server has no mesh of this digest now, or does not answer."""
+    """The server has no mesh with this digest, or does not answer."""
 
 
 class _RobotMeshes:
@@ -55,14 +55,15 @@ class _RobotMeshes:
 
     def __init__(self, urdf: str) -> None:
         self.urdf: str | None = urdf
-        """None when :attr:`missing` is known."""
+        """URDF text; None after :attr:`missing` was read from it."""
         self.missing: set[str] = set()
         self.received: dict[str, np.ndarray] = {}
         self.retry_period = RETRY_PERIOD
+        """Time from one round of requests to the next [s]."""
         self.retry_at = 0.0
-        """Time from one round to the next [s], and when that is due (monotonic clock)."""
+        """Time of the next round [s, monotonic clock]."""
         self.is_changed = False
-        """Meshes were received that :meth:`MeshExchange.changed` has not reported."""
+        """Whether meshes were received that :meth:`MeshExchange.changed` has not reported yet."""
 
 
 class MeshExchange:
@@ -70,16 +71,16 @@ class MeshExchange:
 
     def __init__(self) -> None:
         self.bus: Bus | None = None
-        """Over which meshes are fetched; nothing is fetched without it, nor without a server."""
+        """Bus for fetching meshes; nothing is fetched without a bus or without a server."""
         self.received_count = 0
-        """Meshes of other clients that were received, from the network or from the cache."""
+        """Number of meshes of other clients that were received, from the network or from the cache."""
         self.refused_count = 0
-        """... that had another digest or were no triangles; boxes stay in their place."""
+        """Number of meshes of other clients refused for a wrong digest or invalid triangles; boxes replace them."""
         self.refused_offers = 0
-        """Own meshes that the server did not take."""
+        """Number of own meshes that the server did not accept."""
         self._offers: list[tuple[Bus, str]] = []
         self._offered: dict[int, int] = {}
-        """By index in :attr:`_offers`: the admission since which the server has them."""
+        """By index in :attr:`_offers`: number of the admission at the server since which it has the meshes."""
         self._robots: dict[str, _RobotMeshes] = {}
         self._changed: collections.deque[str] = collections.deque()
         self._refused: set[str] = set()
@@ -91,7 +92,7 @@ class MeshExchange:
     # ------------------------------------------------------------ called by the loop
 
     def offer(self, bus: Bus, urdf: str) -> None:
-        """Let the server keep the meshes of a local robot, whose actor is on this ``bus``."""
+        """Offer the server the meshes of a local robot, whose actor uses ``bus``."""
         if "digest=" in urdf:
             self._offers.append((bus, urdf))
             self._start()
@@ -104,25 +105,25 @@ class MeshExchange:
             self._start()
 
     def forget(self, name: str) -> None:
-        """A remote robot has left."""
+        """Forget a remote robot that has left."""
         with self._lock:
             self._robots.pop(name, None)
 
     def changed(self) -> list[str]:
-        """Robots of which meshes have arrived since the last call, as many of them as the server has."""
+        """Robots that have received, since the last call, all their meshes that the server has."""
         names = []
         while self._changed:
             names.append(self._changed.popleft())
         return names
 
     def received(self, name: str) -> Mapping[str, np.ndarray]:
-        """Corners [face, 3, 3] m of all meshes of a robot that have arrived, by digest; any thread may ask."""
+        """Corners [face, 3, 3] m of the received meshes of a robot, by digest. Safe from any thread."""
         with self._lock:
             robot = self._robots.get(name)
             return {} if robot is None else dict(robot.received)
 
     def refuse(self, name: str) -> None:
-        """The received meshes of a robot cannot be used: count them, and keep boxes from now on."""
+        """Count the received meshes of a robot as unusable, and use boxes from now on."""
         with self._lock:
             robot = self._robots.get(name)
             if robot is not None:
@@ -131,7 +132,7 @@ class MeshExchange:
                 robot.missing.clear()
 
     def close(self) -> None:
-        """End the thread; a question under way is given up. Idempotent."""
+        """End the thread; a running request is abandoned. Idempotent."""
         self._closing.set()
         self._wakeup.set()
 
@@ -149,19 +150,19 @@ class MeshExchange:
             try:
                 self._offer_all()
                 self._fetch_all()
-            except Exception:  # meshes are not worth the client
+            except Exception:  # failures with meshes must not end the client
                 log.exception("an error in the exchange of meshes; tried again")
             self._wakeup.wait(RETRY_PERIOD)
 
     def _offer_all(self) -> None:
-        """Offer the meshes of robots that the server, or one that took its place, does not have yet."""
+        """Offer the meshes of robots that the present server does not have yet."""
         for i, (bus, urdf) in enumerate(list(self._offers)):
             admissions = bus.admissions
             if admissions and self._offered.get(i) != admissions and self._offer_robot(bus, urdf):
                 self._offered[i] = admissions
 
     def _offer_robot(self, bus: Bus, urdf: str) -> bool:
-        """Offer the meshes of one robot; whether the server answered."""
+        """Offer the meshes of one robot. Returns whether the server answered."""
         for digest, mesh in list_meshes(urdf).items():
             wanted = _ask(bus, MeshPart(digest, mesh.size))
             if wanted is None:
@@ -169,7 +170,7 @@ class MeshExchange:
             if not wanted.refused and wanted.offset < mesh.size:
                 try:
                     payload = triangles.encode_triangles(read_triangles(mesh.file))
-                except Exception as error:  # each format has errors of its own
+                except Exception as error:  # each mesh format raises its own errors
                     log.warning("mesh %s cannot be offered to others any more: %s", mesh.file, error)
                     self.refused_offers += 1
                     continue
@@ -184,8 +185,11 @@ class MeshExchange:
         return True
 
     def _fetch_all(self) -> None:
-        """One round of questions for what is missing. A robot is reported when all of its meshes that the server has
-        are there, so that it is compiled as few times as possible."""
+        """One round of requests for missing meshes.
+
+        A robot is reported when all its meshes on the server have arrived, so that it is compiled as rarely as
+        possible.
+        """
         bus = self.bus
         if bus is None or not bus.admissions:
             return
@@ -210,7 +214,7 @@ class MeshExchange:
                 self._changed.append(name)
 
     def _receive(self, bus: Bus, robot: _RobotMeshes, digest: str) -> bool:
-        """Get one mesh from another robot, the cache or the server; whether it came."""
+        """Get one mesh from another robot, the cache or the server. Returns whether it was received."""
         with self._lock:
             known = next((one.received[digest] for one in self._robots.values() if digest in one.received), None)
             held = sum(corners.nbytes for one in self._robots.values() for corners in one.received.values())
@@ -232,9 +236,9 @@ class MeshExchange:
         return True
 
     def _load(self, bus: Bus, digest: str) -> np.ndarray:
-        """Corners [face, 3, 3] m of a mesh, from the cache on disk or from the server."""
+        """Corners [face, 3, 3] m of a mesh, from the disk cache or from the server."""
         cached = (disk_cache.load(CACHE_NAME, digest) or {}).get("corners")
-        if cached is not None and triangles.digest_of(cached.tobytes()) == digest:  # else another program wrote it
+        if cached is not None and triangles.digest_of(cached.tobytes()) == digest:  # otherwise another program wrote it
             return triangles.decode_triangles(cached.tobytes())
         corners = triangles.decode_triangles(_fetch(bus, digest, self._closing.is_set))
         disk_cache.keep(CACHE_NAME, digest, {"corners": corners})
@@ -252,7 +256,10 @@ def _ask(bus: Bus, part: MeshPart) -> MeshWanted | None:
 
 
 def _fetch(bus: Bus, digest: str, is_closing: Callable[[], bool]) -> bytes:
-    """A mesh from the server, part by part; :class:`_Missing`, or :class:`MessageError` if it has another digest."""
+    """Fetch a mesh from the server, part by part.
+
+    Raises :class:`_Missing`, or :class:`MessageError` if the mesh has another digest.
+    """
     arrived = bytearray()
     size = 1
     while len(arrived) < size:

@@ -1,7 +1,7 @@
-"""Boxes, free bunches and cut branches that several clients share: remote states applied, local changes collected.
+"""Boxes, free bunches and cut branches shared by several clients: applies remote states and collects local changes.
 
-Objects that a remote actor moves are blended towards its states. An object at rest by a retained record is held in the
-frame of what it rests on, wherever that moves, unless an actor of this client moves it.
+Objects moved by a remote actor are blended towards its states. An object with a retained record of rest is held in the
+frame of its support, even if the support moves, unless an actor of this client moves the object.
 """
 
 from __future__ import annotations
@@ -24,47 +24,46 @@ from vinesim.world import Physics
 BLEND_PER_STEP = 0.2
 """Share of the difference to its owner's state by which a copy is corrected in one step."""
 TOUCHED_BLEND_PER_STEP = 0.05
-"""The same of a copy that an actor touches here, of this client or the copy of another's: corrections must not pull the
-copy through the hand. TUNED."""
+"""``BLEND_PER_STEP`` for a copy that any actor touches here, because corrections must not pull the copy through a hand.
+TUNED."""
 FAR_ANGLE = 0.1
-"""Difference of a joint [rad] from which a touched copy is corrected as fast as any other, and between in proportion:
-one of the two has slipped off. TUNED."""
+"""Joint error [rad] from which a touched copy is corrected as fast as other copies, because one of the two bodies has
+slipped off. Below it the share is interpolated. TUNED."""
 ACTIVATION_PERIOD = 20
 """Ticks between two activations of dormant bunches."""
 CARRIED_DISTANCE = 3.0
-"""The record of what rests on an actor is published again when it was carried so far [m]: half a cell, so that those
-who come later receive it from the cells around them."""
+"""The record of an object that rests on an actor is published again after this distance [m]. It is half a cell, so
+that clients that join later receive the record from the cells around them."""
 ACTIVATION_BATCH = 4
-"""Dormant bunches that get bodies at once: making one takes milliseconds."""
+"""Largest number of dormant bunches that get bodies at once; making a body takes milliseconds."""
 
 
 class ObjectSync:
-    """The state of shared objects, and of changes to trees, that one client knows; numbers are ids of :mod:`ids`."""
+    """One client's state of shared objects and of changes to trees. Numbers are ids of :mod:`vinesim.scene.ids`."""
 
     def __init__(
         self, physics: Physics, local_actors: Collection[str], is_present: Callable[[str], bool] = lambda _: True
     ) -> None:
-        """``local_actors``: the names of all actors that this client simulates; ``is_present(name)``: whether another
-        actor is in the world now."""
+        """``local_actors``: names of this client's actors; ``is_present(name)``: whether another actor is present."""
         self.physics = physics
         self._local_actors = local_actors
         self._is_present = is_present
         self._remote_updates: dict[int, ObjectUpdate] = {}
-        """Objects that remote actors move now."""
+        """Last states of the objects that remote actors are moving."""
         self._resting: dict[int, RetainedRecord] = {}
-        """Objects at rest by a retained record."""
+        """Objects at rest according to a retained record."""
         self._supported: dict[str, set[int]] = {}
-        """Objects at rest on each parent frame but the ground."""
+        """Objects at rest on each parent frame except the ground."""
         self._changed_trees: set[int] = set()
-        """Trees that picks or cuts have changed."""
+        """Trees changed by picks or cuts."""
         self._cut_bodies: dict[int, list[int]] = {}
-        """Bodies that were cut off each tree, in rising order."""
+        """Bodies that were cut off each tree, ascending."""
         self._detachments: tuple[Detachment, ...] = ()
 
     # ------------------------------------------------------------------ received
 
     def receive(self, inbox: Inbox) -> None:
-        """Apply everything that the network brought; once before every step."""
+        """Before every step: apply everything received from the network."""
         tracker = self.physics.support_tracker
         self.physics.remotely_posed = self.physics.remotely_posed[:0]
         self._apply_records(inbox.records)
@@ -82,7 +81,7 @@ class ObjectSync:
         self._activate_dormant_bunches()
 
     def _apply_records(self, records: Iterable[tuple[RetainedRecord, bool]]) -> None:
-        """Apply retained records, many at once after joining late; the pose in a record counts only if it ``holds``."""
+        """Apply retained records (many at once after joining late), each with whether its pose still ``holds``."""
         newest: dict[int, tuple[RetainedRecord, bool]] = {}  # several local actors receive the same records
         for record, holds in records:
             if is_tree(record.object):
@@ -111,7 +110,7 @@ class ObjectSync:
             )
 
     def _apply_object_record(self, record: RetainedRecord, holds: bool) -> bool:
-        """Put a box or a bunch where a record says; True if it is a bunch that has no body here and needs none yet."""
+        """Move a box or a bunch to the pose in a record. Returns True for a bunch that needs no body here yet."""
         number = record.object
         kind, bunch = split_object_id(number)
         bodiless = kind == ObjectKind.BUNCH and number not in self.physics.support_tracker
@@ -129,8 +128,10 @@ class ObjectSync:
         return bodiless
 
     def _let_fall(self, record: RetainedRecord, *, is_known: bool) -> None:
-        """Let a box or a bunch move from where a record says; one with a body stays where it is if that ``is_known``
-        better than from the record."""
+        """Let a box or a bunch move freely from the pose in a record.
+
+        ``is_known``: the present pose of its body is more exact than the record, so the body stays there.
+        """
         number = record.object
         tracker = self.physics.support_tracker
         self._clear_resting(number)
@@ -143,9 +144,9 @@ class ObjectSync:
         tracker.set_moving([number])
 
     def carrier_left(self, name: str) -> None:
-        """An actor has left: what rested on it and has no body here gets one, and falls when the actor's copy is gone.
+        """Give bodies to the objects that rested on an actor that has left. They fall when the actor's copy is removed.
 
-        To be called while the copy is still there.
+        Call it while the copy still exists.
         """
         for parent in [parent for parent in self._supported if _carrier(parent) == name]:
             has_frame = self.physics.support_tracker.support_state(parent) is not None
@@ -160,14 +161,14 @@ class ObjectSync:
                 self.apply_remote_cut(body)
 
     def _apply_tree_record(self, record: RetainedRecord) -> list[TreeUpdate]:
-        """Take over the state of a tree that a record has; that state if the tree rests in it."""
+        """Apply the state of a tree in a record. Returns that state if the tree rests in it."""
         self._changed_trees.add(record.object)
         (update,) = decode_trees(record.trees, self.physics.model.tree_size).updates(record.author)
         self.blend_tree(update, 1.0)
         return [] if record.moving else [update]
 
     def _activate_dormant_bunches(self) -> None:
-        """Give dormant bunches near an actor their bodies, a few at a time."""
+        """Give bodies to dormant bunches near an actor, a few at a time."""
         dormant = self.physics.dormant_bunches
         if len(dormant) and self.physics.tick % ACTIVATION_PERIOD == 0:
             rigid = self.physics.rigid
@@ -193,7 +194,7 @@ class ObjectSync:
             self._changed_trees.add(self._tree_of(bunch))
 
     def _hold_resting_objects(self) -> None:
-        """Move objects with the remote frames that they rest in; put back those that only remote copies have pushed."""
+        """Move resting objects with their remote supports, and put back objects that only remote copies have pushed."""
         if not self._resting:
             return
         moving = set(self.physics.support_tracker.moving)
@@ -211,27 +212,27 @@ class ObjectSync:
                 self._place_on_support(sorted(objects))
 
     def _set_resting(self, number: int, record: RetainedRecord) -> None:
-        """From now on an object rests where a record says."""
+        """Set an object at rest at the pose in a record."""
         self._clear_resting(number)
         self._resting[number] = record
         if record.parent != GROUND:
             self._supported.setdefault(record.parent, set()).add(number)
 
     def _clear_resting(self, number: int) -> None:
-        """An object does not rest by a record any more."""
+        """Forget the record of rest of an object."""
         record = self._resting.pop(number, None)
         if record is not None and record.parent != GROUND:
             self._supported[record.parent].discard(number)
 
     def _is_moved_remotely(self, parent: str) -> bool:
-        """Whether a remote actor moves a parent frame, itself or by what it rests on."""
+        """Whether a remote actor moves a parent frame directly or through the support of the frame."""
         boxes, base = self._supports(parent)
         if any(box in self._remote_updates for box in boxes):
             return True
         return base != GROUND and _carrier(base) not in self._local_actors
 
     def _place_on_support(self, numbers: list[int]) -> None:
-        """Put objects of one parent, as far as they have bodies, where they rest in its frame."""
+        """Put the objects of one parent that have bodies at their poses of rest in its frame."""
         tracker = self.physics.support_tracker
         numbers = [number for number in numbers if number in tracker]
         if not numbers:
@@ -243,20 +244,22 @@ class ObjectSync:
             tracker.set_states(numbers, *there)
             for number, pose in zip(numbers, relative, strict=True):
                 tracker.set_at_rest(number, parent, pose)
-        elif self._is_present(_carrier(parent)):  # it has no body here yet
+        elif self._is_present(_carrier(parent)):  # the carrier has no body here yet
             for number in numbers:
                 if (place := self._resting[number].place) is not None:
                     tracker.set_state(number, np.array(place), np.zeros(6))
                     tracker.set_at_rest(number, GROUND, np.array(place))
 
     def touched_blend(self, update: TreeUpdate) -> float:
-        """Share for :meth:`blend_tree` of a tree that an actor of this client touches."""
+        """Share for :meth:`blend_tree` for a tree that an actor of this client touches."""
         here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
         return touched_share(float(dead_reckoning.angle_between(here, update.joint_q).max()))
 
     def blend_tree(self, update: TreeUpdate, blend: float, rate_blend: float = 1.0) -> None:
-        """Move a tree, and what was cut off it, towards its owner's state by the share ``blend`` (0 to 1), its rates
-        by ``rate_blend``."""
+        """Move a tree, including parts cut off it, towards its owner's state by the share ``blend`` (0 to 1).
+
+        Rates are blended by the share ``rate_blend``.
+        """
         plants = self.physics.plants
         state = self.physics.state
         first = int(self.physics.model.tree_first[update.tree])
@@ -273,7 +276,7 @@ class ObjectSync:
     # ------------------------------------------------------------------ to send
 
     def collect(self) -> None:
-        """After the step: note detachments and update what moves."""
+        """After the step: record detachments and update the set of moving objects."""
         self.physics.support_tracker.update()
         self._detachments = self.physics.detachments
         for detachment in self._detachments:
@@ -282,13 +285,13 @@ class ObjectSync:
                 self._record_cut(detachment.body)
 
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
-        """Objects that actor ``name`` detached in the last step; and those of no local actor if ``all_others``."""
+        """Objects that actor ``name`` detached in the last step; with ``all_others`` also those of no local actor."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
         numbers = [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
         return [number for number in numbers if is_tree(number) or number in self.physics.support_tracker]
 
     def forget(self, number: int) -> None:
-        """A box or free bunch has left the world."""
+        """Forget a box or free bunch that was removed from the world."""
         self._clear_resting(number)
         self._remote_updates.pop(number, None)
 
@@ -298,7 +301,7 @@ class ObjectSync:
         return [*detached, *trees]
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
-        """All that moves and that a local actor touches, itself or by an object of ``mine``, or that slips off it."""
+        """Moving objects that a local actor touches, directly or through an object of ``mine``, or that slip off it."""
         tracker = self.physics.support_tracker
         touched = self.physics.touched
         found: set[int] = set()
@@ -315,7 +318,7 @@ class ObjectSync:
         return sorted(found)
 
     def _supporting_actor(self, number: int) -> str:
-        """The actor whose link an object rests on, or who put down the box that it rests in; empty on the ground."""
+        """Actor whose link supports an object, or who put down the box that contains it; empty on the ground."""
         record = self._resting.get(number)
         if record is None or record.parent == GROUND:
             return ""
@@ -326,10 +329,10 @@ class ObjectSync:
         return resting[-1] if resting else ""
 
     def _supports(self, parent: str) -> tuple[list[int], str]:
-        """The boxes that ``parent`` is or rests in, one in the other, and the frame below them that is no box.
+        """The chain of nested boxes from ``parent`` on, and the frame below the last box.
 
-        That is :data:`GROUND` if a box does not rest by a record, or rests in itself by way of others: records of
-        several authors may say so.
+        This frame is :data:`GROUND` if a box has no record of rest, or if the records form a cycle, which is possible
+        with several authors.
         """
         boxes: list[int] = []
         while (box := parse_object_name(parent)) is not None and box not in boxes:
@@ -341,11 +344,11 @@ class ObjectSync:
 
     @property
     def moving(self) -> list[int]:
-        """All that moves: trees that are not asleep, and objects that do not rest in their parent's frame."""
+        """Everything that moves: awake trees, and objects that are not at rest in their parent's frame."""
         return [*self.physics.sleep_monitor.restless.tolist(), *self.physics.support_tracker.moving]
 
     def read_state(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """State of an object, as :meth:`Replicator.send` takes it."""
+        """State of an object for :meth:`Replicator.send`."""
         if not is_tree(number):
             return self.physics.support_tracker.object_state(number)
         here = self.physics.model.bodies_of(number)
@@ -353,7 +356,7 @@ class ObjectSync:
         return state.joint_q[here], state.joint_qd[here]
 
     def cut_roots(self, tree: int) -> DetachedRoots:
-        """Bodies that were cut off a tree, as :meth:`Replicator.send` takes them."""
+        """Bodies that were cut off a tree, for :meth:`Replicator.send`."""
         bodies = self._cut_bodies.get(tree)
         if not bodies:
             return NO_ROOTS
@@ -366,7 +369,7 @@ class ObjectSync:
         return tree in self._changed_trees
 
     def supported_by(self, name: str) -> list[int]:
-        """Objects with a body here that rest, by their records, on the links of an actor."""
+        """Objects with bodies that rest on the links of an actor according to their records."""
         tracker = self.physics.support_tracker
         return sorted(
             number
@@ -377,7 +380,7 @@ class ObjectSync:
         )
 
     def carried_on(self, name: str) -> list[int]:
-        """Objects at rest on an actor of this client whose records name a place that is far from where they are now."""
+        """Objects at rest on an actor of this client that are far from the positions in their records."""
         if self.physics.tick % ACTIVATION_PERIOD:
             return []
         return [
@@ -388,7 +391,7 @@ class ObjectSync:
         ]
 
     def mark_resting(self, record: RetainedRecord | None) -> None:
-        """A record of an object at rest was sent: from now on it rests here as for all other clients."""
+        """After a record of rest was sent: treat the object as at rest here, as all other clients do."""
         if record is not None and not record.moving and record.object in self.physics.support_tracker:
             self._set_resting(record.object, record)
             self.physics.support_tracker.set_at_rest(record.object, record.parent, np.array(record.pose))
@@ -408,10 +411,10 @@ class ObjectSync:
 
 
 def touched_share(away: float) -> float:
-    """Share by which a touched copy is corrected in one step; ``away`` [rad]: the largest error of a joint."""
+    """Share by which a touched copy is corrected in one step; ``away`` [rad]: largest error of a joint."""
     return max(TOUCHED_BLEND_PER_STEP, BLEND_PER_STEP * min(1.0, away / FAR_ANGLE))
 
 
 def _carrier(parent: str) -> str:
-    """The actor that a parent frame is a link of; empty for the ground and for boxes."""
+    """The actor to which the link of a parent frame belongs; empty for the ground and for boxes."""
     return "" if parse_object_name(parent) is not None else parent.partition("/")[0]

@@ -1,12 +1,12 @@
-"""Two actors of different clients at one tree: the force of the second reaches the simulation that owns the tree.
+"""Forces of a second client's actor on a tree: sends them to the client that owns the tree.
 
-The second actor's client simulates its contacts with its copy of the tree. It sends each as a virtual coupling: a
-spring of fixed stiffness whose anchor is chosen such that, at the place where the copy is, it pulls with the force of
-the contact. The owner's client holds the body by that spring and a damper, solved implicitly with the plant as a
-person's hand is. Where copy and tree agree the force is that of the contact; where they do not, as after a delay, the
-spring pulls them together. A force alone would not: fed back through two delays it grows
-(``docs/decisions/forces-between-clients.md``). Source: virtual coupling, J. E. Colgate et al., 1995; damping that keeps
-delayed springs stable, E. Nuno et al., 2009.
+The second actor's client simulates its contacts with its copy of the tree. It sends each contact as a virtual coupling:
+a spring of fixed stiffness whose anchor is chosen so that the spring applies the contact force at the copy's pose. The
+owner's client holds the body with this spring and a damper, solved implicitly with the plant like a person's hand. If
+copy and tree agree, the spring applies the contact force. If they differ, as after a delay, the spring pulls them
+together. A force alone would not do that: fed back through two delays, errors grow
+(``docs/decisions/forces-between-clients.md``). Sources: virtual coupling, J. E. Colgate et al., 1995; damping for
+stable delayed springs, E. Nuno et al., 2009.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from vinesim.plants.ties import TieLimitError
 from vinesim.world import Physics
 
 STIFFNESS = 300.0
-"""Stiffness of a coupling [N/m]; the same for all clients, since anchors are computed from it."""
+"""Stiffness of a coupling [N/m]. All clients must use the same value, because anchors are computed from it."""
 
 DAMPING = 20.0
-"""Damping of a coupling [N s/m]: the stiffness times more than the longest delay it is meant for, half a round trip of
-0.1 s each way, would be 30; plants have damping of their own. TUNED."""
+"""Damping of a coupling [N s/m]. Stability for a delay of 0.1 s needs 30 (stiffness times delay), but plants have
+damping of their own. TUNED."""
 
 MAX_FORCE = 100.0
-"""Largest force of a coupling [N]: that of a hand (CANOPIES D6.4, section 3.1.1)."""
+"""Largest force of a coupling [N]: the largest force of a hand (CANOPIES D6.4, section 3.1.1)."""
 
 MIN_FORCE = 1e-3
-"""Contacts that press less are not sent [N]."""
+"""Contacts with a smaller force are not sent [N]."""
 
 SLIDE = 0.005
 """A coupling is moved on its body when its point has slid by more than this [m]."""
@@ -47,12 +47,12 @@ class _Tie:
 
 
 class PlantCouplings:
-    """Couplings from this client's contacts, and ties for those of other clients."""
+    """Makes couplings from this client's contacts, and ties for the couplings of other clients."""
 
     def __init__(self, physics: Physics) -> None:
         self.physics = physics
         self.refused = 0
-        """Couplings that found no free tie, each counted once."""
+        """Number of couplings that found no free tie, each counted once."""
         self._ties: dict[tuple[str, int], _Tie] = {}
         self._refused: set[tuple[str, int]] = set()
 
@@ -62,7 +62,7 @@ class PlantCouplings:
         return {int(self.physics.model.body_tree[body]) for _, body in self._ties}
 
     def of_actor(self, actor: str, trees: Collection[int]) -> list[Coupling]:
-        """Couplings [N] of a local actor's contacts of the last step with ``trees``."""
+        """Couplings for a local actor's contacts with ``trees`` in the last step."""
         model = self.physics.model
         found = {}
         for contact in self.physics.contacts if trees else ():
@@ -85,7 +85,7 @@ class PlantCouplings:
         return couplings
 
     def apply(self, couplings: Mapping[str, Collection[Coupling]]) -> None:
-        """Hold bodies by the couplings of remote actors, and no others; before a step."""
+        """Before a step: hold bodies by these couplings of remote actors, and release all others."""
         if not (couplings or self._ties or self._refused):
             return
         wanted = {
@@ -125,7 +125,7 @@ class PlantCouplings:
         self.physics.plants.remove_tie(key[1], self._ties.pop(key).tie)
 
     def _carrier(self, body: int) -> int:
-        """The bunch of a berry cluster; any other body itself."""
+        """The body of the bunch for a berry cluster; ``body`` itself otherwise."""
         model = self.physics.model
         tree = int(model.body_tree[body])
         while body - model.tree_first[tree] >= model.tree_core[tree]:
@@ -133,6 +133,6 @@ class PlantCouplings:
         return body
 
     def _is_attached(self, body: int) -> bool:
-        """Whether a body is not a bunch that has left its plant."""
+        """Whether a body is on its plant; false for picked bunches."""
         bunch = np.flatnonzero(self.physics.model.bunch_body == body)
         return not len(bunch) or bool(self.physics.state.bunch_attached[bunch[0]])

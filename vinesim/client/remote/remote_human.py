@@ -9,19 +9,19 @@ from vinesim.scene.values import HumanPose, HumanSpec, HumanUpdate
 
 
 class RemoteHuman:
-    """A copy whose pose equals the received one to the bit; its hands push objects, but no robots."""
+    """A copy whose pose equals the received pose to the bit. Its hands push objects, but not robots."""
 
     def __init__(self, rigid: RigidWorld, name: str) -> None:
-        """``name`` of a person who was added to ``rigid`` already; see :func:`human_spec`."""
+        """``name``: name of a person who was already added to ``rigid``; see :func:`human_spec`."""
         self.rigid = rigid
         self.name = name
         self.intention = ""
-        """What the person indicates to do."""
+        """Intention that the person indicates."""
         self.pose: HumanPose | None = None
-        """As last received; its fingers tell the gesture."""
+        """Last received pose; its fingers show the gesture."""
 
     def follow(self, update: HumanUpdate) -> None:
-        """Be where ``update`` says at the end of the coming step."""
+        """Move to the pose in ``update`` at the end of the coming step."""
         self.rigid.move_human(self.name, update.pose)
         self.intention = update.intention
         self.pose = update.pose
@@ -32,7 +32,9 @@ class RemoteHuman:
 
 
 def human_spec(hello: Hello, update: HumanUpdate) -> HumanSpec:
-    """A person as physics needs one, from what another client sent; one in an outfit that is unknown here gets that of
-    its name."""
+    """Description of a person for the physics from messages of another client.
+
+    An outfit that is unknown here is replaced by the outfit that follows from the person's name.
+    """
     outfit = hello.outfit if hello.outfit in appearance.outfit_names() else ""
     return HumanSpec(hello.name, hello.index, update.pose, hello.height, outfit=outfit)

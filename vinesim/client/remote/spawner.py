@@ -1,4 +1,4 @@
-"""Adds and removes robots and humans of other clients: an executor loads and compiles, and no step waits for it."""
+"""Adds and removes robots and humans of other clients. An executor loads and compiles, so no step waits."""
 
 from __future__ import annotations
 
@@ -32,16 +32,19 @@ class Prepared:
     """A compiled world with actors that have joined."""
 
     actors: tuple[tuple[Hello, RobotDescription | None], ...]
-    """Those in it, each with its description; None for a human."""
+    """Actors in the world, each with its description; None for a human."""
     refused: tuple[tuple[Hello, ValueError | OSError], ...]
-    """Those that cannot be compiled, each with the reason."""
+    """Actors that cannot be compiled, each with the reason."""
     world: CompiledWorld | None
-    """None if all were refused."""
+    """The compiled world; None if all actors were refused."""
 
 
 class RemoteSpawner:
-    """Remote actors that have joined but have no body here yet, room for free bunches that runs short, and robots whose
-    meshes arrive after they have a body."""
+    """Compiles worlds for remote actors that have no body here yet.
+
+    It also compiles when bodies for free bunches run out, and when meshes of robots arrive after their bodies were
+    made.
+    """
 
     def __init__(
         self,
@@ -50,20 +53,22 @@ class RemoteSpawner:
         executor: concurrent.futures.Executor | None = None,
         meshes: MeshExchange | None = None,
     ) -> None:
-        """``own``: a description that is loaded already, if any; without ``executor`` actors are compiled at once.
-        ``meshes``: those of remote robots; without it they are boxes."""
+        """``own``: a description that is already loaded, if any; ``executor``: None to compile actors in the caller.
+
+        ``meshes``: exchange of meshes of remote robots; without it boxes replace their meshes.
+        """
         self.meshes = meshes or MeshExchange()
         self._spawned: dict[str, Hello] = {}
-        """Robots that have a body here."""
+        """Remote robots with bodies here."""
         self._outdated: set[str] = set()
-        """Robots of which meshes have arrived since their last compilation began."""
+        """Robots with meshes that arrived after their last compilation began."""
         self._renewing: concurrent.futures.Future[Prepared] | None = None
         self.rigid = rigid
         self.own = own
         self._executor = executor
         self._enqueued: dict[str, Hello] = {}
         self._leaving: dict[str, RemoteRobot | RemoteHuman] = {}
-        """Copies of actors that have left, until the world without them is compiled."""
+        """Copies of actors that have left, kept until the world without them is compiled."""
         self._removed: list[str] = []
         self._compiling: concurrent.futures.Future[Prepared] | None = None
 
@@ -71,7 +76,7 @@ class RemoteSpawner:
         return name in self._enqueued
 
     def enqueue(self, hello: Hello) -> None:
-        """Add an actor that has joined; it is spawned at its first pose."""
+        """Add an actor that has joined. It is spawned at its first pose."""
         self._enqueued[hello.name] = hello
 
     def cancel(self, name: str) -> None:
@@ -81,7 +86,7 @@ class RemoteSpawner:
         self._outdated.discard(name)
 
     def remove(self, name: str, copy: RemoteRobot | RemoteHuman) -> None:
-        """Remove the copy of an actor that has left; :meth:`removed` says when that is done."""
+        """Start to remove the copy of an actor that has left; :meth:`removed` reports the end."""
         if self._executor is None:
             copy.remove()
             self._removed.append(name)
@@ -95,9 +100,9 @@ class RemoteSpawner:
         return names
 
     def spawn(self, updates: Mapping[str, RobotUpdate | HumanUpdate]) -> dict[str, RemoteRobot | RemoteHuman]:
-        """The bodies of enqueued actors that became ready, at their poses in ``updates``; between steps.
+        """The copies of enqueued actors that became ready, at their poses in ``updates``. Call it between steps.
 
-        All actors that wait are compiled together. One that cannot be shown is logged and removed.
+        All waiting actors are compiled together. An actor that cannot be compiled is logged and removed.
         """
         if self._compiling is None:
             arrived = [(hello, updates[name]) for name, hello in self._enqueued.items() if name in updates]
@@ -119,9 +124,9 @@ class RemoteSpawner:
                 self.cancel(hello.name)
         hellos = [hello for hello, _ in prepared.actors]
         if any(self._enqueued.get(hello.name) is not hello or hello.name not in updates for hello in hellos):
-            return {}  # one has left meanwhile: compiled again from the next step on
+            return {}  # an actor has left meanwhile, so compile again from the next step on
         if prepared.world is None or not self.rigid.adopt(prepared.world):
-            return {}  # another actor joined or left meanwhile: the same
+            return {}  # another actor joined or left meanwhile, so compile again
         for actor in prepared.world.removed:
             self._leaving.pop(actor.spec.name)
             self._removed.append(actor.spec.name)
@@ -134,18 +139,18 @@ class RemoteSpawner:
     def _body_of(
         self, hello: Hello, description: RobotDescription | None, update: RobotUpdate | HumanUpdate
     ) -> RemoteRobot | RemoteHuman:
-        """The copy of an actor that the rigid world contains now."""
+        """The copy of an actor that is in the rigid world now."""
         if description is None or not isinstance(update, RobotUpdate):
             return RemoteHuman(self.rigid, hello.name)
         self._spawned[hello.name] = hello
-        if description.urdf != hello.urdf:  # not the text of an installed robot, whose meshes are files
+        if description.urdf != hello.urdf:  # otherwise it is an installed robot with mesh files
             self.meshes.want(hello.name, hello.urdf)
         other = RemoteRobot(self.rigid, description, hello.name, hello.index, update.base_q, is_in_world=True)
         self.rigid.place_robot(hello.name, update.base_q, update.position)
         return other
 
     def renewed(self) -> list[RemoteRobot]:
-        """Robots whose meshes have arrived and now stand in the place of boxes, in the state that they were in."""
+        """Robots whose boxes were replaced by received meshes; their states are unchanged."""
         self._outdated.update(self.meshes.changed())
         if self._renewing is None:
             hellos = [self._spawned[name] for name in sorted(self._outdated & self._spawned.keys())]
@@ -163,7 +168,7 @@ class RemoteSpawner:
             self.meshes.refuse(hello.name)
         is_current = all(self._spawned.get(hello.name) is hello for hello, _ in prepared.actors)
         if prepared.world is None or not is_current or not self.rigid.adopt(prepared.world):
-            # another actor joined or left meanwhile: compiled again from the next step on
+            # another actor joined or left meanwhile, so compile again from the next step on
             self._outdated |= {hello.name for hello, _ in prepared.actors} & self._spawned.keys()
             return []
         return [
@@ -175,7 +180,7 @@ class RemoteSpawner:
         ]
 
     def _prepare_again(self, hellos: list[Hello]) -> Prepared:
-        """Compile a world in which robots that are here have the meshes that were received."""
+        """Compile a world in which present robots have their received meshes."""
         specs = []
         actors = []
         refused = []
@@ -200,7 +205,7 @@ class RemoteSpawner:
         return done
 
     def _prepare(self, arrived: list[tuple[Hello, RobotUpdate | HumanUpdate]], without: tuple[str, ...]) -> Prepared:
-        """Compile a world with all actors that can be compiled, ``without`` those that leave."""
+        """Compile a world with all actors that can be compiled, ``without`` the actors that leave."""
         refused: list[tuple[Hello, ValueError | OSError]] = []
         loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]] = []
         for hello, update in arrived:
@@ -210,7 +215,7 @@ class RemoteSpawner:
                 refused.append((hello, error))
         try:
             world = self._compile(loaded, without)
-        except ValueError:  # MuJoCo does not say which one it is
+        except ValueError:  # MuJoCo does not say which actor is at fault
             fine = []
             for one in loaded:
                 try:
@@ -242,15 +247,17 @@ class RemoteSpawner:
 def resolve_description(
     hello: Hello, own: RobotDescription | None, received: Mapping[str, np.ndarray] | None = None
 ) -> RobotDescription:
-    """The robot of another client: an installed one with the same URDF text and sidecar, or one loaded from what it
-    sent. ``received``: corners [face, 3, 3] m of its meshes by digest; boxes stand in for those that are not there."""
+    """Description of another client's robot: an installed robot with equal URDF text and sidecar, or the sent URDF.
+
+    ``received``: corners [face, 3, 3] m of its meshes by digest; boxes replace missing meshes.
+    """
 
     def is_same(known: RobotDescription) -> bool:
         return known.urdf == hello.urdf and encode_sidecar(known.base_limits, known.groups) == hello.sidecar
 
     if own is not None and is_same(own):
         return own
-    name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted, and it becomes a file's name
+    name = hello.robot if is_valid_name(hello.robot) else "robot"  # untrusted input that becomes a file name
     try:
         known = load_description(name)
         if is_same(known):

@@ -1,4 +1,4 @@
-"""Copies of trees that other clients own: each moves by its own physics, and the states of its owner correct it."""
+"""Copies of trees that other clients own. This client simulates each copy, and states from its owner correct it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vinesim.scene.values import TreeUpdate
 from vinesim.world import Physics
 
 CONTACT_MEMORY = 0.15
-"""A copy counts as pressed for so long after it was [s]: a contact that opens and closes is one. GUESSED."""
+"""A copy counts as pressed for this time after a contact ended [s], so that a contact may open briefly. GUESSED."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -23,22 +23,22 @@ class _Copy:
     """One tree of another client."""
 
     update: TreeUpdate
-    """The last state of its owner, at the time it arrived."""
+    """Last state from the owner, with its time of arrival."""
     is_new: bool
-    """It has not corrected the copy yet."""
+    """Whether ``update`` has not yet corrected the copy."""
     correction: np.ndarray
-    """[body, 3] rad by which the joints must still turn, each in its own frame."""
+    """[body, 3] rad, remaining rotation of the joints, each in its own frame."""
     pressed_at: float = -np.inf
-    """When copies of actors or objects last pressed on it [s, own clock]."""
+    """Time at which copies of actors or objects last pressed on the copy [s, own clock]."""
 
 
 class TreeCopies:
-    """The trees that other clients own, as this client simulates them.
+    """Simulated copies of the trees that other clients own.
 
-    A copy feels its own weight, wind and contacts, also those with the copies of its owner. As long as these are all
-    that its owner's tree feels, the physics predicts it better than any extrapolation, and each state that arrives
-    corrects it once. A copy that lacks a force of its owner's, of a hand that holds it there, is drawn to the
-    extrapolated state in every step.
+    A copy feels its weight, wind and contacts, including contacts with the copies of other clients' actors. If no other
+    forces act on the owner's tree, this simulation predicts it better than any extrapolation, and each received state
+    corrects the copy once. If a force is missing here, such as a hand that holds the owner's tree, the copy is pulled
+    to the extrapolated state in every step.
     """
 
     def __init__(self, physics: Physics, objects: ObjectSync) -> None:
@@ -51,7 +51,7 @@ class TreeCopies:
 
     @property
     def trees(self) -> KeysView[int]:
-        """Numbers of the trees."""
+        """Indices of the copied trees."""
         return self._copies.keys()
 
     def apply(
@@ -63,9 +63,9 @@ class TreeCopies:
         local_actors: Collection[str],
         coupled_trees: Collection[int],
     ) -> None:
-        """Take new states of owners and correct the copies; before every step, ``now`` [s] by the client's own clock.
+        """Before every step: take new states from owners and correct the copies; ``now`` [s] on the client's own clock.
 
-        ``coupled_trees``: those that couplings of other clients hold here.
+        ``coupled_trees``: trees that couplings of other clients hold here.
         """
         solver = self.physics.contact_solver
         copies = self._copies
@@ -88,11 +88,11 @@ class TreeCopies:
             touching.setdefault(tree, set()).add(actor)
         for tree, copy in copies.items():
             self.physics.plants.wake(tree)
-            solver.trees_touched_by_copies[tree] = tree not in coupled_trees  # their forces act here once
+            solver.trees_touched_by_copies[tree] = tree not in coupled_trees  # or their forces would act here twice
             self._correct(copy, now, touching.get(tree, set()), local_actors)
 
     def _correct(self, copy: _Copy, now: float, touching: set[str], local_actors: Collection[str]) -> None:
-        """Correct one copy, which actors and objects named ``touching`` pressed in the last step."""
+        """Correct one copy; ``touching``: names of actors and objects that pressed on it in the last step."""
         update = copy.update
         objects = self.objects
         if update.owner in touching or any(parse_object_name(name) is not None for name in touching):
@@ -108,7 +108,7 @@ class TreeCopies:
         copy.is_new = False
 
     def _correct_once(self, copy: _Copy, is_pressed: bool) -> None:
-        """Turn the joints by a share of what the last state has shown to be wrong, and no further."""
+        """Rotate the joints by a share of the error that the last state revealed, until that error is corrected."""
         update = copy.update
         here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
         if copy.is_new:
@@ -121,7 +121,7 @@ class TreeCopies:
 
 
 def _extrapolated(update: TreeUpdate, now: float) -> TreeUpdate:
-    """A state as its owner's clients extrapolate it since it arrived: its velocities fade, and at last it stands."""
+    """Extrapolate a state from its arrival to ``now`` [s]; its velocities fade to zero."""
     age = float(dead_reckoning.clamp_age(now - update.time))
     rate = dead_reckoning.quaternion_rate(update.joint_q, update.joint_qd)
     return dataclasses.replace(

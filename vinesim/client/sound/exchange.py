@@ -1,7 +1,7 @@
-"""All sound that leaves and reaches the actors of one client; once a step, between threads and the network.
+"""Exchanges the sound of one client's actors with the network, once in each step.
 
-Pages and ROS give sound in their own threads, which is stored until the step; what arrives is handed to listeners,
-which only store or send it on. Nothing is decoded or mixed here.
+Pages and ROS deliver sound in their own threads; it is stored until the step. Received sound is passed to listeners,
+which only store it or send it on. Nothing is decoded or mixed here.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from vinesim.robot.drives.robot_instance import RobotInstance
 from vinesim.world import Physics
 
 MAX_WAITING = 100
-"""Frames of one actor that wait for the next step: two seconds; older ones are dropped."""
+"""Largest number of frames of one actor that wait for the next step (two seconds); older frames are dropped."""
 
 RESTART = 0.08
-"""[s] A voice whose frames come this much after their time begins anew, what comes this much before it is dropped."""
+"""[s] A voice restarts if a frame is late by more than this; frames that are early by more than this are dropped."""
 
 RESET = 2.0
-"""[s] By this much the clock was set, and the voice begins anew."""
+"""[s] Frames early by more than this show that the clock was set; the voice then restarts."""
 
 
 class Spoken(NamedTuple):
-    """A frame of sound and where it comes from."""
+    """A frame of sound and the position of its source."""
 
     speaker: str
     frame: VoiceFrame
@@ -49,62 +49,62 @@ class Tone(NamedTuple):
 
     source: str
     frequency: float
-    """[Hz]; 0: silent now"""
+    """[Hz]; 0: the tone has ended"""
     place: np.ndarray
     """[3] m"""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SoundStep:
-    """What reaches an actor in one step."""
+    """Sound that reaches an actor in one step."""
 
     now: float
-    """[s] of the network."""
+    """[s] Network time."""
     to_world: float
-    """[s] Time of the world less that of the network."""
+    """[s] World time minus network time."""
     frames: list[Spoken]
     tones: list[Tone]
 
 
 class Listener(Protocol):
-    """Something that listens for an actor: a page, or the microphone of a robot."""
+    """Receiver of the sound that an actor hears: a page, or the microphone of a robot."""
 
     @property
     def is_open(self) -> bool:
-        """Whether it wants to hear now."""
+        """Whether the listener wants to receive sound now."""
         ...
 
     @property
     def decodes_opus(self) -> bool: ...
 
     def hear(self, step: SoundStep) -> None:
-        """Take what has arrived; called in the loop, and must return at once."""
+        """Take the sound of one step. It is called in the client's loop and must return at once."""
         ...
 
 
 class Voice(NamedTuple):
-    """Who listens to an actor."""
+    """State of the audience of an actor."""
 
     may_speak: bool
-    """Whether anyone may hear it."""
+    """Whether anyone may hear the actor."""
     is_heard: bool = False
     is_heard_plain: bool = False
-    """Whether one of them cannot decode Opus."""
+    """Whether one of the hearers cannot decode Opus."""
 
 
 class _Speaker:
-    """Sound of one local actor on its way."""
+    """Sound of one local actor that waits to be sent."""
 
     def __init__(self) -> None:
         self.waiting: collections.deque[tuple[Codec, bytes, bool]] = collections.deque(maxlen=MAX_WAITING)
         self.next_time: dict[bool, float] = {}
-        """[s] When the next frame begins if the voice goes on, of each kind."""
+        """[s] By kind of frame (main or extra): time at which the next frame begins if the voice continues."""
         self.number = 0
 
     def stamp(self, now: float, is_main: bool) -> float | None:
-        """When a frame that has just arrived began [s]; frames of one voice follow each other without gaps or overlap.
+        """Start time [s] of a frame that has just arrived. Frames of one voice follow without gaps or overlap.
 
-        None: it is one too many, of a page that stood still and sends all at once.
+        None if the frame must be dropped, because a page stalled and now sends many frames at once.
         """
         began = now - FRAME
         expected = self.next_time.get(is_main, -np.inf)
@@ -116,7 +116,7 @@ class _Speaker:
 
 
 class SoundClient(Protocol):
-    """What the exchange needs of the client whose sound it carries."""
+    """Interface of the client to its sound exchange."""
 
     @property
     def post_step(self) -> list[Callable[[Any], None]]: ...
@@ -139,7 +139,7 @@ class SoundClient(Protocol):
 
 
 class SoundExchange:
-    """See the module; one of each client."""
+    """Exchanges the sound of one client's actors between threads and the network."""
 
     def __init__(self, client: SoundClient) -> None:
         self._client = client
@@ -155,31 +155,31 @@ class SoundExchange:
     # ------------------------------------------------------------------ from any thread
 
     def listen(self, actor: str, listener: Listener) -> None:
-        """Hand what reaches a local actor to a listener from now on."""
+        """Pass the sound that reaches a local actor to a listener from now on."""
         self._listeners = [*self._listeners, (actor, listener)]
 
     def stop_listening(self, listener: Listener) -> None:
-        """Hand nothing to a listener any more."""
+        """Stop passing sound to a listener."""
         self._listeners = [one for one in self._listeners if one[1] is not listener]
 
     @property
     def dropped(self) -> int:
-        """Frames that came all at once, of pages, or for loudspeakers that have enough to play."""
+        """Number of frames dropped because pages or loudspeakers had too many frames at once."""
         refused = [one.refused for one in list(self._loudspeakers.values())]
         return self._dropped + sum(math.ceil(size / (2 * FRAME_SAMPLES)) for size in refused)
 
     def speak(self, actor: str, codec: Codec, data: bytes, *, is_main: bool = True) -> None:
-        """Say 20 ms that a local actor has just said; see :meth:`vinesim.net.replication.voices.VoiceSync.say`."""
+        """Send a frame that a local actor has just spoken; see :meth:`vinesim.net.replication.voices.VoiceSync.say`."""
         waiting = self._speaker(actor).waiting
         self._dropped += len(waiting) == MAX_WAITING
         waiting.append((codec, data, is_main))
 
     def play(self, robot: str, pcm: bytes) -> None:
-        """Play PCM16 of any length at the loudspeaker of a local robot, behind what it plays."""
+        """Append PCM16 of any length to the queue of a local robot's loudspeaker."""
         self._loudspeakers.setdefault(robot, Loudspeaker()).play(pcm)
 
     def voice_of(self, actor: str) -> Voice:
-        """Who listens to a local actor that has asked before."""
+        """State of the audience of a local actor, after the first request for it."""
         self._speaker(actor)
         return self._voices.get(actor, Voice(True))
 
@@ -189,7 +189,7 @@ class SoundExchange:
     # ------------------------------------------------------------------ in the loop
 
     def _exchange(self) -> None:
-        """Send what was said, and hand on what has arrived."""
+        """Send local sound, and pass received sound to listeners."""
         is_open = any(listener.is_open for _, listener in self._listeners)
         was_open = self._was_open
         self._was_open = is_open
@@ -220,7 +220,7 @@ class SoundExchange:
                 listener.hear(step)
 
     def _send(self, now: float) -> list[Spoken]:
-        """Send what local actors have said; what other local actors hear of it."""
+        """Send the frames of local actors. Returns the frames that other local actors may hear."""
         said = []
         for robot, loudspeaker in list(self._loudspeakers.items()):
             for _, data in loudspeaker.frames(now):
@@ -253,7 +253,7 @@ class SoundExchange:
         return tones
 
     def place_of(self, actor: str) -> np.ndarray:
-        """Where a local actor speaks and hears [3] m: a person's head, a spectator's eyes, above a robot's base."""
+        """Position [3] m of a local actor's voice and ears: person's head, spectator's eyes, above a robot's base."""
         client = self._client
         if actor in client.humans:
             return client.humans[actor].pose.head[:3]

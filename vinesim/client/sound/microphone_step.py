@@ -1,4 +1,4 @@
-"""What a robot's microphone gets in one step, as plain values for the process that mixes it."""
+"""Input of a robot's microphone in one step, as plain values for the process that mixes sound."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
 
 
 class MicrophoneStep(NamedTuple):
-    """Sound at one place."""
+    """Sound at one place in one step."""
 
     now: float
-    """[s] of the network; blocks up to here may be complete."""
+    """[s] Network time; blocks up to this time may be complete."""
     to_world: float
-    """[s] Time of the world less that of the network."""
+    """[s] World time minus network time."""
     frames: tuple[HeardFrame, ...]
     tones: tuple[tuple[str, float, float], ...]
     """Source, frequency [Hz] and amplitude of each tone."""
 
 
 def at_place(step: SoundStep, place: np.ndarray) -> MicrophoneStep:
-    """What is heard at a ``place`` [3] m; what is beyond reach is left out."""
+    """The sounds of a step that are heard at ``place`` [3] m; sounds beyond reach are left out."""
 
     def loudness(source: np.ndarray) -> float:
         return gain(float(np.linalg.norm(source - place)))

@@ -1,1 +1,1 @@
-"""Tasks of a robot client, their planning, start poses, and the handler of ROS commands."""
+"""Tasks of a robot client and their planning, start poses, and handling of ROS commands and requests."""

@@ -1,7 +1,7 @@
-"""Entities of a client's world, as simulation_interfaces sees them: listed, spawned, deleted, moved, reset.
+"""Entities of a client's world for simulation_interfaces: listing, spawning, deleting, moving and resetting.
 
-Names are those of ``tf_environment`` (``box_3``, ``bunch_00017``), of robots and of people; what was spawned has the
-name that it was given. All methods are called between two steps.
+Boxes and bunches have the names of ``tf_environment`` (``box_3``, ``bunch_00017``), robots and people their own names,
+and spawned entities the names given to them. All methods are called between two steps.
 """
 
 from __future__ import annotations
@@ -30,14 +30,15 @@ from vinesim.scene.ids import ObjectKind, object_id
 from vinesim.scene.values import HumanSpec, RigidBox
 
 BOX_SIZE = (0.6, 0.4, 0.24)
+"""[m] Outer size of a spawned crate, as in composed scenes."""
 BOX_MASS = 1.6
-"""[m] outer size and [kg] mass of a spawned crate, as a composed scene has them."""
+"""[kg] Mass of a spawned crate, as in composed scenes."""
 PERSON_HEIGHT = 1.75
-"""[m]"""
+"""[m] Height of a spawned person."""
 BUNCH_REACH = 0.35
-"""[m] No bunch is longer: the room that one takes."""
+"""[m] Room for a bunch; no bunch is longer."""
 MAX_DISTANCE = 10_000.0
-"""[m] Poses further from the origin are refused: single precision would not resolve a millimetre there."""
+"""[m] Poses further from the origin are refused, because single precision does not resolve a millimetre there."""
 _UNKNOWN = np.full(6, np.nan)
 _BOX_URI = "vinesim:box"
 _PERSON_URI = "vinesim:person"
@@ -66,19 +67,19 @@ _SPAWNABLES = (
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Spawned:
-    """Something that was spawned."""
+    """A spawned entity."""
 
     kind: EntityCategory
     number: int
-    """Of the box or bunch; -1 for a person."""
+    """Number of the box or bunch; -1 for a person."""
     pose: np.ndarray
-    """[7] where it was spawned."""
+    """[7] Pose at which it was spawned."""
 
 
 class WorldEditor:
-    """The entities of one client, and changes to them; :class:`RequestRefused` says why one is not made.
+    """Lists and changes the entities of one client. :class:`RequestRefused` gives the reason of a refusal.
 
-    Only a client whose world is its own changes anything: others would have to be told, and their owners asked.
+    Changes are possible only in a client without a server, because otherwise other clients and owners are concerned.
     """
 
     def __init__(self, client: Client) -> None:
@@ -89,11 +90,11 @@ class WorldEditor:
 
     @property
     def spawnables(self) -> tuple[Spawnable, ...]:
-        """What can be spawned."""
+        """Things that can be spawned."""
         return _SPAWNABLES
 
     def entities(self) -> Iterator[Entity]:
-        """Robots, people, boxes and bunches as this client has them."""
+        """Robots, people, boxes and bunches in this client's world."""
         client = self._client
         physics = client.physics
         rigid = client.physics.rigid
@@ -143,7 +144,7 @@ class WorldEditor:
     # ------------------------------------------------------------------ changes
 
     def spawn(self, given: EntityArguments) -> str:
-        """Add a box, a person or a loose bunch; its name."""
+        """Add a box, a person or a loose bunch. Returns its name."""
         self._require_alone("spawns nothing")
         if not given.uri:
             raise RequestRefused(Refusal.NO_RESOURCE, f"no uri; give {_BOX_URI}, {_PERSON_URI} or {_BUNCH_URI}")
@@ -166,7 +167,7 @@ class WorldEditor:
         return name
 
     def delete(self, name: str) -> None:
-        """Remove a box, a loose bunch, or a person that was spawned."""
+        """Remove a box, a loose bunch or a spawned person."""
         self._require_alone("deletes nothing")
         entity, number = self._movable(name)
         client = self._client
@@ -184,7 +185,7 @@ class WorldEditor:
         self._spawned.pop(name, None)
 
     def set_state(self, given: EntityArguments) -> None:
-        """Put a box, a loose bunch, a robot's base or a person somewhere else; robots and people stand still there."""
+        """Move a box, a loose bunch, a robot's base or a person; robots and people then stand still."""
         self._require_alone("moves nothing by services")
         entity, number = self._movable(given.name)
         pose = _checked_pose(given.pose)
@@ -204,7 +205,11 @@ class WorldEditor:
             client.physics.support_tracker.set_moving([object_id(*number)])
 
     def reset(self, *, keep_state: bool = False, keep_spawned: bool = False) -> None:
-        """The scene as generated, without what was spawned; or only the latter, or with it where it was spawned."""
+        """Reset the world.
+
+        By default all states return to the generated scene and spawned entities are removed. ``keep_state``: only
+        remove spawned entities. ``keep_spawned``: return spawned entities to their poses of spawning.
+        """
         self._require_alone("resets nothing")
         if keep_state:
             for name in list(self._spawned):
@@ -233,7 +238,7 @@ class WorldEditor:
             )
 
     def _movable(self, name: str) -> tuple[Entity, tuple[ObjectKind, int]]:
-        """An entity that can be moved, with the kind and number of its object, (TREE, -1) for actors."""
+        """An entity that can be moved, with the kind and number of its object; (TREE, -1) for actors."""
         entity = next((one for one in self.entities() if one.name == name), None)
         if entity is None:
             raise RequestRefused(Refusal.NOT_FOUND, f"no entity {name!r}; get_entities lists them")
@@ -247,7 +252,7 @@ class WorldEditor:
         return entity, (ObjectKind.BUNCH if kind == "bunch" else ObjectKind.BOX, int(number))
 
     def _free_name(self, given: EntityArguments, stem: str) -> str:
-        """The name that was asked for, or another one if that is allowed."""
+        """The requested name, or another one if that is allowed."""
         taken = {one.name for one in self.entities()}
         if given.name in taken and not given.allow_renaming:
             raise RequestRefused(Refusal.NAME_NOT_UNIQUE, f"there is an entity {given.name!r}; allow renaming")
@@ -264,7 +269,7 @@ class WorldEditor:
         return next(name for i in itertools.count(1) if (name := f"{stem[:40]}_{i}") not in taken)
 
     def _bunch_to_spawn(self, number: str) -> int:
-        """The bunch of a URI, which must hang on its vine."""
+        """The bunch with the number in a URI; it must hang on its vine."""
         physics = self._client.physics
         model = self._client.model
         attached = physics.state.bunch_attached
@@ -284,7 +289,7 @@ class WorldEditor:
         return int(np.argmax(np.where(attached, away, -1.0)))
 
     def _add(self, name: str, one: _Spawned) -> None:
-        """Add what was or is spawned to the world, where it is spawned."""
+        """Add a spawned entity to the world at its pose of spawning."""
         client = self._client
         physics = self._client.physics
         if one.kind is EntityCategory.DYNAMIC_OBJECT:
@@ -297,19 +302,19 @@ class WorldEditor:
             physics.support_tracker.set_state(object_id(ObjectKind.BUNCH, one.number), one.pose, np.zeros(6))
 
     def _stand(self, name: str, root: np.ndarray) -> None:
-        """Let a person that was spawned stand somewhere else."""
+        """Let a spawned person stand at ``root`` [7]."""
         pose = standing_pose(root, PERSON_HEIGHT)
         self._client.humans[name].source = lambda _: pose
 
 
 def _is_free_form(name: str) -> bool:
-    """Whether a name is valid and none of those that boxes and bunches of the scene have."""
+    """Whether a name is valid and differs from the names of the scene's boxes and bunches."""
     kind, _, number = name.partition("_")
     return is_valid_name(name) and not (kind in ("box", "bunch") and number.isdecimal())
 
 
 def _checked_pose(pose: np.ndarray | None) -> np.ndarray:
-    """A pose [7] with a unit quaternion; :class:`RequestRefused` if it is none."""
+    """A pose [7] with a unit quaternion; :class:`RequestRefused` if ``pose`` is not one."""
     if pose is None:
         raise RequestRefused(Refusal.INVALID_POSE, "the pose is not in the frame map, the only one that is known")
     if not np.isfinite(pose).all() or np.abs(pose[:3]).max() > MAX_DISTANCE:

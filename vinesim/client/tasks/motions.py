@@ -1,4 +1,4 @@
-"""Motions of a robot beside its task: drive to a place, keep the head camera on a point."""
+"""Motions of a robot outside its task: drive to a place, keep the head camera on a point."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from vinesim.scene.values import CameraMount
 
 
 class DriveTo:
-    """Drives the base to a place roughly straight ahead, and stops there; call it once a step."""
+    """Drives the base to a place roughly straight ahead and stops there. Call it once in each step."""
 
     POSITION_TOLERANCE = 0.05
-    """[m] A base this near to the place has reached it. GUESSED"""
+    """[m] Distance at which the base has reached the place. GUESSED"""
 
     def __init__(
         self, robot: Robot, place: np.ndarray, *, speed: float = 1.2, may_start: Callable[[], object] = lambda: True
     ) -> None:
-        """``place`` [7]: pose of the base in the world; it stands until ``may_start()`` is true."""
+        """``place`` [7]: pose of the base in the world. The base stands until ``may_start()`` is true."""
         self.robot = robot
         self.speed = speed
         self._may_start = may_start
@@ -44,15 +44,15 @@ class DriveTo:
 
 
 class LookAt:
-    """Keeps the camera on the head pointed at a place, through the Jacobian of any head; call it once a step."""
+    """Keeps the head camera pointed at a place, through the Jacobian of any head. Call it once in each step."""
 
     GAIN = 3.0
     """[1/s] Feedback gain of the pointing angle. GUESSED"""
     PERIOD = 0.05
-    """[s] Between two corrections: a head needs no 100 Hz. GUESSED"""
+    """[s] Period of corrections; a head does not need 100 Hz. GUESSED"""
 
     def __init__(self, robot: Robot, point: Callable[[], np.ndarray]) -> None:
-        """``point`` returns the place to look at [3] m in the world. Without a head and a camera nothing is done."""
+        """``point()`` returns the place to look at [3] m in the world. A robot without a head camera does nothing."""
         description = robot.description
         self.robot = robot
         self.point = point

@@ -21,13 +21,13 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.world import Physics
 
-# Paths of a base on the ground, around posts, trunks, wires and boxes: A* on a grid, then straightened.
+# Paths of a base on the ground around posts, trunks, wires and boxes: A* on a grid, then straightened.
 
 
 GRID_SIZE = 0.1
 """[m] Cell size of the grid on which paths are searched."""
 MARGIN = 3.0
-"""[m] By which the grid extends beyond start and goal."""
+"""[m] Distance by which the grid extends beyond start and goal."""
 
 Cell = tuple[int, int]
 
@@ -35,7 +35,7 @@ Cell = tuple[int, int]
 def find_path(model: Model, start: np.ndarray, goal: np.ndarray, clearance: float) -> np.ndarray | None:
     """Waypoints [n, 2] m of a short path with ``clearance`` [m] on either side, ends included; None if there is none.
 
-    Every waypoint of the grid is dropped that a straight line can replace.
+    Waypoints of the grid that a straight line can replace are dropped.
     """
     low = np.minimum(start, goal) - MARGIN
     shape = tuple((np.ceil((np.maximum(start, goal) + MARGIN - low) / GRID_SIZE)).astype(int))
@@ -92,7 +92,7 @@ def search_grid(free: np.ndarray, first: Cell, last: Cell) -> list[Cell] | None:
 
 
 def _cell(index: np.ndarray) -> Cell:
-    """Whole indices of a cell from ``index`` [2]."""
+    """Integer indices of the cell at ``index`` [2]."""
     return int(index[0]), int(index[1])
 
 
@@ -103,19 +103,21 @@ def _is_line_free(model: Model, start: np.ndarray, end: np.ndarray, clearance: f
     return bool((ground_clearance(model, line) > clearance - 0.5 * GRID_SIZE).all())
 
 
-# Planning of picks: which bunch, from which base pose, into which box, and along which path.
+# Planning of picks: chooses bunch, base pose, box and path.
 #
-# All of it is geometry of the model at rest: clearances of bunches, room for the base, paths on the ground.
+# It uses only the geometry of the model at rest: clearances of bunches, room for the base, paths on the ground.
 
 
 BUNCH_AHEAD = 0.88
+"""[m] Distance of the bunch ahead of the base at the pick."""
 BUNCH_ASIDE = 0.28
-"""[m] Position of the bunch in the base's frame at the pick: ahead, and to the arm's side."""
+"""[m] Distance of the bunch to the arm's side of the base at the pick."""
 HAND_LOWER = np.array([-0.45, -0.11, -0.05])
+"""[m] Lower corner of the box that an open hand sweeps around the grasp; x along the hand, z up."""
 HAND_UPPER = np.array([0.06, 0.11, 0.09])
-"""[m] Corners of the box that an open hand sweeps about the grasp; x along the hand, z up."""
+"""[m] Upper corner of that box."""
 GRASP_HEIGHT = (1.3, 1.75)
-"""[m] Heights of the grasp that arm and lift reach with the hand level."""
+"""[m] Range of heights of the grasp that arm and lift reach with a level hand."""
 MAX_BUNCH_RADIUS = 0.060
 """[m] Largest radius of a bunch that fits between the fingers."""
 GRASP_DEPTH = 0.06
@@ -123,27 +125,27 @@ GRASP_DEPTH = 0.06
 MIN_HAND_CLEARANCE = 0.005
 """[m] Smallest gap between the moving hand and anything but its bunch. GUESSED"""
 FULL_CLEARANCE = 0.03
-"""[m] Wider gaps score no better. GUESSED"""
+"""[m] Gap from which on a wider gap is not rated better. GUESSED"""
 BASE_CLEARANCE = 0.68
-"""[m] A base with its arms tucked needs this distance around its centre."""
+"""[m] Free distance that a base with tucked arms needs around its centre."""
 BOX_AHEAD = 0.10
 BASE_HALF_WIDTH = 0.35
 BOX_GAP = 0.06
 """[m] Distance of a box ahead of the base's centre, half of the base's width, and the gap between both."""
 APPROACH_LENGTHS = (1.1, 0.8)
-"""[m] Lengths of the straight approach along a box; the first for which there is room is taken."""
+"""[m] Lengths of the straight approach along a box; the first one with room is used."""
 LANE_HALF_WIDTH = 0.36
-"""[m] A base that drives straight needs this on either side of its centre."""
+"""[m] Free distance that a base driving straight needs on either side of its centre."""
 OBSTACLE_RADIUS = 0.8
-"""[m] Obstacles farther from a bunch than this cannot meet the hand."""
+"""[m] Obstacles further than this from a bunch cannot touch the hand."""
 OBSTACLE_SPACING = 0.04
-"""[m] Greatest distance of the spheres that stand for trellis and old wood."""
+"""[m] Largest distance between the spheres that represent trellis and old wood."""
 MAX_CANDIDATES = 200
-"""Number of the nearest bunches that are tried."""
+"""Number of nearest bunches that are tried."""
 
 
 def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
-    """Feasible plans, best first: bunches with most clearance, and among those nearer to ``near`` [2] m.
+    """Feasible plans, best first: bunches with the most clearance, with a preference for bunches near ``near`` [2] m.
 
     Raises :class:`PlacementError` if no box can be approached or no bunch can be picked.
     """
@@ -169,10 +171,11 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
 
 
 def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
-    """The bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, however narrow it is about them.
+    """The bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, even without room for the hand.
 
-    Of each bunch its number, the side, the pose [7] of the base where the hand has most room, and that room [m]:
-    negative where the open hand would overlap wood or fruit, and no more than :data:`FULL_CLEARANCE`.
+    Yields for each bunch its number, the side of the arm, the pose [7] of the base where the hand has the most room,
+    and the clearance [m] of the hand, at most :data:`FULL_CLEARANCE`. It is negative if the open hand would overlap
+    wood or fruit.
     """
     seen: set[int] = set()
     middles = bunch_centres(model)
@@ -230,8 +233,10 @@ def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterato
 
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spheres that fill wood, trellis and bunches at rest: centres [n, 3] m, radii [n] m, and the bunch of each [n] or
-    -1."""
+    """Spheres that fill wood, trellis and bunches at rest.
+
+    Returns centres [n, 3] m, radii [n] m, and the bunch of each sphere [n], -1 if it is not part of a bunch.
+    """
     body_q = model.forward_kinematics(model.joint_settled).astype(float)
     owner = model.bunch_of_body()
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
@@ -255,7 +260,7 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _fixed_spheres(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres along everything that stands still: centres [n, 3] m and radii [n] m."""
+    """Spheres along all fixed pieces: centres [n, 3] m and radii [n] m."""
     along = (model.fixed_end - model.fixed_start).astype(float)
     count = np.ceil(np.linalg.norm(along, axis=1) / OBSTACLE_SPACING).astype(int) + 1
     piece = np.repeat(np.arange(len(count)), count)
@@ -266,7 +271,7 @@ def _fixed_spheres(model: Model) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclasses.dataclass(frozen=True)
 class BoxApproach:
-    """A place of the base with a box beside it, and the start of the straight approach to it."""
+    """A position of the base next to a box, and the start of the straight approach to it."""
 
     box: int
     side: str
@@ -279,7 +284,7 @@ class BoxApproach:
 
 
 def box_approaches(model: Model) -> Iterator[BoxApproach]:
-    """All places along the long sides of boxes with room for a base and its approach."""
+    """All positions along the long sides of boxes with room for a base and its approach."""
     for box, (pose, size) in enumerate(zip(model.box_pose.astype(float), model.box_size.astype(float), strict=True)):
         long = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]) if size[0] >= size[1] else np.array([0.0, 1.0, 0.0]))
         apart = BASE_HALF_WIDTH + BOX_GAP + 0.5 * float(size[:2].min())
@@ -296,22 +301,21 @@ def box_approaches(model: Model) -> Iterator[BoxApproach]:
                         break
 
 
-# Planning of box exchanges: paths between the boxes; and a box filled with bunches for the start.
+# Planning of box exchanges: paths between the boxes, and filling of a box for the start.
 
 
 TURNING_RADIUS = 0.92
-"""[m] A carrier with a box at either end needs this distance around its centre to turn."""
+"""[m] Free distance around its centre that a carrier with a box at either end needs to turn."""
 TURNING_DISTANCES = (1.20, 1.35, 1.50)
-"""[m] Distances from the centre of a box at which it turns; the first with room is taken."""
+"""[m] Distances from the centre of a box at which a carrier may turn; the first one with room is used."""
 CARRYING_HALF_WIDTH = 0.40
-"""[m] It needs this on either side of its centre while it drives straight."""
+"""[m] Free distance on either side of its centre that a carrier needs to drive straight."""
 BUNCHES_PER_LAYER = 6
-"""Bunches side by side in one layer of a filled box."""
+"""Number of bunches in one layer of a filled box."""
 
 
 def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
-    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room for
-    it."""
+    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room."""
     if max(full, empty) >= len(model.box_pose):
         raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
     here = start[:2]
@@ -330,7 +334,7 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
 
 
 def turning_places(model: Model, box: int) -> list[np.ndarray]:
-    """Places [2] m straight before the long sides of a box, with room to turn and a free lane to the box."""
+    """Positions [2] m in front of the long sides of a box, with room to turn and a free lane to the box."""
     pose = model.box_pose[box].astype(float)
     size = model.box_size[box].astype(float)
     across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])
@@ -352,7 +356,7 @@ def turning_places(model: Model, box: int) -> list[np.ndarray]:
 def fill_box(physics: Physics, box: int, count: int = 6) -> None:
     """Detach ``count`` bunches and put them into a box in layers, as the start of an exchange.
 
-    Call it between steps. The bunches farthest from the box are taken, so that those around it stay.
+    Call it between steps. It takes the bunches farthest from the box, so that the bunches around the box stay.
     """
     model = physics.model
     pose = model.box_pose[box].astype(float)
@@ -374,29 +378,30 @@ def fill_box(physics: Physics, box: int, count: int = 6) -> None:
         physics.rigid.place_bunch(bunch, frames.compose(pose, turned), np.zeros(6))
 
 
-# Planning of a meeting: the bunch that a person picks, and where a carrier waits with a box beside it.
+# Planning of a meeting: the bunch that a person picks, and the place where a carrier with a box waits.
 
 
 REACH = 0.55
-"""[m] Horizontal distance from a bunch or a box at which a person stands to reach it. GUESSED"""
+"""[m] Horizontal distance of a standing person from the bunch or box that it reaches for. GUESSED"""
 CLAMPED_BOX_DISTANCE = 0.75
 """[m] Approximate distance of a clamped box from the centre of the carrier."""
 PERSON_CLEARANCE = 0.30
-"""[m] A person needs this distance around where it stands and walks. GUESSED"""
+"""[m] Free distance that a person needs around it to stand and walk. GUESSED"""
 BUNCH_HEIGHT = (1.1, 1.75)
-"""[m] Heights of a bunch's centre that a hand takes with ease. GUESSED"""
+"""[m] Range of heights of a bunch's centre that a hand reaches easily. GUESSED"""
 MAX_PULL = 75.0
-"""[N] A bunch that holds on with more is left alone: a hand pulls with 100 N."""
+"""[N] Bunches that need a larger pull are not chosen; a hand pulls with 100 N."""
 KEPT_AWAY = 2.2
-"""[m] The carrier stays so far from where the person picks: its half length, the box, and some steps back. GUESSED"""
+"""[m] Distance of the carrier from the place where the person picks: half the carrier's length, the box, and some steps
+back. GUESSED"""
 MAX_PATHS = 3
-"""Waiting places that are tried for each place of a person: a search takes a second."""
+"""Number of waiting places that are tried for each place of a person; a search takes a second."""
 DISTANCES = (1.2, 1.5, 1.8, 2.2)
-"""[m] From where the person picks to where it gives; the first with room for both is taken."""
+"""[m] Distances from the place where the person picks to the place where it gives; the first one with room is used."""
 
 
 def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
-    """The bunch nearest to a base at ``near`` [7] for which there is room; :class:`PlacementError` if there is none."""
+    """Plan a meeting at the bunch nearest to a base at ``near`` [7] that has room; :class:`PlacementError` without."""
     if box >= len(model.box_pose):
         raise PlacementError(f"no box {box}: this scene has {len(model.box_pose)}; name more in its file")
     ways = [find_path(model, near[:2], place, TURNING_RADIUS) for place in turning_places(model, box)]
@@ -419,7 +424,7 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
 
 
 def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
-    """Whether a ``path`` [n, 2] m of a carrier leaves a person room, who goes some steps back from ``stand`` [2] m."""
+    """Whether the ``path`` [n, 2] m of a carrier leaves room for a person who steps back from ``stand`` [2] m."""
     start = path[:-1]
     way = np.diff(path, axis=0)
     share = np.clip(((stand - start) * way).sum(1) / np.maximum((way * way).sum(1), 1e-12), 0.0, 1.0)
@@ -427,7 +432,7 @@ def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
 
 
 def _standing_places(model: Model, bunch: np.ndarray) -> np.ndarray:
-    """Places [k, 2] m around a bunch [2] m with room for a person, those with most room first."""
+    """Places [k, 2] m around a bunch [2] m with room for a person, most room first."""
     angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     places = bunch + REACH * np.stack([np.cos(angles), np.sin(angles)], 1)
     room = ground_clearance(model, places)
@@ -435,7 +440,7 @@ def _standing_places(model: Model, bunch: np.ndarray) -> np.ndarray:
 
 
 def _waiting_places(model: Model, stand: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Headings [rad] and places [2] m of a carrier whose box a person reaches by a free straight way from ``stand``."""
+    """Headings [rad] and places [2] m of a carrier whose box a person can reach straight from ``stand`` [2] m."""
     found = []
     for far in DISTANCES:
         for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
@@ -451,7 +456,7 @@ def _waiting_places(model: Model, stand: np.ndarray) -> list[tuple[float, np.nda
     return found
 
 
-# The tasks of a robot client by name: planned before the start, begun once physics and robot exist.
+# The tasks of a robot client by name. They are planned before the start and begin when physics and robot exist.
 
 
 TASKS = ("pick", "exchange", "meet")
@@ -459,7 +464,7 @@ TASKS = ("pick", "exchange", "meet")
 
 
 class UnknownTask(ValueError):
-    """There is no task of that name; the text lists those that there are."""
+    """There is no task of that name; the message lists the tasks."""
 
 
 def validate_task_name(job: str | None) -> str | None:
@@ -470,10 +475,10 @@ def validate_task_name(job: str | None) -> str | None:
 
 
 def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physics, Robot], Task], np.ndarray]:
-    """Plan a task: a function that begins it, and the pose [7] at which the robot must start.
+    """Plan a task. Returns a function that begins it, and the pose [7] at which the robot must start.
 
-    ``near`` [7]: its start pose otherwise. Takes 1 to 2 s: not for the real-time loop. Raises :class:`UnknownTask`, and
-    :class:`PlacementError` if the scene has no room for the task.
+    ``near`` [7]: usual start pose of the robot. It takes 1 to 2 s, too long for the real-time loop. Raises
+    :class:`UnknownTask`, and :class:`PlacementError` if the scene has no room for the task.
     """
     if validate_task_name(job) == "pick":
         plan = next(plan_picks(model, near[:2]))
@@ -485,6 +490,6 @@ def plan_task(job: str, model: Model, near: np.ndarray) -> tuple[Callable[[Physi
 
 
 def _begin_swap(physics: Physics, robot: Robot, swap: SwapPlan) -> SwapBoxes:
-    """Fill the box that is to be full, and begin the exchange."""
+    """Fill the box that must be full, and begin the exchange."""
     fill_box(physics, swap.full_box)
     return SwapBoxes(physics, robot, swap)

@@ -1,4 +1,4 @@
-"""Commands from ROS, applied to a robot of this client."""
+"""Applies commands from ROS to a robot of this client."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ from vinesim.ros.commands.types import (
 log = logging.getLogger(__name__)
 
 MAX_LOGGED = 32
-"""Largest number of kinds of refusals in the log: some reasons name what the sender made up."""
+"""Largest number of kinds of refusals in the log. It is limited because some reasons contain text from the sender."""
 
 _NUMBER = r"(?<![\w.])[-+]?(?:\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|nan|inf)(?!\w)"
 _NUMBERS = re.compile(rf"{_NUMBER}(?:,? {_NUMBER})*")
-"""Numbers in a reason: values, which differ with each command, but not those in names of joints."""
+"""Numbers in a reason, except those in joint names; they are values that differ with each command."""
 
 _STATUS = {Outcome.SUCCESSFUL: GoalStatus.SUCCEEDED, Outcome.CANCELED: GoalStatus.CANCELED}
 
@@ -54,19 +54,19 @@ class RosCommandHandler:
         world_time: WorldTime | None = None,
         play: Callable[[bytes], None] = lambda _: None,
     ) -> None:
-        """``commands`` returns the commands that have arrived since the last call; ``finish`` takes ended goals.
+        """``commands`` returns the commands that have arrived since the last call; ``finish`` receives ended goals.
 
-        ``world_time``: in which commands are stamped; without it they are stamped in simulated time. ``play``:
-        takes PCM16 for the loudspeaker.
+        ``world_time``: the time in which commands are stamped; by default simulated time. ``play``: receives PCM16 for
+        the loudspeaker.
         """
         self.robot = robot
         self.controllers = ControllerManager(robot)
         self.rejected_count = 0
-        """Commands that this robot cannot take."""
+        """Number of commands that this robot cannot execute."""
         self._logged: set[tuple[str, str]] = set()
-        """Kinds of refusals that the log has."""
+        """Kinds of refusals that have been logged."""
         self._lights_color: tuple[float, float, float] | None = None
-        """Of the indicator lights; None: that of the pattern."""
+        """Colour of the indicator lights; None: the colour of the pattern."""
         self._commands = commands
         self._finish = finish
         self._world_time = world_time
@@ -84,9 +84,9 @@ class RosCommandHandler:
             self._finish(_goal_result(result))
 
     def _refuse(self, command: Command, error: CommandError) -> None:
-        """Count a command that this robot cannot take; the log has each kind of refusal once.
+        """Count a command that this robot cannot execute, and log each kind of refusal once.
 
-        A kind is a controller, or a type of commands that have none, with a reason, whatever numbers that names.
+        A kind is the controller (or the command's type if it has no controller) with the reason without its numbers.
         """
         self.rejected_count += 1
         sender = getattr(command, "controller", type(command).__name__)
@@ -96,12 +96,12 @@ class RosCommandHandler:
             log.warning("refused a command of %s, further ones of this kind are only counted: %s", sender, error)
 
     def cancel_all(self, time: float) -> None:
-        """Cancel all goals, as the process that serves them is gone."""
+        """Cancel all goals because the process that serves them has ended."""
         self.controllers.cancel_all(time)
         self.controllers.take_results()
 
     def begin_anew(self, robot: Robot) -> None:
-        """Abort all goals, and command ``robot`` from now on: the one that has taken the place of the former."""
+        """Abort all goals, and command ``robot``, which has replaced the former robot, from now on."""
         self.controllers.abort_all("the simulation was reset")
         for result in self.controllers.take_results():
             self._finish(_goal_result(result))
@@ -141,7 +141,7 @@ class RosCommandHandler:
 
 
 def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
-    """A trajectory with its start in simulated time; ``offset`` [s]: of the world's time against that."""
+    """A trajectory with its start in simulated time; ``offset`` [s]: world time minus simulated time."""
 
     def tolerance(given: JointTolerances | None) -> Tolerance | None:
         return None if given is None else Tolerance(given.position, given.velocity)
@@ -159,7 +159,7 @@ def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
 
 
 def _goal_result(result: controller_manager.GoalResult) -> GoalResult:
-    """A result as ROS has it. A goal that another one ended is aborted, with the code of ros2_controllers for that."""
+    """A result in ROS terms. A goal replaced by another one is aborted with the code of ros2_controllers."""
     outcome = result.outcome
     code = {Outcome.PREEMPTED: Outcome.INVALID_GOAL, Outcome.CANCELED: Outcome.SUCCESSFUL}.get(outcome, outcome)
     return GoalResult(result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text, result.gripper)

@@ -1,4 +1,4 @@
-"""Requests of ROS to a client's simulation: pause, single steps, reset, and what is in the world."""
+"""Requests from ROS to a client's simulation: pause, single steps, reset, and entities of the world."""
 
 from __future__ import annotations
 
@@ -19,13 +19,14 @@ from vinesim.ros.commands.types import (
 )
 
 MAX_STEPS = 100_000
-"""Steps that one request may ask for."""
+"""Largest number of steps in one request."""
 
 
 class SimulationControl:
-    """Answers requests between the steps of one client; any thread may :meth:`put` them.
+    """Answers requests between the steps of one client; any thread may :meth:`put` requests.
 
-    Only a client without a server pauses: others would see its actors stand still and take their objects.
+    Only a client without a server may pause. Otherwise other clients would see its actors stand still and take over
+    their objects.
     """
 
     def __init__(self, client: Client, reply: Callable[[SimulationReply | StepProgress], None]) -> None:
@@ -34,22 +35,22 @@ class SimulationControl:
         self._editor = WorldEditor(client)
         self._requests: collections.deque[SimulationRequest] = collections.deque()
         self._stepping: SimulationRequest | None = None
-        """A request whose steps are being simulated."""
+        """Request whose steps are being simulated."""
         self._reported_steps = 0
-        """How many of its steps a :class:`StepProgress` has reported."""
+        """Number of its steps that a :class:`StepProgress` has reported."""
 
     def put(self, request: SimulationRequest) -> None:
         """Add a request."""
         self._requests.append(request)
 
     def __call__(self) -> None:
-        """Answer what can be answered now; call it between two steps."""
+        """Answer all requests that can be answered now. Call it between two steps."""
         self._follow_steps()
         while self._requests:
             self._serve(self._requests.popleft())
 
     def end_steps(self, reason: str) -> None:
-        """End the steps that are being simulated, if there are any, and pause; their request is refused."""
+        """End the requested steps that are being simulated, if any, refuse their request, and pause."""
         if (request := self._stepping) is None:
             return
         done = request.steps - (self._client.steps_before_pause or 0)
@@ -58,7 +59,7 @@ class SimulationControl:
         self._answer(request, refusal=f"{reason} after {done} of {request.steps} steps", kind=Refusal.FAILED)
 
     def _follow_steps(self) -> None:
-        """Report the step that was done since the last call; answer the request after its last step."""
+        """Report the step since the last call, and answer the request after its last step."""
         if (request := self._stepping) is None:
             return
         remaining = self._client.steps_before_pause or 0
@@ -84,7 +85,7 @@ class SimulationControl:
                 self._answer(request, **result)
 
     def _do(self, request: SimulationRequest) -> dict[str, Any]:
-        """Do what can be done at once; what the answer says beside time and pause."""
+        """Execute a request that needs no steps. Returns values for the answer in addition to time and pause."""
         editor = self._editor
         arguments = request.entity or EntityArguments("")
         match request.action:
@@ -111,7 +112,7 @@ class SimulationControl:
         is_step = request.action is SimulationAction.STEP
         if client.world_time.is_shared:
             text = "a client of a shared world cannot pause; start it without --connect"
-            # StepSimulation and SimulateSteps define this code for a simulation that runs
+            # StepSimulation and SimulateSteps define this code for a running simulation
             raise RequestRefused(Refusal.FAILED if is_step else Refusal.INCORRECT_STATE, text)
         if not is_step:
             self.end_steps(f"ended by {request.action}")

@@ -16,23 +16,23 @@ PUSH_HEIGHT = (1.2, 1.75)
 
 
 BASE_CLEARANCE = 0.55
-"""[m] A robot's base needs this distance around its centre."""
+"""[m] Free distance that a robot's base needs around its centre."""
 
 
 QUEUE_SPACING = 1.5
-"""[m] Between robots of one client that start behind one another. GUESSED"""
+"""[m] Distance between robots of one client that start behind each other. GUESSED"""
 OVERHEAD = 1.8
-"""[m] What stands still and is wholly above this does not stop a base with its arms tucked (it is 1.6 m high)."""
+"""[m] Fixed pieces wholly above this height do not block a base with its arms tucked, which is 1.6 m high."""
 MAX_CANDIDATES = 200
-"""Number of the nearest bunches that are tried."""
+"""Number of nearest bunches that are tried."""
 
 
 class PlacementError(ValueError):
-    """The scene lacks the start place, bunch, box or room that was asked for; the text says what it has."""
+    """The scene lacks the requested start place, bunch, box or room; the message says what it has."""
 
 
 def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
-    """Pose [7] of a start place, moved backwards by ``back`` [m]; on a line beside the vines if the scene names none.
+    """Pose [7] of a start place, moved backwards by ``back`` [m]; a place beside the vines if the scene has none.
 
     Raises :class:`PlacementError` if the scene has no start place of that ``number``.
     """
@@ -47,13 +47,13 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
 
 
 def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
-    """Pose [7] of the ``queue``-th robot of a client: the next start places, then in line behind the first ones."""
+    """Pose [7] of the ``queue``-th robot of a client: at the next start places, then in line behind the first ones."""
     lap, place = divmod(number + queue, max(len(scene.spawns), 1)) if queue else (0, number)
     return spawn_pose(scene, place, back + QUEUE_SPACING * lap)
 
 
 def with_start_pose(scene: Scene, x: float, y: float, yaw: float) -> Scene:
-    """The same scene with one start place, at (x, y) [m] with ``yaw`` [rad]."""
+    """A copy of the scene with a single start place, at (x, y) [m] with ``yaw`` [rad]."""
     return msgspec.structs.replace(scene, spawns=(Spawn(name="given", x=x, y=y, yaw=yaw),))
 
 
@@ -65,9 +65,9 @@ def bunch_centres(model: Model) -> np.ndarray:
 
 
 def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
-    """The bunch that an arm reaches best from a base at ``pose`` [7]: ahead, at arm's height, nearest to 0.6 m.
+    """The bunch that an arm reaches best from a base at ``pose`` [7]: ahead, at arm's height, closest to 0.6 m away.
 
-    Raises :class:`PlacementError` if there is none in reach.
+    Raises :class:`PlacementError` if no bunch is in reach.
     """
     local = frames.rotate(frames.conjugate(pose[3:]), bunch_centres(model) - pose[:3])
     distance = np.hypot(local[:, 0], local[:, 1])
@@ -96,11 +96,11 @@ def validate_bunch(model: Model, bunch: int | None) -> int | None:
 
 
 def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
-    """Distance on the ground from points [n, 2] m to the nearest obstacle or box [n] m; infinite without any.
+    """Horizontal distance [n] m from points [n, 2] m to the nearest obstacle or box; infinite if there is none.
 
-    Obstacles are all poles, trunks, wires and arms. What is wholly above :data:`OVERHEAD` does not count.
+    Obstacles are poles, trunks, wires and arms, except those wholly above :data:`OVERHEAD`.
 
-    ``without``: number of a box that is left out.
+    ``without``: number of a box that is ignored.
     """
     solid = np.minimum(model.fixed_start[:, 2], model.fixed_end[:, 2]) < OVERHEAD
     clearance = np.full(len(points), np.inf)
@@ -122,9 +122,9 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
 
 
 def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
-    """A bunch that an arm can push, and a pose [7] of the base for it with room around, nearest to ``near`` [2] m.
+    """A bunch that an arm can push, and a pose [7] of the base with room around it, nearest to ``near`` [2] m.
 
-    Raises :class:`PlacementError` if there is none.
+    Raises :class:`PlacementError` if there is no such bunch.
     """
     centres = bunch_centres(model)
     high = np.flatnonzero((centres[:, 2] > PUSH_HEIGHT[0]) & (centres[:, 2] < PUSH_HEIGHT[1]))

@@ -1,19 +1,20 @@
-// What is pointed at: wood, bunches and rigid bodies along a ray from the eyes.
+// Finds the object that is pointed at: wood, bunches and rigid bodies along a ray from the eyes.
 
 import * as THREE from "./vendor/three.module.js";
 
 const NEAREST = 0.05; // m from the eyes
-/** A metre further off counts as much as so many radians beside the ray. */
+/** Angle beside the ray that counts as much as a metre of distance [rad]. */
 const FARNESS = 0.01;
-/** Hands go into a bunch by this share of its radius, and into a rigid body by this depth [m]. */
+/** Depth to which hands go into a bunch, as a share of its radius, and into a rigid body [m]. */
 const INTO_BUNCH = 0.3,
   INTO_RIGID = 0.02;
 
 /**
- * What a ray from the `eye` in the direction `ray` (both Vector3, of the world) points at, or misses by less than
- * `spread` [rad]: `carrier` and its `name`, a point `at` in its frame, `distance` of that from the eye [m], `what` it is. Of several the
- * one that an arm of `reach` [m] reaches, and next to the ray; null: nothing within `farthest` [m]. With shears, wood:
- * of a bunch the last piece of its stalk. Leaves give way, and are passed through.
+ * The object to which a ray from the `eye` in the direction `ray` (both Vector3, world) points, or which it misses by
+ * less than `spread` [rad]. The result has `carrier` and its `name`, a point `at` in the carrier's frame, the `distance`
+ * of this point from the eye [m], and `what` it is. Among several objects it prefers those within `reach` [m] of an arm,
+ * then those next to the ray; null: nothing within `farthest` [m]. With shears only wood counts, for a bunch the last
+ * segment of its peduncle. Leaves are ignored.
  */
 export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }) {
   const { wood, wood_length, bunch_body, bunch_length, bunch_radius, bunch_stalk, stalk_length } = world.header.arrays;
@@ -60,7 +61,7 @@ export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }
   return best;
 }
 
-/** Nearest points of a ray and of a piece [m] of an axis: how far along the piece, how deep along the ray, the gap between. */
+/** Nearest points of a ray and of a piece of an axis [m]: position along the piece, depth along the ray, and the gap. */
 function nearest(eye, ray, start, axis, length) {
   const apart = eye.clone().sub(start),
     b = ray.dot(axis),

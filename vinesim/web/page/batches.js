@@ -1,12 +1,12 @@
-// Primitives of one kind and level of detail, as one draw call: instances of a mesh that holds several copies of the
-// primitive's own, since an instance costs as much as some dozens of triangles, most of all without a graphics card.
+// Draws the primitives of one kind and level of detail in one draw call. An instance contains several copies of the
+// primitive's mesh, because an instance costs as much as some dozens of triangles, mostly without a graphics card.
 
 import * as THREE from "./vendor/three.module.js";
 import { LIST_WIDTH } from "./shaders.js";
 
-/** Triangles of an instance, about. */
+/** Approximate number of triangles of an instance. */
 const BATCH = 128;
-/** Instead of the row of a primitive, where the last instance has more copies than there are primitives. */
+/** Row number of the unused copies in the last instance. */
 const NOTHING = 0xffffffff;
 
 export class Batches {
@@ -38,7 +38,7 @@ export class Batches {
     this.seen.count = this.unseen.count = 0;
   }
 
-  /** Triangles that are drawn for the eyes. */
+  /** Number of triangles drawn for the eyes. */
   get triangles() {
     return (this.instances(this.seen.count) * this.geometry.index.count) / 3;
   }
@@ -47,7 +47,7 @@ export class Batches {
     return Math.ceil(count / this.copies);
   }
 
-  /** Draw what was added to `seen` for the eyes and the sun from now on, what was added to `unseen` for the sun. */
+  /** From now on draw the primitives in `seen` for the eyes and the sun, those in `unseen` only for the sun. */
   update() {
     const { listed } = this.uniforms,
       { seen, unseen } = this,
@@ -67,14 +67,14 @@ export class Batches {
   }
 }
 
-/** Rows of primitives, in memory that is kept from one list to the next. */
+/** A list of rows of primitives whose memory is reused. */
 class RowList {
   constructor() {
     this.rows = new Uint32Array(1024);
     this.count = 0;
   }
 
-  /** Some primitives more, whose rows follow each other. */
+  /** Add primitives with consecutive rows. */
   add(row, size) {
     const end = this.count + size;
     if (end > this.rows.length) {

@@ -1,4 +1,4 @@
-// Runs before the page's modules, in browsers of any age: a sentence for what is missing, instead of a blank page.
+// Runs before the page's modules, in browsers of any age, and names missing features instead of leaving a blank page.
 (() => {
   var started = false;
 
@@ -24,7 +24,7 @@
     return "";
   }
 
-  /** Called by main.js when the vineyard is there; from then on it reports failures itself. */
+  /** Called by main.js when the vineyard is loaded; from then on main.js reports failures itself. */
   window.pageStarted = () => {
     started = true;
   };

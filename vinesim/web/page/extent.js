@@ -1,12 +1,12 @@
-// How far rigid bodies extend: their outermost points in many directions, whatever their primitives are.
+// Extents of rigid bodies: outermost points in many directions, for all kinds of primitives.
 
 import * as THREE from "./vendor/three.module.js";
 import { BOX, ELLIPSOID, SPHEROID, TRIANGLE } from "./geometry.js";
 
-/** Directions: x y z of one after the other, both of each axis first. With so many a head's top is found within 2 mm. */
+/** Directions, x y z each, beginning with both directions of each axis; enough to find a head's top within 2 mm. */
 const AROUND = directions(122);
 
-/** Points [3] of the primitives of each carrier that lie farthest in the directions `AROUND`, in its frame. */
+/** Outermost points [3] of the primitives of each carrier in the directions `AROUND`, in the carrier's frame. */
 export function outermost({ shape, first, size, kind, carrier }) {
   const hulls = new Map(),
     u = new THREE.Vector3();
@@ -24,7 +24,7 @@ export function outermost({ shape, first, size, kind, carrier }) {
   return new Map([...hulls].map(([of, { points }]) => [of, points]));
 }
 
-/** How far `points` reach in a direction. */
+/** Extent of `points` in a direction. */
 export function farthest(points, { x, y, z }) {
   let along = -Infinity;
   for (let at = 0; at < points.length; at += 3)
@@ -32,7 +32,7 @@ export function farthest(points, { x, y, z }) {
   return along;
 }
 
-/** The box around `points` of `outermost`. */
+/** Bounding box of `points` from `outermost`. */
 export function boxAround(points) {
   return new THREE.Box3().setFromArray(points.subarray(0, 18)); // those along the axes
 }
@@ -53,7 +53,7 @@ class Hull {
   }
 }
 
-/** Point of a primitive that is no triangle, farthest in the direction `u`. */
+/** Outermost point of a primitive (not a triangle) in the direction `u`. */
 function support(shape, at, kind, u) {
   const [a, b, c] = [0, 4, 8].map((from) => new THREE.Vector3().fromArray(shape, at + from)),
     radius = shape[at + 3];
@@ -72,7 +72,7 @@ function support(shape, at, kind, u) {
   return (u.dot(a) > u.dot(b) ? a : b).addScaledVector(u, radius);
 }
 
-/** Both directions of each axis, then `count` others spread evenly. */
+/** Both directions of each axis, then `count` other directions distributed evenly. */
 function directions(count) {
   const axes = [1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1, 0, 0, 0, 1, 0, 0, -1];
   return Float64Array.from(

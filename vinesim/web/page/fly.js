@@ -1,4 +1,4 @@
-// Eyes that fly: keys, mouse, touch and gamepad. Angles about the world's z (yaw) and to the side (pitch).
+// A flying viewpoint, moved by keys, mouse, touch and gamepad. Angles: yaw about the world's z, pitch about the side.
 
 const KEYS = {
   KeyW: [0, 1],
@@ -12,15 +12,15 @@ const KEYS = {
   KeyE: [2, 1],
   KeyQ: [2, -1],
 };
-/** A stick that is less than this share off its middle rests. */
+/** Smallest deflection of a stick that counts, as a share of its range. */
 const REST = 0.15;
 /** Numbers of buttons of a gamepad with the standard mapping. */
 const LEFT_TRIGGER = 6,
   RIGHT_TRIGGER = 7;
-/** Angles beside the line straight behind what is followed, the best ones first [rad]; height of what is looked at [m]. */
+/** Angles to the side of the line behind what is followed, in order of preference [rad]; height of the target [m]. */
 const SIDES = [0.6, -0.6, 0.4, -0.4, 0.2, -0.2],
   AIM = 1.1;
-/** One of them is kept until it has moved so far [m] or turned by twice the angle with this sine. */
+/** A chosen angle is kept until the target has moved this far [m] or turned by twice the angle with this sine. */
 const FAR = 1,
   HALF_TURN = 0.25,
   NOTHING = { at: [NaN, NaN], turned: 0, side: SIDES[0] };
@@ -71,7 +71,7 @@ export class FlyingEyes {
     else this.look(0.0035 * dx, 0.0035 * dy);
   }
 
-  /** Two fingers ask to move [m]. */
+  /** Move by a gesture of two fingers [m]. */
   push(ahead, left) {
     this.move(ahead, left, 0);
   }
@@ -91,7 +91,7 @@ export class FlyingEyes {
     this.place[2] = Math.min(Math.max(this.place[2] + ahead * Math.sin(this.pitch) + up, 0.1), 200);
   }
 
-  /** Apply keys and gamepad for a time [s]; whether the user has moved. */
+  /** Apply keys and gamepad for a time [s]. Returns whether the user has moved. */
   update(seconds) {
     const way = [0, 0, 0];
     for (const code of this.held) way[KEYS[code][0]] += KEYS[code][1];
@@ -109,8 +109,8 @@ export class FlyingEyes {
   }
 
   /**
-   * Look at a point from a distance, over the shoulder: from that side where the least is between, by `between(eye,
-   * point)`. It is chosen anew when the point has moved far, or turned.
+   * Look at a point from a distance, over the shoulder, from the side where the least is in between according to
+   * `between(eye, point)`. The side is chosen again when the point has moved far or turned.
    */
   follow(point, heading, between, distance = 3.2) {
     const behind = (side) => [
@@ -142,8 +142,8 @@ export class FlyingEyes {
 }
 
 /**
- * What a gamepad asks for, shares from -1 to 1: sticks move and turn, triggers sink and rise. Which axis is what is known
- * of the standard mapping only; of other pads the first two count, for a trigger at rest may be an axis at -1.
+ * Commands of a gamepad from -1 to 1: sticks move and turn, triggers sink and rise. The meaning of axes is known only for
+ * the standard mapping. Of other pads only the first two axes are used, because a trigger at rest may be an axis at -1.
  */
 function wishOf({ axes, buttons, mapping }) {
   const isStandard = mapping === "standard",
@@ -158,7 +158,7 @@ function wishOf({ axes, buttons, mapping }) {
   };
 }
 
-/** The share of its way that a stick or trigger is beyond its rest: slow at first, not with a jerk. */
+/** Deflection of a stick or trigger beyond its rest zone, as a share; it increases slowly at first. */
 function beyondRest(value) {
   return (Math.sign(value) * Math.max(Math.abs(value) - REST, 0)) / (1 - REST);
 }

@@ -1,4 +1,4 @@
-// Base meshes of each kind of primitive, coarse to fine; the vertex shaders bend them into place.
+// Base meshes of each kind of primitive in several levels of detail; the vertex shaders deform them.
 
 /** Cone or cylinder with n sides; with ends or as an open tube. */
 function tube(sides, closed, flat) {
@@ -28,7 +28,7 @@ function tube(sides, closed, flat) {
   return { points, faces };
 }
 
-/** Sphere of triangles: an octahedron whose edges were halved so many times. */
+/** Sphere of triangles: an octahedron subdivided repeatedly by halving its edges. */
 function sphere(halvings) {
   const points = [
     [1, 0, 0],
@@ -74,13 +74,13 @@ function sphere(halvings) {
   return { points: points.flat(), faces: faces.flat() };
 }
 
-/** The coarsest sphere, as large as the octahedron beside it seems. */
+/** The coarsest sphere, with the apparent size of the octahedron. */
 function tetrahedron() {
   const s = 0.8;
   return { points: [s, s, s, s, -s, -s, -s, s, -s, -s, -s, s], faces: [0, 1, 2, 0, 3, 1, 0, 2, 3, 1, 3, 2] };
 }
 
-/** Blade of so many strips on each side of the midrib and along it. */
+/** Leaf blade; the arguments are the numbers of strips on each side of the midrib and along it. */
 function blade(across, along) {
   const points = [],
     faces = [],
@@ -94,7 +94,7 @@ function blade(across, along) {
   return { points, faces };
 }
 
-/** Cube whose normals are told by doubled coordinates. */
+/** Cube; a doubled coordinate marks the axis of a vertex's normal. */
 function cube() {
   const points = [],
     faces = [];
@@ -118,7 +118,7 @@ function cube() {
   return { points, faces };
 }
 
-/** How far the flattest face of a mesh is inside the sphere of radius 1 that it stands for. */
+/** Largest distance of a mesh's faces inside the sphere of radius 1 that it approximates. */
 const insideBall = ({ points, faces }) => {
   const at = (k) => points.slice(3 * k, 3 * k + 3),
     minus = (p, q) => p.map((x, axis) => x - q[axis]);
@@ -132,14 +132,14 @@ const insideBall = ({ points, faces }) => {
   }
   return 1 - least;
 };
-/** The same of a cylinder. */
+/** Largest distance of the faces of a cylinder's mesh inside the cylinder of radius 1. */
 const insideTube = (sides) => 1 - Math.cos(Math.PI / sides);
 const BALLS = [sphere(3), sphere(2), sphere(1)],
   SIDES = [16, 10, 6];
 
 /**
- * By kind, in the order of its numbers (primitives.py); each from fine to coarse. `inside`: of bodies that are round, how
- * far each level is inside the true form, as a share of the radius.
+ * Meshes by kind, in the order of the kinds' numbers (primitives.py), each from fine to coarse. `inside`: for round
+ * bodies, distance of each level inside the true shape as a share of the radius.
  */
 export const MESHES = [
   { name: "cone", levels: [tube(7, true, false), tube(4, false, false), tube(3, false, false)] },

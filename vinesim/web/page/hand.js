@@ -1,34 +1,34 @@
-// The right hand of a person without a headset: it reaches to where the mouse points, or for what was tapped.
+// The right hand of a person without a headset. It reaches to where the mouse points, or for a tapped object.
 
 import * as THREE from "./vendor/three.module.js";
 
-/** From the eyes at most, and how fast hands move and turn [m, m/s, rad/s]. */
+/** Largest distance of a hand from the eyes [m]; then the hand's speed [m/s] and rate of turning [rad/s]. */
 export const ARM = 0.75;
 const REACH = 0.9,
   TURN = 3;
 const NEAREST = 0.25; // m from the eyes
-/** A hand comes to what was tapped from so far before it at most [m]: one that came from below would lift it. */
+/** The hand approaches a tapped object from a point at most this far before it [m]; from below it would lift it. */
 const APPROACH = 0.2;
-/** Where the hand hangs, from the eyes: ahead, to the left, up [m]. */
+/** Position of the hanging hand relative to the eyes: ahead, to the left, up [m]. */
 const HANGING = [0.3, -0.2, -0.7];
 /**
- * How a hand comes to what it reaches for: from the line of sight to the left, up and about its own axis [rad], with a
- * share of how steep that line is. An empty hand comes along it; blades come from the right and from below, or the hand
- * would hide what they cut. GUESSED, by pictures.
+ * Direction from which a hand approaches its target, relative to the line of sight: to the left, up and about its own
+ * axis [rad], and the share of that line's steepness. An empty hand approaches along the line. Blades approach from the
+ * right and from below, or the hand would hide what they cut. GUESSED from pictures.
  */
 const EMPTY = { left: 0, up: 0, roll: 0, steep: 1 },
   WITH_SHEARS = { left: 0.9, up: 0.35, roll: -0.8, steep: 0.5 };
-/** Between palm and fingers [m], in the palm's frame. */
+/** Point between palm and fingers, in the palm's frame [m]. */
 const GRASP = [0.06, 0, 0];
 const FIST = [1, 1, 1, 1, 1],
   OPEN = [0, 0, 0, 0, 0];
-/** A finger that moves less than this [px] between touching and leaving the screen has tapped. */
+/** A touch that moves less than this counts as a tap [px]. */
 const STILL = 10;
 
 export class Hand {
   /**
-   * `gestures`: finger poses by name; the digits make them, in their order. `mouth` [3]: where shears cut, in the palm's
-   * frame [m]. `tap(cursor)` is called for taps and clicks at a place of the picture.
+   * `gestures`: finger poses by name, which the digit keys select in this order. `mouth` [3]: point where shears cut, in
+   * the palm's frame [m]. `tap(cursor)` is called for taps and clicks at a point of the picture.
    */
   constructor(element, gestures, mouth, tap) {
     this.mouth = mouth;
@@ -70,7 +70,7 @@ export class Hand {
     });
   }
 
-  /** One finger, or the left button, that touches and leaves at the same place. */
+  /** A tap with one finger, or a click with the left button. */
   listenToTaps(element, tap) {
     const down = new Map();
     let isTap = false;
@@ -103,29 +103,29 @@ export class Hand {
     });
   }
 
-  /** Reach to where the cursor is, or let the arm hang; a hand that holds something goes on holding it. */
+  /** Reach to the cursor, or let the arm hang. A hand that holds something keeps it. */
   toggleReach() {
     this.reaching = !this.reaching;
     this.target = null;
   }
 
-  /** Grasp, or let go; with shears: cut, after which they open again. */
+  /** Grasp or release; with shears: cut and open again. */
   toggleHold() {
     this.closed = !this.closed;
     this.opensAfterCut = this.closed && this.withShears;
   }
 
-  /** Reach for a point in the frame of what carries it, and follow that until the hand closes. */
+  /** Reach for a point in the frame of its carrier, and follow the point until the hand closes. */
   reachFor(target) {
     Object.assign(this, { target, kept: null, reaching: true });
   }
 
-  /** A state tells that the shears have closed. */
+  /** Called when a state reports that the shears have closed. */
   cut() {
     if (this.opensAfterCut) this.closed = this.opensAfterCut = false;
   }
 
-  /** Say on the buttons what the hand does, and with shears what is `between` the blades. */
+  /** Show on the buttons what the hand does, and with shears what is `between` the blades. */
   show(between) {
     const { reach, hold } = this.buttons;
     reach.setAttribute("aria-pressed", String(this.reaching));
@@ -134,7 +134,7 @@ export class Hand {
     if (hold.lastElementChild.textContent !== says) hold.lastElementChild.textContent = says;
   }
 
-  /** What the hand reaches for, from the `eye`: Vector3, at most an arm's length [m]. */
+  /** Target of the hand relative to the `eye` (Vector3), at most an arm's length away [m]. */
   aim(eye, head, ray, world) {
     if (this.target === null) return ray.clone().multiplyScalar(this.distance);
     const { carrier, at, name } = this.target;
@@ -143,7 +143,7 @@ export class Hand {
     return this.kept.clone().applyQuaternion(head);
   }
 
-  /** Move a `place` back `ahead`, the less the nearer the hand is to the line along which it comes there. */
+  /** Move `place` back along `ahead`, less if the hand is near the line of its approach. */
   stopBefore(place, ahead) {
     if (!this.offset) return;
     const way = place.clone().sub(this.offset),
@@ -152,8 +152,8 @@ export class Hand {
   }
 
   /**
-   * The tracked hand for the page's message, a time [s] after the last one: it moves at the speed of an arm.
-   * `pose` [7] of the head, `yaw` of it; `ray` Vector3: direction of the cursor from the eyes.
+   * The tracked hand for the page's message, a time [s] after the last one. It moves at the speed of an arm. `pose` [7]
+   * and `yaw`: of the head; `ray` (Vector3): direction of the cursor from the eyes.
    */
   tracked(pose, yaw, ray, world, seconds) {
     const eye = new THREE.Vector3(...pose.slice(0, 3)),
@@ -190,13 +190,13 @@ export class Hand {
   }
 }
 
-/** Quaternion of angles to the left of a `yaw`, up, and about the hand's own axis. */
+/** Quaternion from angles to the left of a `yaw`, up, and about the hand's own axis. */
 function turnOf({ left, up, roll }, yaw) {
   return new THREE.Quaternion().setFromEuler(new THREE.Euler(roll, -up, yaw + left, "ZYX"));
 }
 
-/** An angle between -pi and pi. */
+/** An angle wrapped to -pi to pi. */
 const wrapped = (angle) => Math.atan2(Math.sin(angle), Math.cos(angle));
 
-/** Where in the picture: -1 to 1, right and up. */
+/** Position in the picture: -1 to 1, right and up. */
 const cursorOf = (event) => [(2 * event.clientX) / innerWidth - 1, 1 - (2 * event.clientY) / innerHeight];

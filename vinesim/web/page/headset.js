@@ -1,4 +1,4 @@
-// A person in a headset: WebXR poses of head and controllers, sticks to walk and turn, pulses for what the hands feel.
+// A person in a headset: WebXR poses of head and controllers, sticks to walk and turn, haptic pulses.
 
 import * as THREE from "./vendor/three.module.js";
 import { Detail, PIXELS } from "./rate.js";
@@ -19,11 +19,11 @@ const AIM = 0.7,
   FARTHEST = 8,
   FLATTEST = 0.1; // share of a stick's way; m; how steep a ray to the floor is at least
 const CLICK = [0.3, 30]; // amplitude and ms of the pulse for a choice
-const RATE = 72; // Hz, of a display that does not tell
+const RATE = 72; // Hz, for a display that does not report its rate
 const STICK = 3; // number of the button under a stick, by the standard mapping of WebXR
 const PINCH = 0.025,
   CLOSED = 0.5; // m between the tips, mean bend of the fingers
-/** A palm is at the hip so far below the eyes and so far beside them [m]. GUESSED. */
+/** Range of distances below the eyes, and distance beside them, at which a palm is at the hip [m]. GUESSED. */
 const HIP = { above: 0.45, below: 0.9, beside: 0.3 };
 
 export class Headset {
@@ -87,9 +87,10 @@ export class Headset {
   }
 
   /**
-   * Of one XRFrame, a time `passed` after the last one, in which the person may move for `seconds`: where the head is,
-   * and how many pixels the next picture has; sticks: left walks where the head looks, right turns by 30 degrees to a side,
-   * chooses when it is pulled back, and pushed ahead marks a place on the floor, to which letting go of it jumps.
+   * Handle one XRFrame, a time `passed` after the last one, in which the person may move for `seconds`. It updates the
+   * head and the number of pixels of the next picture. Sticks: the left one walks where the head looks. The right one
+   * turns by 30 degrees to a side, opens the list when pulled back, and marks a place on the floor when pushed ahead;
+   * releasing it jumps there.
    */
   update(frame, seconds, passed) {
     const viewer = frame?.getViewerPose(this.renderer.xr.getReferenceSpace());
@@ -144,7 +145,7 @@ export class Headset {
     this.mark.visible = false;
   }
 
-  /** A hand whose joints the headset sees: palm on the rig, bend of each finger, whether it holds; null: not seen. */
+  /** A hand tracked by the headset: palm on the rig, bend of each finger, whether it holds; null: not tracked. */
   trackHand(frame, hand) {
     if (!frame?.getJointPose || !hand) return null;
     const space = this.renderer.xr.getReferenceSpace();
@@ -176,7 +177,7 @@ export class Headset {
     return { matrix, fingers, closed };
   }
 
-  /** A hand without a controller that closes at the hip presses; until it opens again it holds nothing. */
+  /** A hand without a controller that closes at the hip acts as a press; it holds nothing until it opens again. */
   takeFromHip(seen, k) {
     const way = new THREE.Vector3()
       .setFromMatrixPosition(seen.matrix)
@@ -189,7 +190,7 @@ export class Headset {
     if (this.closedAtHip[k]) seen.closed = false;
   }
 
-  /** Cosine and sine of where the head looks, about the world's z. */
+  /** Cosine and sine of the head's yaw about the world's z. */
   heading() {
     const [, , , x, y, z, w] = this.head();
     const yaw = Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));

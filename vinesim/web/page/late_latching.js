@@ -1,4 +1,4 @@
-// Late latching: the person's own hands are drawn where they are now, not where they were when the state was sent.
+// Late latching: the person's own hands are drawn at their present poses, not at those when the state was sent.
 
 import * as THREE from "./vendor/three.module.js";
 
@@ -12,7 +12,7 @@ export class LateHands {
     this.held = null; // by side: from the controller of the state to the hand as simulated
   }
 
-  /** A state was applied: hands as simulated, and the controllers that they followed. */
+  /** Called when a state was applied, with the simulated hands and the controllers that they followed. */
   take({ arrays }) {
     const { world } = this,
       { hand_proxy: proxy, hand_controller: controller } = arrays;
@@ -36,14 +36,14 @@ export class LateHands {
     });
   }
 
-  /** Pose (Matrix4, world) of the palm of a side, 0 left and 1 right, where it is now; null: not known. */
+  /** Present pose (Matrix4, world) of the palm of a side, 0 left and 1 right; null: not known. */
   palm(person, k) {
     const seen = person[SIDES[k]];
     return seen === null || this.held === null ? null : matrix(seen.pose).multiply(this.held[k].offset);
   }
 
-  /** Move the hands with their tracked poses of this moment: a free hand has no delay, one that is held back keeps the
-   * offset that it had. */
+  /** Move the hands with their present tracked poses. A free hand has no delay; a hand that is held back keeps its
+   * offset. */
   draw(person) {
     if (this.held === null) return;
     const moved = SIDES.map((_, k) => this.palm(person, k)?.multiply(this.held[k].back) ?? null);

@@ -1,5 +1,5 @@
-// GLSL of the light that cameras see (vinesim/kernels/shading), with the same tables: what a point reflects and lets
-// through of sun, sky, canopy and ground, and how a picture shows it. Linear RGB.
+// GLSL of the cameras' light (vinesim/kernels/shading) with the same tables: reflection and transmission of the light of
+// sun, sky, canopy and ground, and tone mapping. Linear RGB.
 
 export const LIGHT = /* glsl */ `
 precision highp float;
@@ -34,8 +34,8 @@ Surface diffuse(vec3 normal, vec3 albedo, float sky) {
 
 vec4 noiseAt(vec2 at) { return texture(noises, at + 0.5 / 256.0); }
 
-// Share of the sun's light that reaches a point: four samples of the depth that the sun sees. What it grazes is drawn in
-// steps of texels, and must not shade itself.
+// Share of the sun's light that reaches a point, from four samples of the sun's depth map. Surfaces at grazing angles
+// must not shade themselves through the resolution of texels.
 float sunShare(vec3 place, vec3 normal, float sky) {
   float facing = min(dot(normal, sun), 1.0), steep = sqrt(1.0 - facing * facing) / max(facing, 0.12);
   vec4 clip = sunMatrix * vec4(place + normal * sunTexel * (0.5 + 0.8 * (1.0 - facing)), 1.0);
@@ -58,7 +58,7 @@ vec3 ambient(vec3 n, float sky) {
   return above * (0.25 + 0.75 * up) + groundColour * (1.0 - up) * (0.35 + 0.65 * sky);
 }
 
-// What a glossy surface mirrors along r: holes of sky in a dark canopy above, ground below.
+// Reflection in a glossy surface along r: gaps of sky in a dark canopy above, ground below.
 vec3 mirrored(vec3 r, float sky) {
   float hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, noiseAt(vec2(r.x * 0.16 + r.z * 0.09, r.y * 0.16 - r.z * 0.07)).y);
   vec3 above = mix(canopyColour * 0.4, skyColour * 1.3, hole);
@@ -79,7 +79,7 @@ vec3 glossed(Surface s, bool isLeaf, vec3 d, vec3 n, float facing, float lit) {
   return colour + mirrored(r, s.sky) * fresnel * s.reflectivity * s.occlusion;
 }
 
-// Light that leaves a surface towards the eye; plain is the normal of the shape, without relief.
+// Light from a surface towards the eye; plain is the normal of the shape without relief.
 vec3 leaving(Surface s, vec3 plain, vec3 place, bool isLeaf, bool isBerry) {
   vec3 d = normalize(place - eye), n = s.normal;
   if (isLeaf && dot(plain, d) > 0.0) { n = -n; plain = -plain; }
@@ -97,7 +97,7 @@ vec3 leaving(Surface s, vec3 plain, vec3 place, bool isLeaf, bool isBerry) {
   return mix(colour, hazeColour, 0.6 * (1.0 - exp(-length(place - eye) * 0.006)));
 }
 
-// Light in a picture: the filmic curve of Narkowicz (2015), then sRGB.
+// Tone mapping: the filmic curve of Narkowicz (2015), then sRGB.
 vec3 display(vec3 light) {
   vec3 x = min(light * gain, 3.0);
   vec3 film = clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0);
@@ -110,7 +110,7 @@ const uint FOLIAGE = 0u, BERRY = 1u, CANE = 2u, BARK = 3u, POST = 4u, WIRE = 5u,
 const uint SKIN = 9u, PAINT = 10u, GRASS = 11u, LAMP = 12u, RUBBER = 13u, METAL = 14u, STRAW = 15u, REFLEX = 16u, GLASS = 17u;
 `;
 
-/** Berries: local is seed, depth in the bunch, and how far along the axis; neighbours the light that others take. */
+/** Berries: local is seed, depth in the bunch, and position along the axis; neighbours is the light that others block. */
 export const BERRIES = /* glsl */ `
 Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   Surface s = diffuse(n, tint, sky);
@@ -135,7 +135,7 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
 }
 `;
 
-/** Leaves, grass and what has fallen: local is u, v and the number of the outline; detail the midrib and the age. */
+/** Leaves, grass and fallen leaves: local is u, v and the number of the outline; detail is the midrib and the age. */
 export const LEAVES = /* glsl */ `
 uniform sampler2DArray leaves; // veins, slopes of the relief across and along (0.5: none), tone
 
@@ -182,7 +182,7 @@ Surface blade(vec3 plain, vec3 tint, float sky, vec3 local, float seed, vec4 det
 }
 `;
 
-/** Wood, and what is made: grain is the place across (x, y) and along (z) the grain [m]. */
+/** Wood and manufactured objects: grain is the position across (x, y) and along (z) the grain [m]. */
 export const SOLIDS = /* glsl */ `
 void wood(inout Surface s, uint material, vec3 grain, float seed, float height) {
   if (material == CANE) {
@@ -251,7 +251,7 @@ Surface soil(vec2 p) {
   float beyond = min(min(cell.x, cell.y), min(last.x - cell.x, last.y - cell.y)) * ground.z;
   float inside = smoothstep(0.0, 3.0, beyond), outside = 1.0 - inside;
   float sky = beyond > 0.0 ? texture(groundSky, (cell + 0.5) / size).x : 0.75;
-  // clods and sod by the noise that all materials have; both are in steps of 8-bit colours where they are far
+  // clods and sod by the noise of all materials; far away both appear in steps of 8-bit colours
   vec4 coarse = noiseAt(p * 0.21), near = noiseAt(p * 0.8), fields = noiseAt(p * 0.011 + vec2(0.0, 0.37));
   float tone = 0.54 + 0.6 * (near.z - 0.5) + 0.4 * (near.w - 0.5), sod = 0.5 + 0.9 * (near.w - 0.5) + 0.5 * (near.z - 0.5);
   float lane = (p.y - rows.x) / rows.y, away = abs(lane - round(lane)) * rows.y, track = abs(away - 0.5 * rows.y + 0.7);
@@ -269,7 +269,7 @@ Surface soil(vec2 p) {
 }
 `;
 
-/** Clear blue with thin clouds, a halo around the sun, hills in the haze, and trees before them. */
+/** Sky: clear blue with thin clouds, a halo around the sun, hills in the haze, and trees in front of them. */
 export const SKY = /* glsl */ `
 uniform float skyDim;
 

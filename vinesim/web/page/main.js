@@ -1,4 +1,4 @@
-// The page: loads the vineyard, follows its states; a spectator flies, a person walks, reaches and may wear a headset.
+// The page: loads the vineyard and follows its states. A spectator flies; a person walks, reaches and may wear a headset.
 
 import * as THREE from "./vendor/three.module.js";
 import { pointAt } from "./aim.js";
@@ -19,38 +19,38 @@ import { Wrist } from "./wrist.js";
 
 const RETRY = 1000; // ms
 const SILENCE = 3; // s
-/** The shadow map is drawn again after this time [ms] and this number of pictures. */
-const SHADOW_PERIOD = 250;
-const SHADOW_PICTURES = 4;
+const SHADOW_PERIOD = 250,
+  SHADOW_PICTURES = 4; // the shadow map is drawn again after this time [ms] and this number of pictures
 const LONGEST = 0.1; // s: longest time by which the keys move the viewpoint in one picture
 const FINGER = 22; // px: a tap within this distance of a thing selects it
-/** Turn of the view after which the list of visible plants is made again [rad]. */
-const TURN = 0.35;
-/** In a headset: half the diagonal field of view, the same turn, and the angle of one pixel of the finest displays [rad]. */
-const IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
+/** Rotation of the view after which the list of visible plants is rebuilt [rad]. For a headset: half the diagonal field
+ * of view, this rotation, and the angle of one pixel of the finest displays [rad]. */
+const TURN = 0.35,
+  IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
 const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
-const NAME = { far: 11, near: 16, from: 2, gap: 0.04 }; // px of names far away and near, nearer than so many m; m above heads
-/** A browser whose first pictures, by their median, come at a lower rate than SLOW draws less from then on: so many
- * triangles, as a share of a phone's, and so many pixels. One without a graphics card does from the start. */
+// sizes of the names of distant and near actors [px], distance of near ones and gap above heads [m]
+const NAME = { far: 11, near: 16, from: 2, gap: 0.04 };
+/** A browser whose first pictures have a median rate below SLOW [Hz] draws less from then on: FEW triangles (as a share
+ * of a phone's) and FEW_PIXELS. A browser without a graphics card does so from the start. */
 const SLOW = 5,
   FIRST_PICTURES = 12,
   FEW = 0.3,
   FEW_PIXELS = 250_000;
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
-/** Pictures a second on a screen, at which as much is drawn as they allow [Hz]. */
+/** Rate of pictures on a screen to which the number of triangles is adapted [Hz]. */
 const RATE = 60;
 const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser.";
 const NOBODY =
   "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
 
-/** A number in the address, null if it has none: triangles, pictures a second (rate), shadows. */
+/** A number in the page's address (triangles, rate or shadows), null if it is missing. */
 const asked = (name) => {
   const given = new URLSearchParams(location.search).get(name);
   return given === null ? null : Number(given);
 };
 
-/** What the page has done, for those who look at it from outside. */
+/** Counters of the page for tests and tools. */
 const page = {
   states: 0,
   drawn: 0,
@@ -144,7 +144,7 @@ class Viewer {
     this.renderer.setAnimationLoop((_, frame) => this.draw(frame));
   }
 
-  /** One button for each thing that a person may indicate to do; a second click ends it. */
+  /** One button for each intention; a second click ends it. */
   offerIntentions(intentions) {
     const panel = element("intentions");
     this.asks = panel.querySelector("summary").textContent;
@@ -160,7 +160,7 @@ class Viewer {
     }
   }
 
-  /** What the person is going to do from now on; empty: nothing. */
+  /** Set the person's intention; empty: none. */
   indicate(intention) {
     if (!this.isPerson) return;
     this.intention = intention;
@@ -194,7 +194,7 @@ class Viewer {
     this.socket.onclose = () => setTimeout(() => this.reconnect(), RETRY);
   }
 
-  /** The client may have been started again, with another vineyard or with this one at rest. */
+  /** Reconnect; the client may have been restarted with another vineyard or with this one at rest. */
   async reconnect() {
     element("state").textContent = "the client is gone; waiting for it ...";
     try {
@@ -213,7 +213,7 @@ class Viewer {
   }
 
   async take(state) {
-    // poses of trees come once: those of a state that is overtaken before it is drawn count, too
+    // poses of trees are sent once, so poses in a state that is replaced before it is drawn must be used, too
     this.world.apply(state);
     this.newest = state;
     if (this.timeline?.show(state.replay)) this.absence.expect();
@@ -232,7 +232,7 @@ class Viewer {
     }
   }
 
-  /** Rigid bodies by a state: shapes and poses change together, for the same row may be another body's before. */
+  /** Update rigid bodies from a state. Shapes and poses change together, because a row may belong to another body. */
   takeRigid(state) {
     this.latest = state;
     if (this.shapes !== null && this.shapes.version === state.rigid) {
@@ -244,7 +244,7 @@ class Viewer {
     this.lateHands.take(state);
   }
 
-  /** What the user wants of the recording, at once: none of its states may follow while it pauses. */
+  /** Send the user's command to the recording at once, because no state may follow while it pauses. */
   ask(replay) {
     if (this.socket.readyState === WebSocket.OPEN)
       this.socket.send(JSON.stringify({ ...this.message(this.eyes.pose), replay }));
@@ -347,7 +347,7 @@ class Viewer {
     }
   }
 
-  /** Of a vineyard that is too large for a page: the plants around the eye instead of those that it has left. */
+  /** For a vineyard that is too large for a page: load the plants around the eye in place of distant ones. */
   async loadPlants({ x, y, z }) {
     if (this.isLoadingPlants) return;
     this.isLoadingPlants = true;
@@ -357,12 +357,12 @@ class Viewer {
     this.isLoadingPlants = false;
   }
 
-  /** Triangles that are drawn from now on, as a multiple of those of a phone. */
+  /** Set the number of triangles to draw from now on, as a multiple of a phone's. */
   setBudget(multiple) {
     this.world.setBudget(multiple * TRIANGLE_BUDGET);
   }
 
-  /** After the first pictures: what a newcomer may wonder about. */
+  /** After the first pictures: show hints for new users. */
   adviseOnce(actors) {
     if (this.isAdvised || this.first.median === null) return;
     this.isAdvised = true;
@@ -375,14 +375,14 @@ class Viewer {
     say(TOO_SLOW);
   }
 
-  /** Few triangles and pixels, for good. */
+  /** Draw few triangles and pixels from now on. */
   drawLess() {
     this.isSlow = true;
     this.detail = null;
     this.setBudget(FEW);
   }
 
-  /** What the client is told: the state that was drawn, where the eyes are, and the person's head and hands. */
+  /** Send the client the drawn state, the viewpoint, and the person's head and hands. */
   message(pose) {
     const message = { drawn: page.tick, view: pose, overlays: this.overlays.areShown };
     if (!this.isPerson) return message;
@@ -404,7 +404,7 @@ class Viewer {
     return new THREE.Vector3(x, -z, y);
   }
 
-  /** Reach for what was tapped; what is too far away is said. */
+  /** Reach for a tapped object, or say that it is too far away. */
   reach(cursor) {
     if (this.headset.isWorn) return;
     const spread = (FINGER / (innerHeight / 2)) * Math.tan(((this.camera.fov / 2) * Math.PI) / 180);
@@ -419,7 +419,7 @@ class Viewer {
     else say(`This ${found.what} is ${found.distance.toFixed(1)} m away, an arm reaches ${ARM} m: walk nearer.`);
   }
 
-  /** Half of what the camera sees, corner to corner [rad]. */
+  /** Half of the camera's diagonal field of view [rad]. */
   get diagonal() {
     return Math.atan(Math.tan(((this.camera.fov / 2) * Math.PI) / 180) * Math.hypot(1, this.camera.aspect));
   }
@@ -429,7 +429,7 @@ class Viewer {
     return (2 * Math.tan(((this.camera.fov / 2) * Math.PI) / 180)) / this.renderer.domElement.height;
   }
 
-  /** The camera to a pose: x forward and z up in the world, which is turned by 90 degrees. */
+  /** Move the camera to a pose with x forward and z up, in the world, which is rotated by 90 degrees. */
   look(pose) {
     const target = ahead(pose).applyEuler(this.world.group.rotation);
     this.rig.position.set(0, 0, 0);
@@ -439,7 +439,7 @@ class Viewer {
     this.rig.updateMatrixWorld();
   }
 
-  /** Names above the other actors. */
+  /** Draw names above the other actors. */
   label(actors) {
     const names = element("names"),
       there = new Set(),
@@ -475,12 +475,12 @@ class Viewer {
       }
   }
 
-  /** Carriers of an actor. */
+  /** Carriers that belong to an actor. */
   parts(actor) {
     return this.world.names.flatMap((name, k) => (name.startsWith(`${actor}/`) ? [this.world.bodies + 1 + k] : []));
   }
 
-  /** A point (Vector3, world) in the picture: -1 to 1 right and up, beyond 1 in z: behind the eyes. */
+  /** Position of a point (Vector3, world) in the picture: -1 to 1, right and up; z above 1 means behind the eyes. */
   project(point) {
     return point.clone().applyEuler(this.world.group.rotation).project(this.camera);
   }
@@ -494,17 +494,17 @@ class Viewer {
   }
 }
 
-/** Where eyes at a pose [7] look, in the world. */
+/** Direction in the world of eyes at a pose [7]. */
 function ahead(pose) {
   return new THREE.Vector3(1, 0, 0).applyQuaternion(new THREE.Quaternion(...pose.slice(3)));
 }
 
-/** Quaternion, in the world, of something flat that faces eyes at a pose [7]. */
+/** Orientation in the world of a plane that faces eyes at a pose [7]. */
 function facing(pose) {
   return new THREE.Quaternion(...pose.slice(3)).multiply(new THREE.Quaternion(0, -Math.SQRT1_2, 0, Math.SQRT1_2));
 }
 
-/** What draws in this browser; empty if it does not say. */
+/** Name of the browser's renderer; empty if unknown. */
 function graphicsCard() {
   const gl = document.createElement("canvas").getContext("webgl2"),
     names = gl?.getExtension("WEBGL_debug_renderer_info");

@@ -1,15 +1,15 @@
-// Sentences for the user: what happened while nothing was drawn, and what this address cannot offer.
+// Messages for the user: changes while nothing was drawn, and features that this address cannot offer.
 
 const SHOWN_FOR = 12_000; // ms
 const FIRST = 5; // pictures in which a browser compiles shaders, however long that takes
 const TIMES = 5;
 
-/** Whether a time between two pictures is much longer than the usual one: an absence, also on slow machines. */
+/** Whether a time between two pictures is much longer than usual, which means an absence, also on slow machines. */
 export function isUnusual(passed, usual) {
   return passed > TIMES * usual;
 }
 
-/** Show a sentence for a while, or until it is clicked; one that is shown already comes once more. */
+/** Show a sentence for a while or until it is clicked; a sentence already shown starts again. */
 export function say(text, { stays = false } = {}) {
   const notices = document.getElementById("notices");
   for (const shown of [...notices.children]) if (shown.textContent === text) shown.remove();
@@ -21,24 +21,24 @@ export function say(text, { stays = false } = {}) {
   if (!stays) setTimeout(() => notice.remove(), SHOWN_FOR);
 }
 
-/** Compares what was there before a gap with what is there after it, and says so. */
+/** Compares the world before and after a gap, and reports the changes. */
 export class Absence {
   constructor() {
     this.known = null; // before the newest picture: time, picked bunches, actors
-    this.before = null; // before a gap that was not told of yet
+    this.before = null; // the world before a gap that was not reported yet
     this.told = []; // sentences so far
-    this.long = 3; // a longer time of the world between two pictures is told of, if that is not usual here [s]
+    this.long = 3; // a longer world time between two pictures is reported unless it is usual here [s]
     this.usual = 0; // time of the world between two pictures, smoothed [s]
     this.pictures = 0;
   }
 
-  /** The next jump of time was asked for. */
+  /** The user has requested the next jump of time. */
   expect() {
     this.known = null;
   }
 
-  /** A picture was drawn at a time of the world [s]; `picked` bunches and names of `actors`, null: not known yet, the
-   * next picture tells. */
+  /** Called when a picture was drawn at a world time [s], with the number of `picked` bunches and the names of `actors`;
+   * null: not known before the next picture. */
   drawn(time, picked, actors) {
     const { known } = this,
       passed = known === null ? 0 : time - known.time;

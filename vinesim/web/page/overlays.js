@@ -1,4 +1,4 @@
-// What is not to be seen, drawn on demand: contact forces, areas of interest, and who owns what.
+// Overlays, drawn on demand: contact forces, areas of interest, and owners.
 
 import * as THREE from "./vendor/three.module.js";
 
@@ -44,7 +44,7 @@ export class Overlays {
     this.buttons[name].setAttribute("aria-pressed", String(this.shown.has(name)));
   }
 
-  /** Whether the client is to send more than poses. */
+  /** Whether the client must send more than poses. */
   get areShown() {
     return this.shown.size > 0;
   }
@@ -53,7 +53,7 @@ export class Overlays {
     if (state.owners) this.state = state;
   }
 
-  /** Draw the newest; `actors` with their carriers. */
+  /** Draw the newest overlays; `actors` with their carriers. */
   draw(actors, camera) {
     const { state } = this;
     this.forces.visible = this.shown.has("forces") && state !== null;
@@ -92,7 +92,7 @@ export class Overlays {
     }
   }
 
-  /** Where a tree, box or bunch is [3]; null: not here. */
+  /** Position [3] of a tree, box or bunch; null: not loaded. */
   place(name) {
     const [kind, index] = name.split("/"),
       { world } = this;

@@ -1,4 +1,4 @@
-// A person without a headset: walks in the world's time, by keys or by two fingers.
+// A person without a headset walks in the world's time, by keys or by two fingers.
 
 import { FlyingEyes } from "./fly.js";
 
@@ -7,24 +7,24 @@ const WALK = 1.4,
 const LONGEST_WISH = 1; // m that fingers ask for in advance
 
 /**
- * A person walks and reaches in the world's time: where the client is slower than real time, or pauses, so is the person,
- * and hands stay as fast in the world as an arm is.
+ * A person walks and reaches in the world's time. If the client is slower than real time or pauses, so does the person,
+ * so that hands have the speed of an arm in the world.
  */
 export class Pace {
-  /** `most` [s]: of the world's time that may be made up for. */
+  /** `most` [s]: largest world time that the person may catch up. */
   constructor(most) {
     this.most = this.left = most;
     this.time = null;
   }
 
-  /** A state of a time of the world [s] has come. */
+  /** Called when a state of a world time [s] has arrived. */
   earn(time) {
     const passed = this.time === null ? 0 : time - this.time;
     this.time = time;
     this.left = passed < 0 ? this.most : Math.min(this.left + passed, this.most);
   }
 
-  /** Of the time [s] since the last picture, that in which the person moves. */
+  /** The part of the time since the last picture in which the person moves [s]. */
   spend(passed) {
     const seconds = Math.min(passed, this.left);
     this.left -= seconds;
@@ -32,7 +32,7 @@ export class Pace {
   }
 }
 
-/** Eyes at the height of a person who walks. */
+/** Viewpoint of a walking person. */
 export class WalkingEyes extends FlyingEyes {
   constructor(element, pose) {
     super(element, pose);
@@ -42,7 +42,7 @@ export class WalkingEyes extends FlyingEyes {
     this.wish = [0, 0]; // m ahead and to the left that fingers have asked for, and that are not walked yet
   }
 
-  /** Fingers may be faster than a person. */
+  /** Limit the motion, because fingers may be faster than a person. */
   push(ahead, left) {
     const wish = [this.wish[0] + ahead, this.wish[1] + left],
       length = Math.hypot(...wish);

@@ -1,6 +1,6 @@
-// How fast pictures come, and what is done where that is too slow. Times in seconds.
+// Measures the rate of pictures and adapts the detail to it. Times in seconds.
 
-/** The first pictures of a page: one of them waits for the graphics card's compilers, which says nothing of the others. */
+/** Rate of the first pictures of a page; one of them waits for the compilers of the graphics card. */
 export class FirstPictures {
   constructor(count) {
     this.count = count;
@@ -11,7 +11,7 @@ export class FirstPictures {
     if (this.times.length < this.count) this.times.push(seconds);
   }
 
-  /** Median time from one to the next; null until all have come. */
+  /** Median time from one picture to the next; null until all of them were drawn. */
   get median() {
     return this.times.length < this.count ? null : [...this.times].sort((a, b) => a - b)[this.count >> 1];
   }
@@ -20,13 +20,13 @@ export class FirstPictures {
 const WINDOW = 36; // pictures by which the detail is judged
 const LATE = 1.4; // periods: a picture that takes longer has missed one
 const MOST_LATE = 0.25; // share of a window
-const STRAY = 1; // late pictures of a window that mean nothing: a collector ran, a list was made anew
+const STRAY = 1; // late pictures of a window that are ignored: a garbage collector ran, or a list was rebuilt
 const LONGEST_CALM = 16; // times the calm at first
 
 /**
- * How much is drawn, 1 at first, so that pictures come at a rate: `less` times as much after a window with many late
- * ones, `more` after `calm` windows without, between `least` and `most`. More that proves too much is tried again
- * after twice as long.
+ * Amount that is drawn, 1 at first, adapted so that pictures keep a rate. It is multiplied by `less` after a window with
+ * many late pictures, and by `more` after `calm` windows without, between `least` and `most`. An increase that was too
+ * much is tried again after twice the time.
  */
 export class Detail {
   constructor({ least, most, less, more, calm }) {
@@ -39,7 +39,8 @@ export class Detail {
     this.isTrial = false;
   }
 
-  /** A picture came `seconds` after the last one, where `rate` [Hz] are wanted. Whether the value has changed. */
+  /** Called when a picture was drawn `seconds` after the last one; `rate` [Hz] is wanted. Returns whether the value has
+   * changed. */
   add(seconds, rate) {
     this.late += seconds > LATE / rate;
     if (++this.seen < WINDOW) return false;
@@ -61,7 +62,7 @@ export class Detail {
   }
 }
 
-/** Of a headset: share of the pixels' rows and columns. */
+/** Amount for a headset: share of the rows and columns of pixels. */
 export const PIXELS = { least: 0.5, most: 1, less: 0.85, more: 1.06, calm: 20 };
-/** On a screen: triangles, as a multiple of those that a phone draws. */
+/** Amount for a screen: number of triangles relative to a phone. */
 export const TRIANGLES = { least: 0.4, most: 4, less: 0.7, more: 1.4, calm: 3 };

@@ -1,5 +1,5 @@
-// GLSL of the primitives that cameras and lidars see (vinesim/kernels/raster/primitives.py): every vertex finds its
-// primitive and the pose that carries it in textures, so that a body moves by eight numbers, whatever grows on it.
+// GLSL of the primitives of cameras and lidars (vinesim/kernels/raster/primitives.py). Every vertex reads its primitive
+// and the pose of its carrier from textures, so that moving a body changes only eight numbers.
 
 import { BERRIES, GROUND, LEAVES, LIGHT, MATERIALS, SKY, SOLIDS } from "./light.js";
 
@@ -230,7 +230,7 @@ void main() {
   );
 }
 
-/** Fragment shader for what the sun sees: only depth. */
+/** Fragment shader for the sun's depth map. */
 export function depthOnly(kind) {
   return `precision highp float;
 precision highp sampler2DArray;

@@ -6,13 +6,13 @@ import { say } from "./notices.js";
 
 const SIDES = ["left", "right"];
 const MARK = { inner: 0.017, outer: 0.021, dot: 0.005 }; // radii of a ring around the cut, and of a dot in it [m]
-/** With nothing between the blades, with what they would cut, with wood that is too strong. */
+/** Colours of the mark: with nothing between the blades, with something they would cut, with wood that is too strong. */
 const NOTHING = 0xffffff,
   CUTS = 0x3dff6e,
   TOO_STRONG = 0xff4d3d;
 
 export class Shears {
-  /** `mouth` [3]: where they cut, in the palm's frame [m]; null: the page has no person who can take them. */
+  /** `mouth` [3]: point where the shears cut, in the palm's frame [m]; null: the page has no person to take them. */
   constructor(mouth, group) {
     this.mouth = mouth;
     this.taken = { left: false, right: false };
@@ -39,13 +39,13 @@ export class Shears {
     this.button.setAttribute("aria-pressed", String(this.taken.right));
   }
 
-  /** Whether the left and the right hand have them, for the page's message. */
+  /** Whether the left and the right hand have shears, for the page's message. */
   get inHands() {
     return SIDES.map((side) => this.taken[side]);
   }
 
-  /** A state has come: say what the shears have cut each time that they have closed since the last one; whether they
-   * have. */
+  /** Called when a state has arrived: report what each closing of the shears since the last state has cut. Returns
+   * whether they have closed. */
   take({ shears }) {
     if (!shears) return false;
     const since = this.closures === null ? 0 : Math.max(shears.closures - this.closures, 0);
@@ -58,7 +58,7 @@ export class Shears {
     return since > 0;
   }
 
-  /** Marks where the blades cut now, for palms (Matrix4 or null) and eyes (Quaternion) in the world. */
+  /** Mark where the blades cut now, for palms (Matrix4 or null) and eyes (Quaternion) in the world. */
   draw(palms, turn) {
     this.marks.forEach((mark, k) => {
       mark.visible = this.taken[SIDES[k]] && palms[k] !== null;
@@ -74,7 +74,7 @@ export class Shears {
   }
 }
 
-/** A ring, and a dot that is shown in it, which nothing covers. */
+/** A ring with a dot, drawn in front of everything. */
 function makeMark() {
   const mark = new THREE.Group();
   for (const shape of [new THREE.RingGeometry(MARK.inner, MARK.outer, 40), new THREE.CircleGeometry(MARK.dot, 20)]) {

@@ -3,7 +3,7 @@
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 
 export class Timeline {
-  /** `status` as in every state of a recording; `ask` is called with what the user wants. */
+  /** `status` as in every state of a recording; `ask` is called with the user's command. */
   constructor(status, ask) {
     this.ask = ask;
     this.panel = document.getElementById("timeline");
@@ -40,7 +40,7 @@ export class Timeline {
     this.ask({ paused, speed, seek: wish.seek ?? null });
   }
 
-  /** A state has come; whether the recording has jumped to another time. */
+  /** Called when a state has arrived. Returns whether the recording has jumped to another time. */
   show(status) {
     const jumped = this.status !== undefined && status.jumps !== this.status.jumps;
     this.status = status;

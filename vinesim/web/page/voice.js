@@ -1,4 +1,4 @@
-// Hears and speaks: a socket of its own, Opus by WebCodecs or PCM16, each speaker where it is, the tones of lights.
+// Sound of the page: its own socket, Opus by WebCodecs or PCM16, voices at the speakers' positions, tones of lights.
 
 const RATE = 48000,
   FRAME = 960,
@@ -11,14 +11,14 @@ const BITRATE = 24000,
   SILENCE = 10000; // bit/s, ms, ms without a frame until a speaker is forgotten
 const TAPS = 48;
 
-/** Low pass for every third sample. */
+/** Low pass before taking every third sample. */
 const LOW_PASS = Float32Array.from({ length: TAPS }, (_, k) => {
   const t = (0.9 * (k - (TAPS - 1) / 2)) / PCM_FACTOR;
   const window = 0.54 - 0.46 * Math.cos((2 * Math.PI * k) / (TAPS - 1));
   return (0.9 / PCM_FACTOR) * (t === 0 ? 1 : Math.sin(Math.PI * t) / (Math.PI * t)) * window;
 });
 
-/** PCM16 of 16 kHz of the frames of one microphone. */
+/** Converts the frames of one microphone to PCM16 at 16 kHz. */
 class Downsampler {
   constructor() {
     this.before = new Float32Array(TAPS - 1);
@@ -39,7 +39,7 @@ class Downsampler {
   }
 }
 
-/** Samples at 48 kHz of PCM16 of 16 kHz, on straight lines from the last sample of the frame before. */
+/** Samples at 48 kHz from PCM16 at 16 kHz by linear interpolation, beginning at the last sample of the frame before. */
 function upsample(pcm, last) {
   const samples = new Float32Array(pcm.length * PCM_FACTOR);
   for (let i = 0; i < pcm.length; ++i) {
@@ -50,7 +50,7 @@ function upsample(pcm, last) {
   return samples;
 }
 
-/** A place from which sound comes: 1/d by the panner, and the fade to nothing at the end of hearing reach. */
+/** A source of sound: 1/d by the panner, and the fade to zero at the end of hearing reach. */
 class Source {
   constructor(context, law) {
     [this.reference, this.reach, this.fade] = law;
@@ -71,7 +71,7 @@ class Source {
     [this.panner.positionX.value, this.panner.positionY.value, this.panner.positionZ.value] = place;
   }
 
-  /** `ear`: place [3] of the listener. */
+  /** `ear`: position [3] of the listener. */
   update(ear) {
     const distance = Math.hypot(...this.place.map((value, axis) => value - ear[axis]));
     this.end.gain.value = Math.min(1, Math.max(0, (this.reach - distance) / this.fade));
@@ -82,7 +82,7 @@ class Source {
   }
 }
 
-/** The voice of one speaker: decodes its frames and plays them where it is. */
+/** The voice of one speaker: decodes its frames and plays them at the speaker's position. */
 class Speaker extends Source {
   constructor(context, law) {
     super(context, law);
@@ -196,7 +196,7 @@ export class Voice {
     this.press(this.hearing, this.context.state === "running");
   }
 
-  /** Begin to hear; the browser allows it after a click or a key. True: it works. */
+  /** Begin to hear, which browsers allow only after a click or a key. Returns whether it works. */
   async hear() {
     if (this.context) {
       await this.context.resume();
@@ -206,7 +206,7 @@ export class Voice {
       this.say("sound needs https or this machine itself: start the client with --page-lan and open its address");
       return false;
     }
-    // the shortest buffers that there are: 11 ms to the ear in Chromium 156, 42 ms with "interactive"
+    // the shortest buffers: 11 ms to the ear in Chromium 156, 42 ms with "interactive"
     const context = new AudioContext({ sampleRate: RATE, latencyHint: 0 });
     await context.audioWorklet.addModule("voice_worklet.js");
     this.opus = await hasOpus();
@@ -225,7 +225,7 @@ export class Voice {
     this.socket.onclose = () => setTimeout(() => this.connect(), RETRY);
   }
 
-  /** What the client says: whether this page may speak, what is wanted, and which lights sound. */
+  /** Handle a text from the client: whether this page may speak, which frames are wanted, and which lights sound. */
   obey(status) {
     this.status = status;
     if (this.microphone) this.say(status.objection);
@@ -241,7 +241,7 @@ export class Voice {
     }
   }
 
-  /** A frame of a speaker. */
+  /** Handle a frame of a speaker. */
   take(message) {
     const view = new DataView(message),
       length = view.getUint8(1);
@@ -254,7 +254,7 @@ export class Voice {
     this.counts.received += 1;
   }
 
-  /** Once a frame: the ears are at a pose [7], x forward and z up. */
+  /** Called for every picture: set the pose [7] of the ears, x forward and z up. */
   listen(pose) {
     if (!this.context) return;
     const listener = this.context.listener,
@@ -379,7 +379,7 @@ async function hasOpus() {
   }
 }
 
-/** A sentence for whoever wanted to speak. */
+/** Show a sentence to a user who wanted to speak. */
 function explain(failure) {
   const sentences = {
     NotFoundError: "no microphone was found: connect one, then press speak again",

@@ -1,11 +1,11 @@
-// In the thread of sound: cuts the microphone into frames, and plays the frames of one speaker at an even pace.
+// Audio worklet: splits the microphone's sound into frames, and plays the frames of one speaker at a steady pace.
 
 const FRAME = 960; // samples of 20 ms at 48 kHz
-/** Delay of a voice behind the beginning of its first frame, at first and at most: a frame, and a reserve. */
+/** Initial and largest delay of a voice after the beginning of its first frame: one frame and a reserve. */
 const START = 1.5 * FRAME,
   LARGEST = 12 * FRAME; // samples
 const RESERVE = FRAME / 2; // samples by which frames may come too early
-const EASE = 8; // of what was too early, the share 1/so much is waited for no more
+const EASE = 8; // the delay is reduced by 1 / EASE of the time by which frames were early
 const SPARE = 4 * FRAME; // samples that may wait beyond these
 const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
 const RAMP = 96; // samples of a fade, 2 ms
@@ -37,9 +37,9 @@ class Capture extends AudioWorkletProcessor {
 }
 
 /**
- * Plays a voice half a frame after its first frame has come. A queue that is empty amid a voice makes it wait for
- * longer from then on. What every frame of a sentence came too early by is waited for less from the next one on, and one
- * that goes on for a second is cut by a frame, so that a voice is soon no later than its network makes it.
+ * Plays a voice half a frame after its first frame has arrived. If the queue runs empty within a voice, the delay is
+ * increased. If all frames of a sentence arrived early, the delay of the next sentence is reduced by this time, and a
+ * sentence longer than a second is shortened by a frame. So the delay of a voice soon is only that of its network.
  */
 class Player extends AudioWorkletProcessor {
   constructor() {
@@ -73,7 +73,7 @@ class Player extends AudioWorkletProcessor {
     this.port.postMessage(this.counts);
   }
 
-  /** After some samples of a voice that goes on: cut what has waited for nothing. */
+  /** During a voice that continues: drop samples that waited without need. */
   follow(count) {
     if (!this.plays) return;
     this.passed += count;
@@ -90,7 +90,7 @@ class Player extends AudioWorkletProcessor {
     this.least = Infinity;
   }
 
-  /** The queue is empty: the voice has stalled, or a sentence is over. */
+  /** Called when the queue is empty: the voice has stalled, or a sentence has ended. */
   end() {
     this.plays = false;
     const isStall = this.peak > SILENT;

@@ -12,40 +12,40 @@ const SHAPE_SHIFT = 10,
 /** Distances [m] from which the next coarser level is drawn, in units of a cluster's thickness. */
 const LEVEL_DISTANCE = [60, 190, 400];
 const COARSEST = 1000;
-/** Where the budget is short, what is far goes rather than that what is near gets edges: levels are coarser by this at
- * most, and by more with budgets below that of a phone, with which bunches go last. */
+/** If the budget of triangles is short, distant parts are dropped before near parts become angular. Levels are made
+ * coarser by at most the first factor, or the second one with budgets below a phone's, where bunches are dropped last. */
 const NEAR_COARSER = 1.5,
   MOST_SHORT = 5;
-/** Rigid bodies are drawn by these coarser levels once plants are coarser than asked for by so much. */
+/** Factors by which plants are coarser than wanted, from which on rigid bodies are drawn one and two levels coarser. */
 const RIGID_COARSER = [3, 8];
-/** Round parts of rigid bodies are drawn so coarsely that this is wrong at most, in pixels. */
+/** Largest error of the shape of round parts of rigid bodies, in pixels. */
 const ROUNDNESS = 0.5;
-/** A cluster hides what is behind this share of its ball; at the end of a line of sight, where an actor works, plants
- * must be. */
+/** Share of a cluster's bounding sphere that hides what is behind it, and share of a line of sight up to which plants
+ * count as hiding; at its end, where an actor works, there must be plants. */
 const HALF_FULL = 0.5,
   MOST_BETWEEN = 0.8;
-/** The list is made anew when a rigid body comes nearer, or goes, by this factor; not if it stays nearer than so many m. */
+/** The list is rebuilt when the distance of a rigid body changes by this factor, unless it stays below NEAR [m]. */
 const COMES_NEARER = 1.3,
   NEAR = 1.5;
-/** A cluster whose parts are thinner than 1/so many of its distance is not drawn. */
+/** A cluster is not drawn if its distance is more than this many times the thickness of its parts. */
 const VANISHING = 2600;
-/** Of leaves and grass less: where some must be missing, bunches and posts are missed more. */
+/** VANISHING for leaves and grass. It is smaller, because missing bunches and posts are more noticeable. */
 const VANISHING_LEAVES = 1300;
-/** Of the budget plants have this share at least, however many triangles robots and people have. */
+/** Smallest share of the budget for plants, however many triangles robots and people have. */
 const LEAST_PLANTS = 0.5;
-/** A body that is so far from where it rests [m] is drawn wherever it may be. */
+/** A body further than this from its rest position is always drawn [m]. */
 const STRAY = 0.2;
-/** Of a phone, and of each eye of a headset. */
+/** Number of triangles for a phone, and for each eye of a headset. */
 export const TRIANGLE_BUDGET = 300_000;
-/** The lists of what is drawn are made anew when the eye has moved so far [m]. */
+/** Distance of the eye's motion after which the lists of drawn primitives are rebuilt [m]. */
 const STRIDE = 0.25;
 const SUN_SIZE = 2048,
   SUN_REACH = 9,
   SUN_NEAR = 1,
   SUN_FAR = 60;
-/** Of how far berries are loaded around a place, the share after which the plants around another one are. */
+/** Plants are loaded again after the eye has moved by this share of the loading distance of berries. */
 const LEFT = 0.5;
-/** Rigid primitives for which there is room from the start. */
+/** Initial capacity for rigid primitives. */
 const RIGID_ROOM = 16384;
 
 export class World {
@@ -88,7 +88,8 @@ export class World {
     this.poses.needsUpdate = this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
 
-  /** What stands and grows around a place [3]; `reach`: how far from there no berry is missing [m], null: nothing is anywhere. */
+  /** Set the fixed things and plants around a place [3]. `reach`: distance up to which all berries are loaded [m]; null:
+   * everything is loaded. */
   setPlants({ arrays, reach }, place) {
     this.write(arrays, 0);
     this.plantClusters = clusters(arrays);
@@ -99,12 +100,12 @@ export class World {
     this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
 
-  /** Whether eyes have come so far that the plants around them should be loaded. */
+  /** Whether the eyes have moved so far that the plants around them should be loaded. */
   isLeft(eye) {
     return this.reach !== null && eye.distanceTo(this.around) > LEFT * this.reach;
   }
 
-  /** All plants to their poses [7] at rest. */
+  /** Move all plants to their poses [7] at rest. */
   rest(poses) {
     this.strayed.clear();
     for (let k = 0; k < this.bodies; ++k) {
@@ -115,7 +116,7 @@ export class World {
     this.poses.needsUpdate = true;
   }
 
-  /** Rows of primitives into the textures, from a row on. */
+  /** Write primitives into the textures, from a row on. */
   write(arrays, row) {
     this.shapes.image.data.set(arrays.shape, row * 16);
     const surface = this.surfaces.image.data,
@@ -232,7 +233,7 @@ export class World {
     return mesh;
   }
 
-  /** Shapes of robots, people, boxes and picked bunches. */
+  /** Set the shapes of robots, people, boxes and picked bunches. */
   setRigid(header) {
     const { arrays } = header,
       count = arrays.material.length;
@@ -254,7 +255,7 @@ export class World {
     this.listedAt = null;
   }
 
-  /** Poses of the trees that have moved, and what was picked. */
+  /** Set the poses of moved trees, and the picked bunches. */
   apply(state) {
     const { body, place, turn, picked } = state.arrays;
     const rest = this.header.arrays.poses;
@@ -279,7 +280,7 @@ export class World {
     }
   }
 
-  /** Poses and lights of robots, people, boxes and picked bunches, numbered as in `setRigid`. */
+  /** Set poses and lights of robots, people, boxes and picked bunches, numbered as in `setRigid`. */
   applyRigid({ rigid_place, rigid_turn, ...arrays }) {
     for (let k = 0; k < rigid_place.length / 3; ++k) this.pose(this.bodies + 1 + k, rigid_place, rigid_turn, k);
     this.poses.needsUpdate = true;
@@ -290,7 +291,7 @@ export class World {
     this.light(arrays);
   }
 
-  /** Colours of indicator lights; only rows that have changed go to the graphics card. */
+  /** Set colours of indicator lights; only changed rows are sent to the graphics card. */
   light({ lamp, lamp_surface, lamp_material }) {
     const surface = this.surfaces.image.data,
       colour = new Uint32Array(lamp_surface.slice().buffer);
@@ -310,12 +311,12 @@ export class World {
     for (let axis = 0; axis < 4; ++axis) data[8 * carrier + 4 + axis] = turn[4 * k + axis] / 32767;
   }
 
-  /** Place [3] of a carrier, in the world. */
+  /** Position [3] of a carrier in the world. */
   place(carrier) {
     return new THREE.Vector3().fromArray(this.poses.image.data, 8 * carrier);
   }
 
-  /** Name of a rigid body, whose carrier changes when others come and go; "": a plant's. */
+  /** Name of a carrier's rigid body, "" for plants. A body's carrier changes when other bodies are added or removed. */
   nameOf(carrier) {
     return this.names[carrier - this.bodies - 1] ?? "";
   }
@@ -330,12 +331,12 @@ export class World {
     return point.clone().sub(this.place(carrier)).applyQuaternion(this.turn(carrier).conjugate());
   }
 
-  /** A point (Vector3) in the frame of a carrier, in the world. */
+  /** World position of a point (Vector3) in the frame of a carrier. */
   beyond(carrier, point) {
     return point.clone().applyQuaternion(this.turn(carrier)).add(this.place(carrier));
   }
 
-  /** Height of the highest point of some carriers [m]. */
+  /** Height of the highest point of several carriers [m]. */
   top(carriers) {
     return Math.max(
       ...carriers
@@ -353,7 +354,7 @@ export class World {
     return Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z));
   }
 
-  /** Triangles that are drawn at most, from the next list on. */
+  /** Set the largest number of triangles, from the next list on. */
   setBudget(triangles) {
     if (triangles > this.budget) this.coarser = 1; // the list finds how much coarser it has to be
     this.budget = triangles;
@@ -361,9 +362,9 @@ export class World {
   }
 
   /**
-   * Choose what is drawn, and how finely, for the eye [3] in the world that sees what is within an angle `field` of the
-   * direction `ahead`, in pixels of an angle `pixel`. The list is good until the eyes have turned by `turn` or see more or less at once; what they cannot
-   * see until then only casts shadows.
+   * Choose what is drawn and at which level of detail, for an eye [3] in the world that looks along `ahead` with half
+   * the field of view `field` and pixels of the angle `pixel`. The list is valid until the eyes have turned by `turn` or
+   * their field of view changes; things that cannot be seen until then only cast shadows.
    */
   list(eye, ahead, { field, turn, pixel }) {
     this.eye.copy(eye);
@@ -408,7 +409,7 @@ export class World {
     }
   }
 
-  /** How many clusters of plants are on the line from an eye [3] to a point [3] in the world, or around the eye. */
+  /** Number of clusters of plants on the line from an eye [3] to a point [3] in the world, or around the eye. */
   countBetween(eye, point) {
     const { first, ball } = this.plantClusters,
       way = point.map((value, axis) => value - eye[axis]);
@@ -425,7 +426,7 @@ export class World {
     return count;
   }
 
-  /** From the eye to the surface of a rigid body at least [m]. */
+  /** Lower bound of the distance from the eye to the surface of a rigid body [m]. */
   away(carrier) {
     const { min, max } = this.bounds.get(carrier),
       { x, y, z } = this.eye,
@@ -465,7 +466,7 @@ export class World {
     }
   }
 
-  /** What the sun sees around the eye, into the depth texture that the shaders read. */
+  /** Render the sun's depth map around the eye. */
   renderShadow(renderer) {
     const sun = this.common.sun.value,
       camera = this.sunCamera;
@@ -491,12 +492,12 @@ export class World {
   }
 }
 
-/** Parts of the page's own person that would be before its eyes. */
+/** Parts of the page's own person that would hide its view. */
 function partsBeforeEyes({ person }) {
   return new Set(person === null ? [] : ["head", "neck"].map((part) => `${person}/${part}`));
 }
 
-/** Uniforms of the light that cameras see. */
+/** Uniforms of the cameras' light. */
 function lightOf({ balance, exposure, dim, ...colours }) {
   const uniforms = { gain: { value: new THREE.Vector3(...balance).multiplyScalar(exposure) }, skyDim: { value: dim } };
   for (const [name, colour] of Object.entries(colours))
@@ -504,7 +505,7 @@ function lightOf({ balance, exposure, dim, ...colours }) {
   return uniforms;
 }
 
-/** A table whose mean is seen from far. */
+/** A texture of a table with mipmaps. */
 function smoothTable(texture) {
   texture.minFilter = THREE.LinearMipmapLinearFilter;
   texture.magFilter = THREE.LinearFilter;
@@ -537,7 +538,7 @@ function dataTexture(format, type, Kind, channels, texels, shift) {
   return texture;
 }
 
-/** Runs of primitives, with the mean thickness of their parts and the largest radius [m]. */
+/** Runs of primitives with the mean thickness of their parts and their largest radius [m]. */
 function clusters(arrays) {
   const { first, size, kind, bunch, ball, shape } = arrays,
     count = first.length;
