@@ -25,6 +25,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
+from vinesim.core.warp_arrays import share
 from vinesim.kernels.launch import BoundLaunch as Launch
 from vinesim.kernels.launch import bind_launch, bound, join_partitions
 from vinesim.kernels.plants import first_mode, structs
@@ -184,7 +185,8 @@ class ArticulationSolver:
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.awake_list = np.zeros(trees, np.int32)
-        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree]."""
+        self.awake_count = np.zeros(1, np.int32)
+        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree], and how many [1]."""
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
         self.tree_substeps = np.ones(trees, np.int32)
@@ -337,7 +339,12 @@ class ArticulationSolver:
 
     def _list_awake(self) -> None:
         self._awake = np.flatnonzero(self.state.tree_awake).astype(np.int32)
+        self.awake_count[0] = len(self._awake)
         self.awake_list[: len(self._awake)] = self._awake
+
+    def awake_trees(self) -> list[wp.array]:
+        """How many trees are awake [1], and which [tree]: for kernels on a CPU, which stay bound to both."""
+        return [share(self.awake_count, wp.int32), share(self.awake_list, wp.int32)]
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
         """All bodies of some trees, tree by tree [k]."""

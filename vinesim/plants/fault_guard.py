@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core.warp_arrays import share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.plants.articulation_solver import ArticulationSolver
 
@@ -46,10 +46,12 @@ class FaultGuard:
         """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
         self._faults: list[Fault] = []
         self._fastest = np.zeros(1, np.float32)
-        self._find_fastest = bind_launch(
-            find_fastest,
-            [share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
-            [share(self._fastest, wp.float32)],
+        self._find_fastest = KernelGraph(
+            KernelLaunch(
+                find_fastest,
+                [*plants.awake_trees(), share(plants.tree_rate, wp.float32)],
+                [share(self._fastest, wp.float32)],
+            )
         )
 
     def stop_faulty_trees(self) -> np.ndarray:

@@ -1,0 +1,89 @@
+"""Sequences of kernels on fixed arrays, each made by one call: captured once into a graph of Warp, then replayed.
+
+``wp.launch`` packs the arguments of a kernel at every launch: 10 us for twenty arguments, more than most of our kernels
+run. A graph keeps them: 0.2 us a kernel, and 1.4 us for the call (docs/decisions/kernel-graphs.md).
+
+The number of threads of a launch is part of its graph. So how many items there are stands in an array, ``count`` [1]
+int32, which NumPy or an earlier kernel of the sequence writes. A kernel has more threads than items, and begins with
+``if wp.tid() >= count[0]: return``, which takes a CPU less than a nanosecond. A sequence has a graph for each number of
+threads in :data:`TIERS`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import warp as wp
+
+TIERS = (64, 1024, 16384, 262144, 4194304)
+"""Numbers of threads. At most fifteen of sixteen threads have nothing to do, which takes as long as one tree in a
+hundred; to capture a launch takes 0.3 ms. MEASURED."""
+THREADS_PER_BLOCK = 32
+"""CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
+
+_capturing = threading.Lock()
+"""Warp captures one graph at a time."""
+
+
+@dataclasses.dataclass(frozen=True)
+class KernelLaunch:
+    """A kernel and its arguments: numbers, structs, and arrays that stay where they are."""
+
+    kernel: wp.Kernel
+    inputs: Sequence[Any]
+    outputs: Sequence[Any] = ()
+    threads: int = 0
+    """How many it has; 0: one for each item, of which it reads how many there are."""
+    width: int = 1
+    """Threads for each item: the second dimension of ``wp.tid()`` if there are several."""
+    block: int = THREADS_PER_BLOCK
+    """Threads of a block, on CUDA."""
+
+    def launch(self, items: int, device: wp.Device) -> None:
+        """Launch it with room for so many items."""
+        rows = self.threads or items
+        dim = rows if self.width == 1 else (rows, self.width)
+        wp.launch(self.kernel, dim, inputs=self.inputs, outputs=self.outputs, device=device, block_dim=self.block)
+
+
+class KernelGraph:
+    """Launches that follow each other."""
+
+    def __init__(self, *launches: KernelLaunch, device: str = "cpu") -> None:
+        self._launches = launches
+        self._device = wp.get_device(device)
+        self._graphs: dict[int, Any] = {}
+
+    def __call__(self, capacity: int = 1) -> None:
+        """Make the launches; no count that their kernels read may be above ``capacity``.
+
+        On CUDA they are only queued, and within a capture of the caller's they become part of that.
+        """
+        tier = tier_of(capacity)
+        if self._device.is_cuda and self._device.is_capturing:
+            self._launch(tier)
+            return
+        graph = self._graphs.get(tier)
+        if graph is None:
+            graph = self._graphs[tier] = self._capture(tier)
+        wp.capture_launch(graph)
+
+    def _launch(self, tier: int) -> None:
+        for launch in self._launches:
+            launch.launch(tier, self._device)
+
+    def _capture(self, tier: int) -> Any:
+        with _capturing, wp.ScopedCapture(self._device) as capture:
+            self._launch(tier)
+        return capture.graph
+
+
+def tier_of(capacity: int) -> int:
+    """The least of :data:`TIERS` that has room for so many items; :class:`ValueError` if none has."""
+    for tier in TIERS:
+        if capacity <= tier:
+            return tier
+    raise ValueError(f"{capacity} items for one launch: there is room for {TIERS[-1]}")
