@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -26,8 +26,8 @@ import warp as wp
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
-from vinesim.kernels.launch import BoundLaunch as Launch
-from vinesim.kernels.launch import bind_launch, bound, join_partitions
+from vinesim.kernels.graph import KernelGraph, KernelLaunch, tier_of
+from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.kernels.plants import first_mode, structs
 from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
 from vinesim.kernels.plants.energy_budget import (
@@ -39,7 +39,7 @@ from vinesim.kernels.plants.energy_budget import (
     choose_budget,
     keep_budget,
 )
-from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, substeps_for
+from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
 from vinesim.kernels.plants.floating_components import correct_floating_momentum
 from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.plants.integration import integrate
@@ -55,6 +55,21 @@ from vinesim.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
+
+# Places in the array of counts: how many entries of each list kernels take.
+_STEPPING = 0
+_SUBSET = 1
+_GROUPS = 2
+_WHOLE = 3
+_WHOLE_BUDGETS = 4
+_FLOATING = 5
+_DIVIDED = 6
+_DIVIDED_BUDGETS = 7
+_DIVIDED_FLOATING = 8
+_LEVEL = 9
+_LEVELS = 10
+_COUNTS = 11
+"""The last two: which substep is next, and how many there are."""
 
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
@@ -75,7 +90,7 @@ class ArticulationSolver:
         dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
-        threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
+        threads: on a CPU, so many threads share the contacts (the result is the same to the bit).
         fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
             ``PhysicsParameters``, and :mod:`vinesim.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
@@ -127,11 +142,11 @@ class ArticulationSolver:
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
         self.launch_pool = LaunchPool(threads)
-        """Threads that share launches over trees."""
+        """Threads that share the launches of contacts."""
         weakref.finalize(self, self.launch_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
-        self.launches = KernelLaunches(self, numbers, self.launch_pool, MAX_SUBSTEPS if substeps else 1)
+        self.launches = KernelLaunches(self, numbers, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
             buffers,
@@ -140,18 +155,19 @@ class ArticulationSolver:
             tree_steps=self._steps,
             tree_rate=self.tree_rate,
             tree_budget=self.tree_budget,
-            stepping=self._stepping,
-            groups=self._groups,
-            floating=self._floating,
+            lists={
+                "stepping": self._stepping,
+                "divided": self._divided,
+                "groups": self._groups,
+                "floating": self._floating,
+                "divided_floating": self._divided_floating,
+                "levels": self._levels,
+            },
+            counts=self._counts,
             topologies=Topologies(model, state.body_cut, self.tree_moving),
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
             | model.is_on_arm(),
         )
-
-        def apply_on_device(touched: int, first: int = 0, partition: int = 0) -> None:
-            self.launches.upload_wrenches(len(self._runner.stepped))
-            self.launches.apply_wrenches(touched)
-
         self._loads = ContactLoads(
             body_tree=model.body_tree,
             place_in_tree=self._place_in_tree,
@@ -159,10 +175,10 @@ class ArticulationSolver:
             tree_moving=self.tree_moving,
             body_wrench=self._wrench,
             touched=self._subset,
+            touched_count=self._counts[_SUBSET : _SUBSET + 1],
             euler_steps=self._euler_steps,
             onset=self.onset_steps + 1,  # the first step counts
-            apply=bound(apply_on_device) if buffers.has_copies else self.launches.apply_wrenches,
-            pool=self.launch_pool,
+            then=() if buffers.has_copies else (self.launches.wrenches,),
         )
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -227,12 +243,15 @@ class ArticulationSolver:
         self._offset = model.body_offset.copy()
         self._rest = model.body_rest.copy()
         self._falls = np.zeros(bodies, np.bool_)  # of a floating component that no tie holds
-        self._floating = np.zeros(bodies, np.int32)
+        self._floating, self._divided_floating = (np.zeros(bodies, np.int32) for _ in range(2))
         self._falling_roots = np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
         self._euler_steps = np.zeros(trees, np.int32)
         self._steps = np.ones(trees, np.int32)
-        self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
+        self._stepping, self._divided, self._subset = (np.zeros(trees, np.int32) for _ in range(3))
+        self._groups = np.zeros((trees, 2), np.int32)
+        self._levels = np.zeros((MAX_SUBSTEPS, 3), np.int32)
+        self._counts = np.zeros(_COUNTS, np.int32)
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
@@ -254,10 +273,14 @@ class ArticulationSolver:
                 "body_parent": self._parent,
                 "body_root": self._root,
                 "stepping": self._stepping,
+                "divided": self._divided,
                 "subset": self._subset,
+                "counts": self._counts,
+                "levels": self._levels,
                 "tree_euler_steps": self._euler_steps,
                 "tree_steps": self._steps,
                 "floating": self._floating,
+                "divided_floating": self._divided_floating,
                 "tree_substeps": self.tree_substeps,
                 "tree_budget": self.tree_budget,
             },
@@ -463,21 +486,23 @@ class ArticulationSolver:
         """
         launches = self.launches
         touched = _NO_TREES
-        loads = self._loads
         count = len(self._runner.stepped)
         if bodies is not None and len(bodies):
-            touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
-        elif len(loads):
-            self._unload(count)
+            touched = self._load(bodies, np.asarray(wrenches))
+        elif len(self._loads):
+            self._load(_NO_TREES, _NO_WRENCHES)
         self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
 
-    def _unload(self, count: int) -> None:
-        """Take the wrenches of the last contacts off the first ``count`` trees of the list."""
-        self._loads.replace(_NO_TREES, _NO_WRENCHES, self.tick)
-        self.launches.upload_wrenches(count)
+    def _load(self, bodies: np.ndarray, wrenches: np.ndarray) -> np.ndarray:
+        """Let wrenches [n, 6] on bodies [n] act instead of those of the last step; returns the trees touched [k]."""
+        touched = self._loads.replace(bodies, wrenches, self.tick)
+        if self.buffers.has_copies:
+            self.launches.upload_wrenches(len(self._runner.stepped))
+            self.launches.apply_wrenches(len(touched))
+        return touched
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
@@ -490,7 +515,7 @@ class ArticulationSolver:
     def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
         """Many steps of the awake trees: no sleep, no fault guard, no contacts but what ``between`` launches.
 
-        Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
+        A GPU works on its own copies meanwhile: :meth:`upload` before and
         :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free``, ``acceleration``
         are of the last step; a tree that went wrong stays where it was (``tree_rate`` NaN or above ``fault_rate``).
         """
@@ -498,8 +523,9 @@ class ArticulationSolver:
         floating = self._floating_roots()
         if len(self._loads) and steps > 0:  # the next prediction still knows the last contacts
             self._runner.predict()
-            self._unload(len(self._runner.stepped))
+            self._load(_NO_TREES, _NO_WRENCHES)
             self._runner.integrate(_NO_TREES, *floating)
+            self.buffers.synchronize()
             self._runner.advance(steps - 1, *floating, between)
         else:
             self._runner.advance(steps, *floating, between)
@@ -534,6 +560,7 @@ class ArticulationSolver:
     def list_subset(self, trees: np.ndarray) -> None:
         """List trees [k] for the kernels that do not work on all awake ones."""
         self._subset[: len(trees)] = trees
+        self._counts[_SUBSET] = len(trees)
 
     def require_stepped(self, bodies: np.ndarray) -> None:
         """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
@@ -848,9 +875,6 @@ def blend_towards(
 # Kernels of the articulation solver, each bound once to its arrays, and the transfers of rows around them.
 
 
-TREES_PER_CHUNK = {"predict": 2, "integrate": 16, "wrenches": 4}
-"""Trees that a thread takes at a time: work of 3 to 8 us, beside which taking them is nothing. DERIVED from the times
-of one tree of 17 bodies."""
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
 """Rows that are carried to the device before every prediction."""
 DEVICE_RESULTS = (
@@ -865,6 +889,11 @@ DEVICE_RESULTS = (
 """Rows that kernels write, or that are carried over when they are needed."""
 TREE_INPUTS = (
     "stepping",
+    "divided",
+    "floating",
+    "divided_floating",
+    "counts",
+    "levels",
     "tree_moving",
     "tree_phi",
     "tree_euler_steps",
@@ -929,21 +958,24 @@ class JointWrenches:
 
     places: np.ndarray
     """[joint] int32 bodies, where kernels find them: to be written by the caller."""
+    count: np.ndarray
+    """[1] int32 how many joints: to be written by the caller."""
     carried: np.ndarray
     """[joint, 6] N, N m"""
-    compute: Launch
-    """Fills :attr:`carried` of the first joints."""
+    launch: KernelLaunch
+    """Fills :attr:`carried`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """The launches of a step on the same arrays."""
+    """The kernels of a step on the same arrays."""
 
-    predict_groups: Launch
+    predict: KernelGraph
     """Over groups of trees; on a GPU each tree is a group."""
-    predict: Launch
-    integrate: Callable[..., None]
-    correct_floating_momentum: Launch
+    integrate: KernelGraph
+    """Integrates the trees of whole steps."""
+    take_substep: KernelGraph
+    """Predicts and integrates the trees that take the next substep."""
 
 
 class KernelLaunches:
@@ -956,13 +988,9 @@ class KernelLaunches:
     their own (:attr:`resident`), with :meth:`upload_trees` before and :meth:`download_trees` after.
     """
 
-    def __init__(
-        self, solver: ArticulationSolver, parameters: dict[str, float], pool: LaunchPool, max_substeps: int
-    ) -> None:
-        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity;
-        ``pool``: threads that share the launches over trees."""
+    def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], max_substeps: int) -> None:
+        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity."""
         self.buffers = solver.buffers
-        self._pool = pool
         self._max_substeps = max_substeps
         self._body_tree = solver.model.body_tree
         self.changed = False
@@ -975,14 +1003,12 @@ class KernelLaunches:
         self._budget_phase = -1
         self._seldom: list[str] = []
         self._register_arrays(solver)
-        self._record_transfers()
         self._arrays = self.buffers.arrays
+        self._record_transfers()
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
-        self.shared = Step(
-            self.predict_groups or self.predict, self.predict, self.integrate, self.correct_floating_momentum
-        )
-        """The launches of a step on what NumPy sees."""
+        self.shared = self._record_step_kernels(self.parameters)
+        """The kernels of a step on what NumPy sees."""
         self.resident = self.shared
         """Those of steps between which nothing comes back to the host."""
         self.resident_arrays = self.buffers.arrays
@@ -993,7 +1019,7 @@ class KernelLaunches:
             self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
         )
         self.response_capacity = 0
-        self._joint_wrenches = self.record_joint_wrenches(1)  # or the first bunch that is picked would wait for it
+        self._make_room_for_joints(1)  # or the first bunch that is picked would wait for it
 
     # ------------------------------------------------------------------ arrays
 
@@ -1056,21 +1082,36 @@ class KernelLaunches:
             setattr(filled, field, arrays[value] if isinstance(value, str) else value)
         return filled
 
-    def record(self, kernel: Any, *arguments: object, **options: Any) -> Launch:
-        """Bind a kernel; a string among the arguments names an array."""
-        given = [self._arrays[value] if isinstance(value, str) else value for value in arguments]
-        return bind_launch(kernel, given, [], device=str(self.buffers.device), **options)
+    def launch(self, kernel: Any, *arguments: object, **options: Any) -> KernelLaunch:
+        """A kernel and its arguments; a string among them names an array."""
+        return KernelLaunch(kernel, self._named(arguments), **options)
 
-    def record_shared(self, kernel: Any, *arguments: object, chunk: int) -> Launch:
-        """The same of a kernel whose list is ``trees``, shared in chunks of so many."""
-        launch = self.record(kernel, *arguments, index_list="trees", partitions=self._pool.size)
-        return self._pool.share([launch], chunk)
+    def graph(self, *launches: KernelLaunch) -> KernelGraph:
+        """Launches that follow each other, on the device."""
+        return KernelGraph(*launches, device=str(self.buffers.device))
+
+    def record(self, kernel: Any, *arguments: object, **options: Any) -> BoundLaunch:
+        """A kernel of contacts, for :attr:`ArticulationSolver.launch_pool`."""
+        return bind_launch(kernel, self._named(arguments), [], device=str(self.buffers.device), **options)
+
+    def _named(self, arguments: Sequence[object]) -> list[Any]:
+        return [self._arrays[value] if isinstance(value, str) else value for value in arguments]
+
+    def count(self, place: int) -> wp.array:
+        """One of the counts [1]."""
+        return self._arrays["counts"][place : place + 1]
+
+    @property
+    def subset(self) -> tuple[wp.array, wp.array]:
+        """How many trees :meth:`ArticulationSolver.list_subset` has listed [1], and which [tree]."""
+        return self.count(_SUBSET), self._arrays["subset"]
 
     # ------------------------------------------------------------------ transfers of the listed trees' rows
 
     def _record_transfers(self) -> None:
         def copier(trees: str, *names: str, to_host: bool = False) -> Callable[[int], None]:
-            return self.buffers.row_copier(names, trees, to_host=to_host)
+            count = self.count(_STEPPING if trees == "stepping" else _SUBSET)
+            return self.buffers.row_copier(names, trees, count, to_host=to_host)
 
         self.upload_step = copier("stepping", *STEP_INPUTS)
         self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
@@ -1090,7 +1131,6 @@ class KernelLaunches:
 
     def _record_step(self, parameters: Any) -> None:
         fill = self.fill
-        record = self.record
         s = structs
         self._model = fill(s.ArticulationModel)
         self._forces = fill(s.AppliedForces)
@@ -1098,50 +1138,73 @@ class KernelLaunches:
         self._bodies = fill(s.BodyState)
         self._factors = fill(s.Factors)
         scratch = fill(s.Scratch)
-        prediction = fill(s.Prediction)
-        self.predict = self._record_predict(parameters, "stepping")
-        self.predict_subset = self._record_predict(parameters, "subset")
-        self.predict_groups = (
-            None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
+        self.predict_subset = self.graph(self._predict(parameters, _SUBSET, "subset"))
+        self.forward_kinematics = self.graph(
+            self.launch(forward_kinematics, self._model, *self.subset, joints, self._bodies)
         )
-        """Predicts groups of trees, on a CPU."""
-        self.integrate = self._record_integrate(parameters)
-        self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
-        self.apply_wrenches = self.record_shared(
+        self.wrenches = self.launch(
             apply_wrenches,
             parameters.dt,
             self._model,
-            "subset",
+            *self.subset,
             "body_wrench",
             self._factors,
             fill(s.WrenchScratch),
             scratch,
-            prediction,
-            chunk=TREES_PER_CHUNK["wrenches"],
+            fill(s.Prediction),
         )
-        self.correct_floating_momentum = self._record_momentum(parameters)
-        self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
-        self.count_substeps = record(
-            first_mode.count_substeps,
-            parameters.dt,
-            first_mode.MAX_ANGLE,
-            self._max_substeps,
-            self._model,
-            "stepping",
-            scratch,
-            fill(s.WrenchScratch),
-            "tree_substeps",
+        self.apply_wrenches = self.graph(self.wrenches)
+        stepping = (self.count(_STEPPING), "stepping")
+        self.count_substeps = self.graph(
+            self.launch(
+                first_mode.count_substeps,
+                parameters.dt,
+                first_mode.MAX_ANGLE,
+                self._max_substeps,
+                self._model,
+                *stepping,
+                scratch,
+                fill(s.WrenchScratch),
+                "tree_substeps",
+            ),
+            self.launch(choose_budget, parameters, self._model, *stepping, scratch, "tree_budget"),
+        )
+        """Also chooses how energies are watched."""
+
+    def _record_step_kernels(self, parameters: Any) -> Step:
+        """The kernels of a step on the present arrays."""
+        in_groups = not self.buffers.has_copies
+        predict = self._predict_groups(parameters) if in_groups else self._predict(parameters, _GROUPS, "stepping")
+        begin = self.launch(
+            begin_substep,
+            self.count(_LEVELS),
+            "levels",
+            *(self.count(place) for place in (_LEVEL, _DIVIDED, _DIVIDED_BUDGETS, _DIVIDED_FLOATING)),
+            threads=1,
+        )
+        whole = self._integrate(parameters, _WHOLE, _WHOLE_BUDGETS, "stepping")
+        divided = self._integrate(parameters, _DIVIDED, _DIVIDED_BUDGETS, "divided")
+        return Step(
+            self.graph(predict),
+            self.graph(*whole, self._correct_momentum(parameters, _FLOATING, "floating")),
+            self.graph(
+                begin,
+                self._predict(parameters, _DIVIDED, "divided"),
+                *divided,
+                self._correct_momentum(parameters, _DIVIDED_FLOATING, "divided_floating"),
+            ),
         )
 
-    def _record_predict(self, parameters: Any, trees: str) -> Launch:
+    def _predict(self, parameters: Any, count: int, trees: str) -> KernelLaunch:
         fill = self.fill
         s = structs
         kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
-        return self.record_shared(
+        return self.launch(
             kernel[0],
             parameters,
             fill(s.ArticulationModel),
             *kernel[1],
+            self.count(count),
             trees,
             "tree_phi",
             "tree_euler_steps",
@@ -1153,37 +1216,58 @@ class KernelLaunches:
             fill(s.Factors),
             fill(s.Scratch),
             fill(s.Prediction),
-            chunk=TREES_PER_CHUNK["predict"],
         )
 
-    def _record_integrate(self, parameters: Any) -> Callable[..., None]:
+    def _predict_groups(self, parameters: Any) -> KernelLaunch:
+        """The prediction of up to eight trees at once."""
+        size = LANES * RECORD * (self.buffers.max_tree_size + 2)
+        return self.launch(
+            predict_groups,
+            parameters,
+            self._model,
+            self.count(_GROUPS),
+            "groups",
+            "stepping",
+            "tree_phi",
+            "tree_euler_steps",
+            "tree_steps",
+            self._forces,
+            self.fill(structs.JointState),
+            wp.zeros(size, dtype=float, device=self.buffers.device),
+            "phi_used",
+            self._bodies,
+            self._factors,
+            self.fill(structs.Scratch),
+            self.fill(structs.Prediction),
+        )
+
+    def _integrate(self, parameters: Any, count: int, budgets: int, trees: str) -> list[KernelLaunch]:
         """An integration, with the energy budgets around it."""
         fill = self.fill
-        record = self.record
         s = structs
         model, forces, joints, prediction = (
             fill(struct) for struct in (s.ArticulationModel, s.AppliedForces, s.JointState, s.Prediction)
         )
-        partitioned = {"index_list": "trees", "partitions": self._pool.size}
         apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
-        begin = record(
+        begin = self.launch(
             begin_budget,
             parameters,
             model,
-            "stepping",
+            self.count(budgets),
+            trees,
             "tree_budget",
             "tree_phi",
             forces,
             joints,
             self.budget,
             apart,
-            **partitioned,
         )
-        move = record(
+        move = self.launch(
             integrate,
             parameters,
             model,
-            "stepping",
+            self.count(count),
+            trees,
             "tree_awake",
             "phi_used",
             "tree_steps",
@@ -1192,13 +1276,13 @@ class KernelLaunches:
             "tree_rate",
             "tree_euler_steps",
             joints,
-            **partitioned,
         )
-        keep = record(
+        keep = self.launch(
             keep_budget,
             parameters,
             model,
-            "stepping",
+            self.count(budgets),
+            trees,
             "tree_budget",
             "tree_phi",
             "tree_steps",
@@ -1211,19 +1295,18 @@ class KernelLaunches:
             fill(s.Factors),
             fill(s.Scratch),
             fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"),
-            **partitioned,
         )
-        chunk = TREES_PER_CHUNK["integrate"]
-        return self._keeping_budgets(self._pool.share([move], chunk), self._pool.share([begin, move, keep], chunk))
+        return [begin, move, keep]
 
-    def _record_momentum(self, parameters: Any) -> Launch:
+    def _correct_momentum(self, parameters: Any, count: int, roots: str) -> KernelLaunch:
         fill = self.fill
         s = structs
-        return self.record(
+        return self.launch(
             correct_floating_momentum,
             parameters,
             fill(s.ArticulationModel),
-            "floating",
+            self.count(count),
+            roots,
             "phi_used",
             "tree_rate",
             "tree_steps",
@@ -1233,18 +1316,16 @@ class KernelLaunches:
             "lever",
             fill(s.FloatingScratch),
             fill(s.JointState),
-            index_list="roots",
         )
 
     def _record_resident(self, parameters: Any) -> None:
-        """The launches of a step once more, on copies of what there is of each tree."""
+        """The kernels of a step once more, on copies of what there is of each tree."""
         device = self.buffers.device
         shared = self.buffers.arrays
         names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
         copies = {name: wp.empty_like(shared[name], device=device) for name in names}
         self.resident_arrays = self._arrays = shared | copies
-        predict = self._record_predict(parameters, "stepping")
-        self.resident = Step(predict, predict, self._record_integrate(parameters), self._record_momentum(parameters))
+        self.resident = self._record_step_kernels(parameters)
         self._arrays = shared
 
     def upload_trees(self) -> None:
@@ -1264,8 +1345,8 @@ class KernelLaunches:
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
-    def look_for_budgets(self, steps: int = 1) -> None:
-        """Once before the integrations of a step or of so many: decide whether they keep energy budgets.
+    def keeps_budgets(self, steps: int = 1) -> bool:
+        """Once before the integrations of a step or of so many: whether they are to keep energy budgets.
 
         Always on a GPU and in many steps. Otherwise in one step of eight, and in the seven that follow if a tree is
         watched closely after it.
@@ -1276,41 +1357,7 @@ class KernelLaunches:
         elif self._budget_phase == 1 and self._keeps_budgets:
             limit, watch = (row[self._budgeted].max() for row in self._budget_rows)
             self._keeps_budgets = self._watches_closely or bool(watch > 0 or limit >= NO_LIMIT)
-
-    def _keeping_budgets(self, move: Launch, move_with_budgets: Launch) -> Callable[..., None]:
-        """An integration, with what keeps the energy budgets around it in steps that do."""
-
-        def launch(*which: int) -> None:
-            (move_with_budgets if self._keeps_budgets else move)(*which)
-
-        return launch
-
-    def _record_groups(self, parameters: Any, joints: Any, scratch: Any, prediction: Any) -> Launch:
-        """The prediction of up to eight trees at once, each thread with memory of its own."""
-        size = LANES * RECORD * (self.buffers.max_tree_size + 2)
-        launches = [
-            self.record(
-                predict_groups,
-                parameters,
-                self._model,
-                "groups",
-                "stepping",
-                "tree_phi",
-                "tree_euler_steps",
-                "tree_steps",
-                self._forces,
-                joints,
-                wp.zeros(size, dtype=float, device=self.buffers.device),
-                "phi_used",
-                self._bodies,
-                self._factors,
-                scratch,
-                prediction,
-                index_list="groups",
-            )
-            for _ in range(self._pool.size)
-        ]
-        return self._pool.share([join_partitions(launches)], 1)
+        return self._keeps_budgets
 
     def _record_impact(self, parameters: Any) -> None:
         """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""
@@ -1319,33 +1366,36 @@ class KernelLaunches:
         joints = fill(s.JointState)
         scratch = fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
-        self.factor_impact = self.record(
-            predict,
-            parameters,
-            self._model,
-            "subset",
-            "tree_phi",
-            "tree_euler_steps",
-            "tree_steps",
-            self._forces,
-            joints,
-            "impact_phi",
-            self._bodies,
-            self._factors,
-            scratch,
-            prediction,
-            index_list="trees",
+        self.factor_impact = self.graph(
+            self.launch(
+                predict,
+                parameters,
+                self._model,
+                *self.subset,
+                "tree_phi",
+                "tree_euler_steps",
+                "tree_steps",
+                self._forces,
+                joints,
+                "impact_phi",
+                self._bodies,
+                self._factors,
+                scratch,
+                prediction,
+            )
         )
-        self.apply_impulses = self.record(
-            apply_wrenches,
-            1.0,
-            self._model,
-            "subset",
-            "body_impulse",
-            self._factors,
-            fill(s.WrenchScratch),
-            scratch,
-            prediction,
+        self.apply_impulses = self.graph(
+            self.launch(
+                apply_wrenches,
+                1.0,
+                self._model,
+                *self.subset,
+                "body_impulse",
+                self._factors,
+                fill(s.WrenchScratch),
+                scratch,
+                prediction,
+            )
         )
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
@@ -1356,6 +1406,7 @@ class KernelLaunches:
         if n > self.response_capacity or self.response_capacity == 0:
             self._record_response(max(2 * self.response_capacity, n, MIN_CAPACITY))
         self._response_bodies[:n] = buffers.slots[bodies]
+        self._response_count[0] = n
         self._respond(n)
         buffers.synchronize()
         return self._response[:n]
@@ -1377,6 +1428,7 @@ class KernelLaunches:
     def _record_response(self, capacity: int) -> None:
         self.response_capacity = capacity
         buffers = self.buffers
+        self._response_count = buffers.pinned(np.zeros(1, np.int32))
         self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
         self._response = buffers.pinned(np.zeros((capacity, 6, buffers.max_tree_size, 6), np.float32))
         buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
@@ -1387,34 +1439,45 @@ class KernelLaunches:
             name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
             for name in structs.fields(structs.ResponseColumns)
         }
-        self._respond = self.record(
-            impulse_response,
-            self._model,
-            stride,
-            "response_bodies",
-            self._factors,
-            self.fill(structs.ResponseColumns, **columns),
-            "response",
+        self._respond = self.graph(
+            self.launch(
+                impulse_response,
+                self._model,
+                stride,
+                buffers.reach(self._response_count, wp.int32, "response_count"),
+                "response_bodies",
+                self._factors,
+                self.fill(structs.ResponseColumns, **columns),
+                "response",
+            )
         )
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
+        if len(bodies) > len(self._joint_wrenches.places):
+            self._make_room_for_joints(2 * len(bodies))
         wrenches = self._joint_wrenches
-        if len(bodies) > len(wrenches.places):
-            wrenches = self._joint_wrenches = self.record_joint_wrenches(2 * len(bodies))
         wrenches.places[: len(bodies)] = self.buffers.slots[bodies]
-        wrenches.compute(len(bodies))
+        wrenches.count[0] = len(bodies)
+        self._carry(len(bodies))
+        self.buffers.synchronize()
         return wrenches.carried[: len(bodies)].copy()
 
-    def record_joint_wrenches(self, capacity: int) -> JointWrenches:
+    def _make_room_for_joints(self, capacity: int) -> None:
+        self._joint_wrenches = self.joint_wrenches(capacity)
+        self._carry = self.graph(self._joint_wrenches.launch)
+
+    def joint_wrenches(self, capacity: int) -> JointWrenches:
         """What computes the wrenches that up to so many joints carried in the last step."""
         buffers = self.buffers
         places = buffers.pinned(np.zeros(capacity, np.int32))
+        count = buffers.pinned(np.zeros(1, np.int32))
         carried = buffers.pinned(np.zeros((capacity, 6), np.float32))
-        launch = self.record(
+        launch = self.launch(
             joint_wrench,
             self.parameters,
             self._model,
+            buffers.reach(count, wp.int32, "joint_count"),
             buffers.reach(places, wp.int32, "joint_bodies"),
             "phi_used",
             "tree_steps",
@@ -1423,12 +1486,7 @@ class KernelLaunches:
             "body_acceleration",
             buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
         )
-
-        def launch_and_wait(count: int, first: int = 0, partition: int = 0) -> None:
-            launch(count)
-            buffers.synchronize()
-
-        return JointWrenches(places, carried, bound(launch_and_wait) if buffers.has_copies else launch)
+        return JointWrenches(places, count, carried, launch)
 
 
 # Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.
@@ -1457,9 +1515,11 @@ class StepRunner:
         tree_budget: [tree] how each tree's energy is watched.
         whole: [tree] bool, trees on wires, whose steps are never divided.
         tree_rate: [tree] what the kernels write of each tree's speed.
-        stepping: [tree] int32, the list that the kernels read.
-        groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
-        floating: [tree] int32, the floating roots that the kernels read.
+        lists: int32, what the kernels read: ``stepping`` [tree], all trees; ``divided`` [tree], those of more substeps
+            than one once more; ``groups`` [tree, 2], first place in the list and number of trees; ``floating``,
+            ``divided_floating`` [body], roots of trees of one step and of more; ``levels`` [substep, 3], how many
+            trees, energy budgets and roots take it.
+        counts: [:data:`_COUNTS`] int32, how many entries of these the kernels take.
         topologies: of the trees.
     """
 
@@ -1473,18 +1533,17 @@ class StepRunner:
         tree_budget: np.ndarray,
         whole: np.ndarray,
         tree_rate: np.ndarray,
-        stepping: np.ndarray,
-        groups: np.ndarray,
-        floating: np.ndarray,
+        lists: dict[str, np.ndarray],
+        counts: np.ndarray,
         topologies: Topologies,
     ) -> None:
         self._buffers = buffers
         self._launches = launches
-        self._list = stepping
+        self._lists = lists
+        self._counts = counts
         self._substeps = tree_substeps
         self._steps_of = tree_steps
         self._rate = tree_rate
-        self._floating = floating
         self._is_whole = whole
         self._budget_kind = tree_budget
         self.stepped = np.zeros(0, np.int32)
@@ -1494,14 +1553,13 @@ class StepRunner:
         self.fast = np.zeros(0, np.int32)
         """Those of them whose step is to be divided [k], sorted."""
         self._whole = 0
-        self._levels = ()
+        self._levels: Levels = ()
         self._roots = 0
-        self._root_levels = ()
+        self._root_levels: Levels = ()
         self._divided = np.zeros(0, np.int32)
         """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
-        self._groups = groups
         self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
         """Place in the list at which each group begins, and the end of the list."""
@@ -1519,9 +1577,9 @@ class StepRunner:
         self.is_stepped[self.stepped] = False
         self.is_stepped[trees] = True
         self.stepped = trees
-        self._list[: len(trees)] = trees
+        self._lists["stepping"][: len(trees)] = trees
+        self._counts[_STEPPING] = len(trees)
         self._launches.count_substeps(len(trees))
-        self._launches.choose_budget(len(trees))
         self._buffers.synchronize()
         self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
         self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
@@ -1542,11 +1600,13 @@ class StepRunner:
         listed, self._whole, self._levels = _by_substeps(np.arange(len(trees)), self._steps_of[trees])
         trees = trees[listed]
         topologies = topologies[listed]
-        self._list[: len(trees)] = trees
-        in_groups = self._launches.predict_groups is not None
+        self._lists["stepping"][: len(trees)] = trees
+        self._lists["divided"][: len(trees) - self._whole] = trees[self._whole :]
+        in_groups = not self._buffers.has_copies
         self._starts = group_starts(topologies, self._whole) if in_groups else np.arange(len(trees) + 1)
-        counts = np.diff(self._starts)
-        self._groups[: len(counts), 0], self._groups[: len(counts), 1] = self._starts[:-1], counts
+        groups = self._lists["groups"][: len(self._starts) - 1]
+        groups[:, 0] = self._starts[:-1]
+        groups[:, 1] = np.diff(self._starts)
         self._whole_groups = int(np.searchsorted(self._starts, self._whole))
 
     def _divide(self, touched: np.ndarray) -> None:
@@ -1569,7 +1629,25 @@ class StepRunner:
             self._root_levels = ()
             return
         order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
-        self._floating[: len(roots)] = roots[order]
+        roots = roots[order]
+        self._lists["floating"][: self._roots] = roots[: self._roots]
+        self._lists["divided_floating"][: len(roots) - self._roots] = roots[self._roots :]
+
+    def _count(self, steps: int = 1) -> None:
+        """Tell the kernels of integrations how many entries of the lists they are to take."""
+        counts = self._counts
+        keeps_budgets = self._launches.keeps_budgets(steps)
+        counts[_WHOLE] = self._whole
+        counts[_WHOLE_BUDGETS] = self._whole if keeps_budgets else 0
+        counts[_FLOATING] = self._roots
+        if self._levels:
+            levels = self._lists["levels"][: len(self._levels)]
+            levels[:, 0] = self._levels
+            levels[:, 1] = levels[:, 0] * keeps_budgets
+            levels[:, 2] = 0
+            levels[: len(self._root_levels), 2] = self._root_levels
+            counts[_LEVEL] = 0
+            counts[_LEVELS] = len(self._levels)
 
     # ------------------------------------------------------------------ a step
 
@@ -1577,7 +1655,9 @@ class StepRunner:
         """Predict the listed trees over the whole step."""
         if len(self.fast):
             self._steps_of[self.fast] = 1
-        self._launches.shared.predict_groups(len(self._starts) - 1)
+        groups = len(self._starts) - 1
+        self._counts[_GROUPS] = groups
+        self._launches.shared.predict(groups)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
@@ -1586,19 +1666,13 @@ class StepRunner:
         """
         self._divide(touched)
         self._list_roots(roots, root_trees)
-        self._launches.look_for_budgets()
-        self._launches.integrate(self._whole)
-        self._launches.correct_floating_momentum(self._roots)
-        self._take_substeps(self._launches.shared)
+        self._count()
+        self._integrate(self._launches.shared)
 
-    def _take_substeps(self, step: Step) -> None:
-        roots = self._root_levels
-        first = self._whole
-        for level, count in enumerate(self._levels):
-            step.predict(count, first)
-            step.integrate(count, first)
-            if level < len(roots):
-                step.correct_floating_momentum(roots[level], self._roots)
+    def _integrate(self, step: Step) -> None:
+        step.integrate(max(self._whole, self._roots))
+        for _ in self._levels:
+            step.take_substep(max(self._levels + self._root_levels))
 
     # ------------------------------------------------------------------ many steps
 
@@ -1608,13 +1682,15 @@ class StepRunner:
         """Predict and integrate so many times without coming back in between; ``between`` launches what comes there."""
         self._divide(np.zeros(0, np.int32))
         self._list_roots(roots, root_trees)
-        count = len(self.stepped)
-        if count == 0:
+        if len(self.stepped) == 0:
             return
-        self._launches.look_for_budgets(steps)
+        self._count(steps)
+        self._counts[_GROUPS] = self._whole_groups
         self._launches.upload_trees()
         if not self._buffers.device.is_cpu:
-            what = (self._whole, self._levels, self._roots, self._root_levels, between)
+            divided = max((0, *self._levels, *self._root_levels))
+            tiers = tuple(map(tier_of, (self._whole_groups, max(self._whole, self._roots), divided)))
+            what = (tiers, len(self._levels), between)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
                     self._steps(1, between)
@@ -1629,12 +1705,10 @@ class StepRunner:
     def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
         step = self._launches.resident
         for _ in range(steps):
-            step.predict_groups(self._whole_groups)
+            step.predict(self._whole_groups)
             if between is not None:
                 between()
-            step.integrate(self._whole)
-            step.correct_floating_momentum(self._roots)
-            self._take_substeps(step)
+            self._integrate(step)
 
 
 def _levels(steps: np.ndarray) -> Levels:

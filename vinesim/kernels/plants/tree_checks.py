@@ -73,6 +73,7 @@ def count_overloaded_steps(
     bunch_pull: wp.array(dtype=float),
     bunch_bend: wp.array(dtype=float),
     # in
+    count: wp.array(dtype=wp.int32),
     bunches: wp.array(dtype=wp.int32),
     carried: wp.array(dtype=wp.spatial_vector),
     is_attached: wp.array(dtype=wp.bool),
@@ -87,6 +88,8 @@ def count_overloaded_steps(
     is_remote: [tree]; picked bunches and those of remote trees are left out. longest_out: [1] most steps of all.
     """
     i = wp.tid()
+    if i >= count[0]:
+        return
     bunch = bunches[i]
     if is_attached[bunch] and not is_remote[body_tree[bunch_body[bunch]]]:
         force = wp.spatial_top(carried[i])
