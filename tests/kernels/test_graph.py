@@ -94,6 +94,12 @@ def test_the_threads_of_an_item_are_the_second_dimension() -> None:
     assert cells.tolist() == [[0, 1, 2], [10, 11, 12], [-1, -1, -1]]
 
 
+def test_a_launch_of_no_threads_does_nothing() -> None:
+    cells = np.full((1, 2), -1, np.int32)
+    KernelGraph(KernelLaunch(number_cells, [ints(np.ones(1, np.int32))], [ints(cells)], threads=0, width=2))()
+    assert cells.tolist() == [[-1, -1]]
+
+
 def test_tiers_hold_what_is_asked_for() -> None:
     assert [tier_of(n) for n in (0, 1, TIERS[0], TIERS[0] + 1)] == [TIERS[0]] * 3 + [TIERS[1]]
     with pytest.raises(ValueError, match="4194305 items for one launch: there is room for 4194304"):

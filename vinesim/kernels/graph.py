@@ -25,7 +25,8 @@ THREADS_PER_BLOCK = 32
 """CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
 
 _capturing = threading.Lock()
-"""Warp captures one graph at a time."""
+"""Warp captures one graph at a time. No other thread may call ``wp.launch`` meanwhile: Warp keeps a table for the graph
+that it would write to as well."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,8 +36,8 @@ class KernelLaunch:
     kernel: wp.Kernel
     inputs: Sequence[Any]
     outputs: Sequence[Any] = ()
-    threads: int = 0
-    """How many it has; 0: one for each item, of which it reads how many there are."""
+    threads: int | None = None
+    """How many it has; None: one for each item, of which it reads how many there are."""
     width: int = 1
     """Threads for each item: the second dimension of ``wp.tid()`` if there are several."""
     block: int = THREADS_PER_BLOCK
@@ -44,7 +45,7 @@ class KernelLaunch:
 
     def launch(self, items: int, device: wp.Device) -> None:
         """Launch it with room for so many items."""
-        rows = self.threads or items
+        rows = items if self.threads is None else self.threads
         dim = rows if self.width == 1 else (rows, self.width)
         wp.launch(self.kernel, dim, inputs=self.inputs, outputs=self.outputs, device=device, block_dim=self.block)
 
