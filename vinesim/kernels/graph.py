@@ -56,35 +56,43 @@ class KernelGraph:
     def __init__(self, *launches: KernelLaunch, device: str = "cpu") -> None:
         self._launches = launches
         self._device = wp.get_device(device)
+        self._is_cuda = self._device.is_cuda
         self._graphs: dict[int, Any] = {}
+        self._graph: Any = None
+        self._room = range(0)
+        """The graph of the last call, and the capacities that it is for."""
 
     def __call__(self, capacity: int = 1) -> None:
         """Make the launches; no count that their kernels read may be above ``capacity``.
 
         On CUDA they are only queued, and within a capture of the caller's they become part of that.
         """
-        tier = tier_of(capacity)
-        if self._device.is_cuda and self._device.is_capturing:
-            self._launch(tier)
+        if self._is_cuda and self._device.is_capturing:
+            self._launch(tier_of(capacity).stop - 1)
             return
-        graph = self._graphs.get(tier)
-        if graph is None:
-            graph = self._graphs[tier] = self._capture(tier)
-        wp.capture_launch(graph)
+        if capacity not in self._room:
+            self._choose(tier_of(capacity))
+        wp.capture_launch(self._graph)
 
-    def _launch(self, tier: int) -> None:
+    def _launch(self, items: int) -> None:
         for launch in self._launches:
-            launch.launch(tier, self._device)
+            launch.launch(items, self._device)
 
-    def _capture(self, tier: int) -> Any:
-        with _capturing, wp.ScopedCapture(self._device) as capture:
-            self._launch(tier)
-        return capture.graph
+    def _choose(self, tier: range) -> None:
+        most = tier.stop - 1
+        if most not in self._graphs:
+            with _capturing, wp.ScopedCapture(self._device) as capture:
+                self._launch(most)
+            self._graphs[most] = capture.graph
+        self._graph = self._graphs[most]
+        self._room = tier
 
 
-def tier_of(capacity: int) -> int:
-    """The least of :data:`TIERS` that has room for so many items; :class:`ValueError` if none has."""
-    for tier in TIERS:
-        if capacity <= tier:
-            return tier
+def tier_of(capacity: int) -> range:
+    """The capacities that share a graph with this one; :class:`ValueError` beyond the last of :data:`TIERS`."""
+    least = 0
+    for most in TIERS:
+        if capacity <= most:
+            return range(least, most + 1)
+        least = most + 1
     raise ValueError(f"{capacity} items for one launch: there is room for {TIERS[-1]}")

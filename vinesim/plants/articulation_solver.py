@@ -61,14 +61,12 @@ _STEPPING = 0
 _SUBSET = 1
 _GROUPS = 2
 _WHOLE = 3
-_WHOLE_BUDGETS = 4
-_FLOATING = 5
-_DIVIDED = 6
-_DIVIDED_BUDGETS = 7
-_DIVIDED_FLOATING = 8
-_LEVEL = 9
-_LEVELS = 10
-_COUNTS = 11
+_FLOATING = 4
+_DIVIDED = 5
+_DIVIDED_FLOATING = 6
+_LEVEL = 7
+_LEVELS = 8
+_COUNTS = 9
 """The last two: which substep is next, and how many there are."""
 
 _NO_TREES = np.zeros(0, np.int32)
@@ -250,7 +248,7 @@ class ArticulationSolver:
         self._steps = np.ones(trees, np.int32)
         self._stepping, self._divided, self._subset = (np.zeros(trees, np.int32) for _ in range(3))
         self._groups = np.zeros((trees, 2), np.int32)
-        self._levels = np.zeros((MAX_SUBSTEPS, 3), np.int32)
+        self._levels = np.zeros((MAX_SUBSTEPS, 2), np.int32)
         self._counts = np.zeros(_COUNTS, np.int32)
 
     def _pin_arrays(self) -> None:
@@ -972,10 +970,10 @@ class Step:
 
     predict: KernelGraph
     """Over groups of trees; on a GPU each tree is a group."""
-    integrate: KernelGraph
-    """Integrates the trees of whole steps."""
-    take_substep: KernelGraph
-    """Predicts and integrates the trees that take the next substep."""
+    integrate: dict[tuple[bool, bool], KernelGraph]
+    """Integrates the trees of whole steps: by whether energy budgets are kept and whether there are floating roots."""
+    take_substep: dict[tuple[bool, bool], KernelGraph]
+    """Predicts and integrates the trees that take the next substep, likewise."""
 
 
 class KernelLaunches:
@@ -1179,20 +1177,16 @@ class KernelLaunches:
             begin_substep,
             self.count(_LEVELS),
             "levels",
-            *(self.count(place) for place in (_LEVEL, _DIVIDED, _DIVIDED_BUDGETS, _DIVIDED_FLOATING)),
+            *(self.count(place) for place in (_LEVEL, _DIVIDED, _DIVIDED_FLOATING)),
             threads=1,
         )
-        whole = self._integrate(parameters, _WHOLE, _WHOLE_BUDGETS, "stepping")
-        divided = self._integrate(parameters, _DIVIDED, _DIVIDED_BUDGETS, "divided")
+        predict_divided = self._predict(parameters, _DIVIDED, "divided")
+        whole = self._integrate(parameters, _WHOLE, "stepping", _FLOATING, "floating")
+        divided = self._integrate(parameters, _DIVIDED, "divided", _DIVIDED_FLOATING, "divided_floating")
         return Step(
             self.graph(predict),
-            self.graph(*whole, self._correct_momentum(parameters, _FLOATING, "floating")),
-            self.graph(
-                begin,
-                self._predict(parameters, _DIVIDED, "divided"),
-                *divided,
-                self._correct_momentum(parameters, _DIVIDED_FLOATING, "divided_floating"),
-            ),
+            {which: self.graph(*launches) for which, launches in whole.items()},
+            {which: self.graph(begin, predict_divided, *launches) for which, launches in divided.items()},
         )
 
     def _predict(self, parameters: Any, count: int, trees: str) -> KernelLaunch:
@@ -1241,8 +1235,10 @@ class KernelLaunches:
             self.fill(structs.Prediction),
         )
 
-    def _integrate(self, parameters: Any, count: int, budgets: int, trees: str) -> list[KernelLaunch]:
-        """An integration, with the energy budgets around it."""
+    def _integrate(
+        self, parameters: Any, count: int, trees: str, root_count: int, roots: str
+    ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
+        """An integration, by whether it has the energy budgets around it, and floating roots behind it."""
         fill = self.fill
         s = structs
         model, forces, joints, prediction = (
@@ -1253,7 +1249,7 @@ class KernelLaunches:
             begin_budget,
             parameters,
             model,
-            self.count(budgets),
+            self.count(count),
             trees,
             "tree_budget",
             "tree_phi",
@@ -1281,7 +1277,7 @@ class KernelLaunches:
             keep_budget,
             parameters,
             model,
-            self.count(budgets),
+            self.count(count),
             trees,
             "tree_budget",
             "tree_phi",
@@ -1296,7 +1292,13 @@ class KernelLaunches:
             fill(s.Scratch),
             fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"),
         )
-        return [begin, move, keep]
+        correct = self._correct_momentum(parameters, root_count, roots)
+        return {
+            (False, False): [move],
+            (False, True): [move, correct],
+            (True, False): [begin, move, keep],
+            (True, True): [begin, move, keep, correct],
+        }
 
     def _correct_momentum(self, parameters: Any, count: int, roots: str) -> KernelLaunch:
         fill = self.fill
@@ -1517,8 +1519,8 @@ class StepRunner:
         tree_rate: [tree] what the kernels write of each tree's speed.
         lists: int32, what the kernels read: ``stepping`` [tree], all trees; ``divided`` [tree], those of more substeps
             than one once more; ``groups`` [tree, 2], first place in the list and number of trees; ``floating``,
-            ``divided_floating`` [body], roots of trees of one step and of more; ``levels`` [substep, 3], how many
-            trees, energy budgets and roots take it.
+            ``divided_floating`` [body], roots of trees of one step and of more; ``levels`` [substep, 2], how many
+            trees and roots take it.
         counts: [:data:`_COUNTS`] int32, how many entries of these the kernels take.
         topologies: of the trees.
     """
@@ -1553,6 +1555,8 @@ class StepRunner:
         self.fast = np.zeros(0, np.int32)
         """Those of them whose step is to be divided [k], sorted."""
         self._whole = 0
+        self._kind = (False, False)
+        """Whether the integrations of this step keep energy budgets, and whether there are floating roots."""
         self._levels: Levels = ()
         self._roots = 0
         self._root_levels: Levels = ()
@@ -1636,16 +1640,14 @@ class StepRunner:
     def _count(self, steps: int = 1) -> None:
         """Tell the kernels of integrations how many entries of the lists they are to take."""
         counts = self._counts
-        keeps_budgets = self._launches.keeps_budgets(steps)
+        self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
         counts[_WHOLE] = self._whole
-        counts[_WHOLE_BUDGETS] = self._whole if keeps_budgets else 0
         counts[_FLOATING] = self._roots
         if self._levels:
             levels = self._lists["levels"][: len(self._levels)]
             levels[:, 0] = self._levels
-            levels[:, 1] = levels[:, 0] * keeps_budgets
-            levels[:, 2] = 0
-            levels[: len(self._root_levels), 2] = self._root_levels
+            levels[:, 1] = 0
+            levels[: len(self._root_levels), 1] = self._root_levels
             counts[_LEVEL] = 0
             counts[_LEVELS] = len(self._levels)
 
@@ -1670,9 +1672,9 @@ class StepRunner:
         self._integrate(self._launches.shared)
 
     def _integrate(self, step: Step) -> None:
-        step.integrate(max(self._whole, self._roots))
+        step.integrate[self._kind](max(self._whole, self._roots))
         for _ in self._levels:
-            step.take_substep(max(self._levels + self._root_levels))
+            step.take_substep[self._kind](max(self._levels + self._root_levels))
 
     # ------------------------------------------------------------------ many steps
 
@@ -1690,7 +1692,7 @@ class StepRunner:
         if not self._buffers.device.is_cpu:
             divided = max((0, *self._levels, *self._root_levels))
             tiers = tuple(map(tier_of, (self._whole_groups, max(self._whole, self._roots), divided)))
-            what = (tiers, len(self._levels), between)
+            what = (tiers, self._kind, len(self._levels), between)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
                     self._steps(1, between)

@@ -142,15 +142,13 @@ def begin_substep(
     # out
     level_out: wp.array(dtype=wp.int32),
     tree_count_out: wp.array(dtype=wp.int32),
-    budget_count_out: wp.array(dtype=wp.int32),
     root_count_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all: how many trees, energy budgets and floating roots the next substep is of.
+    """One thread in all: how many trees and floating roots the next substep is of.
 
-    levels: [substep, 3] these numbers. level_out: [1] which substep is next; after the last of level_count [1] the first.
+    levels: [substep, 2] these numbers. level_out: [1] which substep is next; after the last of level_count [1] the first.
     """
     level = level_out[0]
     tree_count_out[0] = levels[level, 0]
-    budget_count_out[0] = levels[level, 1]
-    root_count_out[0] = levels[level, 2]
+    root_count_out[0] = levels[level, 1]
     level_out[0] = (level + 1) % level_count[0]
