@@ -26,7 +26,7 @@ import warp as wp
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
-from vinesim.kernels.graph import KernelGraph, KernelLaunch, tier_of
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.kernels.plants import first_mode, structs
 from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
@@ -47,6 +47,7 @@ from vinesim.kernels.plants.joint_wrench import joint_wrench
 from vinesim.kernels.plants.kinematics import forward_kinematics
 from vinesim.kernels.plants.lean_prediction import predict_lean
 from vinesim.kernels.plants.prediction import predict
+from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
@@ -203,6 +204,7 @@ class ArticulationSolver:
         """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree], and how many [1]."""
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
+        self._fastest = np.zeros(1, np.float32)
         self.tree_substeps = np.ones(trees, np.int32)
         """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
         self.tree_budget = np.zeros(trees, np.int32)
@@ -291,6 +293,7 @@ class ArticulationSolver:
                 "tree_phi": self.phi,
                 "phi_used": self.phi_used,
                 "tree_rate": self.tree_rate,
+                "fastest": self._fastest,
             },
             wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
             wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
@@ -489,10 +492,17 @@ class ArticulationSolver:
             touched = self._load(bodies, np.asarray(wrenches))
         elif len(self._loads):
             self._load(_NO_TREES, _NO_WRENCHES)
+        self._fastest[0] = 0.0
         self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
+
+    def fastest_rate(self) -> float:
+        """Of :attr:`tree_rate` of the last ``integrate()`` the largest, or more; infinite if one is not a number."""
+        if self.buffers.has_copies:
+            return float(np.nan_to_num(self.tree_rate[self._awake], nan=math.inf).max(initial=0.0))
+        return float(self._fastest[0])
 
     def _load(self, bodies: np.ndarray, wrenches: np.ndarray) -> np.ndarray:
         """Let wrenches [n, 6] on bodies [n] act instead of those of the last step; returns the trees touched [k]."""
@@ -1293,11 +1303,13 @@ class KernelLaunches:
             fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"),
         )
         correct = self._correct_momentum(parameters, root_count, roots)
+        stepping = (self.count(_STEPPING), "stepping")
+        last = [] if self.buffers.has_copies else [self.launch(find_fastest, *stepping, "tree_rate", "fastest")]
         return {
-            (False, False): [move],
-            (False, True): [move, correct],
-            (True, False): [begin, move, keep],
-            (True, True): [begin, move, keep, correct],
+            (False, False): [move, *last],
+            (False, True): [move, correct, *last],
+            (True, False): [begin, move, keep, *last],
+            (True, True): [begin, move, keep, correct, *last],
         }
 
     def _correct_momentum(self, parameters: Any, count: int, roots: str) -> KernelLaunch:
@@ -1557,6 +1569,8 @@ class StepRunner:
         self._whole = 0
         self._kind = (False, False)
         """Whether the integrations of this step keep energy budgets, and whether there are floating roots."""
+        self._room = 0
+        """No list of an integration is longer."""
         self._levels: Levels = ()
         self._roots = 0
         self._root_levels: Levels = ()
@@ -1641,6 +1655,7 @@ class StepRunner:
         """Tell the kernels of integrations how many entries of the lists they are to take."""
         counts = self._counts
         self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
+        self._room = max(len(self.stepped), self._roots + sum(self._root_levels[:1]))
         counts[_WHOLE] = self._whole
         counts[_FLOATING] = self._roots
         if self._levels:
@@ -1672,9 +1687,9 @@ class StepRunner:
         self._integrate(self._launches.shared)
 
     def _integrate(self, step: Step) -> None:
-        step.integrate[self._kind](max(self._whole, self._roots))
+        step.integrate[self._kind](self._room)
         for _ in self._levels:
-            step.take_substep[self._kind](max(self._levels + self._root_levels))
+            step.take_substep[self._kind](self._room)
 
     # ------------------------------------------------------------------ many steps
 
@@ -1690,9 +1705,7 @@ class StepRunner:
         self._counts[_GROUPS] = self._whole_groups
         self._launches.upload_trees()
         if not self._buffers.device.is_cpu:
-            divided = max((0, *self._levels, *self._root_levels))
-            tiers = tuple(map(tier_of, (self._whole_groups, max(self._whole, self._roots), divided)))
-            what = (tiers, self._kind, len(self._levels), between)
+            what = (self._whole_groups, self._room, len(self._levels), self._kind, between)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
                     self._steps(1, between)

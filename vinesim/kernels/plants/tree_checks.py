@@ -52,7 +52,7 @@ def find_fastest(
 ):
     """One thread per listed tree: the largest rate of all, infinite if one is not a number.
 
-    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, 0 before.
+    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, raised to that.
     """
     if wp.tid() >= count[0]:
         return
