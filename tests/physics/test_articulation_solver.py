@@ -11,6 +11,7 @@ import warp as wp
 from tests.support.clustered_trees import clustered, momenta, moving
 from tests.support.waiting import deadline
 from vinesim.core import frames
+from vinesim.kernels.graph import TIERS
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import DeviceBuffers, DeviceUnavailable
 from vinesim.plants.fault_guard import FaultGuard
@@ -627,6 +628,28 @@ def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatc
         arrays, measured = run_with_events(**options)
         assert arrays == single_threaded, options
         np.testing.assert_array_equal(measured, response)
+
+
+@pytest.mark.parametrize("in_one_call", [False, True])
+def test_more_trees_than_a_graph_has_room_for_move_as_one_does(in_one_call: bool) -> None:
+    """Their steps are divided into substeps. The fault of the last tree is seen."""
+    moved = []
+    for count in (1, TIERS[0] + 6):
+        model = canes(count)
+        plants = ArticulationSolver(model, State.at_rest(model))
+        plants.wake(np.arange(count))
+        plants.state.joint_qd[:, 1] = np.tile(np.linspace(0.0, 2.0, 5), count)
+        if in_one_call:
+            plants.advance(20)
+        else:
+            step(plants, 20)
+        assert (plants.tree_substeps > 1).all()
+        moved.append(plants.state.joint_q[-5:].copy())
+        plants.state.joint_qd[-1] = np.nan
+        step(plants)
+        assert plants.fastest_rate() == np.inf
+        assert FaultGuard(plants).stop_faulty_trees().tolist() == [count - 1]
+    np.testing.assert_array_equal(moved[0], moved[1])
 
 
 def test_advance_equals_repeated_predict_and_integrate() -> None:

@@ -1674,7 +1674,8 @@ class StepRunner:
             self._steps_of[self.fast] = 1
         groups = len(self._starts) - 1
         self._counts[_GROUPS] = groups
-        self._launches.shared.predict(groups)
+        if groups:
+            self._launches.shared.predict(groups)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
@@ -1687,6 +1688,8 @@ class StepRunner:
         self._integrate(self._launches.shared)
 
     def _integrate(self, step: Step) -> None:
+        if self._room == 0:
+            return
         step.integrate[self._kind](self._room)
         for _ in self._levels:
             step.take_substep[self._kind](self._room)

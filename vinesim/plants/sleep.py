@@ -113,7 +113,8 @@ class SleepMonitor:
         plants = self.plants
         self._limit[0] = self.rate
         self._longest[0] = 0
-        self._count_quiet_steps(len(plants.awake))
+        if len(plants.awake):
+            self._count_quiet_steps(len(plants.awake))
         return plants.tick % self._check_steps == 0 and bool(self._longest[0] >= self.patience)
 
     def check(
