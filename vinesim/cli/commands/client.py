@@ -54,7 +54,10 @@ Device = Annotated[
     ),
 ]
 Threads = Annotated[
-    int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 100 awake trees, on free cores.")
+    int,
+    typer.Option(
+        min=1, help="Threads for the contacts of plants on the CPU; pays from 100 awake trees, on free cores."
+    ),
 ]
 Out = Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")]
 SensorRate = Annotated[
