@@ -70,7 +70,7 @@ class Simulation:
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``: where plants are stepped, and cameras and lidars that look
                 at this world compute.
-            threads: of the CPU that share the plants.
+            threads: of the CPU that share the contacts of plants.
         """
         self.scene: Scene | None = None
         """The scene that was simulated; None for a model or canes."""

@@ -65,10 +65,10 @@ _WHOLE = 3
 _FLOATING = 4
 _DIVIDED = 5
 _DIVIDED_FLOATING = 6
-_LEVEL = 7
+_NEXT_LEVEL = 7
 _LEVELS = 8
 _COUNTS = 9
-"""The last two: which substep is next, and how many there are."""
+"""How many counts there are. :data:`_NEXT_LEVEL`: which substep is next; :data:`_LEVELS`: how many there are."""
 
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
@@ -1187,7 +1187,7 @@ class KernelLaunches:
             begin_substep,
             self.count(_LEVELS),
             "levels",
-            *(self.count(place) for place in (_LEVEL, _DIVIDED, _DIVIDED_FLOATING)),
+            *(self.count(place) for place in (_NEXT_LEVEL, _DIVIDED, _DIVIDED_FLOATING)),
             threads=1,
         )
         predict_divided = self._predict(parameters, _DIVIDED, "divided")
@@ -1663,7 +1663,7 @@ class StepRunner:
             levels[:, 0] = self._levels
             levels[:, 1] = 0
             levels[: len(self._root_levels), 1] = self._root_levels
-            counts[_LEVEL] = 0
+            counts[_NEXT_LEVEL] = 0
             counts[_LEVELS] = len(self._levels)
 
     # ------------------------------------------------------------------ a step
