@@ -296,7 +296,7 @@ def _wear(page: browser.Page, world: Recorded, address: str, eyes: tuple[int, in
 
 def _wait_for_scale(page: browser.Page) -> None:
     """Until a headset's page has asked for the same number of pixels for a while."""
-    ask = f"[{SCALE}, vinesim.core.frames]"
+    ask = f"[{SCALE}, vinesim.frames]"
     end = time.monotonic() + PATIENCE
     scale, since = page.run(ask)
     while time.monotonic() < end:
@@ -324,9 +324,9 @@ def _errors(page: browser.Page) -> Iterator[dict[str, Any]]:
 
 def _measure(page: browser.Page, case: str, bar: float | None) -> Iterator[dict[str, Any]]:
     time.sleep(SETTLING)
-    before = page.run("[vinesim.core.frames, vinesim.states, performance.now()]")
+    before = page.run("[vinesim.frames, vinesim.states, performance.now()]")
     time.sleep(SECONDS)
-    after = page.run("[vinesim.core.frames, vinesim.states, performance.now(), vinesim.calls, vinesim.triangles]")
+    after = page.run("[vinesim.frames, vinesim.states, performance.now(), vinesim.calls, vinesim.triangles]")
     seconds = 1e-3 * (after[2] - before[2])
     rate = {"case": f"{case}: pictures", "value": (after[0] - before[0]) / seconds, "unit": "Hz"}
     yield rate | ({} if bar is None else {"peer": "bar, at least", "peer_value": bar})

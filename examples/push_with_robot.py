@@ -4,9 +4,9 @@ import numpy as np
 
 import vinesim
 
-upwards = vinesim.core.frames.from_x_axis(np.array([0.0, 0.0, 1.0]))
+upwards = vinesim.frames.from_x_axis(np.array([0.0, 0.0, 1.0]))
 cane = vinesim.CaneBuilder(
-    length=1.2, radius=0.005, damping_ratio=0.1, pose=vinesim.core.frames.pose([1.0, 0.0, 0.0], upwards)
+    length=1.2, radius=0.005, damping_ratio=0.1, pose=vinesim.frames.pose([1.0, 0.0, 0.0], upwards)
 )
 simulation = vinesim.Simulation(cane)
 robot = simulation.add_robot("vinebot", pose=(0.0, 0.0, 0.0))  # x, y, yaw

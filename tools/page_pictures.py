@@ -95,7 +95,7 @@ class Photographer:
 
     def settled(self) -> np.ndarray:
         """The page's picture when so many more were drawn that the shadows are of now."""
-        self.wait(f"vinesim.core.frames > {self.page.run('vinesim.core.frames')} + 5")
+        self.wait(f"vinesim.frames > {self.page.run('vinesim.frames')} + 5")
         return self.page.picture()
 
     def photographs(self, name: str) -> Iterator[tuple[str, np.ndarray]]:

@@ -64,7 +64,7 @@ class Physics:
         model: constants of the vineyard.
         parameters: all numbers of the physics.
         device: ``"cpu"`` or ``"cuda"``, see :class:`ArticulationSolver`.
-        threads: of the CPU that share the plants, see :class:`ArticulationSolver`.
+        threads: of the CPU that share the contacts of plants, see :class:`ArticulationSolver`.
         detachment: whether bunches detach when they are pulled too hard.
         """
         p = parameters

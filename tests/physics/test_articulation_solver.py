@@ -11,7 +11,8 @@ import warp as wp
 from tests.support.clustered_trees import clustered, momenta, moving
 from tests.support.waiting import deadline
 from vinesim.core import frames
-from vinesim.plants.articulation_solver import TREES_PER_CHUNK, ArticulationSolver
+from vinesim.kernels.graph import TIERS
+from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import DeviceBuffers, DeviceUnavailable
 from vinesim.plants.fault_guard import FaultGuard
 from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
@@ -621,14 +622,34 @@ def filled_with_nan(make: Callable[..., wp.array]) -> Callable[..., wp.array]:
 def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("empty", "empty_like"):  # whatever reads memory before it is written shall show
         monkeypatch.setattr(wp, name, filled_with_nan(getattr(wp, name)))
-    for work in TREES_PER_CHUNK:
-        monkeypatch.setitem(TREES_PER_CHUNK, work, 1)  # even of so few trees each thread takes some
     single_threaded, response = run_with_events()
     copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
-    for options in ({"threads": 2}, {"threads": 3}, *copies):
+    for options in ({"threads": 2}, *copies):
         arrays, measured = run_with_events(**options)
         assert arrays == single_threaded, options
         np.testing.assert_array_equal(measured, response)
+
+
+@pytest.mark.parametrize("in_one_call", [False, True])
+def test_more_trees_than_a_graph_has_room_for_move_as_one_does(in_one_call: bool) -> None:
+    """Their steps are divided into substeps. The fault of the last tree is seen."""
+    moved = []
+    for count in (1, TIERS[0] + 6):
+        model = canes(count)
+        plants = ArticulationSolver(model, State.at_rest(model))
+        plants.wake(np.arange(count))
+        plants.state.joint_qd[:, 1] = np.tile(np.linspace(0.0, 2.0, 5), count)
+        if in_one_call:
+            plants.advance(20)
+        else:
+            step(plants, 20)
+        assert (plants.tree_substeps > 1).all()
+        moved.append(plants.state.joint_q[-5:].copy())
+        plants.state.joint_qd[-1] = np.nan
+        step(plants)
+        assert plants.fastest_rate() == np.inf
+        assert FaultGuard(plants).stop_faulty_trees().tolist() == [count - 1]
+    np.testing.assert_array_equal(moved[0], moved[1])
 
 
 def test_advance_equals_repeated_predict_and_integrate() -> None:

@@ -42,7 +42,9 @@ def test_rows_of_listed_trees_are_uploaded_and_downloaded(buffers: DeviceBuffers
     buffers.add_body_rows("number", numbers, wp.int32)
     on_device = buffers.arrays["place"].numpy()[buffers.slots]
     np.testing.assert_array_equal(on_device, positions)
-    upload, download = (buffers.row_copier(("place", "number"), "trees", to_host=back) for back in (False, True))
+    names = ("place", "number")
+    count = wp.array([2], dtype=wp.int32, device="cpu")
+    upload, download = (buffers.row_copier(names, "trees", count, to_host=back) for back in (False, True))
     before = positions.copy()
     positions += 100.0
     numbers += 100
@@ -54,6 +56,7 @@ def test_rows_of_listed_trees_are_uploaded_and_downloaded(buffers: DeviceBuffers
     np.testing.assert_array_equal(buffers.arrays["number"].numpy()[buffers.slots], np.arange(8) + 100 * listed)
     positions[:] = 0.0
     numbers[:] = 0
+    count.fill_(1)
     download(1)
     returned = np.array([0, 0, 0, 1, 1, 1, 0, 0], bool)
     np.testing.assert_array_equal(positions, np.where(returned[:, None], before + 100.0, 0.0))

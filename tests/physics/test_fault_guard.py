@@ -175,10 +175,10 @@ def test_a_cut_body_with_a_non_finite_position_is_reset() -> None:
     plants = row(2)
     state = plants.state
     drawn = state.body_q[9, :3].copy()
-    state.body_cut[9] = True
+    plants.cut(9)
     state.joint_x[9], state.joint_xd[9] = np.nan, 3.0
-    plants.wake(1)
-    plants.tree_rate[1] = np.nan
+    plants.predict()
+    plants.integrate()
     assert FaultGuard(plants).stop_faulty_trees().tolist() == [1]
     np.testing.assert_array_equal(state.joint_x[9], drawn)
     assert not state.joint_xd[9].any()

@@ -7,7 +7,6 @@ import pytest
 
 from vinesim.bench import scenes
 from vinesim.contact import detection, impulse_solver
-from vinesim.plants import articulation_solver
 from vinesim.world import Physics
 
 
@@ -29,7 +28,7 @@ def states(threads: int, bars: int = 3, canes: int = 12) -> list[bytes]:
 @pytest.mark.parametrize("threads", [2, 3])
 def test_threads_change_no_bit_of_contacts(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
     alone = states(1)
-    for sizes in (articulation_solver.TREES_PER_CHUNK, detection.TREES_PER_CHUNK, impulse_solver.ITEMS_PER_CHUNK):
+    for sizes in (detection.TREES_PER_CHUNK, impulse_solver.ITEMS_PER_CHUNK):
         for work in sizes:
             monkeypatch.setitem(sizes, work, 1)  # even of so little each thread takes some
     assert states(threads) == alone

@@ -133,7 +133,11 @@ def test_a_missing_bunch_is_reported_with_the_reason(vinebot: RobotDescription):
 def test_a_robot_without_a_cutter_is_refused(vinebot: RobotDescription):
     model, task = vineyard(7)
     physics = Physics(model)
-    robot = picker(physics, dataclasses.replace(vinebot, cutters=()), task.base_pose)
+    robot = picker(
+        physics,
+        dataclasses.replace(vinebot, grippers=tuple(g for g in vinebot.grippers if g not in vinebot.cutters)),
+        task.base_pose,
+    )
     with pytest.raises(CommandError, match="no gripper with a cutter on its"):
         PickBunch(physics, robot, task)
 

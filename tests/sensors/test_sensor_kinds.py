@@ -1,9 +1,9 @@
 """The registry of kinds of sensors: what each layer knows of a kind is where the kind says."""
 
 import pytest
-from vinesim.robot.description.errors import DescriptionError
 
 from vinesim.robot.description.sidecar import read_sidecar
+from vinesim.robot.description.urdf import DescriptionError
 from vinesim.scene.values import SENSOR_KINDS
 from vinesim.sensors.sensor import maker
 

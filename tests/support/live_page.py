@@ -124,5 +124,5 @@ def touch_screen(page, width, height):
 
 def is_drawn_anew(page):
     """Wait until pictures begun from now on are drawn."""
-    drawn = page.run("vinesim.core.frames")
-    wait(lambda: page.run("vinesim.core.frames") > drawn + 1, "two pictures later")
+    drawn = page.run("vinesim.frames")
+    wait(lambda: page.run("vinesim.frames") > drawn + 1, "two pictures later")

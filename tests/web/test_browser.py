@@ -349,8 +349,8 @@ def pinch(page, place):
     """Open the emulated right hand, move it to a place [3] m above the floor, and pinch there."""
     for script in ("updatePinchValue(0)", f"position.set{place}", "updatePinchValue(1)"):
         page.run(f"device.hands.right.{script}, 0")
-        drawn = page.run("vinesim.core.frames")
-        wait(lambda drawn=drawn: page.run("vinesim.core.frames") > drawn + 1, "two pictures later")
+        drawn = page.run("vinesim.frames")
+        wait(lambda drawn=drawn: page.run("vinesim.frames") > drawn + 1, "two pictures later")
 
 
 @pytest.mark.slow

@@ -65,8 +65,8 @@ def page_picture(page, client, eye, target):
         page.run("['frame', 'names'].forEach((id) => { document.getElementById(id).style.visibility = 'hidden'; })")
         page.look(eye, target)
         page.run("vinesim.viewer.world.listedAt = null, 0")
-        drawn = page.run("vinesim.core.frames")
-        wait(lambda: page.run("vinesim.core.frames") > drawn + 5, "a picture with shadows of what is drawn")
+        drawn = page.run("vinesim.frames")
+        wait(lambda: page.run("vinesim.frames") > drawn + 5, "a picture with shadows of what is drawn")
         failed = (
             "vinesim.viewer.renderer.info.programs.filter(({ diagnostics }) => diagnostics?.runnable === false).length"
         )

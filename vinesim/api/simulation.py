@@ -69,7 +69,7 @@ class Simulation:
             sleep: whether trees at rest fall asleep; it replaces ``parameters.sleep``.
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
-            threads: number of CPU threads for the plants.
+            threads: number of CPU threads that share the contacts of plants.
         """
         self.scene: Scene | None = None
         """The simulated scene; None for a model or canes."""

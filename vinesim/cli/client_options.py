@@ -120,7 +120,10 @@ class ClientOptions:
         ),
     ] = "cpu"
     threads: Annotated[
-        int, typer.Option(min=1, help="Threads for the plants on the CPU; pays from 100 awake trees, on free cores.")
+        int,
+        typer.Option(
+            min=1, help="Threads for the contacts of plants on the CPU; pays from 100 awake trees, on free cores."
+        ),
     ] = 1
     seconds: Seconds = None
     out: Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")] = None

@@ -7,7 +7,6 @@ cut falls with everything that grows on it, including its bunches (:meth:`Articu
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import math
 
@@ -18,7 +17,7 @@ from vinesim.contact.contact_solver import ContactSolver
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.tree_checks import count_overloaded_steps
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
 from vinesim.rigid.free_bunch import FreeBunch
@@ -86,7 +85,6 @@ class DetachmentMonitor:
         self._first = np.searchsorted(trees[order], np.arange(len(model.tree_first) + 1))
         self._wood = np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE))
         self._awake: np.ndarray | None = None
-        self._awake_count = ctypes.c_int32()
         self._awake_bunches = np.zeros(len(order), np.int32)
         self._longest = np.zeros(1, np.int32)
         self._detachments: list[Detachment] = []
@@ -94,14 +92,15 @@ class DetachmentMonitor:
 
     def _bind(self) -> None:
         model = self.plants.model
-        self._peduncles = peduncles = self.plants.launches.record_joint_wrenches(max(len(self._bunches), 1))
-        count_steps = bind_launch(
+        self._peduncles = peduncles = self.plants.launches.joint_wrenches(max(len(self._bunches), 1))
+        count_steps = KernelLaunch(
             count_overloaded_steps,
             [
                 share(model.bunch_body, wp.int32),
                 share(model.body_tree, wp.int32),
                 share(model.bunch_pull, wp.float32),
                 share(model.bunch_bend, wp.float32),
+                share(peduncles.count, wp.int32),
                 share(self._awake_bunches, wp.int32),
                 share(peduncles.carried, wp.spatial_vector),
                 share(self.plants.state.bunch_attached, wp.bool),
@@ -109,13 +108,11 @@ class DetachmentMonitor:
             ],
             [share(self._overloaded_steps, wp.int32), share(self._longest, wp.int32)],
         )
-        count = self._awake_count
-        self._count_overloaded_steps = self.plants.launch_pool.sequence(
-            [
-                (peduncles.compute, count),
-                (count_steps, count),
-            ]
-        )
+        if self.plants.buffers.has_copies:
+            self._count_overloaded_steps = KernelGraph(count_steps)
+            self._weigh = self.plants.launches.graph(peduncles.launch)
+        else:
+            self._count_overloaded_steps = KernelGraph(peduncles.launch, count_steps)
 
     # ------------------------------------------------------------------ the tick
 
@@ -133,10 +130,13 @@ class DetachmentMonitor:
         """Detach bunches whose peduncles were overloaded for ``detachment_duration``, on trees simulated here."""
         self._list_awake_bunches()
         self._longest[0] = 0
-        self._count_overloaded_steps()
+        count = int(self._peduncles.count[0])
+        if self.plants.buffers.has_copies:
+            self._weigh(count)
+            self.plants.buffers.synchronize()
+        self._count_overloaded_steps(count)
         if self._longest[0] < self._overload_limit:
             return
-        count = self._awake_count.value
         model = self.plants.model
         attached = self.plants.state.bunch_attached
         for i in np.flatnonzero(self._overloaded_steps[self._awake_bunches[:count]] >= self._overload_limit).tolist():
@@ -157,7 +157,7 @@ class DetachmentMonitor:
             self._awake = awake
             first = self._first[awake]
             bunches = self._bunches[spans(first, self._first[awake + 1] - first)]
-            self._awake_count.value = len(bunches)
+            self._peduncles.count[0] = len(bunches)
             self._awake_bunches[: len(bunches)] = bunches
             self._peduncles.places[: len(bunches)] = self.plants.buffers.slots[self.plants.model.bunch_body[bunches]]
 

@@ -14,10 +14,10 @@ from typing import Protocol, cast
 
 import warp as wp
 
+from vinesim.kernels.graph import THREADS_PER_BLOCK
+
 MAX_THREADS = 4
 """A picture or a scan is not shared by more threads of a CPU than this: the gain is used up."""
-THREADS_PER_BLOCK = 32
-"""CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
 
 
 @dataclasses.dataclass(frozen=True)

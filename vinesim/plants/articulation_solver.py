@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -25,8 +25,9 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
-from vinesim.kernels.launch import BoundLaunch as Launch
-from vinesim.kernels.launch import bind_launch, bound, join_partitions
+from vinesim.core.warp_arrays import share
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
+from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.kernels.plants import first_mode, structs
 from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
 from vinesim.kernels.plants.energy_budget import (
@@ -38,7 +39,7 @@ from vinesim.kernels.plants.energy_budget import (
     choose_budget,
     keep_budget,
 )
-from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, substeps_for
+from vinesim.kernels.plants.first_mode import MAX_SUBSTEPS, begin_substep, substeps_for
 from vinesim.kernels.plants.floating_components import correct_floating_momentum
 from vinesim.kernels.plants.impulse_response import apply_wrenches, impulse_response
 from vinesim.kernels.plants.integration import integrate
@@ -46,6 +47,7 @@ from vinesim.kernels.plants.joint_wrench import joint_wrench
 from vinesim.kernels.plants.kinematics import forward_kinematics
 from vinesim.kernels.plants.lean_prediction import predict_lean
 from vinesim.kernels.plants.prediction import predict
+from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
@@ -54,6 +56,19 @@ from vinesim.plants.validation import checked_trees, validate
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
+
+# Places in the array of counts: how many entries of each list kernels take.
+_STEPPING = 0
+_SUBSET = 1
+_GROUPS = 2
+_WHOLE = 3
+_FLOATING = 4
+_DIVIDED = 5
+_DIVIDED_FLOATING = 6
+_NEXT_LEVEL = 7
+_LEVELS = 8
+_COUNTS = 9
+"""How many counts there are. :data:`_NEXT_LEVEL`: which substep is next; :data:`_LEVELS`: how many there are."""
 
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
@@ -74,7 +89,7 @@ class ArticulationSolver:
         dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
-        threads: on a CPU, so many threads share the awake trees (the result is the same to the bit).
+        threads: on a CPU, so many threads share the contacts (the result is the same to the bit).
         fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
             ``PhysicsParameters``, and :mod:`vinesim.plants.fault_guard`.
         geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
@@ -126,11 +141,11 @@ class ArticulationSolver:
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
         self.launch_pool = LaunchPool(threads)
-        """Threads that share launches over trees."""
+        """Threads that share the launches of contacts."""
         weakref.finalize(self, self.launch_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
-        self.launches = KernelLaunches(self, numbers, self.launch_pool, MAX_SUBSTEPS if substeps else 1)
+        self.launches = KernelLaunches(self, numbers, MAX_SUBSTEPS if substeps else 1)
         """Kernels on these arrays."""
         self._runner = StepRunner(
             buffers,
@@ -139,18 +154,19 @@ class ArticulationSolver:
             tree_steps=self._steps,
             tree_rate=self.tree_rate,
             tree_budget=self.tree_budget,
-            stepping=self._stepping,
-            groups=self._groups,
-            floating=self._floating,
+            lists={
+                "stepping": self._stepping,
+                "divided": self._divided,
+                "groups": self._groups,
+                "floating": self._floating,
+                "divided_floating": self._divided_floating,
+                "levels": self._levels,
+            },
+            counts=self._counts,
             topologies=Topologies(model, state.body_cut, self.tree_moving),
             whole=np.isin(np.arange(len(model.tree_first)), model.body_tree[model.tie_body[self.ties.on_wire]])
             | model.is_on_arm(),
         )
-
-        def apply_on_device(touched: int, first: int = 0, partition: int = 0) -> None:
-            self.launches.upload_wrenches(len(self._runner.stepped))
-            self.launches.apply_wrenches(touched)
-
         self._loads = ContactLoads(
             body_tree=model.body_tree,
             place_in_tree=self._place_in_tree,
@@ -158,10 +174,10 @@ class ArticulationSolver:
             tree_moving=self.tree_moving,
             body_wrench=self._wrench,
             touched=self._subset,
+            touched_count=self._counts[_SUBSET : _SUBSET + 1],
             euler_steps=self._euler_steps,
             onset=self.onset_steps + 1,  # the first step counts
-            apply=bound(apply_on_device) if buffers.has_copies else self.launches.apply_wrenches,
-            pool=self.launch_pool,
+            then=() if buffers.has_copies else (self.launches.wrenches,),
         )
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
@@ -184,9 +200,11 @@ class ArticulationSolver:
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.awake_list = np.zeros(trees, np.int32)
-        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree]."""
+        self.awake_count = np.zeros(1, np.int32)
+        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree], and how many [1]."""
         self.tree_rate = np.zeros(trees, np.float32)
         """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
+        self._fastest = np.zeros(1, np.float32)
         self.tree_substeps = np.ones(trees, np.int32)
         """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
         self.tree_budget = np.zeros(trees, np.int32)
@@ -225,12 +243,15 @@ class ArticulationSolver:
         self._offset = model.body_offset.copy()
         self._rest = model.body_rest.copy()
         self._falls = np.zeros(bodies, np.bool_)  # of a floating component that no tie holds
-        self._floating = np.zeros(bodies, np.int32)
+        self._floating, self._divided_floating = (np.zeros(bodies, np.int32) for _ in range(2))
         self._falling_roots = np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
         self._euler_steps = np.zeros(trees, np.int32)
         self._steps = np.ones(trees, np.int32)
-        self._stepping, self._subset, self._groups = (np.zeros(n, np.int32) for n in (trees, trees, (trees, 2)))
+        self._stepping, self._divided, self._subset = (np.zeros(trees, np.int32) for _ in range(3))
+        self._groups = np.zeros((trees, 2), np.int32)
+        self._levels = np.zeros((MAX_SUBSTEPS, 2), np.int32)
+        self._counts = np.zeros(_COUNTS, np.int32)
 
     def _pin_arrays(self) -> None:
         """Move the arrays of solver, ties and state to where the device can reach them."""
@@ -252,10 +273,14 @@ class ArticulationSolver:
                 "body_parent": self._parent,
                 "body_root": self._root,
                 "stepping": self._stepping,
+                "divided": self._divided,
                 "subset": self._subset,
+                "counts": self._counts,
+                "levels": self._levels,
                 "tree_euler_steps": self._euler_steps,
                 "tree_steps": self._steps,
                 "floating": self._floating,
+                "divided_floating": self._divided_floating,
                 "tree_substeps": self.tree_substeps,
                 "tree_budget": self.tree_budget,
             },
@@ -268,6 +293,7 @@ class ArticulationSolver:
                 "tree_phi": self.phi,
                 "phi_used": self.phi_used,
                 "tree_rate": self.tree_rate,
+                "fastest": self._fastest,
             },
             wp.vec2i: {"tie_span": ties.span, "groups": self._groups},
             wp.bool: {"tree_awake": state.tree_awake, "body_falls": self._falls},
@@ -337,7 +363,12 @@ class ArticulationSolver:
 
     def _list_awake(self) -> None:
         self._awake = np.flatnonzero(self.state.tree_awake).astype(np.int32)
+        self.awake_count[0] = len(self._awake)
         self.awake_list[: len(self._awake)] = self._awake
+
+    def awake_trees(self) -> list[wp.array]:
+        """How many trees are awake [1], and which [tree]: for kernels on a CPU, which stay bound to both."""
+        return [share(self.awake_count, wp.int32), share(self.awake_list, wp.int32)]
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
         """All bodies of some trees, tree by tree [k]."""
@@ -456,21 +487,30 @@ class ArticulationSolver:
         """
         launches = self.launches
         touched = _NO_TREES
-        loads = self._loads
         count = len(self._runner.stepped)
         if bodies is not None and len(bodies):
-            touched = loads.replace(bodies, np.asarray(wrenches), self.tick)
-        elif len(loads):
-            self._unload(count)
+            touched = self._load(bodies, np.asarray(wrenches))
+        elif len(self._loads):
+            self._load(_NO_TREES, _NO_WRENCHES)
+        self._fastest[0] = 0.0
         self._runner.integrate(touched, *self._floating_roots())
         launches.download_joints(count)
         self.buffers.synchronize()
         self.tick += 1
 
-    def _unload(self, count: int) -> None:
-        """Take the wrenches of the last contacts off the first ``count`` trees of the list."""
-        self._loads.replace(_NO_TREES, _NO_WRENCHES, self.tick)
-        self.launches.upload_wrenches(count)
+    def fastest_rate(self) -> float:
+        """Of :attr:`tree_rate` of the last ``integrate()`` the largest, or more; infinite if one is not a number."""
+        if self.buffers.has_copies:
+            return float(np.nan_to_num(self.tree_rate[self._awake], nan=math.inf).max(initial=0.0))
+        return float(self._fastest[0])
+
+    def _load(self, bodies: np.ndarray, wrenches: np.ndarray) -> np.ndarray:
+        """Let wrenches [n, 6] on bodies [n] act instead of those of the last step; returns the trees touched [k]."""
+        touched = self._loads.replace(bodies, wrenches, self.tick)
+        if self.buffers.has_copies:
+            self.launches.upload_wrenches(len(self._runner.stepped))
+            self.launches.apply_wrenches(len(touched))
+        return touched
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
         """The floating roots that this step moves: where kernels find them, and their trees."""
@@ -483,7 +523,7 @@ class ArticulationSolver:
     def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
         """Many steps of the awake trees: no sleep, no fault guard, no contacts but what ``between`` launches.
 
-        Threads part once for all of them. A GPU works on its own copies meanwhile: :meth:`upload` before and
+        A GPU works on its own copies meanwhile: :meth:`upload` before and
         :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free``, ``acceleration``
         are of the last step; a tree that went wrong stays where it was (``tree_rate`` NaN or above ``fault_rate``).
         """
@@ -491,8 +531,9 @@ class ArticulationSolver:
         floating = self._floating_roots()
         if len(self._loads) and steps > 0:  # the next prediction still knows the last contacts
             self._runner.predict()
-            self._unload(len(self._runner.stepped))
+            self._load(_NO_TREES, _NO_WRENCHES)
             self._runner.integrate(_NO_TREES, *floating)
+            self.buffers.synchronize()
             self._runner.advance(steps - 1, *floating, between)
         else:
             self._runner.advance(steps, *floating, between)
@@ -527,6 +568,7 @@ class ArticulationSolver:
     def list_subset(self, trees: np.ndarray) -> None:
         """List trees [k] for the kernels that do not work on all awake ones."""
         self._subset[: len(trees)] = trees
+        self._counts[_SUBSET] = len(trees)
 
     def require_stepped(self, bodies: np.ndarray) -> None:
         """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
@@ -841,9 +883,6 @@ def blend_towards(
 # Kernels of the articulation solver, each bound once to its arrays, and the transfers of rows around them.
 
 
-TREES_PER_CHUNK = {"predict": 2, "integrate": 16, "wrenches": 4}
-"""Trees that a thread takes at a time: work of 3 to 8 us, beside which taking them is nothing. DERIVED from the times
-of one tree of 17 bodies."""
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
 """Rows that are carried to the device before every prediction."""
 DEVICE_RESULTS = (
@@ -858,6 +897,11 @@ DEVICE_RESULTS = (
 """Rows that kernels write, or that are carried over when they are needed."""
 TREE_INPUTS = (
     "stepping",
+    "divided",
+    "floating",
+    "divided_floating",
+    "counts",
+    "levels",
     "tree_moving",
     "tree_phi",
     "tree_euler_steps",
@@ -922,21 +966,24 @@ class JointWrenches:
 
     places: np.ndarray
     """[joint] int32 bodies, where kernels find them: to be written by the caller."""
+    count: np.ndarray
+    """[1] int32 how many joints: to be written by the caller."""
     carried: np.ndarray
     """[joint, 6] N, N m"""
-    compute: Launch
-    """Fills :attr:`carried` of the first joints."""
+    launch: KernelLaunch
+    """Fills :attr:`carried`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """The launches of a step on the same arrays."""
+    """The kernels of a step on the same arrays."""
 
-    predict_groups: Launch
+    predict: KernelGraph
     """Over groups of trees; on a GPU each tree is a group."""
-    predict: Launch
-    integrate: Callable[..., None]
-    correct_floating_momentum: Launch
+    integrate: dict[tuple[bool, bool], KernelGraph]
+    """Integrates the trees of whole steps: by whether energy budgets are kept and whether there are floating roots."""
+    take_substep: dict[tuple[bool, bool], KernelGraph]
+    """Predicts and integrates the trees that take the next substep, likewise."""
 
 
 class KernelLaunches:
@@ -949,13 +996,9 @@ class KernelLaunches:
     their own (:attr:`resident`), with :meth:`upload_trees` before and :meth:`download_trees` after.
     """
 
-    def __init__(
-        self, solver: ArticulationSolver, parameters: dict[str, float], pool: LaunchPool, max_substeps: int
-    ) -> None:
-        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity;
-        ``pool``: threads that share the launches over trees."""
+    def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], max_substeps: int) -> None:
+        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity."""
         self.buffers = solver.buffers
-        self._pool = pool
         self._max_substeps = max_substeps
         self._body_tree = solver.model.body_tree
         self.changed = False
@@ -968,14 +1011,12 @@ class KernelLaunches:
         self._budget_phase = -1
         self._seldom: list[str] = []
         self._register_arrays(solver)
-        self._record_transfers()
         self._arrays = self.buffers.arrays
+        self._record_transfers()
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
-        self.shared = Step(
-            self.predict_groups or self.predict, self.predict, self.integrate, self.correct_floating_momentum
-        )
-        """The launches of a step on what NumPy sees."""
+        self.shared = self._record_step_kernels(self.parameters)
+        """The kernels of a step on what NumPy sees."""
         self.resident = self.shared
         """Those of steps between which nothing comes back to the host."""
         self.resident_arrays = self.buffers.arrays
@@ -986,7 +1027,7 @@ class KernelLaunches:
             self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
         )
         self.response_capacity = 0
-        self._joint_wrenches = self.record_joint_wrenches(1)  # or the first bunch that is picked would wait for it
+        self._make_room_for_joints(1)  # or the first bunch that is picked would wait for it
 
     # ------------------------------------------------------------------ arrays
 
@@ -1049,21 +1090,36 @@ class KernelLaunches:
             setattr(filled, field, arrays[value] if isinstance(value, str) else value)
         return filled
 
-    def record(self, kernel: Any, *arguments: object, **options: Any) -> Launch:
-        """Bind a kernel; a string among the arguments names an array."""
-        given = [self._arrays[value] if isinstance(value, str) else value for value in arguments]
-        return bind_launch(kernel, given, [], device=str(self.buffers.device), **options)
+    def launch(self, kernel: Any, *arguments: object, **options: Any) -> KernelLaunch:
+        """A kernel and its arguments; a string among them names an array."""
+        return KernelLaunch(kernel, self._named(arguments), **options)
 
-    def record_shared(self, kernel: Any, *arguments: object, chunk: int) -> Launch:
-        """The same of a kernel whose list is ``trees``, shared in chunks of so many."""
-        launch = self.record(kernel, *arguments, index_list="trees", partitions=self._pool.size)
-        return self._pool.share([launch], chunk)
+    def graph(self, *launches: KernelLaunch) -> KernelGraph:
+        """Launches that follow each other, on the device."""
+        return KernelGraph(*launches, device=str(self.buffers.device))
+
+    def record(self, kernel: Any, *arguments: object, **options: Any) -> BoundLaunch:
+        """A kernel of contacts, for :attr:`ArticulationSolver.launch_pool`."""
+        return bind_launch(kernel, self._named(arguments), [], device=str(self.buffers.device), **options)
+
+    def _named(self, arguments: Sequence[object]) -> list[Any]:
+        return [self._arrays[value] if isinstance(value, str) else value for value in arguments]
+
+    def count(self, place: int) -> wp.array:
+        """One of the counts [1]."""
+        return self._arrays["counts"][place : place + 1]
+
+    @property
+    def subset(self) -> tuple[wp.array, wp.array]:
+        """How many trees :meth:`ArticulationSolver.list_subset` has listed [1], and which [tree]."""
+        return self.count(_SUBSET), self._arrays["subset"]
 
     # ------------------------------------------------------------------ transfers of the listed trees' rows
 
     def _record_transfers(self) -> None:
         def copier(trees: str, *names: str, to_host: bool = False) -> Callable[[int], None]:
-            return self.buffers.row_copier(names, trees, to_host=to_host)
+            count = self.count(_STEPPING if trees == "stepping" else _SUBSET)
+            return self.buffers.row_copier(names, trees, count, to_host=to_host)
 
         self.upload_step = copier("stepping", *STEP_INPUTS)
         self.download_prediction = copier("stepping", "body_q", "body_qd", "body_qd_free", to_host=True)
@@ -1083,7 +1139,6 @@ class KernelLaunches:
 
     def _record_step(self, parameters: Any) -> None:
         fill = self.fill
-        record = self.record
         s = structs
         self._model = fill(s.ArticulationModel)
         self._forces = fill(s.AppliedForces)
@@ -1091,50 +1146,69 @@ class KernelLaunches:
         self._bodies = fill(s.BodyState)
         self._factors = fill(s.Factors)
         scratch = fill(s.Scratch)
-        prediction = fill(s.Prediction)
-        self.predict = self._record_predict(parameters, "stepping")
-        self.predict_subset = self._record_predict(parameters, "subset")
-        self.predict_groups = (
-            None if self.buffers.has_copies else self._record_groups(parameters, joints, scratch, prediction)
+        self.predict_subset = self.graph(self._predict(parameters, _SUBSET, "subset"))
+        self.forward_kinematics = self.graph(
+            self.launch(forward_kinematics, self._model, *self.subset, joints, self._bodies)
         )
-        """Predicts groups of trees, on a CPU."""
-        self.integrate = self._record_integrate(parameters)
-        self.forward_kinematics = record(forward_kinematics, self._model, "subset", joints, self._bodies)
-        self.apply_wrenches = self.record_shared(
+        self.wrenches = self.launch(
             apply_wrenches,
             parameters.dt,
             self._model,
-            "subset",
+            *self.subset,
             "body_wrench",
             self._factors,
             fill(s.WrenchScratch),
             scratch,
-            prediction,
-            chunk=TREES_PER_CHUNK["wrenches"],
+            fill(s.Prediction),
         )
-        self.correct_floating_momentum = self._record_momentum(parameters)
-        self.choose_budget = record(choose_budget, parameters, self._model, "stepping", scratch, "tree_budget")
-        self.count_substeps = record(
-            first_mode.count_substeps,
-            parameters.dt,
-            first_mode.MAX_ANGLE,
-            self._max_substeps,
-            self._model,
-            "stepping",
-            scratch,
-            fill(s.WrenchScratch),
-            "tree_substeps",
+        self.apply_wrenches = self.graph(self.wrenches)
+        stepping = (self.count(_STEPPING), "stepping")
+        self.count_substeps = self.graph(
+            self.launch(
+                first_mode.count_substeps,
+                parameters.dt,
+                first_mode.MAX_ANGLE,
+                self._max_substeps,
+                self._model,
+                *stepping,
+                scratch,
+                fill(s.WrenchScratch),
+                "tree_substeps",
+            ),
+            self.launch(choose_budget, parameters, self._model, *stepping, scratch, "tree_budget"),
+        )
+        """Also chooses how energies are watched."""
+
+    def _record_step_kernels(self, parameters: Any) -> Step:
+        """The kernels of a step on the present arrays."""
+        in_groups = not self.buffers.has_copies
+        predict = self._predict_groups(parameters) if in_groups else self._predict(parameters, _GROUPS, "stepping")
+        begin = self.launch(
+            begin_substep,
+            self.count(_LEVELS),
+            "levels",
+            *(self.count(place) for place in (_NEXT_LEVEL, _DIVIDED, _DIVIDED_FLOATING)),
+            threads=1,
+        )
+        predict_divided = self._predict(parameters, _DIVIDED, "divided")
+        whole = self._integrate(parameters, _WHOLE, "stepping", _FLOATING, "floating")
+        divided = self._integrate(parameters, _DIVIDED, "divided", _DIVIDED_FLOATING, "divided_floating")
+        return Step(
+            self.graph(predict),
+            {which: self.graph(*launches) for which, launches in whole.items()},
+            {which: self.graph(begin, predict_divided, *launches) for which, launches in divided.items()},
         )
 
-    def _record_predict(self, parameters: Any, trees: str) -> Launch:
+    def _predict(self, parameters: Any, count: int, trees: str) -> KernelLaunch:
         fill = self.fill
         s = structs
         kernel = (predict_lean, ("body_branches",)) if self.buffers.has_copies else (predict, ())
-        return self.record_shared(
+        return self.launch(
             kernel[0],
             parameters,
             fill(s.ArticulationModel),
             *kernel[1],
+            self.count(count),
             trees,
             "tree_phi",
             "tree_euler_steps",
@@ -1146,37 +1220,60 @@ class KernelLaunches:
             fill(s.Factors),
             fill(s.Scratch),
             fill(s.Prediction),
-            chunk=TREES_PER_CHUNK["predict"],
         )
 
-    def _record_integrate(self, parameters: Any) -> Callable[..., None]:
-        """An integration, with the energy budgets around it."""
+    def _predict_groups(self, parameters: Any) -> KernelLaunch:
+        """The prediction of up to eight trees at once."""
+        size = LANES * RECORD * (self.buffers.max_tree_size + 2)
+        return self.launch(
+            predict_groups,
+            parameters,
+            self._model,
+            self.count(_GROUPS),
+            "groups",
+            "stepping",
+            "tree_phi",
+            "tree_euler_steps",
+            "tree_steps",
+            self._forces,
+            self.fill(structs.JointState),
+            wp.zeros(size, dtype=float, device=self.buffers.device),
+            "phi_used",
+            self._bodies,
+            self._factors,
+            self.fill(structs.Scratch),
+            self.fill(structs.Prediction),
+        )
+
+    def _integrate(
+        self, parameters: Any, count: int, trees: str, root_count: int, roots: str
+    ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
+        """An integration, by whether it has the energy budgets around it, and floating roots behind it."""
         fill = self.fill
-        record = self.record
         s = structs
         model, forces, joints, prediction = (
             fill(struct) for struct in (s.ArticulationModel, s.AppliedForces, s.JointState, s.Prediction)
         )
-        partitioned = {"index_list": "trees", "partitions": self._pool.size}
         apart = fill(s.BodyState, body_q="after_q", body_qd="after_qd")
-        begin = record(
+        begin = self.launch(
             begin_budget,
             parameters,
             model,
-            "stepping",
+            self.count(count),
+            trees,
             "tree_budget",
             "tree_phi",
             forces,
             joints,
             self.budget,
             apart,
-            **partitioned,
         )
-        move = record(
+        move = self.launch(
             integrate,
             parameters,
             model,
-            "stepping",
+            self.count(count),
+            trees,
             "tree_awake",
             "phi_used",
             "tree_steps",
@@ -1185,13 +1282,13 @@ class KernelLaunches:
             "tree_rate",
             "tree_euler_steps",
             joints,
-            **partitioned,
         )
-        keep = record(
+        keep = self.launch(
             keep_budget,
             parameters,
             model,
-            "stepping",
+            self.count(count),
+            trees,
             "tree_budget",
             "tree_phi",
             "tree_steps",
@@ -1204,19 +1301,26 @@ class KernelLaunches:
             fill(s.Factors),
             fill(s.Scratch),
             fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity"),
-            **partitioned,
         )
-        chunk = TREES_PER_CHUNK["integrate"]
-        return self._keeping_budgets(self._pool.share([move], chunk), self._pool.share([begin, move, keep], chunk))
+        correct = self._correct_momentum(parameters, root_count, roots)
+        stepping = (self.count(_STEPPING), "stepping")
+        last = [] if self.buffers.has_copies else [self.launch(find_fastest, *stepping, "tree_rate", "fastest")]
+        return {
+            (False, False): [move, *last],
+            (False, True): [move, correct, *last],
+            (True, False): [begin, move, keep, *last],
+            (True, True): [begin, move, keep, correct, *last],
+        }
 
-    def _record_momentum(self, parameters: Any) -> Launch:
+    def _correct_momentum(self, parameters: Any, count: int, roots: str) -> KernelLaunch:
         fill = self.fill
         s = structs
-        return self.record(
+        return self.launch(
             correct_floating_momentum,
             parameters,
             fill(s.ArticulationModel),
-            "floating",
+            self.count(count),
+            roots,
             "phi_used",
             "tree_rate",
             "tree_steps",
@@ -1226,18 +1330,16 @@ class KernelLaunches:
             "lever",
             fill(s.FloatingScratch),
             fill(s.JointState),
-            index_list="roots",
         )
 
     def _record_resident(self, parameters: Any) -> None:
-        """The launches of a step once more, on copies of what there is of each tree."""
+        """The kernels of a step once more, on copies of what there is of each tree."""
         device = self.buffers.device
         shared = self.buffers.arrays
         names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
         copies = {name: wp.empty_like(shared[name], device=device) for name in names}
         self.resident_arrays = self._arrays = shared | copies
-        predict = self._record_predict(parameters, "stepping")
-        self.resident = Step(predict, predict, self._record_integrate(parameters), self._record_momentum(parameters))
+        self.resident = self._record_step_kernels(parameters)
         self._arrays = shared
 
     def upload_trees(self) -> None:
@@ -1257,8 +1359,8 @@ class KernelLaunches:
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
-    def look_for_budgets(self, steps: int = 1) -> None:
-        """Once before the integrations of a step or of so many: decide whether they keep energy budgets.
+    def keeps_budgets(self, steps: int = 1) -> bool:
+        """Once before the integrations of a step or of so many: whether they are to keep energy budgets.
 
         Always on a GPU and in many steps. Otherwise in one step of eight, and in the seven that follow if a tree is
         watched closely after it.
@@ -1269,41 +1371,7 @@ class KernelLaunches:
         elif self._budget_phase == 1 and self._keeps_budgets:
             limit, watch = (row[self._budgeted].max() for row in self._budget_rows)
             self._keeps_budgets = self._watches_closely or bool(watch > 0 or limit >= NO_LIMIT)
-
-    def _keeping_budgets(self, move: Launch, move_with_budgets: Launch) -> Callable[..., None]:
-        """An integration, with what keeps the energy budgets around it in steps that do."""
-
-        def launch(*which: int) -> None:
-            (move_with_budgets if self._keeps_budgets else move)(*which)
-
-        return launch
-
-    def _record_groups(self, parameters: Any, joints: Any, scratch: Any, prediction: Any) -> Launch:
-        """The prediction of up to eight trees at once, each thread with memory of its own."""
-        size = LANES * RECORD * (self.buffers.max_tree_size + 2)
-        launches = [
-            self.record(
-                predict_groups,
-                parameters,
-                self._model,
-                "groups",
-                "stepping",
-                "tree_phi",
-                "tree_euler_steps",
-                "tree_steps",
-                self._forces,
-                joints,
-                wp.zeros(size, dtype=float, device=self.buffers.device),
-                "phi_used",
-                self._bodies,
-                self._factors,
-                scratch,
-                prediction,
-                index_list="groups",
-            )
-            for _ in range(self._pool.size)
-        ]
-        return self._pool.share([join_partitions(launches)], 1)
+        return self._keeps_budgets
 
     def _record_impact(self, parameters: Any) -> None:
         """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""
@@ -1312,33 +1380,36 @@ class KernelLaunches:
         joints = fill(s.JointState)
         scratch = fill(s.Scratch)
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
-        self.factor_impact = self.record(
-            predict,
-            parameters,
-            self._model,
-            "subset",
-            "tree_phi",
-            "tree_euler_steps",
-            "tree_steps",
-            self._forces,
-            joints,
-            "impact_phi",
-            self._bodies,
-            self._factors,
-            scratch,
-            prediction,
-            index_list="trees",
+        self.factor_impact = self.graph(
+            self.launch(
+                predict,
+                parameters,
+                self._model,
+                *self.subset,
+                "tree_phi",
+                "tree_euler_steps",
+                "tree_steps",
+                self._forces,
+                joints,
+                "impact_phi",
+                self._bodies,
+                self._factors,
+                scratch,
+                prediction,
+            )
         )
-        self.apply_impulses = self.record(
-            apply_wrenches,
-            1.0,
-            self._model,
-            "subset",
-            "body_impulse",
-            self._factors,
-            fill(s.WrenchScratch),
-            scratch,
-            prediction,
+        self.apply_impulses = self.graph(
+            self.launch(
+                apply_wrenches,
+                1.0,
+                self._model,
+                *self.subset,
+                "body_impulse",
+                self._factors,
+                fill(s.WrenchScratch),
+                scratch,
+                prediction,
+            )
         )
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
@@ -1349,6 +1420,7 @@ class KernelLaunches:
         if n > self.response_capacity or self.response_capacity == 0:
             self._record_response(max(2 * self.response_capacity, n, MIN_CAPACITY))
         self._response_bodies[:n] = buffers.slots[bodies]
+        self._response_count[0] = n
         self._respond(n)
         buffers.synchronize()
         return self._response[:n]
@@ -1370,6 +1442,7 @@ class KernelLaunches:
     def _record_response(self, capacity: int) -> None:
         self.response_capacity = capacity
         buffers = self.buffers
+        self._response_count = buffers.pinned(np.zeros(1, np.int32))
         self._response_bodies = buffers.pinned(np.zeros(capacity, np.int32))
         self._response = buffers.pinned(np.zeros((capacity, 6, buffers.max_tree_size, 6), np.float32))
         buffers.add_shared("response_bodies", self._response_bodies, wp.int32)
@@ -1380,34 +1453,45 @@ class KernelLaunches:
             name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
             for name in structs.fields(structs.ResponseColumns)
         }
-        self._respond = self.record(
-            impulse_response,
-            self._model,
-            stride,
-            "response_bodies",
-            self._factors,
-            self.fill(structs.ResponseColumns, **columns),
-            "response",
+        self._respond = self.graph(
+            self.launch(
+                impulse_response,
+                self._model,
+                stride,
+                buffers.reach(self._response_count, wp.int32, "response_count"),
+                "response_bodies",
+                self._factors,
+                self.fill(structs.ResponseColumns, **columns),
+                "response",
+            )
         )
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
+        if len(bodies) > len(self._joint_wrenches.places):
+            self._make_room_for_joints(2 * len(bodies))
         wrenches = self._joint_wrenches
-        if len(bodies) > len(wrenches.places):
-            wrenches = self._joint_wrenches = self.record_joint_wrenches(2 * len(bodies))
         wrenches.places[: len(bodies)] = self.buffers.slots[bodies]
-        wrenches.compute(len(bodies))
+        wrenches.count[0] = len(bodies)
+        self._carry(len(bodies))
+        self.buffers.synchronize()
         return wrenches.carried[: len(bodies)].copy()
 
-    def record_joint_wrenches(self, capacity: int) -> JointWrenches:
+    def _make_room_for_joints(self, capacity: int) -> None:
+        self._joint_wrenches = self.joint_wrenches(capacity)
+        self._carry = self.graph(self._joint_wrenches.launch)
+
+    def joint_wrenches(self, capacity: int) -> JointWrenches:
         """What computes the wrenches that up to so many joints carried in the last step."""
         buffers = self.buffers
         places = buffers.pinned(np.zeros(capacity, np.int32))
+        count = buffers.pinned(np.zeros(1, np.int32))
         carried = buffers.pinned(np.zeros((capacity, 6), np.float32))
-        launch = self.record(
+        launch = self.launch(
             joint_wrench,
             self.parameters,
             self._model,
+            buffers.reach(count, wp.int32, "joint_count"),
             buffers.reach(places, wp.int32, "joint_bodies"),
             "phi_used",
             "tree_steps",
@@ -1416,12 +1500,7 @@ class KernelLaunches:
             "body_acceleration",
             buffers.reach(carried, wp.spatial_vector, "joint_wrench"),
         )
-
-        def launch_and_wait(count: int, first: int = 0, partition: int = 0) -> None:
-            launch(count)
-            buffers.synchronize()
-
-        return JointWrenches(places, carried, bound(launch_and_wait) if buffers.has_copies else launch)
+        return JointWrenches(places, count, carried, launch)
 
 
 # Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.
@@ -1450,9 +1529,11 @@ class StepRunner:
         tree_budget: [tree] how each tree's energy is watched.
         whole: [tree] bool, trees on wires, whose steps are never divided.
         tree_rate: [tree] what the kernels write of each tree's speed.
-        stepping: [tree] int32, the list that the kernels read.
-        groups: [tree, 2] int32, groups that the kernels read: first place in the list, number of trees.
-        floating: [tree] int32, the floating roots that the kernels read.
+        lists: int32, what the kernels read: ``stepping`` [tree], all trees; ``divided`` [tree], those of more substeps
+            than one once more; ``groups`` [tree, 2], first place in the list and number of trees; ``floating``,
+            ``divided_floating`` [body], roots of trees of one step and of more; ``levels`` [substep, 2], how many
+            trees and roots take it.
+        counts: [:data:`_COUNTS`] int32, how many entries of these the kernels take.
         topologies: of the trees.
     """
 
@@ -1466,18 +1547,17 @@ class StepRunner:
         tree_budget: np.ndarray,
         whole: np.ndarray,
         tree_rate: np.ndarray,
-        stepping: np.ndarray,
-        groups: np.ndarray,
-        floating: np.ndarray,
+        lists: dict[str, np.ndarray],
+        counts: np.ndarray,
         topologies: Topologies,
     ) -> None:
         self._buffers = buffers
         self._launches = launches
-        self._list = stepping
+        self._lists = lists
+        self._counts = counts
         self._substeps = tree_substeps
         self._steps_of = tree_steps
         self._rate = tree_rate
-        self._floating = floating
         self._is_whole = whole
         self._budget_kind = tree_budget
         self.stepped = np.zeros(0, np.int32)
@@ -1487,14 +1567,17 @@ class StepRunner:
         self.fast = np.zeros(0, np.int32)
         """Those of them whose step is to be divided [k], sorted."""
         self._whole = 0
-        self._levels = ()
+        self._kind = (False, False)
+        """Whether the integrations of this step keep energy budgets, and whether there are floating roots."""
+        self._room = 0
+        """No list of an integration is longer."""
+        self._levels: Levels = ()
         self._roots = 0
-        self._root_levels = ()
+        self._root_levels: Levels = ()
         self._divided = np.zeros(0, np.int32)
         """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
-        self._groups = groups
         self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
         """Place in the list at which each group begins, and the end of the list."""
@@ -1512,9 +1595,9 @@ class StepRunner:
         self.is_stepped[self.stepped] = False
         self.is_stepped[trees] = True
         self.stepped = trees
-        self._list[: len(trees)] = trees
+        self._lists["stepping"][: len(trees)] = trees
+        self._counts[_STEPPING] = len(trees)
         self._launches.count_substeps(len(trees))
-        self._launches.choose_budget(len(trees))
         self._buffers.synchronize()
         self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
         self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
@@ -1535,11 +1618,13 @@ class StepRunner:
         listed, self._whole, self._levels = _by_substeps(np.arange(len(trees)), self._steps_of[trees])
         trees = trees[listed]
         topologies = topologies[listed]
-        self._list[: len(trees)] = trees
-        in_groups = self._launches.predict_groups is not None
+        self._lists["stepping"][: len(trees)] = trees
+        self._lists["divided"][: len(trees) - self._whole] = trees[self._whole :]
+        in_groups = not self._buffers.has_copies
         self._starts = group_starts(topologies, self._whole) if in_groups else np.arange(len(trees) + 1)
-        counts = np.diff(self._starts)
-        self._groups[: len(counts), 0], self._groups[: len(counts), 1] = self._starts[:-1], counts
+        groups = self._lists["groups"][: len(self._starts) - 1]
+        groups[:, 0] = self._starts[:-1]
+        groups[:, 1] = np.diff(self._starts)
         self._whole_groups = int(np.searchsorted(self._starts, self._whole))
 
     def _divide(self, touched: np.ndarray) -> None:
@@ -1562,7 +1647,24 @@ class StepRunner:
             self._root_levels = ()
             return
         order, self._roots, self._root_levels = _by_substeps(np.arange(len(roots)), self._steps_of[trees])
-        self._floating[: len(roots)] = roots[order]
+        roots = roots[order]
+        self._lists["floating"][: self._roots] = roots[: self._roots]
+        self._lists["divided_floating"][: len(roots) - self._roots] = roots[self._roots :]
+
+    def _count(self, steps: int = 1) -> None:
+        """Tell the kernels of integrations how many entries of the lists they are to take."""
+        counts = self._counts
+        self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
+        self._room = max(len(self.stepped), self._roots + sum(self._root_levels[:1]))
+        counts[_WHOLE] = self._whole
+        counts[_FLOATING] = self._roots
+        if self._levels:
+            levels = self._lists["levels"][: len(self._levels)]
+            levels[:, 0] = self._levels
+            levels[:, 1] = 0
+            levels[: len(self._root_levels), 1] = self._root_levels
+            counts[_NEXT_LEVEL] = 0
+            counts[_LEVELS] = len(self._levels)
 
     # ------------------------------------------------------------------ a step
 
@@ -1570,7 +1672,10 @@ class StepRunner:
         """Predict the listed trees over the whole step."""
         if len(self.fast):
             self._steps_of[self.fast] = 1
-        self._launches.shared.predict_groups(len(self._starts) - 1)
+        groups = len(self._starts) - 1
+        self._counts[_GROUPS] = groups
+        if groups:
+            self._launches.shared.predict(groups)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
         """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
@@ -1579,19 +1684,15 @@ class StepRunner:
         """
         self._divide(touched)
         self._list_roots(roots, root_trees)
-        self._launches.look_for_budgets()
-        self._launches.integrate(self._whole)
-        self._launches.correct_floating_momentum(self._roots)
-        self._take_substeps(self._launches.shared)
+        self._count()
+        self._integrate(self._launches.shared)
 
-    def _take_substeps(self, step: Step) -> None:
-        roots = self._root_levels
-        first = self._whole
-        for level, count in enumerate(self._levels):
-            step.predict(count, first)
-            step.integrate(count, first)
-            if level < len(roots):
-                step.correct_floating_momentum(roots[level], self._roots)
+    def _integrate(self, step: Step) -> None:
+        if self._room == 0:
+            return
+        step.integrate[self._kind](self._room)
+        for _ in self._levels:
+            step.take_substep[self._kind](self._room)
 
     # ------------------------------------------------------------------ many steps
 
@@ -1601,13 +1702,13 @@ class StepRunner:
         """Predict and integrate so many times without coming back in between; ``between`` launches what comes there."""
         self._divide(np.zeros(0, np.int32))
         self._list_roots(roots, root_trees)
-        count = len(self.stepped)
-        if count == 0:
+        if len(self.stepped) == 0:
             return
-        self._launches.look_for_budgets(steps)
+        self._count(steps)
+        self._counts[_GROUPS] = self._whole_groups
         self._launches.upload_trees()
         if not self._buffers.device.is_cpu:
-            what = (self._whole, self._levels, self._roots, self._root_levels, between)
+            what = (self._whole_groups, self._room, len(self._levels), self._kind, between)
             if self._graph is None or self._graph_of != what:
                 with wp.ScopedCapture(self._buffers.device) as capture:
                     self._steps(1, between)
@@ -1622,12 +1723,10 @@ class StepRunner:
     def _steps(self, steps: int, between: Callable[[], None] | None) -> None:
         step = self._launches.resident
         for _ in range(steps):
-            step.predict_groups(self._whole_groups)
+            step.predict(self._whole_groups)
             if between is not None:
                 between()
-            step.integrate(self._whole)
-            step.correct_floating_momentum(self._roots)
-            self._take_substeps(step)
+            self._integrate(step)
 
 
 def _levels(steps: np.ndarray) -> Levels:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import warp as wp
 
-from vinesim.core.warp_arrays import entry, share
-from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.core.warp_arrays import share
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants import contact_loads as kernels
-from vinesim.kernels.shared_launch import ONCE, LaunchPool
 
 LEAST_ROOM = 64
 """Bodies for which there is room at least."""
@@ -26,23 +27,21 @@ class ContactLoads:
         tree_moving: np.ndarray,
         body_wrench: np.ndarray,
         touched: np.ndarray,
+        touched_count: np.ndarray,
         euler_steps: np.ndarray,
         onset: int,
-        apply: BoundLaunch,
-        pool: LaunchPool,
+        then: Sequence[KernelLaunch],
     ) -> None:
         """Args:
         body_tree, place_in_tree: [body] tree of each, and its number there.
         is_stepped, tree_moving: [tree] whether it was in the last prediction, and how many of its bodies move.
         body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
-        touched: [tree] where the touched trees are listed.
+        touched, touched_count: [tree], [1] where the touched trees are listed, and how many they are.
         euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
-        apply: lets what has been summed act on the touched trees.
-        pool: makes the launches.
+        then: what follows at once: lets what has been summed act on the touched trees.
         """
-        self._apply = apply
-        self._pool = pool
-        self._touched_count = np.zeros(1, np.int32)
+        self._then = then
+        self._touched_count = touched_count
         self._touched = touched
         self._body_tree = body_tree
         self._place_in_tree = place_in_tree
@@ -72,12 +71,13 @@ class ContactLoads:
         self._loaded[: len(loaded)] = loaded
         self._body = np.zeros(bodies, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
-        load = bind_launch(
+        load = KernelLaunch(
             kernels.load_bodies,
             [*self._given, share(self._body, wp.int32), share(self._wrench, wp.spatial_vector)],
             [share(self._numbers, wp.int64), share(self._loaded, wp.int32), *self._results],
+            threads=1,
         )
-        self._load = self._pool.sequence([(load, ONCE), (self._apply, entry(self._touched_count))])
+        self._load = KernelGraph(load, *self._then)
 
     def __len__(self) -> int:
         """How many bodies are loaded, those given several times counted so often."""
@@ -96,7 +96,7 @@ class ContactLoads:
         self._body[:count] = bodies
         self._wrench[:count] = wrenches
         self._numbers[kernels.GIVEN], self._numbers[kernels.TICK] = count, tick
-        self._load()
+        self._load(count)
         if self._numbers[kernels.REFUSED]:
             self.require_stepped(bodies)
         return self._touched[: self._touched_count[0]]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.gather_scatter import copy_rows
 
 WARP_SIZE = 32
@@ -176,13 +176,16 @@ class DeviceBuffers:
             there[self.slots] = np.where(data >= 0, self.slots[data], data) if name in self._points else data
             self.arrays[name].assign(there)
 
-    def row_copier(self, names: tuple[str, ...], trees: str, *, to_host: bool = False) -> Callable[[int], None]:
-        """A function of n that copies rows of the first n ``trees`` to the device, or to the host (``to_host``).
+    def row_copier(
+        self, names: tuple[str, ...], trees: str, count: wp.array, *, to_host: bool = False
+    ) -> Callable[[int], None]:
+        """What copies rows of the first ``count`` [1] trees of a list to the device, or to the host (``to_host``).
 
+        It is called with a number that the count does not exceed.
         Nothing happens where both sides share their memory.
         """
         if not self.has_copies:
-            return lambda count: None
+            return lambda capacity: None
         widths = np.array([self.host[name][:1].size for name in names])
         starts = np.append(0, np.cumsum(widths * self._largest))
         here = (1, "host_first", [self.host[name].ctypes.data for name in names])
@@ -191,10 +194,9 @@ class DeviceBuffers:
         ints = [wp.array(x, dtype=wp.int32, device=self.device) for x in (starts, widths)]
         addresses = [wp.array(np.array(x, np.uint64), dtype=wp.uint64, device=self.device) for x in (source, target)]
         a = self.arrays
-        threads = int(starts[-1])
-        given = [threads, pitch, pitch_there, a[first], a[first_there], a["tree_size"], *ints, a[trees], addresses[0]]
-        launch = bind_launch(copy_rows, given, [addresses[1]], device=str(self.device), block=256)
-        return lambda count: launch(count * threads)
+        given = [pitch, pitch_there, a[first], a[first_there], a["tree_size"], *ints, count, a[trees], addresses[0]]
+        copy = KernelLaunch(copy_rows, given, [addresses[1]], width=int(starts[-1]), block=256)
+        return KernelGraph(copy, device=str(self.device))
 
     def synchronize(self) -> None:
         """Wait until the device has done all its work."""

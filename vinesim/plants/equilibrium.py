@@ -39,7 +39,7 @@ class EquilibriumFinder:
         buffers.arrays["no_turn_rate"] = wp.zeros(trees, dtype=wp.vec3, device=device)
         for name, dtype in (("rest_q", wp.transform), ("rest_qd", wrench), ("static_load", wrench)):
             buffers.add_scratch(name, dtype)
-        self._upload = buffers.row_copier(_INPUTS, "subset")
+        self._upload = buffers.row_copier(_INPUTS, "subset", plants.launches.subset[0])
         self._record(plants)
 
     def _record(self, plants: ArticulationSolver) -> None:
@@ -49,7 +49,7 @@ class EquilibriumFinder:
         fill = launches.fill
         numbers = {name: getattr(launches.parameters, name) for name in s.fields(s.SolverParameters)}
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
-        self._measure = launches.record(
+        measure = launches.launch(
             residual_motion,
             fill(s.SolverParameters, **(numbers | {"dt": REST_STEP})),
             fill(s.ArticulationModel, joint_damping="no_rate"),
@@ -57,7 +57,7 @@ class EquilibriumFinder:
             "tie_axis",
             "tie_softening",
             "root_softening",
-            "subset",
+            *launches.subset,
             fill(s.AppliedForces),
             fill(s.JointState),
             fill(s.JointState, joint_xd="no_rate", joint_qd="no_rate"),
@@ -71,6 +71,7 @@ class EquilibriumFinder:
             "rest_distance",
             "is_free",
         )
+        self._measure = launches.graph(measure)
 
     def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Speed [k] m/s of the fastest point of some trees [k], distance [k] m of the one that is furthest from where

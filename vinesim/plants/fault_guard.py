@@ -11,11 +11,7 @@ import dataclasses
 import logging
 
 import numpy as np
-import warp as wp
 
-from vinesim.core.warp_arrays import share
-from vinesim.kernels.launch import bind_launch
-from vinesim.kernels.plants.tree_checks import find_fastest
 from vinesim.plants.articulation_solver import ArticulationSolver
 
 log = logging.getLogger(__name__)
@@ -45,21 +41,14 @@ class FaultGuard:
         self.slowed = 0
         """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
         self._faults: list[Fault] = []
-        self._fastest = np.zeros(1, np.float32)
-        self._find_fastest = bind_launch(
-            find_fastest,
-            [share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
-            [share(self._fastest, wp.float32)],
-        )
 
     def stop_faulty_trees(self) -> np.ndarray:
         """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
         plants = self.plants
         state = self.plants.state
         awake = plants.awake
-        self._fastest[0] = 0.0
-        self._find_fastest(len(awake))
-        if self._fastest[0] <= plants.max_rate and self._fastest[0] <= plants.fault_rate:
+        fastest = plants.fastest_rate()
+        if fastest <= plants.max_rate and fastest <= plants.fault_rate:
             return _NO_TREES
         rate = plants.tree_rate[awake]
         stopped = awake[~(rate <= plants.fault_rate)]

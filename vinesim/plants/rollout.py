@@ -18,6 +18,7 @@ itself damps that much, and asking for less changes nothing.
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import math
 from typing import Any
 
@@ -137,6 +138,7 @@ class Rollout:
         parameters = kernel_parameters(_DEFAULTS, dt, fast_rate, max_rate, fault_rate, geometric_stiffness)
         self._given: dict[str, Any] = parameters | {"pitch": 1}
         self._arrays = {
+            "count": wp.array([trees], dtype=wp.int32, device=self.device),
             "trees": wp.array(np.arange(trees), dtype=wp.int32, device=self.device),
             "tree_phi": wp.array(np.full(trees, phi), dtype=float, device=self.device),
             "tree_awake": wp.array(np.ones(trees), dtype=wp.bool, device=self.device),
@@ -264,27 +266,27 @@ class Rollout:
 
     def _launch(self, kernel: Any, slot: int, end: bool = False) -> tuple[Any, Any]:
         """The launch of one kernel in one step, and its adjoint."""
-        values = [self._argument(kernel, arg, slot, end) for arg in kernel.adj.args]
-        adjoints = [self._adjoint(arg, value) for arg, value in zip(kernel.adj.args, values, strict=True)]
+        types = inspect.get_annotations(kernel.func)
+        values = [self._argument(kernel, name, kind, slot, end) for name, kind in types.items()]
+        adjoints = [self._adjoint(kind, value) for kind, value in zip(types.values(), values, strict=True)]
         common: dict[str, Any] = {"dim": len(self.model.tree_first), "inputs": values, "device": self.device}
         common |= {"record_cmd": True}
         return wp.launch(kernel, **common), wp.launch(kernel, adj_inputs=adjoints, adjoint=True, **common)
 
-    def _argument(self, kernel: Any, arg: Any, slot: int, end: bool) -> Any:
+    def _argument(self, kernel: Any, name: str, kind: Any, slot: int, end: bool) -> Any:
         """What an argument is in one step: a struct filled field by field, an array, or a number."""
-        name = arg.label.removesuffix("_out")
-        written = arg.label.endswith("_out")
-        if not isinstance(arg.type, _STRUCT):
-            return self._value(kernel, name, arg.type, written, slot, end)
-        filled = arg.type()
-        for field, var in structs.fields(arg.type).items():
+        written = name.endswith("_out")
+        if not isinstance(kind, _STRUCT):
+            return self._value(kernel, name.removesuffix("_out"), kind, written, slot, end)
+        filled = kind()
+        for field, var in structs.fields(kind).items():
             setattr(filled, field, self._value(kernel, field, var.type, written, slot, end))
         return filled
 
-    def _adjoint(self, arg: Any, value: Any) -> Any:
+    def _adjoint(self, kind: Any, value: Any) -> Any:
         """Where an argument's derivatives are: a struct's arrays bring their own."""
-        if isinstance(arg.type, _STRUCT):
-            return arg.type()
+        if isinstance(kind, _STRUCT):
+            return kind()
         return value.grad if isinstance(value, wp.array) else None
 
     def _value(self, kernel: Any, name: str, kind: Any, written: bool, slot: int, end: bool) -> Any:

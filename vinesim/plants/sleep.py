@@ -14,7 +14,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core.warp_arrays import share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.tree_checks import count_quiet_steps
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.equilibrium import EquilibriumFinder
@@ -62,15 +62,17 @@ class SleepMonitor:
         self._limit = np.zeros(1, np.float32)
         self._longest = np.zeros(1, np.int32)
         """[1] What :attr:`rate` is, and for how many steps the joints of the quietest awake tree have been slower."""
-        self._count_quiet_steps = bind_launch(
-            count_quiet_steps,
-            [share(self._limit, wp.float32), share(plants.awake_list, wp.int32), share(plants.tree_rate, wp.float32)],
-            [
-                share(self.quiet_steps, wp.int32),
-                share(self._is_at_rest, wp.bool),
-                share(self._seen_tick, wp.int64),
-                share(self._longest, wp.int32),
-            ],
+        self._count_quiet_steps = KernelGraph(
+            KernelLaunch(
+                count_quiet_steps,
+                [share(self._limit, wp.float32), *plants.awake_trees(), share(plants.tree_rate, wp.float32)],
+                [
+                    share(self.quiet_steps, wp.int32),
+                    share(self._is_at_rest, wp.bool),
+                    share(self._seen_tick, wp.int64),
+                    share(self._longest, wp.int32),
+                ],
+            )
         )
 
     @property
@@ -111,7 +113,8 @@ class SleepMonitor:
         plants = self.plants
         self._limit[0] = self.rate
         self._longest[0] = 0
-        self._count_quiet_steps(len(plants.awake))
+        if len(plants.awake):
+            self._count_quiet_steps(len(plants.awake))
         return plants.tick % self._check_steps == 0 and bool(self._longest[0] >= self.patience)
 
     def check(

@@ -8,7 +8,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.rigid import human_kinematics as kernels
 from vinesim.scene import appearance
 from vinesim.scene.appearance import PHALANGES
@@ -153,23 +153,27 @@ class PostureSolver:
             return wp.array(data, dtype=wp.float64, device="cpu", copy=False)
 
         neck = wp.vec3d(-EYES_TO_HEAD_BACK, 0.0, NECK_BELOW_EYES)
-        self._pose_torso_and_legs = bind_launch(
+        pose_torso_and_legs = KernelLaunch(
             kernels.pose_torso_and_legs,
             [THIGH_LENGTH * height, SHANK_LENGTH * height, HIP_HALF_WIDTH * height, neck, shared(self._tracked)],
             [shared(self._parts)],
+            threads=3,
         )
-        self._pose_difference = bind_launch(
+        self._pose_torso_and_legs = KernelGraph(pose_torso_and_legs)
+        pose_difference = KernelLaunch(
             kernels.pose_difference,
             [shared(self._start), shared(self._goal)],
             [shared(rows) for rows in self._difference],
+            threads=poses,
         )
+        self._pose_difference = KernelGraph(pose_difference)
         looks = appearance.load_human_model(height)
         self._ends = np.zeros((4, 7))
         self._closed = np.zeros(2 * len(appearance.FINGERS))
         self._visual_parts = np.zeros((len(VISUAL_PARTS), 7))
         limbs = looks.limbs
         bones = [np.ascontiguousarray(table) for table in (looks.root, looks.length, looks.bent)]
-        self._pose_arms_and_fingers = bind_launch(
+        pose_arms_and_fingers = KernelLaunch(
             kernels.pose_arms_and_fingers,
             [
                 limbs.upper_arm,
@@ -182,12 +186,14 @@ class PostureSolver:
                 shared(self._closed),
             ],
             [shared(self._visual_parts)],
+            threads=3 + len(self._closed),
         )
+        self._pose_arms_and_fingers = KernelGraph(pose_arms_and_fingers)
 
     def body_parts(self, pose: HumanPose) -> np.ndarray:
         """Poses [part, 7] of :data:`BODY_PARTS`. Knees bend forward as required by hips and ankles."""
         self._tracked[:] = pose.head, pose.hips, pose.left_foot, pose.right_foot
-        self._pose_torso_and_legs(3)
+        self._pose_torso_and_legs()
         return self._parts.copy()
 
     def visual_parts(
@@ -202,7 +208,7 @@ class PostureSolver:
             closed: [10] bend of each finger from 0 to 1, left hand first.
         """
         self._ends[0], self._ends[1], self._ends[2:], self._closed[:] = chest, head, hands, closed
-        self._pose_arms_and_fingers(3 + len(self._closed))
+        self._pose_arms_and_fingers()
         return self._visual_parts.copy()
 
     def difference(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
@@ -213,5 +219,5 @@ class PostureSolver:
         """
         np.concatenate(start, out=self._start)
         np.concatenate(goal, out=self._goal)
-        self._pose_difference(len(self._start))
+        self._pose_difference()
         return self._difference

@@ -14,7 +14,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.rigid import joint_servos
 from vinesim.rigid import mujoco_contacts, recompile
 from vinesim.rigid.static_world import ALL_BITS, GROUND, REMOTE_HAND, contact_friction, geom_user
@@ -170,7 +170,7 @@ class RobotBody:
         """Before a step: turn the targets into MuJoCo's controls."""
         if self._controls_of is not d:
             self._bind_controls(d, dt)
-        self._apply_controls(1)
+        self._apply_controls()
 
     def _bind_controls(self, d: mujoco.MjData, dt: float) -> None:
         """Bind the kernel that writes MuJoCo's controls: one call instead of twenty NumPy calls on short arrays."""
@@ -196,11 +196,13 @@ class RobotBody:
             q=self.base_q,
             actuator=self.base_actuator,
         )
-        self._apply_controls = bind_launch(
+        apply = KernelLaunch(
             joint_servos.apply_controls,
             [dt, drives.struct, base.struct, share(d.qpos, wp.float64), share(d.qvel, wp.float64)],
             [share(values, wp.float64) for values in (self.control, self.base_target, d.ctrl)],
+            threads=1,
         )
+        self._apply_controls = KernelGraph(apply)
 
     def transmitted_effort(self, d: mujoco.MjData) -> np.ndarray:
         """[joint] N m or N, effort of the drives in the last step: servo plus gravity compensation."""

@@ -21,7 +21,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core.warp_arrays import SharedArrays, share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.wires import wire_contacts as kernels
 from vinesim.scene.model import Model
 from vinesim.wires.elastic_supports import LEAST_SHARE, WIRE_DAMPING_TIME, ElasticSupports
@@ -97,15 +97,17 @@ class DeflectedWires:
         """Pieces [k] whose offset is not 0; a view that the next step changes."""
         return self._geoms.deflected[: self._geoms.count[0]]
 
-    def bind(self, contacts: SharedArrays) -> tuple[Callable[..., None], Callable[..., None]]:
-        """Functions that find the springs of ``contacts``, and that add what presses of them, for one thread each."""
+    def bind(self, contacts: SharedArrays) -> tuple[KernelGraph, KernelGraph]:
+        """What finds the springs of ``contacts``, and what adds those that press."""
         wires, nodes, bodies, springs = self._supports.wire_structs
-        find = bind_launch(
+        find = KernelLaunch(
             kernels.find_wire_springs,
             [self._numbers, wires, nodes, self._geoms.struct, bodies, springs, self._load, self.presses.struct],
             [contacts.struct],
+            threads=1,
         )
-        return find, bind_launch(kernels.add_presses, [self._numbers, contacts.struct], [self._found.struct])
+        add = KernelLaunch(kernels.add_presses, [self._numbers, contacts.struct], [self._found.struct], threads=1)
+        return KernelGraph(find), KernelGraph(add)
 
     def end_step(self, rigid_asleep: np.ndarray) -> None:
         """Move the geoms after what presses on them, let go those that nothing presses on, and load the supports.
@@ -115,7 +117,7 @@ class DeflectedWires:
         if not (self._found.count[0] or self.presses.count[0] or self._geoms.count[0]):
             return
         self._rigid_asleep[:] = rigid_asleep
-        self._deflect(1)
+        self._deflect()
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
     def let_go(self, trees: np.ndarray) -> None:
@@ -129,11 +131,13 @@ class DeflectedWires:
         for k in np.flatnonzero(presses.tree[: presses.count[0]] < 0).tolist():
             presses.key[k], presses.tree[k] = numbers(int(presses.key[k]))
         self._rigid_asleep = np.full(trees, -1, np.int32)
-        self._deflect = bind_launch(
+        deflect = KernelLaunch(
             kernels.deflect_wires,
             [self._numbers, *self._supports.wire_structs[:2], self._tree_awake, share(self._rigid_asleep, wp.int32)],
             [self._found.struct, self.presses.struct, self._load, self._is_loaded, self._geoms.struct],
+            threads=1,
         )
+        self._deflect = KernelGraph(deflect)
 
 
 class WireContacts:
@@ -198,7 +202,7 @@ class WireContacts:
         a.key[:count] = key
         a.tree[:count] = tree
         a.count[0] = count
-        self._find(1)
+        self._find()
 
     def add_presses(self, force: np.ndarray, velocity: np.ndarray) -> None:
         """Note what the solve has found.
@@ -208,7 +212,7 @@ class WireContacts:
             velocity: [contact] m/s along the normal, of what presses, at the end of the step.
         """
         self._arrays.force[: len(self)], self._arrays.velocity[: len(self)] = force, velocity
-        self._add(1)
+        self._add()
 
 
 def _numbers(dt: float) -> kernels.WireNumbers:

@@ -12,7 +12,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.wires import elastic_supports as kernels
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
 from vinesim.plants.equilibrium import EquilibriumFinder
@@ -60,7 +60,7 @@ class ElasticSupports:
         self._was_active = np.zeros(len(first), np.bool_)
         self._active = np.zeros(len(first), np.int32)
         self._is_moved = np.zeros(trees, np.bool_)
-        self._active_count = 0
+        self._active_count = np.zeros(1, np.int32)
         self._moved_count = np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)
         """[tree] Whether another tree that is awake is on one of its supports."""
@@ -137,10 +137,11 @@ class ElasticSupports:
         node_struct = SharedArrays(kernels.SupportNodes, **nodes).struct
         body_struct = SharedArrays(kernels.SupportedBodies, **bodies).struct
         spring_struct = SharedArrays(kernels.SupportedSprings, **springs).struct
-        self._solve = bind_launch(
+        solve = KernelLaunch(
             kernels.balance_supports,
             [
                 node_struct,
+                share(self._active_count, wp.int32),
                 share(self._active, wp.int32),
                 share(state.tree_awake, wp.bool),
                 share(self._is_placed, wp.bool),
@@ -153,6 +154,7 @@ class ElasticSupports:
                 share(self._moved_count, wp.int32),
             ],
         )
+        self._solve = KernelGraph(solve)
         self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
         """What :func:`kernels.wire_spring` asks for, but for the loads."""
 
@@ -166,7 +168,7 @@ class ElasticSupports:
     @property
     def active(self) -> np.ndarray:
         """The supports [k] that the last :meth:`update` computed."""
-        return self._active[: self._active_count]
+        return self._active[: self._active_count[0]]
 
     def moved_pieces(self) -> np.ndarray:
         """Pieces of wire [k] that were computed since the last call, or will be next: no other has moved."""
@@ -191,10 +193,11 @@ class ElasticSupports:
         if not self._is_listed or len(self._placed):
             self._is_listed = len(self._placed) == 0 and len(self._unloaded) == 0
             self._list_supports()
-        if self._active_count == 0:
+        count = int(self._active_count[0])
+        if count == 0:
             return
         self._is_placed[self._placed] = True
-        self._solve(self._active_count)
+        self._solve(count)
         self._is_placed[self._placed] = False
         self._placed = _NO_TREES
         self._unloaded = _NO_SUPPORTS
@@ -210,7 +213,7 @@ class ElasticSupports:
         count = self._tree_start[trees + 1] - self._tree_start[trees]
         support = self._tree_supports[spans(self._tree_start[trees], count)]
         supports = np.unique(np.concatenate([support, self._loaded, self._unloaded]))
-        self._active_count = len(supports)
+        self._active_count[0] = len(supports)
         self._active[: len(supports)] = supports
         self._was_active[supports] = True
         of_awake = count[: len(self._awake)].sum()

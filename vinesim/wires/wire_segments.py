@@ -9,7 +9,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.wires import wire_shapes as kernels
 from vinesim.plants.articulation_solver import spans
 from vinesim.scene.model import Model
@@ -92,13 +92,15 @@ class WireShapes:
         self._first = first
         self._piece = segments.piece
         self._may_have_moved = np.zeros(pieces, np.bool_)
+        self._count = np.zeros(1, np.int32)
         self._listed = np.zeros(pieces, np.int32)
         self._poses = SegmentPoses()
         structs = supports.wire_structs
-        self._pose = bind_launch(
+        pose = KernelLaunch(
             kernels.pose_wire_segments,
             [
                 *structs[:2],
+                share(self._count, wp.int32),
                 share(self._listed, wp.int32),
                 share(supports.deflection, wp.vec3d),
                 wires.presses.struct,
@@ -106,6 +108,7 @@ class WireShapes:
             ],
             [self._shapes.struct],
         )
+        self._pose = KernelGraph(pose)
 
     def poses(self) -> SegmentPoses:
         """The segments that are away from where they were drawn."""
@@ -117,6 +120,7 @@ class WireShapes:
         if len(pieces) == 0:
             return self._poses
         self._listed[: len(pieces)] = pieces
+        self._count[0] = len(pieces)
         self._pose(len(pieces))
         segment = spans(self._first[pieces], self._first[pieces + 1] - self._first[pieces])
         segment = segment[self._shapes.is_moved[segment]]

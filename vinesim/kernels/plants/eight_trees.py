@@ -512,6 +512,7 @@ def predict_groups(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     groups: wp.array(dtype=wp.vec2i),
     trees: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
@@ -530,24 +531,28 @@ def predict_groups(
     """One thread solves the motion of up to eight trees of one topology as :func:`predict` does of each.
 
     groups: [thread] first place in ``trees``, and how many; in a group of two or more no root floats. records_out:
-    scratch, no two threads at once; the others are those of :func:`predict`.
+    scratch of all threads, which run one after the other; the others are those of :func:`predict`.
     """
+    if wp.tid() >= count[0]:
+        return
     span = groups[wp.tid()]
-    count = span[1]
+    members = span[1]
     phis = Lanes()
     listed = LaneIndices()
-    together = count >= MIN_LANES
+    together = members >= MIN_LANES
     for lane in range(LANES):
-        tree = trees[span[0] + wp.min(lane, count - 1)]
+        tree = trees[span[0] + wp.min(lane, members - 1)]
         listed[lane] = tree
         phi = chosen_phi(p, model, joints, tree, tree_phi[tree], tree_euler_steps[tree])
         phis[lane] = phi
         tree_phi_out[tree] = phi
         together = together and tree_steps[tree] == 1 and not is_conservative(p, phi)
     if together:
-        walk_eight(p, model, forces, joints, listed, count, phis, records_out, bodies_out, factors_out, prediction_out)
+        walk_eight(
+            p, model, forces, joints, listed, members, phis, records_out, bodies_out, factors_out, prediction_out
+        )
     else:
-        for lane in range(count):
+        for lane in range(members):
             tree = listed[lane]
             step = substep_parameters(p, tree_steps[tree])
             predict_tree(

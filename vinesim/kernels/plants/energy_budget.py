@@ -102,6 +102,7 @@ def choose_budget(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     # out
     scratch_out: Scratch,
@@ -112,6 +113,8 @@ def choose_budget(
     trees: [thread] which tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or :data:`NO_BUDGET` with
     a floating root or without geometric stiffness. scratch_out holds nothing that is needed later.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
@@ -169,6 +172,7 @@ def begin_budget(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_budget: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
@@ -184,6 +188,8 @@ def begin_budget(
     of this step. joints: at its start. budget_out: the limit is :data:`NO_LIMIT` while outer forces act. bodies_out:
     scratch.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     kind = tree_budget[tree]
     if kind == NO_BUDGET or not is_watched(kind, tree_phi[tree], tree, budget_out):
@@ -360,6 +366,7 @@ def keep_budget(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_budget: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
@@ -382,6 +389,8 @@ def keep_budget(
     is divided into; this is one of them. joints_out: at its end, slower where energy was taken; tree_euler_steps_out:
     [tree] then at least 1. All that follows is scratch.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     kind = tree_budget[tree]
     if kind == NO_BUDGET:

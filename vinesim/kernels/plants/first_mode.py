@@ -69,6 +69,7 @@ def count_substeps(
     max_substeps: int,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     # out
     scratch_out: Scratch,
@@ -84,6 +85,8 @@ def count_substeps(
     trees: [thread] which tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the mode turns by at most
     ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last prediction stay.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
@@ -125,7 +128,27 @@ def count_substeps(
             square = kinetic / elastic
             for k in range(first, first + size * model.pitch, model.pitch):
                 scratch_out.Du[k] = scratch_out.Du[k] / largest
-    count = float(1.0)
+    substeps = float(1.0)
     if square > 0.0:
-        count = wp.clamp(wp.ceil(wp.sqrt(square) * dt / max_angle), 1.0, float(max_substeps))
-    tree_substeps_out[tree] = int(count)
+        substeps = wp.clamp(wp.ceil(wp.sqrt(square) * dt / max_angle), 1.0, float(max_substeps))
+    tree_substeps_out[tree] = int(substeps)
+
+
+@wp.kernel
+def begin_substep(
+    # in
+    level_count: wp.array(dtype=wp.int32),
+    levels: wp.array2d(dtype=wp.int32),
+    # out
+    level_out: wp.array(dtype=wp.int32),
+    tree_count_out: wp.array(dtype=wp.int32),
+    root_count_out: wp.array(dtype=wp.int32),
+):
+    """One thread in all: how many trees and floating roots the next substep is of.
+
+    levels: [substep, 2] these numbers. level_out: [1] which substep is next; after the last of level_count [1] the first.
+    """
+    level = level_out[0]
+    tree_count_out[0] = levels[level, 0]
+    root_count_out[0] = levels[level, 1]
+    level_out[0] = (level + 1) % level_count[0]

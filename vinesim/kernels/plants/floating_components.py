@@ -158,6 +158,7 @@ def correct_floating_momentum(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     roots: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_rate: wp.array(dtype=float),
@@ -177,6 +178,8 @@ def correct_floating_momentum(
     start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; lever: [body] m. joints_out: joints at the end
     of the step; rotation, rates and place of the root are corrected.
     """
+    if wp.tid() >= count[0]:
+        return
     root = roots[wp.tid()]
     tree = model.body_tree[root]
     step = substep_parameters(p, tree_steps[tree])

@@ -8,7 +8,6 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def copy_rows(
     # model
-    threads: int,
     pitch: int,
     pitch_there: int,
     tree_first: wp.array(dtype=wp.int32),
@@ -17,18 +16,20 @@ def copy_rows(
     starts: wp.array(dtype=wp.int32),
     widths: wp.array(dtype=wp.int32),
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     addresses: wp.array(dtype=wp.uint64),
     # out
     addresses_out: wp.array(dtype=wp.uint64),
 ):
-    """One thread copies one word of four bytes: of one listed tree (``threads`` each), of one array.
+    """One thread copies one word of four bytes: of one listed tree (the first dimension), of one array.
 
     starts, widths: [array] first thread of an array within a tree, and words of one row. addresses, addresses_out:
     [array] pointers of source and target, of rows ``pitch`` and ``pitch_there`` apart.
     """
-    slot = wp.tid() / threads
-    thread = wp.tid() - slot * threads
+    slot, thread = wp.tid()
+    if slot >= count[0]:
+        return
     tree = trees[slot]
     n = wp.int32(0)
     while thread >= starts[n + 1]:

@@ -91,6 +91,7 @@ def impulse_response(
     model: ArticulationModel,
     stride: int,
     # in
+    count: wp.array(dtype=wp.int32),
     bodies: wp.array(dtype=wp.int32),
     factors: Factors,
     # out
@@ -105,6 +106,8 @@ def impulse_response(
     [thread * stride + body of the tree] scratch, ``stride`` being the extent of the largest tree.
     """
     slot = wp.tid()
+    if slot >= count[0]:
+        return
     body = bodies[slot]
     tree = model.body_tree[body]
     first = model.tree_first[tree]
@@ -194,6 +197,7 @@ def apply_wrenches(
     dt: float,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     body_wrench: wp.array(dtype=wp.spatial_vector),
     factors: Factors,
@@ -207,4 +211,6 @@ def apply_wrenches(
     trees: [thread] which tree. body_wrench: [body] N, N m at the origin, world axes; with dt = 1 an impulse, N s, N m s.
     prediction_out: accelerations and joint rates grow; ``body_qd_free`` stays. work_out, scratch_out.Du: scratch.
     """
+    if wp.tid() >= count[0]:
+        return
     apply_tree_wrenches(trees[wp.tid()], dt, model, body_wrench, factors, work_out, scratch_out, prediction_out)

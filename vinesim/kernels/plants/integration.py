@@ -25,6 +25,7 @@ def integrate(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_awake: wp.array(dtype=wp.bool),
     tree_phi: wp.array(dtype=float),
@@ -44,6 +45,8 @@ def integrate(
     ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps and substeps still to be taken with phi = 1,
     counted down here. joints_out: [body] rotations by the exponential map of the mean rate; may be ``joints``.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     substeps = tree_steps[tree]
     if not tree_awake[tree] or (substeps > 1 and not tree_rate_out[tree] <= p.fault_rate):

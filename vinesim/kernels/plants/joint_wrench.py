@@ -15,6 +15,7 @@ def joint_wrench(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     joint_bodies: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_steps: wp.array(dtype=wp.int32),
@@ -32,6 +33,8 @@ def joint_wrench(
     about the body's origin, world axes; zero for what has been cut off.
     """
     slot = wp.tid()
+    if slot >= count[0]:
+        return
     body = joint_bodies[slot]
     tree = model.body_tree[body]
     pivot = wp.transform_get_translation(bodies.body_q[body])

@@ -87,6 +87,7 @@ def forward_kinematics(
     # model
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     joints: JointState,
     # out
@@ -99,6 +100,8 @@ def forward_kinematics(
     trees: [thread] which tree. joints, bodies_out: [body] see their structs; nothing else is written, so this may run
     between a prediction and its integration.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     for k in range(first, first + model.tree_size[tree] * model.pitch, model.pitch):

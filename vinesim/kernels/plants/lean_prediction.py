@@ -293,6 +293,7 @@ def predict_lean(
     model: ArticulationModel,
     is_branching: wp.array(dtype=wp.bool),
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_euler_steps: wp.array(dtype=wp.int32),
@@ -311,6 +312,8 @@ def predict_lean(
     is_branching: [body] whether a body is the parent of another than the next one. Conservative trees take the passes of
     that kernel.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     phi = chosen_phi(p, model, joints, tree, tree_phi[tree], tree_euler_steps[tree])
     tree_phi_out[tree] = phi

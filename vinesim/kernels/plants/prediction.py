@@ -317,6 +317,7 @@ def predict(
     p: SolverParameters,
     model: ArticulationModel,
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_phi: wp.array(dtype=float),
     tree_euler_steps: wp.array(dtype=wp.int32),
@@ -340,6 +341,8 @@ def predict(
     at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
     that is needed later.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     phi = chosen_phi(p, model, joints, tree, tree_phi[tree], tree_euler_steps[tree])
     tree_phi_out[tree] = phi

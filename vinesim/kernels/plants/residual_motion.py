@@ -86,6 +86,7 @@ def residual_motion(
     # in
     tie_softening: wp.array(dtype=float),
     root_softening: wp.array(dtype=wp.vec3),
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     forces: AppliedForces,
     joints: JointState,
@@ -113,6 +114,8 @@ def residual_motion(
     is_free_out: [tree] whether nothing touches it and none of it floats, so that all of its displacement is known. All
     else that is written is scratch.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     first = model.tree_first[tree]
     end = first + model.tree_moving[tree] * model.pitch

@@ -12,6 +12,7 @@ wp.set_module_options({"enable_backward": False})
 def count_quiet_steps(
     # in
     limit: wp.array(dtype=float),
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_rate: wp.array(dtype=float),
     # out
@@ -25,6 +26,8 @@ def count_quiet_steps(
     limit: [1] rad/s. tree_rate: [tree] rad/s. A tree that moves is not at rest, and was not seen still (-1) before.
     longest_out: [1] most steps of all.
     """
+    if wp.tid() >= count[0]:
+        return
     tree = trees[wp.tid()]
     if tree_rate[tree] < limit[0]:
         quiet_steps_out[tree] = quiet_steps_out[tree] + 1
@@ -41,6 +44,7 @@ def count_quiet_steps(
 @wp.kernel
 def find_fastest(
     # in
+    count: wp.array(dtype=wp.int32),
     trees: wp.array(dtype=wp.int32),
     tree_rate: wp.array(dtype=float),
     # out
@@ -48,8 +52,10 @@ def find_fastest(
 ):
     """One thread per listed tree: the largest rate of all, infinite if one is not a number.
 
-    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, 0 before.
+    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, raised to that.
     """
+    if wp.tid() >= count[0]:
+        return
     rate = tree_rate[trees[wp.tid()]]
     if wp.isnan(rate):
         rate = wp.inf
@@ -67,6 +73,7 @@ def count_overloaded_steps(
     bunch_pull: wp.array(dtype=float),
     bunch_bend: wp.array(dtype=float),
     # in
+    count: wp.array(dtype=wp.int32),
     bunches: wp.array(dtype=wp.int32),
     carried: wp.array(dtype=wp.spatial_vector),
     is_attached: wp.array(dtype=wp.bool),
@@ -81,6 +88,8 @@ def count_overloaded_steps(
     is_remote: [tree]; picked bunches and those of remote trees are left out. longest_out: [1] most steps of all.
     """
     i = wp.tid()
+    if i >= count[0]:
+        return
     bunch = bunches[i]
     if is_attached[bunch] and not is_remote[body_tree[bunch_body[bunch]]]:
         force = wp.spatial_top(carried[i])

@@ -156,6 +156,7 @@ def balance_supports(
     # model
     nodes: SupportNodes,
     # in
+    count: wp.array(dtype=wp.int32),
     supports: wp.array(dtype=wp.int32),
     tree_awake: wp.array(dtype=wp.bool),
     is_placed: wp.array(dtype=wp.bool),
@@ -172,6 +173,8 @@ def balance_supports(
     springs_out: of this support's nodes. is_moved_out: [tree] set for sleeping trees under which the support has moved
     further than ``wake_distance`` since they fell asleep; moved_count_out: [1] raised for each.
     """
+    if wp.tid() >= count[0]:
+        return
     support = supports[wp.tid()]
     first = nodes.first[support]
     end = nodes.first[support + 1]

@@ -53,6 +53,7 @@ def pose_wire_segments(
     wires: Wires,
     nodes: SupportNodes,
     # in
+    count: wp.array(dtype=wp.int32),
     pieces: wp.array(dtype=wp.int32),
     deflection: wp.array(dtype=wp.vec3d),
     presses: WirePresses,
@@ -61,6 +62,8 @@ def pose_wire_segments(
     segments_out: SegmentShapes,
 ):
     """One thread per listed piece of wire. deflection: [node] m."""
+    if wp.tid() >= count[0]:
+        return
     piece = pieces[wp.tid()]
     length = wires.length[piece]
     axis = geoms.axis[piece]

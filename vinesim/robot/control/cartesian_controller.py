@@ -22,7 +22,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.robot import inverse_kinematics
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError, clip
@@ -242,7 +242,7 @@ class InverseKinematics:
             is_used=np.zeros(rows, np.int32),
         )
         inputs = (self.jacobian, self.velocity, self.posture_rates, self.min_rates, self.max_rates, joint_weights)
-        self._launch = bind_launch(
+        solve = KernelLaunch(
             inverse_kinematics.solve_prioritized_ik,
             [
                 share(np.cumsum(task_rows, dtype=np.int32), wp.int32),
@@ -250,12 +250,14 @@ class InverseKinematics:
                 MIN_SINGULAR_VALUE,
             ],
             [scratch.struct, share(self.rates, wp.float64)],
+            threads=1,
         )
+        self._solve = KernelGraph(solve)
 
     def solve(self) -> np.ndarray:
         """Joint rates [joint] for the present inputs; the array is used again by the next call.
 
         Joints that would exceed their bounds are fixed there, one at a time, and the others do the tasks.
         """
-        self._launch(1)
+        self._solve()
         return self.rates

@@ -11,13 +11,13 @@ fast: it turns to where the spring gives what position, velocity, effort or impe
 from __future__ import annotations
 
 import enum
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
 from vinesim.core.warp_arrays import SharedArrays, share
-from vinesim.kernels.launch import bind_launch
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.rigid import joint_servos
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import Drive
@@ -93,11 +93,11 @@ class JointServos:
         self._position, self._middle, self._velocity_now, self._inertia = (np.zeros(joints) for _ in range(4))
         self._max_tracking_error = np.zeros(joints)
         self._max_impulse = np.zeros(joints)
-        self._launch = self._bind_launch()
+        self._advance = self._advance_kernel()
         self.hold()
 
-    def _bind_launch(self) -> Callable[..., None]:
-        """Bind the kernel of :meth:`_advance_setpoints` to the arrays of this robot."""
+    def _advance_kernel(self) -> KernelGraph:
+        """The kernel of :meth:`_advance_setpoints` on the arrays of this robot."""
         limits = SharedArrays(
             joint_servos.ServoLimits,
             lower=self.lower_limit,
@@ -108,11 +108,13 @@ class JointServos:
         )
         read = (self._command, self._position, self._middle, self._velocity_now, self._inertia)
         written = (self.setpoint, self._rate, self._target_velocity)
-        return bind_launch(
+        advance = KernelLaunch(
             joint_servos.advance_setpoints,
             [self._rigid.dt, limits.struct, share(self.interface, wp.int64), *(share(a, wp.float64) for a in read)],
             [share(a, wp.float64) for a in written],
+            threads=len(self.setpoint),
         )
+        return KernelGraph(advance)
 
     def hold(self) -> None:
         """Drop all commands: position control at the present positions. Gains and effort limits stay."""
@@ -207,7 +209,7 @@ class JointServos:
         self._velocity_now[:], self._inertia[:] = velocity, self._rigid.joint_inertia(self._name)
         for fingers in self._finger_groups.values():
             self._middle[fingers] = position[fingers].sum() / len(fingers)
-        self._launch(len(position))
+        self._advance()
         return self._target_velocity
 
     def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
