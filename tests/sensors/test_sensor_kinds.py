@@ -38,11 +38,11 @@ def test_the_table_of_a_kind_is_read_and_checked(name, tmp_path):
     kind = SENSOR_KINDS[name]
     file = tmp_path / "robot.toml"
     file.write_text(f'[[{kind.table}]]\nname = "s"\nframe = "link"\ntype = "t"\nrate = 2.5\n')
-    (mount,) = read_sidecar(file).mounts(name) or ()
+    [mount] = list(read_sidecar(file).mounts(name) or ())
     assert (mount.kind, mount.name, mount.frame, mount.type, mount.rate) == (name, "s", "link", "t", 2.5)
     assert mount.fault() is None
     file.write_text(f'[[{kind.table}]]\nname = "s"\nframe = "link"\nrate = 0.0\n')
-    (slow,) = read_sidecar(file).mounts(name) or ()
+    [slow] = list(read_sidecar(file).mounts(name) or ())
     assert slow.fault() == ("the rate 0.0", "give 0.01 to 1000 Hz")
     file.write_text(f'[[{kind.table}]]\nname = "s"\nframe = "link"\nlens = 1\n')
     with pytest.raises(DescriptionError, match=rf"lens.*{kind.table}"):
