@@ -7,13 +7,13 @@ wp.set_module_options({"enable_backward": False})
 LOADED = wp.constant(0)
 """Index in ``numbers``: number of bodies that the last step loaded."""
 GIVEN = wp.constant(1)
-"""Index: number of bodies that are loaded now."""
+"""Index in ``numbers``: number of bodies that are loaded now."""
 TICK = wp.constant(2)
-"""Index: number of this step."""
+"""Index in ``numbers``: number of this step."""
 ONSET_STEPS = wp.constant(3)
-"""Index: number of steps with phi = 1 at the begin of a contact, the first one included."""
+"""Index in ``numbers``: number of steps with phi = 1 at the beginning of a contact, including the first one."""
 REFUSED = wp.constant(4)
-"""Index: the first given body that cannot be loaded, counted from 1; 0 if all can be loaded."""
+"""Index in ``numbers``: the first given body that cannot be loaded, counted from 1; 0 if all can be loaded."""
 NUMBERS = 5
 
 
