@@ -21,8 +21,7 @@ import warp as wp
 from vinesim.kernels.launch import BoundLaunch, bind_launch, bound, usable_cores
 
 POLL_TIME = 300_000
-"""[ns] How long an idle thread polls: longer than the pauses between the launches of a step, much shorter than a step.
-"""
+"""[ns] How long an idle thread polls: longer than the pauses between a step's launches, much shorter than a step."""
 
 _IDLE = 0
 _ASLEEP = 3

@@ -15,8 +15,7 @@ wp.set_module_options({"enable_backward": False})
 PLANE_STEPS = wp.constant(64)
 """Largest number of steps to the deepest place of a segment. Each step takes another plane, so about five suffice."""
 HULL_TOLERANCE = wp.constant(wp.float64(1.0e-7))
-"""[m] A point this far beyond the border of a face still counts as above the face, for rounding of a mesh's vertices.
-"""
+"""[m] A point this far beyond a face's border still counts as above the face, as vertices of a mesh are rounded."""
 
 
 @wp.func

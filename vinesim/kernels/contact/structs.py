@@ -202,8 +202,7 @@ class Geoms:
     friction: wp.array(dtype=wp.float64)
     """[1] The geom's own friction coefficient, for all contacts. 0: the coefficient of the two materials applies."""
     is_remote: wp.array(dtype=wp.bool)
-    """[geom] Whether the geom belongs to the copy of another client's robot or person, which touches remote trees only.
-    """
+    """[geom] Whether the geom belongs to a copy of another client's robot or person. It touches remote trees only."""
 
 
 @wp.struct
@@ -334,8 +333,7 @@ class Candidates:
     near_pairs: wp.array(dtype=wp.vec2i)
     """[awake tree * room + k] Scratch: pairs of a capsule and a geom whose boxes overlap."""
     skipped_geoms: wp.array(dtype=wp.int32)
-    """[awake tree] Number of static geoms whose box overlaps the tree's box but for which ``near_geoms`` had no room.
-    """
+    """[awake tree] Number of static geoms whose box overlaps the tree's but for which ``near_geoms`` had no room."""
     feature: wp.array2d(dtype=wp.int32)
     """[awake tree, slot] 2 * capsule, plus 1 for the second contact point along a face; -1 for an empty slot."""
     other: wp.array2d(dtype=wp.int32)

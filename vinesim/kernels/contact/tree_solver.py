@@ -29,8 +29,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 LANES_ACROSS = wp.constant(16)
-"""Number of threads that share the columns of a row when a linear system is solved; a warp works on two rows at once.
-"""
+"""Number of threads that share the columns of a row in the solution of a linear system. A warp takes two rows at once."""
 FIRST_SWEEPS = wp.constant(2)
 """Number of sweeps after which a tree is listed as one that needs more. The search can return to the impulses then."""
 MOST_NEWTON_CONTACTS = wp.constant(16)

@@ -96,8 +96,7 @@ MAX_SAG = wp.constant(4.0)
 were linear and the tree kept the shape of its relaxed springs, level."""
 
 MIN_PHI = wp.constant(0.549)
-"""A tree with a smaller phi is watched closely, because phi then does not damp the modes that the step cannot resolve.
-"""
+"""A tree with a smaller phi is watched closely, because phi does not damp the modes that the step cannot resolve."""
 
 BACKTRACKS = wp.constant(8)
 """Largest number of times that the turn of a step is halved. DERIVED: 0.4 % of it is then left."""
