@@ -5,7 +5,7 @@ error feeds energy; docs/decisions/integrator.md has the figures. So the energy 
 measured at the end of a step, and may not exceed its least past value by more than a band. If it does, the rates are
 filtered at fixed pose,
 
-(M + c K) v' = M v,    c = 0.1 dt^2,
+    (M + c K) v' = M v,    c = 0.1 dt^2,
 
 which removes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and nearly all of modes far beyond. The
 filter can only reduce kinetic energy. Any excess that remains is removed from all rates alike, and the next step is

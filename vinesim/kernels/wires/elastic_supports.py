@@ -5,10 +5,10 @@ nodes are the places where shoots hold it, with springs in series between them: 
 free length l; G J / l for an arm. In balance K u = f, where K is tridiagonal and u are the deflections. The force of
 node i is f_i = k_i (s_i - u_i). For a wire, k is the stiffness of a tie and s the displacement of its point across the
 wire. For an arm, f is the moment along the arm of the spring of a root's joint. With the rest of that spring turned by
-u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint (theta - u e) / 2, so that k = e^T
-K_joint e and k s = e^T K_joint (theta - theta_drawn). The shoots feel the force (K^-1 + k^-1)^-1 s:
-its stiffness is symmetric and less than that of ties and joints alone. Other forces on a wire (*loads*) add to f. A wire does not stretch
-along itself. It ends at posts; an arm is clamped at the trunk and free at its end.
+u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint (theta - u e) / 2, so that k =
+e^T K_joint e and k s = e^T K_joint (theta - theta_drawn). The shoots feel the force (K^-1 + k^-1)^-1 s: its stiffness
+is symmetric and less than that of ties and joints alone. Other forces on a wire (*loads*) add to f. A wire does not
+stretch along itself. It ends at posts; an arm is clamped at the trunk and free at its end.
 
 Ties and joints are implicit in the prediction of each tree, with anchors and rests on the support. The support follows
 the trees' state at the start of the step, and moves on as fast as they do. Compared with a solve of all trees of a
