@@ -1,4 +1,4 @@
-"""Arrays of the plants and of the rigid world that detection and solve share, as the contact kernels see them."""
+"""Arrays of the plants and of the rigid world that collision detection, the impulse solver and their kernels share."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from vinesim.wires.elastic_supports import WIRE_DAMPING_TIME
 
 
 def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
-    """The numbers of the contact model as a Warp struct."""
+    """Returns the numbers of the contact model as a Warp struct."""
     made = structs.Parameters()
     made.dt = p.dt
     made.margin = p.contact_margin
@@ -38,7 +38,7 @@ def kernel_parameters(p: PhysicsParameters) -> structs.Parameters:
 
 
 def material_pairs(p: PhysicsParameters) -> np.ndarray:
-    """What contacts have of their two materials: records of :class:`Surface` [material, material]."""
+    """Returns the contact properties of each pair of materials: records of :class:`Surface` [material, material]."""
     tables = pair_tables(p)
     stiffness = tables["stiffness"]
     tables["damping"] = p.contact_damping_time * stiffness
@@ -50,7 +50,7 @@ def material_pairs(p: PhysicsParameters) -> np.ndarray:
 
 
 class PlantArrays:
-    """Bodies, trees and capsules of all plants."""
+    """Arrays of the bodies, trees and capsules of all plants, as the contact kernels read them."""
 
     def __init__(self, model: Model, plants: ArticulationSolver, capsules: PlantCapsules) -> None:
         state = plants.state
@@ -102,10 +102,13 @@ class PlantArrays:
 
 
 def _tied_geoms(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Wires that each body does not collide with [body, k], MuJoCo's numbers or -1: those to which it, its parent or a
-    child of it is tied. Such a tie is a spring both ways; the geom of the wire stands where the wire is when straight.
+    """Returns the wires that each body does not collide with [body, k], as MuJoCo geom indices; -1 for no wire.
 
-    Also returns the body [body, k] whose joint connects it with that parent or child, -1 where it is tied itself.
+    A body does not collide with the wires to which it, its parent or one of its children is tied. Such a tie is a
+    spring that acts in both directions, and the geom of the wire lies where the straight wire would be.
+
+    Also returns the body [body, k] whose joint connects the body with that parent or child; -1 where the body itself is
+    tied.
     """
     bound = model.tie_wire >= 0
     body = model.tie_body[bound]
@@ -131,10 +134,10 @@ _GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if f
 
 
 class RigidArrays:
-    """Geoms and degrees of freedom of the rigid world, from one recompilation of it to the next.
+    """Geoms and degrees of freedom of the rigid world, from one compilation of the world to the next.
 
-    There is room for all geoms that the world can list, so that kernels stay bound to the arrays when hands open and
-    close and when bunches take bodies: :meth:`update` writes what is listed now.
+    The arrays have room for all geoms that the world can list, so kernels stay bound to them when hands open and close
+    and when bunches take bodies. :meth:`update` writes the geoms that are listed now.
     """
 
     def __init__(
@@ -144,7 +147,7 @@ class RigidArrays:
         kernel_parameters: structs.Parameters,
         previous: RigidArrays | None,
     ) -> None:
-        """``previous``: where the velocities of the last step are taken from, by the names of degrees of freedom."""
+        """``previous``: arrays from which the velocities of the last step are taken, by names of degrees of freedom."""
         self.world = rigid.mj_model
         data = rigid.mj_data
         world = self.world
@@ -153,16 +156,19 @@ class RigidArrays:
         self.geoms = SharedArrays.zeros(structs.Geoms, self.capacity, count=np.zeros(2, np.int32))
         self.geom_states = SharedArrays.zeros(structs.GeomStates, self.capacity)
         self.bunch_of_geom = np.full(self.capacity, -1, np.int32)
-        """[geom] the free bunch that it belongs to, -1 for none."""
+        """[geom] Index of the free bunch that the geom belongs to; -1 for geoms of no bunch."""
         self.actors = SharedArrays.zeros(
             structs.Actors, self.capacity, start=np.zeros(self.capacity + 1, np.int32), count=np.zeros(1, np.int32)
         )
         self.hulls = rigid.hulls
         self._is_wire = rigid.model.fixed_tension > 0.0
         self.wire_of_geom = np.full(self.capacity + 1, -1)
-        """[geom] the fixed piece, where that is a wire that gives; -1 for others, and at the end for other plants."""
+        """[geom] Index of the fixed piece if the geom is a wire that deflects, else -1.
+
+        The last entry, -1, stands for plants.
+        """
         self.geom_of_wire = np.full(len(self._is_wire), -1)
-        """[fixed piece] the geom of a wire that gives, -1 for others."""
+        """[fixed piece] Index of the geom if the piece is a wire that deflects, else -1."""
         self._list(rigid, remote_actors)
         self.dof_names = rigid.dof_names
         velocity = rigid.velocity_free
@@ -194,7 +200,7 @@ class RigidArrays:
         qvel, qacc = (share(values, wp.float64) for values in (data.qvel, data.qacc))
         self._free_velocities = [kernel_parameters, qvel, qacc]
         self.dofs = ctypes.c_int32(world.nv)
-        """How many there are."""
+        """Number of degrees of freedom."""
         self.factors = SharedArrays(
             structs.RigidFactors,
             tree_dof=world.tree_dofadr,
@@ -232,11 +238,14 @@ class RigidArrays:
 
     @functools.cached_property
     def names(self) -> list[tuple[str, str, int]]:
-        """[geom] names of the listed geoms that outlive a recompilation."""
+        """[geom] Names of the listed geoms. They stay valid when the world is compiled again."""
         return persistent_names(self.listed)
 
     def update(self, rigid: RigidWorld, remote_actors: set[str]) -> np.ndarray:
-        """Take over that the same world has listed its geoms anew; the new number [geom] of each former one, or -1."""
+        """Write the geoms again after the same world has renumbered them.
+
+        Returns the new index [geom] of each previously listed geom; -1 if it is no longer listed.
+        """
         former = self.geoms.id[: self.count].copy()
         self._list(rigid, remote_actors)
         self.__dict__.pop("names", None)
@@ -252,5 +261,7 @@ class RigidArrays:
 
     @functools.cached_property
     def take_free_velocities(self) -> BoundLaunch:
-        """Takes over the free velocity of each dof in the coming step, and what plants changed in the last one."""
+        """Launch that reads each dof's free velocity of the coming step, and by how much plants changed it in the last
+        step.
+        """
         return bind_launch(broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct])

@@ -1,8 +1,9 @@
 """Contacts of plants with rigid bodies and with each other: one solve a step, shared by plants and rigid bodies.
 
-Both sides predict how fast they would move without contacts, and how an impulse changes that. The impulses that keep
-them apart are then found for both at once, so they feel equal and opposite forces in the same step. Solving them in
-turn with penalty springs instead (a *staggered* scheme) is unstable from 1e4 N/m on.
+Plants and rigid bodies both predict their velocities without contacts, and how an impulse changes these velocities.
+The impulses that keep them apart are then found for both at once, so plants and rigid bodies feel equal and opposite
+forces in the same step. Solving the two in turn with penalty springs instead (a *staggered* scheme) is unstable from
+1e4 N/m on.
 
 Stages: :meth:`ContactSolver.wake_near_trees` (``detection``: broadphase), the prediction of the plants,
 :meth:`ContactSolver.solve` (``detection``: narrowphase; ``impulse_solver``: islands and impulses).
@@ -25,21 +26,23 @@ from vinesim.wires.deflected_wires import DeflectedWires
 
 
 class ContactSolver:
-    """Contacts between the plants and the rigid world of one step.
+    """Contacts between the plants and the rigid world in one step.
 
-    ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to; ``solve()`` (after it)
-    leaves ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for ``rigid.integrate()``.
+    ``wake_near_trees()`` (before ``plants.predict()``) wakes the trees that an actor is near to. ``solve()`` (after
+    ``plants.predict()``) writes ``bodies`` and ``wrenches`` for ``plants.integrate()`` and ``rigid_force`` for
+    ``rigid.integrate()``.
 
-    Robots, people, boxes and free bunches wake the trees that they are near to, awake trees those that they touch.
-    Static geoms (ground, trellis, wood) only hold back what moves already. What overlaps in the scene as generated is
-    in contact only beyond that. All numbers come from ``rigid.parameters``; of more contacts than
-    ``contact_capacity``, the deepest are kept, and ``dropped_contacts`` and ``overflow_message`` report it.
+    Robots, people, boxes and free bunches wake the trees that they are near to. Awake trees wake the trees that they
+    touch. Static geoms (ground, trellis, wood) wake no tree; they only hold back bodies that already move. Shapes that
+    overlap in the scene as generated are in contact only where they overlap more than that. All numbers come from
+    ``rigid.parameters``. If there are more contacts than ``contact_capacity``, the deepest are kept, and
+    ``dropped_contacts`` and ``overflow_message`` report the others.
     """
 
     def __init__(
         self, model: Model, plants: ArticulationSolver, rigid: RigidWorld, wires: DeflectedWires | None = None
     ) -> None:
-        """``wires``: those that give to what presses on them; without, none does."""
+        """``wires``: the trellis wires that deflect under contact forces. If None, all wires are rigid."""
         self.model = model
         self.plants = plants
         self.rigid = rigid
@@ -48,21 +51,21 @@ class ContactSolver:
         self.plant_plant_contacts = True
         """Whether bunches and branches of awake trees touch each other too."""
         self.count = 0
-        """Contacts of the last step, those without force included."""
+        """Number of contacts in the last step, including contacts without force."""
         self.dropped_contacts = 0
-        """Contacts left out since the start, for want of room."""
+        """Number of contacts left out since the start because the contact arrays were full."""
         self.overflow_message = ""
-        """When contacts were last left out and how many: empty if never."""
+        """Says how many contacts were left out the last time this happened, and the remedy. Empty if none ever was."""
         self.skipped_geoms = 0
-        """Static geoms left out since the start, as more of them were near one tree than there is room for."""
+        """Number of static geoms left out since the start because too many of them were near one tree."""
         self.near_trees = np.zeros(0, np.int32)
-        """Trees [k] whose box a robot or a moving box reaches into: these must not fall asleep."""
+        """[k] Trees whose bounding box a robot or a moving box reaches into. These trees must not fall asleep."""
         self.remote_actors: set[str] = set()
         """Robots and people that another client controls. Their contacts are computed by that client: here they touch
         only remote trees, so that each contact counts once and a distant copy disturbs nothing.
         """
         self.remote_trees = np.zeros(len(model.tree_first), np.bool_)
-        """[tree] whether another client owns its state; to be written by the client."""
+        """[tree] Whether another client owns the tree's state. The client writes this array."""
         self._awake = np.zeros(0, np.int32)
         self._reported: tuple[Contact, ...] | None = ()
         self._touched: tuple[tuple[int, str], ...] | None = ()
@@ -80,7 +83,7 @@ class ContactSolver:
     # ------------------------------------------------------------------ stages of a step
 
     def wake_near_trees(self) -> None:
-        """Wake the trees that a robot, a person or a moving object is near to; the rest cost one comparison each."""
+        """Wake the trees that a robot, a person or a moving object is near to. The others cost one comparison."""
         if self._generation != self.rigid.generation:
             self._update_rigid_world()
         if self._awake is not self.plants.awake:
@@ -95,7 +98,7 @@ class ContactSolver:
             self.plants.wake(self.near_trees)
 
     def solve(self) -> None:
-        """Find the contacts of all awake trees, and of those that these wake, and their forces."""
+        """Find the contacts of all awake trees, and of the sleeping trees that they wake, and the contact forces."""
         self.count = 0
         self._reported = ()
         self._touched = ()
@@ -110,7 +113,7 @@ class ContactSolver:
             self.impulses.clear()
 
     def _wake_reached_trees(self) -> np.ndarray:
-        """Wake the sleeping trees that awake ones touch, those that these touch, and so on.
+        """Wake the sleeping trees that awake trees touch, then the sleeping trees that these touch, and so on.
 
         Returns all awake trees [k].
         """
@@ -125,7 +128,7 @@ class ContactSolver:
         return plants.awake
 
     def _find_contacts(self, awake: np.ndarray) -> None:
-        """List the contacts of the awake trees; of too many, the deepest."""
+        """List the contacts of the awake trees. If there are too many, keep the deepest."""
         detection = self.detection
         impulses = self.impulses
         capacity = self.impulses.capacity
@@ -153,8 +156,8 @@ class ContactSolver:
     def _predict_impacted(self, awake: np.ndarray) -> None:
         """Integrate trees that are about to suffer an impact with phi = 1 from this step on.
 
-        The trapezoidal rule moves a body by the mean of its velocities before and after: a body hit from rest would
-        give way only half as far as it must, overlap, and be thrown out again.
+        The trapezoidal rule moves a body by the mean of its velocities before and after the step. A body hit from rest
+        would therefore give way only half as far as it must, overlap, and be thrown out again.
         """
         impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
         changed = impacted[self.plants.phi_used[impacted] < 1.0]
@@ -163,7 +166,7 @@ class ContactSolver:
             self.plants.predict(changed)
 
     def report_wires(self) -> None:
-        """Tell the wires what plants pressed on them in the last step."""
+        """Pass the forces with which plants pressed on the wires in the last step to the wires."""
         if self.count:
             self.impulses.report_wires()
 
@@ -171,27 +174,27 @@ class ContactSolver:
 
     @property
     def bodies(self) -> np.ndarray:
-        """Plant bodies in contact [n], sorted."""
+        """[n] Indices of the plant bodies in contact, sorted."""
         return self.impulses.bodies
 
     @property
     def wrenches(self) -> np.ndarray:
-        """[n, 6] N, N m on ``bodies``, at their origins, world axes."""
+        """[n, 6] Force (N) and torque (N m) of the contacts on each of ``bodies``, at the body's origin, world axes."""
         return self.impulses.wrenches
 
     @property
     def rigid_force(self) -> np.ndarray | None:
-        """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
+        """[dof] Generalised force (N or N m) of the same contacts on the rigid world. None without contact."""
         return self.impulses.rigid_force
 
     @property
     def trees_touched_by_copies(self) -> np.ndarray:
-        """[tree] whether copies of remote actors touch it; to be written by the client."""
+        """[tree] Whether local copies of remote actors touch the tree. The client writes this array."""
         return self._arrays.trees.is_remote
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """The contacts of the last step that press, sorted by (tree, body, capsule, other).
+        """The contacts of the last step that carry a force, sorted by (tree, body, capsule, other).
 
         Static geoms have the actor ``world`` (links ``ground``, ``fixed/7``), other plants the actor ``plants`` (links
         ``body/42``).
@@ -229,7 +232,7 @@ class ContactSolver:
         return self._touched
 
     def _actor_and_link(self, other: int) -> tuple[str, str]:
-        """Actor and link of the other side of a contact."""
+        """Returns the actor and the link of a contact's second geom, ``other`` (negative: a capsule of a plant)."""
         if other < 0:
             return "plants", f"body/{self.capsules.body[-1 - other]}"
         assert self._rigid_arrays is not None
@@ -238,8 +241,11 @@ class ContactSolver:
     # ------------------------------------------------------------------ queries and updates between steps
 
     def nearest_body(self, points: np.ndarray, max_distance: float) -> tuple[float, int] | None:
-        """See :func:`vinesim.contact.plant_capsules.nearest_body`; searches all trees near ``points`` [k, 3]
-        m."""
+        """Returns the distance (m) from ``points`` [k, 3] m to the nearest plant body, and that body's index.
+
+        None if no body is within ``max_distance`` (m). Searches all trees near the points; see
+        :func:`vinesim.contact.plant_capsules.nearest_body`.
+        """
         low = points.min(0) - max_distance
         high = points.max(0) + max_distance
         boxes = self.detection.tree_boxes
@@ -250,11 +256,11 @@ class ContactSolver:
         return nearest_body(self.capsules, self.model, self.plants.state, trees, points, max_distance)
 
     def update_tree_bounds(self, trees: np.ndarray) -> None:
-        """Bring the boxes of trees [k] that sleep up to date after they were moved."""
+        """Update the bounding boxes of the sleeping trees ``trees`` [k] after their bodies were moved."""
         self.detection.update_tree_bounds(trees)
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """See :meth:`ContactDetection.ignore_overlaps`."""
+        """Let a picked bunch pass through the trees that it overlaps: :meth:`ContactDetection.ignore_overlaps`."""
         self.detection.ignore_overlaps(bunch, low, high)
 
     def _update_rigid_world(self) -> None:

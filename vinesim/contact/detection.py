@@ -1,9 +1,9 @@
-"""Collision detection of plants: boxes of trees and geoms, trees that actors are near, and candidates of contacts.
+"""Collision detection of plants: bounding boxes, the trees near actors, and candidate contacts.
 
 The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
-prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake ones touch) and
-:attr:`ContactDetection.narrowphase` (of the awake trees). Kernels are bound to their arrays once for each listing of
-the rigid world: a bound launch costs a fifth of a plain one.
+prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake trees touch) and
+:attr:`ContactDetection.narrowphase` (contacts of the awake trees). Kernels are bound to their arrays once for each
+listing of the rigid world, as a bound launch costs a fifth of a plain launch.
 """
 
 from __future__ import annotations
@@ -32,13 +32,16 @@ from vinesim.wires.deflected_wires import DeflectedWires
 
 AABB_BLOCK = int(structs.AABB_BLOCK)
 TREES_PER_CHUNK = {"boxes": 8, "rigid": 2, "plants": 4}
-"""Trees that a thread takes at a time: work of 3 to 8 us. DERIVED from the times of one tree of 17 bodies."""
+"""Kernel family -> number of trees that a thread takes at a time, 3 to 8 us of work.
+
+DERIVED from the times of one tree of 17 bodies.
+"""
 MAX_PASSING_BUNCHES = 4
-"""Picked bunches that can pass through one tree at once; a further one touches it at once."""
+"""Number of picked bunches that can pass through one tree at the same time. A further bunch touches it at once."""
 PAIRS_AT_ONCE = 64
-"""Pairs of capsules and geoms of one tree that are looked at in one go."""
+"""Number of capsule-geom pairs of one tree that the narrowphase handles in one pass."""
 MIN_TREE_ROOM = 64
-"""Rows of the candidates that are allocated at least; more when more trees are awake."""
+"""Least number of rows (awake trees) of the candidate arrays. They grow when more trees are awake."""
 _NO_TREES = np.zeros(0, np.intp)
 
 
@@ -64,24 +67,25 @@ class ContactDetection:
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
         self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
         self.counters = np.zeros(structs.COUNTERS, np.int32)
-        """See :mod:`vinesim.kernels.contact.structs`."""
+        """[COUNTERS] Counts that the kernels write. :mod:`vinesim.kernels.contact.structs` names the entries."""
         self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
         self._wood_boxes = SharedArrays.zeros(structs.Aabbs, trees)
         blocks = -(-trees // AABB_BLOCK)
         self._blocks = np.zeros(blocks, np.int32)
         self._block_boxes = SharedArrays.zeros(structs.Aabbs, blocks)
         self._listed: np.ndarray | None = None
-        """Awake trees that the kernels' lists are about; None after others were listed."""
+        """Awake trees that the kernels' lists hold. None after the lists were filled with other trees."""
         self._block_count = ctypes.c_int32()
-        """Blocks of these trees."""
+        """Number of blocks that these trees belong to."""
         self._searching_trees = ctypes.c_int32()
+        """Number of awake trees that are compared with sleeping trees."""
         self._paired_trees = ctypes.c_int32()
-        """Awake trees that look for sleeping ones, and for each other."""
+        """Number of awake trees that are compared with each other."""
         self.slots = np.arange(parameters.max_contacts_per_tree)
         self._room = 0
 
     def set_rigid_world(self, rigid_arrays: RigidArrays) -> None:
-        """Take over the geoms of the rigid world after it was compiled anew."""
+        """Take over the geoms of the rigid world after it was compiled again."""
         self.rigid_arrays = rigid_arrays
         self._static_bounded = False
         self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-rigid_arrays.static // AABB_BLOCK))
@@ -92,11 +96,11 @@ class ContactDetection:
         self._allocate_candidates(max(self._room, MIN_TREE_ROOM))
 
     def update_rigid_geoms(self) -> None:
-        """The same rigid world has listed its geoms anew: the static ones have other numbers."""
+        """Compute the boxes of static geoms again, because the rigid world has renumbered its geoms."""
         self._static_bounded = False
 
     def _allocate_candidates(self, trees: int) -> None:
-        """Room for the candidates of so many awake trees."""
+        """Allocate the candidate arrays for ``trees`` awake trees, and bind the kernels to them."""
         self._room, slots = trees, len(self.slots)
         static = min(self.rigid_arrays.static, self.parameters.max_static_geoms_per_tree)
         near = self.rigid_arrays.capacity - self.rigid_arrays.static + static
@@ -115,7 +119,7 @@ class ContactDetection:
     # ------------------------------------------------------------------ broadphase
 
     def update_tree_bounds(self, trees: np.ndarray) -> None:
-        """Bring the boxes of some trees [k], and of their blocks, up to the poses of their bodies."""
+        """Update the bounding boxes of ``trees`` [k] and of their blocks to the present poses of the bodies."""
         self._list(trees)
         self._listed = None
         self._searching_trees.value = 0
@@ -123,18 +127,21 @@ class ContactDetection:
         self.compare_anew()
 
     def _list(self, trees: np.ndarray) -> None:
-        """Write the lists of kernels that are about some trees [k], and their blocks."""
+        """Write ``trees`` [k] and their blocks into the lists that the kernels read."""
         blocks = np.unique(trees // AABB_BLOCK)
         self.arrays.trees.awake[: len(trees)], self._blocks[: len(blocks)] = trees, blocks
         self.counters[structs.AWAKE_TREES] = len(trees)
         self._block_count.value = len(blocks)
 
     def compare_anew(self) -> None:
-        """Compare all capsules of awake trees with the sleeping ones in the next step, however little they move."""
+        """Make the next step compare all capsules of awake trees with those of sleeping trees.
+
+        Otherwise, capsules that moved less than their last known clearance are skipped.
+        """
         self._clearances.distance[:] = -1.0
 
     def find_near_trees(self) -> np.ndarray:
-        """Trees [k] whose box a geom of an actor overlaps within the step."""
+        """Returns the trees [k] whose bounding box a geom of an actor overlaps within the step."""
         if not self._static_bounded:
             self._bound_static_geoms()
         self.counters[structs.NEAR_ASLEEP] = 0
@@ -142,7 +149,7 @@ class ContactDetection:
         return self._is_near.nonzero()[0]
 
     def move_wires(self, pieces: np.ndarray, wires: DeflectedWires) -> None:
-        """Bring the geoms of wires [k] to where these are deflected to."""
+        """Move the geoms of the wire pieces ``pieces`` [k] to the deflected positions of these pieces."""
         if not self._static_bounded:
             self._bound_static_geoms()
         arrays = self.rigid_arrays
@@ -152,7 +159,7 @@ class ContactDetection:
         ends = np.stack([wires.start[pieces], wires.end[pieces]], 1) + wires.offset[pieces]
         states.offset[geoms] = wires.offset[pieces].mean(1)
         states.center[geoms] = ends.mean(1)
-        # it may spring back within the step
+        # the wire may spring back within the step
         states.speed[geoms] = np.sqrt((wires.offset[pieces] ** 2).sum(2).max(1)) / self.parameters.dt
         grown = (arrays.geoms.size[geoms, 0] + self.parameters.contact_margin)[:, None]
         states.low[geoms] = ends.min(1) - grown
@@ -162,7 +169,7 @@ class ContactDetection:
         np.maximum.at(boxes.high, block, states.high[geoms])
 
     def _bound_static_geoms(self) -> None:
-        """Boxes around blocks of static geoms; the ground reaches down without end."""
+        """Compute the bounding boxes of the blocks of static geoms. The ground's box has no lower end."""
         self._geom_aabbs(self.rigid_arrays.count)
         first = self.rigid_arrays.movable
         states = self.rigid_arrays.geom_states
@@ -179,8 +186,11 @@ class ContactDetection:
     # ------------------------------------------------------------------ narrowphase
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Let a bunch that was picked within the box ``low`` [3] to ``high`` [3] m pass through the trees that it
-        overlaps, until it is clear of them: as it hung there, that overlap was no contact."""
+        """Let a picked bunch pass through the trees that it overlaps, until it is clear of them.
+
+        The bunch was picked within the box ``low`` [3] to ``high`` [3] m. While it hung there, its overlap with these
+        trees was no contact.
+        """
         near = np.flatnonzero(((self.tree_boxes.low <= high) & (low <= self.tree_boxes.high)).all(1))
         room = self._passing[near] < 0
         near = near[room.any(1)]
@@ -188,8 +198,11 @@ class ContactDetection:
         self._passing[near, room.argmax(1)] = bunch
 
     def find_reached_trees(self, awake: np.ndarray, among_plants: bool) -> np.ndarray:
-        """Take the awake trees [k] and bring their boxes up to their predicted motion. Returns the sleeping trees [j]
-        that they touch, or will before the step ends; none unless plants touch each other (``among_plants``)."""
+        """Update the boxes of the awake trees [k] to their predicted motion, and find the sleeping trees they touch.
+
+        Returns the sleeping trees [j] that the awake trees touch now or will touch before the step ends; no trees
+        unless plants can touch each other (``among_plants``).
+        """
         if awake is not self._listed:
             self._list(awake)
             self._listed = awake
@@ -198,7 +211,7 @@ class ContactDetection:
         count = len(awake)
         sleep = among_plants and len(awake) < len(self._is_reached)
         self._paired_trees.value = count if among_plants else 0
-        self._searching_trees.value = count if sleep else 0  # one that falls asleep has them compared anew
+        self._searching_trees.value = count if sleep else 0  # a tree that falls asleep calls compare_anew()
         self._find_reached_trees()
         if not sleep:
             return _NO_TREES
@@ -207,7 +220,7 @@ class ContactDetection:
         return reached
 
     def deepest(self, trees: int, count: int) -> np.ndarray:
-        """The ``count`` candidates with the smallest gap, as numbers row * slots + slot in ascending order."""
+        """Returns the ``count`` candidates with the smallest gap, as indices row * slots + slot in ascending order."""
         found = np.flatnonzero(self.slots < self.candidates.count[:trees, None])
         return np.sort(found[np.argsort(self.candidates.gap.ravel()[found], kind="stable")[:count]])
 
@@ -233,7 +246,7 @@ class ContactDetection:
         candidates = self.candidates.struct
 
         def bind_shared(kernel: wp.Kernel, given: list, results: list, chunk: str) -> BoundLaunch:
-            """The same of a kernel over trees, which the threads of the plants share."""
+            """Bind a kernel over trees to its arrays, as a launch whose work the threads of the plants share."""
             pool = self.plants.launch_pool
             launch = bind_launch(kernel, given, results, index_list="order", partitions=pool.size)
             return pool.share([launch], TREES_PER_CHUNK[chunk])
@@ -311,7 +324,7 @@ class ContactDetection:
                 (mark_near_trees, ctypes.c_int32(len(self._blocks))),
             ]
         )
-        # boxes of blocks: or a tree that was dragged out of its block would have no actor near
+        # without the boxes of blocks, actors near a tree that was dragged out of its block would be missed
         self._find_reached_trees = sequence(
             [
                 (tree_aabbs, awake),

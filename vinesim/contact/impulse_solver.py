@@ -1,4 +1,4 @@
-"""Solve of all contacts of a step at once: islands, Jacobians, Delassus matrix, projected Gauss-Seidel, warm start.
+"""Solves all contacts of a step at once: islands, Jacobians, Delassus matrix, projected Gauss-Seidel, warm start.
 
 The stages of :meth:`ImpulseSolver.solve` follow the kernels: ``islands``, ``jacobians``, ``row_response``,
 ``delassus``, ``projected_gauss_seidel`` (with the steps of ``newton``), ``forces``.
@@ -33,15 +33,15 @@ ITEMS_PER_CHUNK = {
     "solve_islands": 1,
     "store_warm_start": 48,
 }
-"""Contacts or islands that a thread takes at a time: work of 5 us and more."""
+"""Kernel -> number of contacts or islands that a thread takes at a time: 5 us of work or more."""
 MATRIX_CONTACTS = 16
-"""Room for the matrices of the blocks is made for blocks of so many contacts, and more when they are larger."""
+"""Number of contacts in a block for which the matrices have room at first. They grow if blocks are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
-"""Number that a warm start keeps for a geom that is gone."""
+"""Geom index that a warm start stores for a geom that no longer exists."""
 
 
 class ImpulseSolver:
-    """Finds the impulses that keep plants and rigid bodies apart, and what they do to either side."""
+    """Finds the impulses that keep plants and rigid bodies apart, and their effect on plants and on rigid bodies."""
 
     def __init__(
         self,
@@ -52,7 +52,7 @@ class ImpulseSolver:
         kernel_parameters: structs.Parameters,
         wires: DeflectedWires | None = None,
     ) -> None:
-        """``wires``: those that give; without, none does."""
+        """``wires``: the trellis wires that deflect under contact forces. If None, all wires are rigid."""
         self._wires = None if wires is None else WireContacts(wires)
         self._at_wires = np.zeros(0, int)
         self.plants = plants
@@ -103,26 +103,30 @@ class ImpulseSolver:
         self._rigid_spans = np.zeros((n, 2), np.int32)
         self._most_contacts = 0
         self._columns = 0
-        """[contact, 2] From which degree of freedom to which its rows of rigid bodies may be other than 0; the most
-        contacts of one solve, and how long their rows are."""
+        # _rigid_spans [contact, 2]: first degree of freedom at which the contact's rigid rows may differ from 0, and
+        # the end of that range. _most_contacts: the largest number of contacts in one solve. _columns: length of their
+        # rows.
         self._memory: dict[str, np.ndarray] = {}
-        """See :meth:`_kept`."""
+        """Name -> memory that :meth:`_kept` reuses."""
         self._wrench = np.zeros((2 * n, 6))
         self.bodies = np.zeros(0, np.int32)
-        """Plant bodies in contact [n], sorted; a view that the next solve changes, as the next two."""
+        """[n] Indices of the plant bodies in contact, sorted.
+
+        A view that the next solve changes, like the next two arrays.
+        """
         self.wrenches = np.zeros((0, 6))
-        """[n, 6] N, N m on them, at their origins, world axes."""
+        """[n, 6] Force (N) and torque (N m) of the contacts on each of ``bodies``, at the body's origin, world axes."""
         self.rigid_force: np.ndarray | None = None
-        """[dof] N or N m, generalised force of the same contacts on the rigid world; None without contact."""
+        """[dof] Generalised force (N or N m) of the same contacts on the rigid world. None without contact."""
         self._padded_rows = 0
-        """Rows of all blocks of the last solve, those that fill them up included."""
+        """Number of rows of all blocks in the last solve, including the rows that pad the blocks."""
         self.unfinished = 0
-        """How often an island of a solve ended at the largest number of sweeps, perhaps not within its tolerance."""
+        """How often the solve of an island ended at the largest number of sweeps, perhaps outside its tolerance."""
 
     def set_rigid_world(
         self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
     ) -> None:
-        """Take over the rigid world after it was compiled anew; the warm start follows the names of the geoms."""
+        """Take over the rigid world after it was compiled again. The warm start is kept by the names of the geoms."""
         self.rigid_arrays = rigid_arrays
         if previous is not None:
             at = {name: i for i, name in enumerate(rigid_arrays.names)}
@@ -134,17 +138,17 @@ class ImpulseSolver:
         self.bind_launches(detection)
 
     def renumber_geoms(self, number: np.ndarray) -> None:
-        """The same rigid world has listed its geoms anew: ``number`` [geom] of each former one, -1 if it is gone."""
+        """Renumber the geoms of the warm start: ``number`` [geom] is a former geom's new index, -1 if it is gone."""
         other = self.warm_start.other[: self.warm_start.count[0]]
         of_geoms = (other >= 0) & (other != REMOVED_GEOM)
         now = number[other[of_geoms]]
         other[of_geoms] = np.where(now >= 0, now, REMOVED_GEOM)
 
     def _allocate(self) -> None:
-        """Arrays whose size depends on the rigid world or on the matrices of the blocks.
+        """Allocate the arrays whose size depends on the rigid world or on the matrices of the blocks.
 
-        The large ones lie in memory that is kept: new pages took 4 ms when an actor joined. Every solve overwrites what
-        it reads of them; rows of rigid bodies are 0 outside of their spans.
+        The large arrays reuse memory from earlier allocations: new pages took 4 ms when an actor joined. Every solve
+        overwrites the entries that it reads. Rows of rigid bodies are 0 outside of their spans.
         """
         world = self.rigid.mj_model
         for name in ("rigid_jacobian", "rigid_response"):
@@ -175,8 +179,11 @@ class ImpulseSolver:
         self.islands = SharedArrays(structs.Islands, rigid_last_contact=labels, dof=dofs, **self._island_arrays)
 
     def _kept(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
-        """An array of this shape in the memory of this name, twice as large as what was asked for when that was
-        made: pages that nothing has touched take no memory."""
+        """Returns an array of shape ``shape`` in the memory kept under ``name``.
+
+        The memory is twice as large as the request for which it was allocated: pages that nothing has touched take no
+        physical memory.
+        """
         size = math.prod(shape)
         memory = self._memory.get(name)
         if memory is None or len(memory) < size:
@@ -185,12 +192,12 @@ class ImpulseSolver:
 
     @property
     def island_count(self) -> int:
-        """Islands of the last solve."""
+        """Number of islands in the last solve."""
         return int(self._detection.counters[structs.ISLANDS])
 
     @property
     def sweeps(self) -> int:
-        """Sweeps that the slowest island of the last solve took."""
+        """Number of sweeps of the island that took the most sweeps in the last solve."""
         return int(self.islands.sweeps[: self.island_count].max(initial=0))
 
     def clear(self) -> None:
@@ -203,7 +210,7 @@ class ImpulseSolver:
     def find_contacts(self) -> None:
         """List the contacts of the listed awake trees, the plant bodies in contact, and the islands.
 
-        Of too many contacts no islands are built: see :meth:`build_islands`.
+        If there are too many contacts, no islands are built; see :meth:`build_islands`.
         """
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
         self._find_contacts()
@@ -213,7 +220,7 @@ class ImpulseSolver:
         self._build_islands(1)
 
     def solve(self, count: int) -> None:
-        """Find the impulses of the first ``count`` contacts, and what they do to either side."""
+        """Find the impulses of the first ``count`` contacts, and their effect on plants and on rigid bodies."""
         n = count
         if self._make_room():
             self._build_islands(1)
@@ -234,7 +241,7 @@ class ImpulseSolver:
         self.wrenches = self._wrench[: counters[structs.BODIES]]
 
     def _solve_constrained(self, count: int) -> None:
-        """The same where MuJoCo's constraints bind rigid bodies: their response comes from MuJoCo."""
+        """Solve the contacts when MuJoCo's constraints bind rigid bodies: MuJoCo then computes their response."""
         self._write_rows()
         self._rigid_spans[:count] = 0, self.rigid.mj_model.nv
         self._respond_constrained(by_rows(self.rows.rigid_jacobian[:count]))
@@ -243,7 +250,10 @@ class ImpulseSolver:
         self._store()
 
     def _make_room(self) -> bool:
-        """Make room for the matrices and responses of the listed contacts; whether they must be listed again."""
+        """Make room for the matrices and responses of the contacts.
+
+        Returns whether the contacts must be listed again.
+        """
         counters = self._detection.counters
         entries = int(counters[structs.MATRIX_ENTRIES])
         larger = entries > len(self._matrix)
@@ -255,7 +265,7 @@ class ImpulseSolver:
         return larger
 
     def _end_at_wires(self, count: int, wires: WireContacts) -> None:
-        """Find the springs of the wires that are in contact."""
+        """Add the stiffness of the deflecting wires to the contacts with them."""
         contacts = self.contacts
         candidates = self._detection.candidates
         piece = self.rigid_arrays.wire_of_geom[np.maximum(contacts.other[:count], -1)]
@@ -279,7 +289,7 @@ class ImpulseSolver:
         contacts.wire_shift[at] = wires.shift
 
     def report_wires(self) -> None:
-        """Tell the wires what pressed on them in the last solve."""
+        """Pass the contact forces of the last solve on the wires to the wires."""
         wires = self._wires
         at = self._at_wires
         contacts = self.contacts
@@ -297,12 +307,12 @@ class ImpulseSolver:
         return response
 
     def _follow_constraints(self, count: int) -> None:
-        """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve took them to.
+        """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve assumed.
 
-        The response to impulses is linear, but contacts of a body with its support may open, or begin to slide. A light
-        body that is pushed as if its support held it gains energy. Each round is a Newton step from the last impulses,
-        with the tangent stiffness of the constraints under them. The impulses of the round with the least error are
-        kept.
+        The solve assumes a linear response to impulses, but contacts of a body with its support may open or begin to
+        slide. A light body that is pushed as if its support held it gains energy. Each round is a Newton step from the
+        last impulses, with the tangent stiffness of the constraints under them. The impulses of the round with the
+        least error are kept.
         """
         rows = self.rows
         system = self.system
@@ -340,12 +350,12 @@ class ImpulseSolver:
                 values[:] = those
 
     def _touched_rigid_bodies(self, count: int) -> np.ndarray:
-        """MuJoCo's bodies [k] on the other side of the first ``count`` contacts, once for each."""
+        """Returns the MuJoCo bodies [k] that the first ``count`` contacts touch, each body once."""
         other = self.contacts.other[:count]
         return self.rigid_arrays.geoms.body[other[other >= 0]]
 
     def bind_launches(self, detection: ContactDetection) -> None:
-        """Bind every kernel to its arrays; to call again when ``detection`` has new arrays of candidates."""
+        """Bind every kernel to its arrays. Call this again when ``detection`` has new candidate arrays."""
         self._detection = detection
         p = self.parameters
         parameters = self._kernel_parameters
@@ -367,7 +377,7 @@ class ImpulseSolver:
         items = share(self._items, wp.int32)
 
         def bind_shared(kernel: wp.Kernel, model: list, given: list, results: list) -> BoundLaunch:
-            """The same of a kernel over items, which the threads of the plants share."""
+            """Bind a kernel over contacts or islands to its arrays, as a launch that the plants' threads share."""
             pool = self.plants.launch_pool
             launch = bind_launch(kernel, [*model, items, *given], results, index_list="items", partitions=pool.size)
             return pool.share([launch], ITEMS_PER_CHUNK[kernel.key])
@@ -423,5 +433,5 @@ class ImpulseSolver:
 
 
 def by_rows(jacobian: np.ndarray) -> np.ndarray:
-    """A rigid Jacobian [contact, dof, 3] as rows [row, dof]."""
+    """Returns a rigid Jacobian [contact, dof, 3] as rows [row, dof]."""
     return jacobian.transpose(0, 2, 1).reshape(-1, jacobian.shape[1])

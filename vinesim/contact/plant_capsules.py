@@ -19,18 +19,23 @@ class PlantCapsules:
     """Collision shapes of all plants: segments with a radius, sorted by body."""
 
     tree_start: np.ndarray
-    """[tree + 1] first capsule of each tree, then their number."""
+    """[tree + 1] Index of the first capsule of each tree; the last entry is the number of capsules."""
     body: np.ndarray
-    """[capsule]"""
+    """[capsule] Index of the body that the capsule belongs to."""
     bunch: np.ndarray
-    """[capsule] the bunch it belongs to, -1 for none. A peduncle goes with its bunch: what is left of it does not
-    collide."""
+    """[capsule] Index of the bunch that the capsule belongs to; -1 for wood.
+
+    The capsule of a peduncle belongs to its bunch: once the bunch is picked, the remaining stub does not collide.
+    """
     level: np.ndarray
-    """[capsule] 0: always there; 1: while its tree is coarse; 2: while it is fine (see ``State.tree_fine``)."""
+    """[capsule] Level of detail at which the capsule exists.
+
+    0: always; 1: while its tree is coarse; 2: while its tree is fine (see ``State.tree_fine``).
+    """
     start: np.ndarray
-    """[capsule, 3] m, in the body's frame; equal to ``end`` for a sphere."""
+    """[capsule, 3] Start of the axis, m, in the body's frame. Equal to ``end`` for a sphere."""
     end: np.ndarray
-    """[capsule, 3] m"""
+    """[capsule, 3] End of the axis, m, in the body's frame."""
     radius: np.ndarray
     """[capsule] m"""
     material: np.ndarray
@@ -38,9 +43,9 @@ class PlantCapsules:
 
 
 def plant_capsules(model: Model) -> PlantCapsules:
-    """A capsule for each piece of wood, a few spheres for each bunch, a capsule or sphere for each of its clusters.
+    """Returns a capsule for each piece of wood, a few spheres for each bunch, and a capsule or sphere for each cluster.
 
-    The spheres stand for a bunch without clusters, and for one with clusters while its tree is coarse.
+    The spheres collide for bunches without clusters. For bunches with clusters, they collide while the tree is coarse.
     """
     parts: list[tuple[int, int, int, float, float, float]] = []  # body, bunch, level, start and end along x, radius
     of_body = {int(b): i for i, b in enumerate(model.bunch_body)}
@@ -64,7 +69,7 @@ def plant_capsules(model: Model) -> PlantCapsules:
             parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
         else:
             parts.append((b, bunch_of[b], 0, 0.0, length, thick))
-    body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also of no bodies
+    body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also works without bodies
     along = np.array([1.0, 0.0, 0.0], np.float32)
     return PlantCapsules(
         tree_start=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),
@@ -79,9 +84,10 @@ def plant_capsules(model: Model) -> PlantCapsules:
 
 
 def spheroid_spheres(half_length: float, max_radius: float) -> list[tuple[float, float]]:
-    """Centre (along the axis, from one end) and radius [m] of the largest spheres that fit a spheroid along its axis.
+    """Returns the centres (along the axis, m from one end) and radii (m) of the largest spheres inside a spheroid.
 
-    About a point c of the axis between the centres of curvature of its ends: R sqrt(1 - c^2 / (a^2 - R^2)).
+    The largest sphere about a point c of the axis, between the centres of curvature of the spheroid's ends, has the
+    radius R sqrt(1 - c^2 / (a^2 - R^2)).
     """
     a = half_length
     r = max_radius
@@ -97,10 +103,10 @@ def spheroid_spheres(half_length: float, max_radius: float) -> list[tuple[float,
 def nearest_body(
     capsules: PlantCapsules, model: Model, state: State, trees: np.ndarray, points: np.ndarray, max_distance: float
 ) -> tuple[float, int] | None:
-    """The plant body nearest to one of some ``points`` [k, 3] m: distance [m] to its surface, and its number.
+    """Returns the distance (m) from ``points`` [k, 3] m to the nearest surface of a plant body, and that body's index.
 
-    Searches ``trees`` [n], whose ``state.body_q`` must be current. Of a bunch the bunch's own body counts, whether or
-    not its clusters move. None if nothing is nearer than ``max_distance`` [m].
+    Searches ``trees`` [n], whose ``state.body_q`` must be current. A bunch counts as its own body, whether or not its
+    clusters move. Returns None if no body is nearer than ``max_distance`` [m].
     """
     c = capsules
     first = c.tree_start[trees].tolist()

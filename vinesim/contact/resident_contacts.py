@@ -1,8 +1,8 @@
-"""Contacts of many independent trees with the static geoms of a scene, found and solved where the trees are.
+"""Contacts of many independent trees with the static geoms of a scene, solved on the device that holds the trees.
 
-For batches: every tree is a world of its own, so trees do not touch each other, and nothing they touch moves. Then the
-contacts of a tree are one island, nothing has to come back to the host between steps, and on a GPU a tree is a thread.
-Detection, rows, Delassus matrix and solve are the functions that
+This is for batches. Every tree is a world of its own: trees do not touch each other, and no geom that they touch moves.
+The contacts of a tree then form one island, no data has to return to the host between steps, and a GPU uses one thread
+for each tree. Detection, rows, Delassus matrix and solve use the functions that
 :class:`vinesim.contact.contact_solver.ContactSolver` launches.
 """
 
@@ -30,19 +30,19 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.physics_parameters import PhysicsParameters
 
 FULL_BLOCK = 128
-"""CUDA threads a block of kernels with several threads for each tree."""
+"""CUDA threads in a block, for kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
 DEFAULT_SLOTS = 8
-"""Contacts that one tree can have at once: 10 kB a tree."""
+"""Default for the number of contacts that one tree can have at once. They take 10 kB a tree."""
 PAIRS_PER_SLOT = 4
-"""Pairs of capsules and geoms whose boxes may overlap, for each contact that a tree can have."""
+"""Room for pairs of capsules and geoms whose boxes overlap: this many for each contact that a tree can have."""
 FIRST_LANES = 16
-"""Threads of a GPU that share a tree of few contacts, a row each."""
+"""Number of GPU threads that share a tree with few contacts; each thread solves one row."""
 WARPS = 132 * 32
-"""Warps of a GPU that solve at once: as many as one with 132 multiprocessors keeps."""
+"""Number of GPU warps that solve at the same time: as many as a GPU with 132 multiprocessors holds."""
 
 Launches = list[tuple[Any, int]]
-"""Bound kernels with their numbers of threads."""
+"""Bound kernels, each with its number of threads."""
 
 
 class ResidentContacts:
@@ -100,7 +100,9 @@ class ResidentContacts:
     # ------------------------------------------------------------------ arrays
 
     def _on_device(self, kind: Any, source: Any, **values: Any) -> Any:
-        """A struct of copies of the arrays of ``source`` on the device; those in ``values`` instead of theirs."""
+        """Returns a ``kind`` struct on the device: arrays from ``values`` where given, else copies of those of
+        ``source``.
+        """
         made = kind()
         for name, field in kind.vars.items():
             given = values.get(name)
@@ -110,7 +112,7 @@ class ResidentContacts:
         return made
 
     def _allocated(self, kind: Any, sizes: dict[str, int], width: dict[str, int]) -> Any:
-        """A struct of arrays of zeros: ``sizes`` by name (1 unless given) and, of tables, ``width``."""
+        """Returns a struct of zeroed arrays, with ``sizes`` by name (default 1) and the ``width`` of 2-D arrays."""
         made = kind()
         for name, field in kind.vars.items():
             size = sizes.get(name, 1)
@@ -132,8 +134,10 @@ class ResidentContacts:
         )
 
     def _interleaved(self, capsules: SharedArrays) -> Any:
-        """The capsules on the device, capsule i of a tree at ``i * trees + tree``; -1 as the body of what does not
-        collide."""
+        """Returns the capsules on the device. Capsule i of a tree is at ``i * trees + tree``.
+
+        Capsules that do not collide have -1 as their body.
+        """
         start = capsules.tree_start
         number = np.arange(start[-1]) - np.repeat(start[:-1], np.diff(start))
         self._capsule_count = (int(number.max(initial=-1)) + 1) * self._trees
@@ -155,14 +159,17 @@ class ResidentContacts:
 
     @property
     def _places(self) -> int:
-        """Entries of an array with a row for each body."""
+        """Number of entries of an array that has a row for each body."""
         return len(self.plants.buffers.arrays["body_parent"])
 
     def _zeros(self, dtype: Any, *shape: int) -> wp.array:
         return wp.zeros(shape, dtype=dtype, device=self._device)
 
     def _take_over_geoms(self, rigid: RigidArrays) -> None:
-        """The static geoms, with boxes around them and around blocks of them; the ground reaches down without end."""
+        """Copy the static geoms to the device, with boxes around each and around blocks.
+
+        The ground's box has no lower end.
+        """
         device = self._device
         self._geoms = self._on_device(structs.Geoms, rigid.geoms.struct)
         self._rigid_bodies = self._on_device(structs.RigidBodies, rigid.bodies.struct)
@@ -182,7 +189,9 @@ class ResidentContacts:
         self._pairs = wp.array(material_pairs(self.parameters), dtype=Surface, device=device)
 
     def _by_slot(self, dtype: Any, columns: int) -> wp.array:
-        """A table [tree, column] of zeros in which the trees of one column lie side by side."""
+        """Returns a table [tree, column] of zeros, stored column by column: neighbouring trees are neighbours in
+        memory.
+        """
         flat = self._zeros(dtype, self._trees * columns)
         strides = (flat.strides[0], flat.strides[0] * self._trees)
         table = wp.array(ptr=flat.ptr, shape=(self._trees, columns), strides=strides, dtype=dtype, device=self._device)
@@ -225,7 +234,10 @@ class ResidentContacts:
     # ------------------------------------------------------------------ kernels
 
     def _bind(self) -> tuple[Launches, Launches, Launches]:
-        """Every kernel of a step, bound to its arrays, with its number of threads: before the solves, these, after."""
+        """Bind every kernel of a step to its arrays, with its number of threads.
+
+        Returns the launches before the solves, the solves, and the launches after them.
+        """
         p = self.parameters
         plants = self.plants.launches
         trees = self._trees
@@ -269,7 +281,7 @@ class ResidentContacts:
 
         is_round = np.isin(self._geoms.kind.numpy(), (PLANE, SPHERE, CAPSULE)).all()
         find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
-        compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # free since the prediction
+        compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # unused memory after the prediction
         before = [
             bound(
                 tree_narrowphase.list_near_pairs,
@@ -406,14 +418,14 @@ class ResidentContacts:
         return before, solves, after
 
     def solve(self) -> None:
-        """Launch what comes between the prediction and the integration of a step: for ``advance()``."""
+        """Launch the kernels that run between the prediction and the integration of a step. For ``advance()``."""
         for launch, count in self._before:
             launch(count)
         (solve_most, of_most), (solve_busy, of_busy) = self._solves
         if self._beside is None:
             solve_most(of_most)
             solve_busy(of_busy)
-        else:  # side by side: few trees are busy, but each of them for long
+        else:  # on two streams: few trees are busy, but each takes long
             with wp.ScopedStream(self._beside):
                 solve_busy(of_busy)
             solve_most(of_most)
@@ -425,21 +437,21 @@ class ResidentContacts:
 
     @property
     def count(self) -> np.ndarray:
-        """[tree] contacts of the last step, those without force included."""
+        """[tree] Number of contacts in the last step, including contacts without force."""
         return self._tree_contacts.count.numpy()
 
     @property
     def dropped(self) -> int:
-        """Contacts left out since the start, for want of slots."""
+        """Number of contacts left out since the start because a tree had no slot for them."""
         return int(self._tree_contacts.dropped.numpy().sum())
 
     @property
     def sweeps(self) -> np.ndarray:
-        """[tree] sweeps of the last solve of trees in contact."""
+        """[tree] Number of sweeps in the last solve; 0 for trees without contact."""
         return np.where(self.count > 0, self._tree_contacts.sweeps.numpy(), 0)
 
     @property
     def force(self) -> np.ndarray:
-        """[tree, 3] N, sum of the forces of all contacts on each tree in the last step."""
+        """[tree, 3] Sum of the forces of all contacts on each tree in the last step, N."""
         force = self.contacts.force.numpy().reshape(self.slots, self._trees, 3)
         return (force * (np.arange(self.slots)[:, None] < self.count)[..., None]).sum(0)

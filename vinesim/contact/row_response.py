@@ -1,4 +1,4 @@
-"""How impulses along the rows of contacts move the plants in contact: computed where the plants are."""
+"""How impulses along the rows of contacts move the plants in contact, computed on the device that holds the plants."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from vinesim.kernels.plants.structs import ArticulationModel, Factors
 from vinesim.plants.articulation_solver import ArticulationSolver
 
 NUMBERS_PER_CONTACT = 256
-"""Room for responses is made for so many numbers a contact, and more when there are more."""
+"""Number of response values for each contact for which there is room at first. The room grows when more are needed."""
 GROUPS_PER_CHUNK = 2
-"""Groups of sides that a thread takes at a time: work of 4 us."""
+"""Number of groups of contact sides that a thread takes at a time: 4 us of work."""
 ROWS_ON_A_GPU = 256
-"""Groups that a GPU works on at once."""
+"""Number of groups that a GPU works on at once."""
 
 
 class RowResponse:
-    """Response of the plants to unit impulses along the rows of up to so many contacts.
+    """Response of the plants to unit impulses along the rows of contacts, up to a fixed number of contacts.
 
-    The device of the plants reaches ``jacobian`` [row, 12], the lists ``body`` and ``tree_end`` [slot] of the plant
-    bodies in contact, ``body_slot`` and ``other_slot`` [contact], and ``groups`` of sides, all of which the contact
-    kernels fill.
+    The contact kernels fill ``jacobian`` [row, 12], the lists ``body`` and ``tree_end`` [slot] of the plant bodies in
+    contact, ``body_slot`` and ``other_slot`` [contact], and ``groups`` of sides. The device that holds the plants can
+    read all of these.
     """
 
     def __init__(self, plants: ArticulationSolver, contacts: int) -> None:
@@ -41,11 +41,11 @@ class RowResponse:
         for name, data in lists.items():
             setattr(self._there, name, buffers.reach(data, wp.int32, name))
         self.numbers = np.zeros(0, np.float32)
-        """Response of each group, see :class:`vinesim.kernels.contact.structs.SideGroups`."""
+        """Response of each group; see :class:`vinesim.kernels.contact.structs.SideGroups`."""
         self.make_room(NUMBERS_PER_CONTACT * contacts)
 
     def make_room(self, numbers: int) -> bool:
-        """Whether ``numbers`` had to be made anew, for so many of them."""
+        """Make room for ``numbers`` response values. Returns whether the array had to be allocated again."""
         if numbers <= len(self.numbers):
             return False
         self.numbers = self.plants.buffers.pinned(np.zeros(2 * numbers, np.float32))
@@ -97,4 +97,4 @@ class RowResponse:
             buffers.synchronize()
 
         self.launch = respond if buffers.device.is_cpu else bound(respond_in_parts)
-        """Fills :attr:`numbers` of groups: all touch trees of the last prediction, and belong to it."""
+        """Launch that fills :attr:`numbers` for groups. All groups must touch trees of the last prediction."""

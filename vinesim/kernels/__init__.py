@@ -1,4 +1,4 @@
-"""Warp kernels: plain arrays in, plain arrays out; one thread does one thing, and its docstring says what."""
+"""Warp kernels. Their inputs and outputs are plain arrays; each docstring says what one thread does."""
 
 import logging
 import os
@@ -8,7 +8,10 @@ import warp as wp
 
 
 def use_temporary_cache(reason: object) -> None:
-    """Keep compiled kernels in a temporary folder, for this process and those that it starts; one warning."""
+    """Keep compiled kernels in a temporary folder, for this process and the processes that it starts.
+
+    Logs one warning.
+    """
     folder = tempfile.mkdtemp(prefix="vinesim-kernels-")
     logging.getLogger(__name__).warning(
         "compiled kernels are kept in %s for this time, as Warp's cache cannot be written (set WARP_CACHE_PATH): %s",
@@ -21,8 +24,10 @@ def use_temporary_cache(reason: object) -> None:
 
 
 def _start_warp() -> None:
-    """Start Warp without its greeting (standard output belongs to the command) and without its words about a missing
-    GPU, which is no reason to warn. Whatever else it writes to standard error is passed on.
+    """Start Warp without its greeting (standard output belongs to the command) and without its message about a missing
+    GPU.
+
+    A missing GPU is no reason to warn. Everything else that Warp writes to standard error is passed on.
     """
     level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.config.log_level = wp.LOG_ERROR
@@ -32,7 +37,7 @@ def _start_warp() -> None:
         try:
             try:
                 wp.init()
-            except OSError as error:  # its cache cannot be made
+            except OSError as error:  # Warp's cache folder cannot be created
                 use_temporary_cache(error)
                 wp.config.kernel_cache_dir = None  # as the environment has it, in all processes alike
                 wp.init()

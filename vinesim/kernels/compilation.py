@@ -42,24 +42,24 @@ PHYSICS_PACKAGES = (
     "rigid",
     "robot",
 )
-"""Kernels that a step needs."""
+"""Packages of the kernels that a physics step needs."""
 SENSOR_PACKAGES = ("raster", "lidar", "stereo", "shading")
-"""Kernels of cameras and lidars."""
+"""Packages of the kernels of cameras and lidars."""
 TIMEOUT = 600.0
-"""How long other processes may take to compile, before this one compiles as well [s]."""
+"""[s] How long other processes may take to compile before this process compiles as well."""
 MAX_COMPILERS = 12
-"""More would wait for the longest module."""
+"""Largest number of compilers. More would only wait for the longest module."""
 NICENESS = 10
-"""Of compilers of what is not waited for: loops of clients that run already come first."""
+"""Niceness of compilers while they compile modules that nothing waits for: loops of running clients come first."""
 ATTEMPTS = 2
-"""A module is given to so many compilers in turn if they die of it."""
+"""Number of compilers to which a module is given in turn if they die while compiling it."""
 POLL_PERIOD = 0.05
-"""Between two looks at what other processes have compiled [s]."""
+"""[s] Time between two checks of what other processes have compiled."""
 LEFTOVER_AGE = 3600.0
-"""Age from which a folder that a compiler works in belongs to one that was killed [s]."""
+"""[s] Age from which a compiler's working folder is taken to be left over from a killed compiler."""
 _PREFIX = "vinesim.kernels."
 _KERNEL = re.compile(rb"^@wp\.kernel|_kernel\(__name__,", re.MULTILINE)
-"""What defines a kernel."""
+"""Matches the definition of a kernel in a module's source."""
 _CUDA_ONLY = (
     "plants.lean_prediction",
     "contact.tree_delassus",
@@ -128,7 +128,9 @@ def compile_kernels(packages: Sequence[str] = (), device: str = "cpu", *, then: 
 
 
 class CompiledModules:
-    """Which modules of this version of the kernels are in Warp's cache: each has a file there that names its folder."""
+    """Tells which modules of this version of the kernels are in Warp's cache, where each has a file that names its
+    folder.
+    """
 
     def __init__(self) -> None:
         self._cache = pathlib.Path(wp.config.kernel_cache_dir)
@@ -138,7 +140,7 @@ class CompiledModules:
         self._folder = self._cache / f"vinesim-{h.hexdigest()}"
 
     def missing(self, names: Sequence[str]) -> list[str]:
-        """Those of some modules that are not there, in their order."""
+        """Returns the modules of ``names`` that are not in the cache, in their order."""
         return [name for name in names if not self._is_there(name)]
 
     def _is_there(self, name: str) -> bool:
@@ -148,7 +150,7 @@ class CompiledModules:
             return False
 
     def add(self, name: str, folder: str) -> None:
-        """Say that a module is in a ``folder`` of Warp's cache."""
+        """Record that a module is in a ``folder`` of Warp's cache."""
         with contextlib.suppress(OSError):  # then the next start looks again
             self._folder.mkdir(exist_ok=True)
             draft = self._folder / f"{name}.{os.getpid()}.part"
@@ -169,8 +171,10 @@ class Compilers:
     def __init__(
         self, names: Sequence[str], later: Sequence[str], compiled: CompiledModules, lock: contextlib.ExitStack
     ) -> None:
-        """Starts with the modules ``names`` in their order, then those of ``later``, while loops may run already; the
-        ``lock`` is held until all are done."""
+        """Start to compile the modules ``names`` in their order, then those of ``later``, while loops may run already.
+
+        The ``lock`` is held until all are done.
+        """
         self._compiled = compiled
         names = [*names, *later]
         self._queue = collections.deque(names)
@@ -188,17 +192,17 @@ class Compilers:
             threading.Thread(target=self._feed, name=f"compiler {number}", daemon=True).start()
 
     def awaited(self, names: Sequence[str]) -> list[str]:
-        """Those of some modules that are yet to be compiled; the others are there, or have failed."""
+        """Returns the modules of ``names`` that are yet to be compiled. The others are compiled or have failed."""
         with self._state:
             return [name for name in names if name in self._awaited]
 
     def count(self, names: Sequence[str]) -> int:
-        """How many of some modules were compiled."""
+        """Returns how many modules of ``names`` were compiled."""
         with self._state:
             return len(self._done.intersection(names))
 
     def _feed(self) -> None:
-        """Let one process compile what is next until nothing is left; start another one if it dies."""
+        """Let one process compile the next module until none is left. Start another process if it dies."""
         process = None
         try:
             while (name := self._next()) is not None:
@@ -250,7 +254,9 @@ class Compilers:
 
 
 def _start_compiler() -> subprocess.Popen[str]:
-    """A process that runs :mod:`vinesim.kernels.compiler_process`, in a group of its own: Ctrl-C is for this process."""
+    """Start :mod:`vinesim.kernels.compiler_process` in a process group of its own, so that Ctrl-C reaches this process
+    only.
+    """
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "vinesim.kernels.compiler_process"],
@@ -263,7 +269,7 @@ def _start_compiler() -> subprocess.Popen[str]:
 
 
 def _ask(process: subprocess.Popen[str], name: str) -> dict[str, str] | None:
-    """The answer of a compiler for a module; None if it has died."""
+    """Returns the answer of a compiler for a module; None if the compiler has died."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:
@@ -280,7 +286,10 @@ def _close(process: subprocess.Popen[str]) -> None:
 
 
 def _compile_for_gpu(names: Sequence[str], device: str) -> None:
-    """Compile modules, or load them if they are compiled, on all cores; the compiler works without the interpreter lock."""
+    """Compile modules on all cores, or load them if they are compiled.
+
+    Warp's compiler releases the interpreter lock.
+    """
     modules = [wp.get_module(importlib.import_module(_PREFIX + name).__name__) for name in names]
     with ProgressLine() as line, concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
         works = [pool.submit(wp.force_load, device, [module], max_workers=0) for module in modules]
@@ -290,11 +299,11 @@ def _compile_for_gpu(names: Sequence[str], device: str) -> None:
 
 
 def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ONLY) -> list[str]:
-    """All modules of some packages that define kernels, below :mod:`vinesim.kernels`, all unless given.
+    """Returns all modules of some packages of :mod:`vinesim.kernels` that define kernels; of all packages by default.
 
     ``packages`` may name single modules, too.
 
-    Long ones first, by and large, so that no core waits for the last one.
+    Long modules roughly come first, so that no core waits for the last one.
     """
     found = {
         name: len(source)
@@ -308,7 +317,7 @@ def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ON
 
 @functools.cache
 def _sources() -> dict[str, bytes]:
-    """The source of each module of the package, by its name below it."""
+    """Returns the source of each module of the package, by its name relative to the package."""
     root = pathlib.Path(vinesim.kernels.__path__[0])
     return {
         ".".join(file.relative_to(root).with_suffix("").parts): file.read_bytes() for file in sorted(root.rglob("*.py"))

@@ -3,4 +3,5 @@
 import warp as wp
 
 INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=9000", "-inline-threshold=100000")
-"""Warp's own, but functions of any size are inlined: a loop with a call is not vectorised, and a call copies all structs."""
+"""Warp's flags, but functions of any size are inlined: loops with calls are not vectorised, and calls copy all structs.
+"""

@@ -1,7 +1,7 @@
-"""A process that compiles kernel modules for the CPU: it reads names of modules from its input, and answers each.
+"""A process that compiles kernel modules for the CPU. It reads names of modules from its input, and answers each.
 
-Warp generates code and compiles it under locks, so that threads of one process compile one module at a time for most of
-the time. The process ends with its input, also while it compiles: none outlives the process that started it.
+Warp generates code and compiles it under locks, so that threads of one process mostly compile one module at a time. The
+process ends when its input ends, even while it compiles, so it never outlives the process that started it.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ import threading
 def main() -> None:
     """Answer each line, the name of a module, with a line of JSON: the folder of the compiled module, or the failure."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
-    os.dup2(2, 1)  # what else is printed goes to standard error
-    # of its own, so that what the compiler leaves there is deleted however the process ends
+    os.dup2(2, 1)  # all other output goes to standard error
+    # a folder of its own, so that the compiler's files are deleted however the process ends
     tempfile.tempdir = tempfile.mkdtemp(prefix="vinesim-compiler-")
     names: queue.SimpleQueue[str] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(names,), daemon=True).start()
@@ -36,7 +36,7 @@ def main() -> None:
 
 
 def _read(names: queue.SimpleQueue[str]) -> None:
-    """Queue the lines of the input; end the process with it."""
+    """Queue the lines of the input. End the process when the input ends."""
     for line in sys.stdin:
         names.put(line.strip())
     shutil.rmtree(tempfile.gettempdir(), ignore_errors=True)
@@ -44,7 +44,7 @@ def _read(names: queue.SimpleQueue[str]) -> None:
 
 
 def _compile(name: str) -> str:
-    """Compile a module unless it is compiled already; its folder in Warp's cache."""
+    """Compile a module unless it is compiled already. Returns its folder in Warp's cache."""
     import warp as wp
 
     module = wp.get_module(importlib.import_module(name).__name__)

@@ -1,12 +1,12 @@
-"""Sequences of kernels on fixed arrays, each made by one call: captured once into a graph of Warp, then replayed.
+"""Sequences of kernels on fixed arrays. A sequence is captured once into a Warp graph, then replayed by one call.
 
-``wp.launch`` packs the arguments of a kernel at every launch: 10 us for twenty arguments, more than most of our kernels
-run. A graph keeps them: 0.2 us a kernel, and 1.4 us for the call (docs/decisions/kernel-graphs.md).
+``wp.launch`` packs the arguments of a kernel at every launch: 10 us for twenty arguments, longer than most of our
+kernels run. A graph keeps them packed: 0.2 us a kernel, and 1.4 us for the call (docs/decisions/kernel-graphs.md).
 
-The number of threads of a launch is part of its graph. So how many items there are stands in an array, ``count`` [1]
-int32, which NumPy or an earlier kernel of the sequence writes. A kernel has more threads than items, and begins with
-``if wp.tid() >= count[0]: return``, which takes a CPU less than a nanosecond. A sequence has a graph for each number of
-threads in :data:`TIERS`.
+The number of threads of a launch is part of its graph. The number of items is therefore stored in an array, ``count``
+[1] int32, which NumPy or an earlier kernel of the sequence writes. A kernel has at least as many threads as items, and
+begins with ``if wp.tid() >= count[0]: return``, which takes a CPU less than a nanosecond. A sequence has a graph for
+each number of threads in :data:`TIERS`.
 """
 
 from __future__ import annotations
@@ -19,39 +19,48 @@ from typing import Any
 import warp as wp
 
 TIERS = (64, 1024, 16384, 262144, 4194304)
-"""Numbers of threads. TUNED: to capture a launch takes 0.3 ms, so that there should be few; the threads without work take
-a hundredth of the time of the others."""
+"""Numbers of threads for which graphs are captured.
+
+TUNED: capturing a launch takes 0.3 ms, so there should be few; threads without work take a hundredth of the time of the
+others.
+"""
 THREADS_PER_BLOCK = 32
-"""CUDA threads a block. One thread is one tree and runs long: small blocks spread few trees over all multiprocessors."""
+"""CUDA threads in a block.
+
+One thread is one tree and runs long; small blocks spread few trees over all multiprocessors.
+"""
 
 _capturing = threading.Lock()
-"""Warp captures one graph at a time. No other thread may call ``wp.launch`` meanwhile: Warp keeps a table for the graph
-that it would write to as well."""
+"""Lock: Warp captures one graph at a time.
+
+No other thread may call ``wp.launch`` during a capture, because it would write to a table that Warp keeps for the
+graph.
+"""
 
 
 @dataclasses.dataclass(frozen=True)
 class KernelLaunch:
-    """A kernel and its arguments: numbers, structs, and arrays that stay where they are."""
+    """A kernel and its arguments: numbers, structs, and arrays that keep their memory."""
 
     kernel: wp.Kernel
     inputs: Sequence[Any]
     outputs: Sequence[Any] = ()
     threads: int | None = None
-    """How many it has; None: one for each item, of which it reads how many there are."""
+    """Number of threads. None: one for each item; the kernel reads the number of items."""
     width: int = 1
     """Threads for each item: the second dimension of ``wp.tid()`` if there are several."""
     block: int = THREADS_PER_BLOCK
-    """Threads of a block, on CUDA."""
+    """Threads in a block, on CUDA."""
 
     def launch(self, items: int, device: wp.Device) -> None:
-        """Launch it with room for so many items."""
+        """Launch the kernel with room for ``items`` items."""
         rows = items if self.threads is None else self.threads
         dim = rows if self.width == 1 else (rows, self.width)
         wp.launch(self.kernel, dim, inputs=self.inputs, outputs=self.outputs, device=device, block_dim=self.block)
 
 
 class KernelGraph:
-    """Launches that follow each other."""
+    """Kernel launches that run one after the other."""
 
     def __init__(self, *launches: KernelLaunch, device: str = "cpu") -> None:
         self._launches = launches
@@ -60,12 +69,12 @@ class KernelGraph:
         self._graphs: dict[int, Any] = {}
         self._graph: Any = None
         self._room = range(0)
-        """The graph of the last call, and the capacities that it is for."""
+        """The capacities for which the graph of the last call was captured."""
 
     def __call__(self, capacity: int = 1) -> None:
-        """Make the launches; no count that their kernels read may be above ``capacity``.
+        """Run the launches. No count that their kernels read may be above ``capacity``.
 
-        On CUDA they are only queued, and within a capture of the caller's they become part of that.
+        On CUDA the launches are only queued. Within a capture of the caller they become part of that capture.
         """
         if self._is_cuda and self._device.is_capturing:
             self._launch(tier_of(capacity).stop - 1)
@@ -89,7 +98,7 @@ class KernelGraph:
 
 
 def tier_of(capacity: int) -> range:
-    """The capacities that share a graph with this one; :class:`ValueError` beyond the last of :data:`TIERS`."""
+    """Returns the capacities that share a graph with this one. :class:`ValueError` beyond the last of :data:`TIERS`."""
     least = 0
     for most in TIERS:
         if capacity <= most:

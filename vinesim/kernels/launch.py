@@ -1,8 +1,9 @@
-"""Launches of kernels bound to their arrays once, and a pool of threads that share one launch.
+"""Launches of kernels whose arguments are packed once, and a pool of threads that share one launch.
 
-Warp packs a kernel's arguments anew at every CPU launch, recorded or not: 10 us for twenty arguments, more than most of
-our kernels run. :func:`bind_launch` packs them once and then only calls the compiled function: 1 us. That call gives the
-interpreter lock away, so Python threads can run a kernel side by side on parts of its list: see :class:`ThreadPool`.
+Warp packs a kernel's arguments again at every CPU launch, recorded or not: 10 us for twenty arguments, longer than most
+of our kernels run. :func:`bind_launch` packs them once; the launch then only calls the compiled function: 1 us. That
+call releases the interpreter lock, so Python threads can run a kernel side by side on parts of its list; see
+:class:`ThreadPool`.
 """
 
 import ctypes
@@ -17,27 +18,30 @@ import warp as wp
 from vinesim.kernels.graph import THREADS_PER_BLOCK
 
 MAX_THREADS = 4
-"""A picture or a scan is not shared by more threads of a CPU than this: the gain is used up."""
+"""Largest number of CPU threads that share a picture or a scan. More threads bring no gain."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PackedLaunch:
-    """A launch as native code makes it."""
+    """The addresses that native code needs to make a launch."""
 
     head: tuple[int, int, int]
-    """Address of the kernel, address of the list, bytes of an entry; the last two are 0 without a list."""
+    """Address of the kernel, address of the list, bytes of an entry. The last two are 0 without a list."""
     parts: tuple[tuple[int, int, int, int, int], ...]
-    """For each partition the addresses of its bounds, of their shape and their size, of its arguments, and of the
-    address of the list in these."""
+    """For each partition the addresses of its bounds, of their shape and their size, and of its arguments, and the
+    address at which these arguments store the address of the list."""
 
 
 class BoundLaunch(Protocol):
     """A kernel on its arrays: ``launch(threads, first, partition)``, see :func:`bind_launch`."""
 
     packed: PackedLaunch | None
-    """None on CUDA, with another version of Warp, and for a launch of several kernels."""
+    """The launch with its arguments packed in advance.
+
+    None on CUDA, with another Warp version, and for several kernels.
+    """
     job: ctypes.Array | None
-    """What :meth:`vinesim.kernels.shared_launch.LaunchPool.share` made for the threads of a pool; else None."""
+    """Job that :meth:`vinesim.kernels.shared_launch.LaunchPool.share` made for the threads of a pool; else None."""
 
     def __call__(self, threads: int, first: int = 0, partition: int = 0) -> None: ...
 
@@ -52,12 +56,13 @@ def bind_launch(
     partitions: int = 1,
     block: int = THREADS_PER_BLOCK,
 ) -> BoundLaunch:
-    """A function that launches ``kernel`` with ``threads`` [first argument] threads on these arrays and structs.
+    """Returns a function that launches ``kernel`` with ``threads`` [first argument] threads on these arrays and
+    structs.
 
-    The arrays must stay where they are; the function keeps Warp's handles of them. With ``index_list``, the name of
-    the list argument of which thread i takes entry i, the CPU function also takes ``first``, the entry of its first
-    thread, and ``partition``, a number below ``partitions`` that no other Python
-    thread uses meanwhile. ``block`` is for CUDA.
+    The arrays must keep their memory; the function holds Warp's handles of them. ``index_list`` names a list argument
+    of which thread i takes entry i. With it, the CPU function also takes ``first``, the entry of its first thread, and
+    ``partition``, a number below ``partitions`` that no other Python thread uses at the same time. ``block`` is for
+    CUDA.
     """
     commands = [
         wp.launch(kernel, 1, inputs=inputs, outputs=outputs, device=device, record_cmd=True, block_dim=block)
@@ -110,7 +115,7 @@ def bind_launch(
 def bound(
     launch: Callable[..., None], packed: PackedLaunch | None = None, job: ctypes.Array | None = None
 ) -> BoundLaunch:
-    """A function that launches kernels, as a :class:`BoundLaunch`."""
+    """Returns a function that launches kernels one after the other, as a :class:`BoundLaunch`."""
     # type: ignore[attr-defined]
     launch.packed = packed
     launch.job = job
@@ -118,7 +123,9 @@ def bound(
 
 
 def join_partitions(launches: Sequence[BoundLaunch]) -> BoundLaunch:
-    """One launch whose partition i is the only one of ``launches[i]``: of a kernel with memory for each thread."""
+    """Returns one launch whose partition i is the only partition of ``launches[i]``, for kernels with memory per
+    thread.
+    """
 
     def launch(threads: int, first: int = 0, partition: int = 0) -> None:
         launches[partition](threads, first)
@@ -129,7 +136,7 @@ def join_partitions(launches: Sequence[BoundLaunch]) -> BoundLaunch:
 
 
 def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> BoundLaunch:
-    """Warp's own replay: what CUDA uses, and what can be captured into a graph."""
+    """Returns Warp's own replay, which CUDA uses and which can be captured into a graph."""
     starts = [0] * len(commands)
 
     def launch(threads: int, first: int = 0, partition: int = 0) -> None:
@@ -144,7 +151,7 @@ def _recorded(commands: list[wp.Launch], inputs: list, at: int) -> BoundLaunch:
 
 
 def usable_cores() -> int:
-    """Cores that this process may use."""
+    """Returns the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -155,7 +162,7 @@ class ThreadPool:
     """
 
     def __init__(self, size: int) -> None:
-        """``size``: how many work at once, the caller of :meth:`run` included."""
+        """``size``: number of threads that work at once, including the caller of :meth:`run`."""
         self.size = size
         self._work: list[Callable[[], None] | None] = [None] * size
         self._failed: list[BaseException] = []

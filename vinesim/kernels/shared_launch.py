@@ -21,26 +21,26 @@ import warp as wp
 from vinesim.kernels.launch import BoundLaunch, bind_launch, bound, usable_cores
 
 POLL_TIME = 300_000
-"""[ns] More than passes between the launches of a step, much less than a step."""
+"""[ns] How long an idle thread polls: longer than the pauses between a step's launches, much shorter than a step."""
 
 _IDLE = 0
 _ASLEEP = 3
 _ENDED = 4
-"""States of a thread that Python knows; native code has them all."""
+"""States of a thread that Python uses. The native code defines all states."""
 _FIRST_THREAD = 16
 _LINE = 8
 """Places in the memory of a pool, by numbers of eight bytes: the states of the threads, each in a cache line of its own
 with the address of its semaphore. Before them, in lines of their own, are the next chunk and the address of the job."""
 ONCE = ctypes.c_int32(1)
-"""Number of threads of a kernel that is one thread in all, for :meth:`LaunchPool.sequence`."""
+"""Number of threads of a kernel that runs as one thread in all, for :meth:`LaunchPool.sequence`."""
 _FIRST_ENTRY = 3
-"""Place in a job, see ``_COMMON``."""
+"""Index of the first entry in a job; see ``_COMMON``."""
 _ALL = 1 << 40
-"""Entries of a chunk of a launch that is not shared."""
+"""Number of entries in a chunk of a launch that is not shared."""
 _SEMAPHORE_SIZE = 128
-"""[bytes] More than any C library's ``sem_t``."""
+"""[bytes] Size of a semaphore: more than any C library's ``sem_t``."""
 _C_FUNCTIONS = ("sem_wait", "clock_gettime", "sem_post", "sched_yield")
-"""Functions of the C library that native code calls, by their addresses."""
+"""Functions of the C library that native code calls by their addresses."""
 
 _COMMON = """
     typedef void (*Kernel)(void*, void*);
@@ -122,9 +122,9 @@ _COMMON = """
 """
 )
 def lead(address: wp.uint64, jobs: wp.uint64, count: int, threads: int, post: wp.uint64, yield_: wp.uint64):
-    """Do jobs one after the other, each with the other threads if it has two chunks or more.
+    """Do jobs one after the other. A job of two chunks or more is shared with the other threads.
 
-    jobs: for each its address, and that of the number of its entries, which is read when the job begins.
+    jobs: for each job its address, and the address of its number of entries, which is read when the job begins.
     """
     ...
 
@@ -174,7 +174,7 @@ def lead_threads(
     jobs: wp.uint64,
     count: int,
 ):
-    """One thread in all: the one that launches."""
+    """One thread in all: the thread that launches."""
     lead(address, jobs, count, threads, post, yield_address)
 
 
@@ -189,15 +189,20 @@ def follow_thread(
     # in
     address: wp.uint64,
 ):
-    """One thread in all: each of the others."""
+    """One thread in all: each of the other threads."""
     follow(address, thread, poll_time, clock, wait, get_time)
 
 
 class LaunchPool:
-    """Threads that share launches with the caller; see the module."""
+    """Threads that share the launches of kernels with the caller.
+
+    The module's docstring describes how they wait and share.
+    """
 
     def __init__(self, size: int) -> None:
-        """``size``: how many work at once, the caller of a launch included; it works alone where it has one core."""
+        """``size``: number of threads that work at once, including the caller of a launch, which works alone on one
+        core.
+        """
         self._cores = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else set(range(usable_cores()))
         size = size if len(self._cores) > 1 else 1
         self._semaphores = [ctypes.create_string_buffer(_SEMAPHORE_SIZE) for _ in range(size)]
@@ -218,7 +223,7 @@ class LaunchPool:
         self._threads: list[threading.Thread] = []
         self._current_core = getattr(library, "sched_getcpu", lambda: -1) if can_sleep else lambda: -1
         self._core = -1
-        """Of the caller when it woke the others last."""
+        """Core on which the caller ran when it last woke the others."""
         for i in range(1, self.size):
             self._memory[self._states[i] + 1] = ctypes.addressof(self._semaphores[i])
             given = [i, POLL_TIME, time.CLOCK_MONOTONIC, *self._calls[:2], self._address]
@@ -227,10 +232,11 @@ class LaunchPool:
             self._threads[-1].start()
 
     def share(self, launches: Sequence[BoundLaunch], chunk: int) -> BoundLaunch:
-        """A launch that the threads share in chunks of so many entries of its list.
+        """Returns a launch that the threads share in chunks of ``chunk`` entries of its list.
 
-        All ``launches`` have the same list and are bound with :attr:`size` partitions; a chunk goes through one after
-        the other. Fewer than two chunks are launched here, and so are launches that native code cannot make.
+        All ``launches`` have the same list and are bound with :attr:`size` partitions; a chunk goes through one launch
+        after the other. The caller alone makes launches of fewer than two chunks, and launches that native code cannot
+        make.
         """
         if self.size == 1 and len(launches) == 1:
             return launches[0]
@@ -255,10 +261,10 @@ class LaunchPool:
         return bound(launch, job=job)
 
     def sequence(self, launches: Sequence[tuple[BoundLaunch, ctypes.c_int32]]) -> Callable[[], None]:
-        """A function that makes ``launches`` one after the other, in one call of native code.
+        """Returns a function that makes ``launches`` one after the other, in one call of native code.
 
-        With each comes the memory of its number of threads, which is read when the launch begins: kernels before it may
-        write it. Launches with :meth:`share` are shared.
+        Each launch comes with the memory of its number of threads. The number is read when the launch begins, so
+        earlier kernels may write it. Launches made by :meth:`share` are shared.
         """
         jobs = [(_job([launch], _ALL) if launch.job is None else launch.job, count) for launch, count in launches]
         native = [(job, count) for job, count in jobs if job is not None]
@@ -278,7 +284,7 @@ class LaunchPool:
         return launch
 
     def _bind(self, jobs: Sequence[tuple[ctypes.Array, ctypes.c_int32]]) -> BoundLaunch:
-        """One launch for jobs, each with the memory of its number of entries."""
+        """Returns one launch for jobs, each with the memory of its number of entries."""
         addresses = [(ctypes.addressof(job), ctypes.addressof(count)) for job, count in jobs]
         listed = (ctypes.c_int64 * (2 * len(jobs)))(*itertools.chain.from_iterable(addresses))
         given = [self.size, *self._calls[2:], self._address, wp.uint64(ctypes.addressof(listed)), len(jobs)]
@@ -287,10 +293,11 @@ class LaunchPool:
         return run
 
     def wake(self) -> None:
-        """Wake the threads that sleep, for a launch that comes soon; on other cores than the caller's.
+        """Wake the sleeping threads for a launch that comes soon, on other cores than the caller's.
 
         Where a virtual machine does not tell that its cores share a cache, Linux wakes a thread on the core on which it
-        ran last, even if the caller is there now and others are free: the caller would wait for as long as it polls.
+        ran last, even if the caller runs there now and other cores are free. The caller would then
+        wait for that thread for as long as it polls.
         """
         if self.size > 1 and (core := self._current_core()) != self._core:
             self._core = core
@@ -305,7 +312,7 @@ class LaunchPool:
 
     @property
     def sleeping(self) -> int:
-        """Threads that sleep now."""
+        """Number of threads that sleep now."""
         return sum(self._memory[state] == _ASLEEP for state in self._states[1 : self.size])
 
     def close(self) -> None:

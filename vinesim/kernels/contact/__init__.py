@@ -1,7 +1,7 @@
 """Contacts of plants with rigid bodies and with each other: broadphase, narrowphase, islands, friction-cone solver.
 
-The stages in their order, a module each: ``broadphase``, ``narrowphase_rigid`` and ``narrowphase_plants``, ``islands``,
+Each stage is a module. In their order: ``broadphase``, ``narrowphase_rigid`` and ``narrowphase_plants``, ``islands``,
 ``jacobians``, ``row_response``, ``delassus``, ``projected_gauss_seidel`` with the steps of ``newton`` on an
-``island_system``, ``forces``. ``structs`` groups their arrays, ``distance`` and ``body_motion`` hold the geometry. Modules
-named ``tree_`` and ``row_solver`` do the same for batches of trees. All solvers call ``friction_law``.
+``island_system``, ``forces``. ``structs`` groups their arrays; ``distance`` and ``body_motion`` hold the geometry. The
+modules named ``tree_`` and ``row_solver`` do the same work for batches of trees. All solvers call ``friction_law``.
 """

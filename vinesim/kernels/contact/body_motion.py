@@ -1,4 +1,4 @@
-"""Motion of bodies within one step: velocities of material points, and where they are when the step ends."""
+"""Motion of bodies within one step: velocities of material points, and their positions at the end of the step."""
 
 import warp as wp
 
@@ -26,7 +26,7 @@ def velocity_at(pose: wp.transform, velocity: wp.spatial_vector, point: wp.vec3d
 
 @wp.func
 def rotate_by_small_angle(angle: wp.vec3d, rotation: wp.mat33d):
-    """A rotation turned by a small angle [rad], to second order."""
+    """Returns a rotation turned by a small angle [rad], to second order."""
     columns = wp.transpose(rotation)
     x = columns[0] + wp.cross(angle, columns[0] + wp.float64(0.5) * wp.cross(angle, columns[0]))
     y = columns[1] + wp.cross(angle, columns[1] + wp.float64(0.5) * wp.cross(angle, columns[1]))
@@ -38,7 +38,7 @@ def rotate_by_small_angle(angle: wp.vec3d, rotation: wp.mat33d):
 def extrapolate_point(
     dt: float, pose: wp.transform, velocity: wp.spatial_vector, acceleration: wp.spatial_vector, point: wp.vec3
 ):
-    """Where a material point of a body is after a step of ``dt`` [s], to second order in dt."""
+    """Returns the position of a body's material point after a step of ``dt`` [s], to second order in dt."""
     arm = point - wp.transform_get_translation(pose)
     omega = wp.spatial_bottom(velocity)
     linear = wp.spatial_top(velocity) + wp.cross(omega, arm)
@@ -57,10 +57,10 @@ def velocity_product_acceleration(
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
 ):
-    """Acceleration (linear, angular) of a body while all joints between it and its root turn at constant rates.
+    """Returns a body's acceleration (linear, angular) while all joints between it and its root turn at constant rates.
 
-    ``known``: a body whose acceleration is known, -1 for none; if it carries this one, only the joints between are looked
-    at. Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
+    ``known``: a body whose acceleration is known, -1 for none. If it carries this body, only the joints between the two
+    are visited. Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
     """
     origin = wp.transform_get_translation(body_q[body])
     linear = wp.vec3()
@@ -95,7 +95,7 @@ def velocity_product_acceleration(
 
 @wp.func
 def was_cut_off(body: int, body_parent: wp.array(dtype=wp.int32), body_cut: wp.array(dtype=wp.bool)):
-    """Whether a joint between a body and the root of its tree was cut."""
+    """Returns whether a joint between a body and the root of its tree was cut."""
     is_off = bool(False)
     k = int(body)
     while k >= 0 and not is_off:

@@ -1,7 +1,7 @@
-"""Broadphase: boxes around geoms, actors, capsules and trees, swept over the step, and the trees that actors are near.
+"""Broadphase: boxes around geoms, actors, capsules and trees, swept over the step, and the trees near actors.
 
-All boxes are axis-aligned. They are grown by how far their content can move in the step, so a sleeping tree wakes before
-anything reaches it.
+All boxes are axis-aligned. They are grown by the distance that their content can move in the step, so that a sleeping
+tree wakes before anything reaches it.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(1.0e30)
-"""[m] Corners of an empty box."""
+"""[m] Coordinates of the corners of an empty box."""
 
 
 DISJOINT = """
@@ -39,13 +39,13 @@ DISJOINT = """
 #endif
     };
 """
-"""Native code: whether two boxes have nothing in common. With a branch for each axis most of the time of a CPU goes into
-wrong predictions."""
+"""Native code that tests whether two boxes are disjoint. It has no branches: with a branch for each axis, a CPU would
+spend most of the time on wrong predictions."""
 
 
 @wp.func_native(DISJOINT + "return disjoint(a_low, a_high, b_low, b_high);")
 def aabbs_disjoint(a_low: wp.vec3, a_high: wp.vec3, b_low: wp.vec3, b_high: wp.vec3) -> bool:
-    """Whether two boxes have nothing in common."""
+    """Returns whether two boxes are disjoint."""
     ...
 
 
@@ -59,7 +59,7 @@ def aabbs_disjoint(a_low: wp.vec3, a_high: wp.vec3, b_low: wp.vec3, b_high: wp.v
 def next_overlap(
     first: int, end: int, low: wp.vec3, high: wp.vec3, lows: wp.array(dtype=wp.vec3), highs: wp.array(dtype=wp.vec3)
 ) -> int:
-    """The first of the boxes from ``first`` on that has something in common with a box; ``end`` if none has."""
+    """Returns the first box, from ``first`` on, that overlaps a given box; ``end`` if none does."""
     ...
 
 
@@ -71,7 +71,9 @@ def exists_at_level(level: int, is_fine: bool):
 
 @wp.func
 def is_collidable(level: int, is_fine: bool, bunch: int, bunch_attached: wp.array(dtype=wp.bool)):
-    """Whether a capsule collides: it exists, and if it belongs to a bunch, that is not picked."""
+    """Returns whether a capsule collides: it exists at the present level of detail, and its bunch, if any, is not
+    picked.
+    """
     collides = exists_at_level(level, is_fine)
     if collides and bunch >= 0:
         collides = bunch_attached[bunch]
@@ -88,7 +90,7 @@ def geom_aabbs(
     # out
     states_out: GeomStates,
 ):
-    """One thread per geom: motion of its centre, and its box, grown by how far it can come in the step."""
+    """One thread per geom. Compute the motion of its centre, and its box, grown by its possible motion in the step."""
     g = wp.tid()
     rotation = rigid.xmat[geoms.id[g]]
     center = rigid.xpos[geoms.id[g]] + rotation * geoms.center[g]
@@ -138,7 +140,7 @@ def geom_aabbs(
 
 @wp.func
 def sweep_capsule(s: int, dt: float, capsules: Capsules, bodies: PlantBodies):
-    """Ends of a capsule in the world, a bound of its speed [m/s], and the corners of its box, grown by its motion."""
+    """Returns a capsule's ends in the world, an upper bound of its speed [m/s], and the corners of its swept box."""
     body = capsules.body[s]
     pose = bodies.q[body]
     velocity = bodies.qd[body]
@@ -167,7 +169,7 @@ def tree_aabbs(
     wood_boxes_out: Aabbs,
     tree_boxes_out: Aabbs,
 ):
-    """One thread per tree: capsules in the world, their boxes, that of the tree, and that of its wood.
+    """One thread per tree. Compute its capsules in the world, their boxes, and the boxes of the tree and of its wood.
 
     Thread i takes the tree ``trees.awake[order[i]]``.
     """
@@ -207,9 +209,10 @@ def take_free_velocities(
     # out
     rigid_out: RigidBodies,
 ):
-    """One thread per degree of freedom: its free velocity in the coming step, and by how much plants changed the last.
+    """One thread per degree of freedom. Copy its free velocity of the coming step, and compute the last correction.
 
-    qvel, qacc: [dof] MuJoCo's; what sleeps has an old acceleration, and no velocity.
+    The correction is the amount by which plants changed the velocity in the last step. qvel, qacc: [dof] MuJoCo's
+    arrays. A sleeping body has an outdated acceleration, and no velocity.
     """
     dof = wp.tid()
     rigid_out.correction_before[dof] = rigid_out.correction[dof]
@@ -231,9 +234,10 @@ def actor_aabbs(
     # out
     actor_boxes_out: Aabbs,
 ):
-    """One thread per actor: the box around it; an empty one for a box or a free bunch that MuJoCo has put to sleep.
+    """One thread per actor. Compute the box around it. It is empty for boxes and free bunches that MuJoCo has put to
+    sleep.
 
-    MuJoCo puts none to sleep on which plants press.
+    MuJoCo puts no body to sleep that plants press on.
     """
     actor = wp.tid()
     first = actors.start[actor]
@@ -255,7 +259,7 @@ def block_aabbs(
     # out
     block_boxes_out: Aabbs,
 ):
-    """One thread per block of 32 boxes: the box around them. Thread i takes the block ``blocks[i]``."""
+    """One thread per block of 32 boxes. Compute the box around them. Thread i takes the block ``blocks[i]``."""
     block = blocks[wp.tid()]
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
@@ -270,7 +274,7 @@ def block_aabbs(
 def overlaps_capsule(
     low: wp.vec3, high: wp.vec3, tree: int, capsules: Capsules, trees: Trees, capsule_states: CapsuleStates
 ):
-    """Whether a box overlaps that of one of the capsules of a tree."""
+    """Returns whether a box overlaps the box of one of a tree's capsules."""
     overlaps = bool(False)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
         if not aabbs_disjoint(low, high, capsule_states.low[s], capsule_states.high[s]):
@@ -296,10 +300,11 @@ def mark_near_trees(
     is_near_out: wp.array(dtype=wp.bool),
     counters_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per block: mark those of its trees, and no others, whose box a geom of an actor overlaps.
+    """One thread per block. Mark the trees of the block whose box a geom of an actor overlaps, and unmark its other
+    trees.
 
-    Boxes and free bunches must overlap the box of a capsule: one that lies on a canopy for hours keeps few trees awake.
-    A remote actor counts at remote trees only. capsule_states: of the last step of each tree.
+    Boxes and free bunches must overlap the box of a capsule: a box that lies on a canopy for hours keeps few trees
+    awake. A remote actor counts at remote trees only. capsule_states: from the last step of each tree.
     """
     block = wp.tid()
     for tree in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, tree_boxes.low.shape[0])):
@@ -335,7 +340,10 @@ def list_near_geoms(
     static_blocks: Aabbs,
     near_geoms_out: wp.array2d(dtype=wp.int32),
 ):
-    """List the geoms whose boxes overlap that of a tree, at most ``most`` static ones; returns the number of all."""
+    """List the geoms whose boxes overlap a tree's box, at most ``most`` static geoms of them.
+
+    Returns the number of overlapping geoms, including those that were not listed.
+    """
     count = int(0)
     movable = geoms.count[0]
     g = next_overlap(0, movable, low, high, geom_states.low, geom_states.high)

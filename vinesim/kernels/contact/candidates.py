@@ -1,4 +1,4 @@
-"""One contact as the narrowphase finds it, and what both narrowphases do with it."""
+"""One contact as the narrowphase finds it, and the functions that both narrowphases use for it."""
 
 import warp as wp
 
@@ -25,15 +25,16 @@ class Candidate:
 
 @wp.func
 def is_smooth(normal: wp.vec3d, end_normal: wp.vec3d):
-    """Whether a contact keeps its side of the other shape in the step."""
+    """Returns whether a contact stays on the same side of the other shape in the step."""
     return wp.dot(normal, end_normal) > MIN_NORMAL_COSINE
 
 
 @wp.func
 def curvature_gap(distance: wp.float64, end_distance: wp.float64, approach: wp.float64, motion: wp.float64):
-    """Change of distance [m] in a step that constant velocity does not explain, at most the relative ``motion`` [m].
+    """Returns the change of distance [m] in a step that constant velocity does not explain.
 
-    ``approach`` [m]: change of distance at constant velocity; negative if the two come together.
+    It is at most the relative ``motion`` [m]. ``approach`` [m]: change of distance at constant velocity; negative if
+    the two come together.
     """
     return wp.clamp(end_distance - distance - approach, -motion, motion)
 

@@ -17,10 +17,11 @@ wp.set_module_options({"enable_backward": False})
 def follow_conjugate_direction(
     island: int, first: int, last: int, gradient_before: wp.float64, islands: Islands, system_out: IslandSystem
 ):
-    """Go on in the conjugate direction after a sweep; returns the square of the gradient [N^2 s^2].
+    """Continue in the conjugate direction after a sweep. Returns the square of the gradient [N^2 s^2].
 
-    ``first``, ``last``: rows of the island. ``gradient_before``: that of the sweep before; 0 after none. A gradient that
-    grows begins the search anew. The next sweep projects the impulses back into their friction cones.
+    ``first``, ``last``: rows of the island. ``gradient_before``: return value after the previous sweep; 0 for the
+    first. If the gradient grows, the search starts again. The next sweep projects the impulses back into their friction
+    cones.
     """
     zero = wp.float64(0.0)
     gradient = wp.float64(0.0)

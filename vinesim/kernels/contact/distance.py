@@ -1,9 +1,9 @@
 """Distances: from points and segments to MuJoCo's primitives, and between two segments.
 
-A plant's capsule is a segment with a radius (a sphere when both ends agree); a rigid geom is one of MuJoCo's primitives.
-:func:`primitive_distance` gives distance and direction from a point to a primitive. Planes, spheres and capsules are
-closest to a segment where a formula says. Along a segment the distance from any primitive is convex, so of the others a
-bisection of its slope finds where they are closest.
+A plant's capsule is a segment with a radius (a sphere when both ends agree). A rigid geom is one of MuJoCo's
+primitives. :func:`primitive_distance` gives distance and direction from a point to a primitive. For planes, spheres and
+capsules, a formula gives the closest point of a segment. For other primitives a bisection of the slope of the distance
+finds it, since the distance from any of them is convex along a segment.
 """
 
 import warp as wp
@@ -22,13 +22,13 @@ MESH = wp.constant(7)
 MIN_COPLANAR_COSINE = wp.constant(wp.float64(0.999))
 """[1] Least cosine between the normals at both ends of the part of a segment that lies along one face. TUNED."""
 MIN_SLANT = wp.constant(wp.float64(1.0e-6))
-"""[1] A segment whose square of the sine to a cylinder's axis is smaller runs along its side."""
+"""[1] A segment runs along a cylinder's side if the squared sine of its angle to the axis is smaller than this."""
 SLOPE_BISECTIONS = wp.constant(30)
 """Halvings of the segment in the search for its closest point: to 1e-9 of its length."""
 ELLIPSOID_NEWTON_STEPS = wp.constant(12)
 """Newton steps to the closest point of an ellipsoid: to 1e-9 m wherever the point is."""
 FACE_BISECTIONS = wp.constant(12)
-"""Halvings in the search for the ends of what lies along a face: to 1/4096 of the segment's length."""
+"""Halvings in the search for the ends of the part along a face: to 1/4096 of the segment's length."""
 
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
@@ -189,7 +189,7 @@ def closest_to_axis(a: wp.vec3d, along: wp.vec3d):
 
 @wp.func
 def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """:func:`closest_on_segment` of any kind of primitive; of the side of a cylinder by a formula."""
+    """Returns :func:`closest_on_segment` for any kind of primitive. A formula serves for the side of a cylinder."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     half = wp.float64(0.5)
@@ -286,7 +286,7 @@ def segment_primitive_distance(
 def is_outside_box(half: wp.vec3d, a: wp.vec3d, b: wp.vec3d, reach: wp.float64):
     """Whether the segment a b is farther than ``reach`` [m] beyond one side of a box, in the box's frame.
 
-    ``half`` [m]: half edges. What the box contains is no nearer.
+    ``half`` [m]: half edges. Everything that the box contains is at least as far away.
     """
     outside = bool(False)
     for i in range(3):

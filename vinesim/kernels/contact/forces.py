@@ -28,9 +28,9 @@ def store_contact(
     contacts_out: Contacts,
     warm_start_out: WarmStart,
 ):
-    """Write the impulse of contact ``c`` as a force on the plant, and what the next step starts from.
+    """Write the impulse of contact ``c`` as a force on the plant, and the warm start of the next step.
 
-    slip_u, slip_v: [m/s] velocities along its tangents with all impulses.
+    slip_u, slip_v: [m/s] velocities along the contact's tangents with all impulses.
     """
     n = 3 * c
     axes = contacts_out.axes[c]
@@ -38,7 +38,7 @@ def store_contact(
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
     impulse = wp.vec3d(impulses[n], impulses[n + 1], impulses[n + 2])
     contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
-    # the stretch with which spring and damper give just this friction: a contact that slides drags its anchor along
+    # the stretch at which spring and damper give exactly this friction: a sliding contact drags its anchor along
     surface = contacts_out.surface[c]
     force_u = impulse[1] / parameters.dt + surface.damping * slip_u
     force_v = impulse[2] / parameters.dt + surface.damping * slip_v
@@ -68,7 +68,7 @@ def store_warm_start(
     contacts_out: Contacts,
     warm_start_out: WarmStart,
 ):
-    """One thread per contact: its impulse as a force on the plant, and what the next step starts from."""
+    """One thread per contact. Write its impulse as a force on the plant, and the warm start of the next step."""
     c = items[wp.tid()]
     velocity = three(3 * c, rows.velocity_free) + contact_velocity(
         contacts_out.place[c], contacts_out.block[c], contacts_out.island[c], islands, rows.delassus, system
@@ -85,7 +85,10 @@ def count_unfinished(
     # out
     counters_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all: the islands whose solve took ``most_sweeps``, so that it may not be within its tolerance."""
+    """One thread in all.
+
+    Count the islands whose solve took ``most_sweeps``, so that it may be outside its tolerance.
+    """
     unfinished = int(0)
     for island in range(counters_out[ISLANDS]):
         if islands.sweeps[island] >= most_sweeps:
@@ -104,7 +107,7 @@ def accumulate_wrenches(
     # out
     wrench_out: wp.array2d(dtype=wp.float64),
 ):
-    """One thread in all: the sum of the wrenches [N, N m] of all contacts on each plant body in contact."""
+    """One thread in all. Sum the wrenches [N, N m] of all contacts on each plant body in contact."""
     for body in range(counters[BODIES]):
         for k in range(6):
             wrench_out[body, k] = wp.float64(0.0)

@@ -1,4 +1,4 @@
-"""The law of a contact: a normal impulse that pushes only, Coulomb friction inside of a cone, and what solvers need of it.
+"""The contact law, and the functions that solvers need for it: compressive normal impulse, Coulomb friction cone.
 
 All solvers of contacts with plants call these functions, on a CPU and on a GPU: islands (``projected_gauss_seidel``,
 ``newton``), trees of batches (``tree_solver``), and the same with rows in the registers of a GPU (``row_solver``).
@@ -14,46 +14,49 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 SLIDING_SHARE = wp.constant(wp.float64(0.999999))
-"""[1] A contact slides if its friction is at least this share of the largest one."""
+"""[1] A contact slides if its friction is at least this share of the largest possible friction."""
 
 MIN_IMPULSE_SCALE = wp.constant(wp.float64(1.0e-5))
-"""[N s] The largest impulse counts as at least this when convergence is judged. TUNED: 1 mN over 10 ms."""
+"""[N s] Lower bound of the impulse to which changes are compared when convergence is judged. TUNED: 1 mN over 10 ms."""
 
 
 @wp.struct
 class Surface:
-    """What the two materials in contact make of it. A new number of theirs needs a field here, and nothing else on its way
-    from :mod:`vinesim.scene.materials` to this law."""
+    """Contact properties of a pair of materials.
+
+    A new property needs a field here, and no other change between :mod:`vinesim.scene.materials` and this law.
+    """
 
     friction: wp.float64
     """[1] Coulomb coefficient."""
     stiffness: wp.float64
-    """[N/m] normal, and as the anchor of friction tangential."""
+    """[N/m] Normal stiffness; also the tangential stiffness of the friction anchor."""
     damping: wp.float64
     """[N s/m]"""
     compliance: wp.float64
-    """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), on the diagonal of the Delassus matrix."""
+    """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), added to the diagonal of the Delassus matrix."""
 
 
 @wp.struct
 class Steps:
-    """How far a step of Gauss-Seidel goes."""
+    """Step sizes of a contact's Gauss-Seidel step."""
 
     normal: wp.float64
-    """[kg] by which a velocity along the normal becomes an impulse."""
+    """[kg] Factor from a residual velocity along the normal to a change of impulse."""
     tangential: wp.float64
-    """[kg] the same along the tangents."""
+    """[kg] Factor from a residual velocity along the tangents to a change of impulse."""
     dragged_u: wp.float64
-    """[1/kg] velocity along the first tangent by an impulse along the normal."""
+    """[1/kg] Velocity along the first tangent by a unit impulse along the normal."""
     dragged_v: wp.float64
-    """[1/kg] the same along the second."""
+    """[1/kg] Velocity along the second tangent by a unit impulse along the normal."""
 
 
 @wp.func
 def steps_of(own: wp.mat33d):
-    """The steps of a contact whose impulses cause velocities ``own`` [1/kg] along its rows, compliance included.
+    """Returns the step sizes of a contact whose impulses cause velocities ``own`` [1/kg] along its rows.
 
-    With the larger eigenvalue of the tangential block a step of friction stays inside of the cone's convergence.
+    ``own`` includes the compliance. The step of friction uses the larger eigenvalue of the tangential block, so that
+    the iteration converges.
     """
     one = wp.float64(1.0)
     mean = wp.float64(0.5) * (own[1, 1] + own[2, 2])
@@ -64,19 +67,21 @@ def steps_of(own: wp.mat33d):
 
 @wp.func
 def presses(x: wp.vec3d):
-    """Whether a contact is closed: else it is open."""
+    """Returns whether a contact is closed (its normal impulse is positive)."""
     return x[0] > wp.float64(0.0)
 
 
 @wp.func
 def slides(x: wp.vec3d, surface: Surface):
-    """Whether the friction of a contact that presses is at its limit: else it sticks."""
+    """Returns whether the friction of a closed contact is at its limit; otherwise the contact sticks."""
     return wp.sqrt(x[1] * x[1] + x[2] * x[2]) >= surface.friction * x[0] * SLIDING_SHARE
 
 
 @wp.func
 def project_into_cone(x: wp.vec3d, surface: Surface):
-    """The impulse with friction of the same direction and of its limit at most, and with none that pulls."""
+    """Returns the impulse inside the friction cone: same direction of friction, limited size, no tensile normal
+    impulse.
+    """
     normal = wp.max(x[0], wp.float64(0.0))
     tangential = wp.sqrt(x[1] * x[1] + x[2] * x[2])
     limit = surface.friction * normal
@@ -88,7 +93,7 @@ def project_into_cone(x: wp.vec3d, surface: Surface):
 
 @wp.func
 def relaxed(x: wp.vec3d, residual: wp.vec3d, steps: Steps, surface: Surface):
-    """The impulse after a Gauss-Seidel step of a contact, normal and then friction."""
+    """Returns the impulse after a Gauss-Seidel step of a contact: first its normal impulse, then its friction."""
     zero = wp.float64(0.0)
     normal = wp.max(zero, x[0] - residual[0] * steps.normal)
     if normal == zero:
@@ -101,7 +106,7 @@ def relaxed(x: wp.vec3d, residual: wp.vec3d, steps: Steps, surface: Surface):
 
 @wp.func
 def size_of_change(change: wp.vec3d):
-    """[N s] How far an impulse has changed, when convergence is judged."""
+    """Returns the size [N s] of a change of impulse that is used to judge convergence."""
     return wp.max(wp.abs(change[0]), wp.abs(change[1]) + wp.abs(change[2]))
 
 

@@ -13,9 +13,9 @@ from vinesim.kernels.contact.structs import Hulls
 wp.set_module_options({"enable_backward": False})
 
 PLANE_STEPS = wp.constant(64)
-"""Bound of the steps to the deepest place of a segment; each takes another plane, so some five do."""
+"""Largest number of steps to the deepest place of a segment. Each step takes another plane, so about five suffice."""
 HULL_TOLERANCE = wp.constant(wp.float64(1.0e-7))
-"""[m] A point that is this far beyond a face's border still is above the face: rounding of a mesh's vertices."""
+"""[m] A point this far beyond a face's border still counts as above the face, as vertices of a mesh are rounded."""
 
 
 @wp.func
@@ -26,7 +26,7 @@ def plane_gap(plane: wp.vec4d, p: wp.vec3d):
 
 @wp.func
 def outermost_plane(hulls: Hulls, hull: int, p: wp.vec3d):
-    """The plane of a hull that a point is farthest outside of."""
+    """Returns the plane of a hull with the largest signed distance to a point."""
     best = hulls.first_plane[hull]
     most = plane_gap(hulls.plane[best], p)
     for k in range(best + 1, hulls.first_plane[hull + 1]):
@@ -39,7 +39,7 @@ def outermost_plane(hulls: Hulls, hull: int, p: wp.vec3d):
 
 @wp.func
 def is_above_face(hulls: Hulls, hull: int, face: int, p: wp.vec3d):
-    """Whether the foot of a point on the plane of a face lies on the hull."""
+    """Returns whether the foot of a point on the plane of a face lies on the hull."""
     plane = hulls.plane[face]
     foot = p - plane_gap(plane, p) * wp.vec3d(plane[0], plane[1], plane[2])
     inside = bool(True)
@@ -128,7 +128,7 @@ def segment_hull_distance(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, rea
 
 @wp.func
 def clip(ends: wp.vec2d, gap_a: wp.float64, gap_b: wp.float64):
-    """The part (0 to 1) of an interval where a linear function with these values at 0 and 1 is not above 0."""
+    """Returns the part (0 to 1) of an interval where a linear function with these values at 0 and 1 is not above 0."""
     change = gap_b - gap_a
     low = ends[0]
     high = ends[1]
@@ -143,9 +143,10 @@ def clip(ends: wp.vec2d, gap_a: wp.float64, gap_b: wp.float64):
 
 @wp.func
 def interval_along_hull(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, closest: vec5d, tolerance: wp.float64):
-    """Both ends (0 to 1) of the part of a segment along a face or an edge of a hull, the same if it crosses that.
+    """Returns both ends (0 to 1) of the part of a segment along a face or an edge of a hull; equal if it crosses that.
 
-    ``closest``: of :func:`segment_hull_distance`; ``tolerance`` [m]: how much farther than there the ends may be.
+    ``closest``: result of :func:`segment_hull_distance`. ``tolerance`` [m]: how much farther from the hull than the
+    closest point the ends may be.
     """
     t = closest[4]
     along = b - a

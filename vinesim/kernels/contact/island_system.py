@@ -1,12 +1,13 @@
-"""The contacts of an island as its solver works on them: a dense system, gathered once a solve.
+"""The contacts of an island as a dense system, which is gathered once for each solve.
 
-v = free + B x + J_r w: B x is what impulses do to plants, by a matrix for each block of contacts that plants couple;
-w = G x, with G = H^-1 J_r^T, are the changes of the velocities of rigid bodies, which couple the blocks. Here these have
-columns for the degrees of freedom of the island alone, and what does not change from sweep to sweep is computed once.
+v = free + B x + J_r w. B x is the change of the plants' velocities by the impulses; B has a matrix for each block of
+contacts that plants couple. w = G x, with G = H^-1 J_r^T, are the changes of the velocities of rigid bodies, which
+couple the blocks. J_r and G have columns for the degrees of freedom of this island only, and values that do not change
+from sweep to sweep are computed once.
 
-Contacts come in the order of the list of islands, so that a block is a stretch of memory. Its rows are filled up with
-zeros to a multiple of eight, so that native loops take eight at a time and have no rest. No product is fused: the results
-do not depend on how wide the vectors of a CPU are.
+Contacts are in the order of the list of islands, so that a block is contiguous in memory. Its rows are padded with
+zeros to a multiple of eight, so that native loops take eight at a time without a remainder. No multiply-add is fused:
+the results do not depend on the vector width of a CPU.
 """
 
 import warp as wp
@@ -17,43 +18,48 @@ from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Rows
 wp.set_module_options({"enable_backward": False})
 
 EIGHT = "typedef double Eight __attribute__((vector_size(64), aligned(8)));"
-"""Native code: eight numbers that are computed at once; wider than the vectors of most CPUs, which then take two or four."""
+"""Native code: a vector of eight numbers. CPUs with narrower vectors compute it in two or four parts."""
 
 
 @wp.struct
 class IslandSystem:
-    """What the solver of an island works with, by place in the list of islands, or by row of its padded blocks."""
+    """Data of the solver for all islands, by place in the list of islands or by row of the padded blocks."""
 
     surface: wp.array(dtype=Surface)
-    """[place]"""
+    """[place] Contact properties of the pair of materials."""
     steps: wp.array(dtype=Steps)
-    """[place]"""
+    """[place] Step sizes of the contact's Gauss-Seidel step."""
     free: wp.array(dtype=wp.float64)
-    """[row] m/s without impulses, bias included."""
+    """[row] Velocity without impulses, bias included, m/s."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] N s"""
+    """[row] Impulse, N s."""
     impulse_first: wp.array(dtype=wp.float64)
-    """[row] N s before the first Newton step."""
+    """[row] Impulse before the first Newton step, N s."""
     impulse_before: wp.array(dtype=wp.float64)
-    """[row] N s before the last sweep."""
+    """[row] Impulse before the last sweep, N s."""
     direction: wp.array(dtype=wp.float64)
-    """[row] N s, direction of search."""
+    """[row] Search direction, N s."""
     jacobian: wp.array(dtype=wp.vec3d)
-    """[entry] J_r of each contact in turn, its three rows by degrees of freedom of the island."""
+    """[entry] J_r, contact by contact: its three rows for each degree of freedom of the island."""
     response: wp.array(dtype=wp.vec3d)
-    """[entry] G^T, in the same way."""
+    """[entry] G^T, in the order of ``jacobian``."""
     velocity: wp.array(dtype=wp.float64)
-    """[place of dof] w: by which the impulses change the velocities of rigid bodies."""
+    """[place of dof] w: change of the velocities of rigid bodies by the impulses."""
     rigid_force: wp.array(dtype=wp.float64)
-    """[dof of MuJoCo] N or N m, generalised force of all contacts on rigid bodies; 0 where there is none."""
+    """[dof of MuJoCo] Generalised force of all contacts on rigid bodies, N or N m; 0 for bodies without contact."""
     pressed: wp.array(dtype=wp.int32)
-    """[place] contacts of each block that press, by their numbers in the block, from its first place on."""
+    """[place] Closed contacts of each block, by their index in the block, stored from the block's first place on."""
     matrix: wp.array(dtype=wp.float64)
-    """[entry] the linear system of a Newton step, of one block of an island after the other; right-hand sides first."""
+    """[entry] Linear systems of a Newton step, for one block of an island after the other.
+
+    Right-hand sides come first.
+    """
     solution: wp.array(dtype=wp.vec3d)
-    """[entry] its solution of each contact in turn: impulses for w = 0, and their change with each entry of w."""
+    """[entry] Solutions of these systems, contact by contact: impulses for w = 0, then their change with each entry of
+    w.
+    """
     rigid_matrix: wp.array2d(dtype=wp.float64)
-    """[place of dof, 1 + dof of the island] what is left of it for w, right-hand side first."""
+    """[place of dof, 1 + dof of the island] System for w that remains after elimination; right-hand side first."""
 
 
 @wp.func_native(
@@ -75,8 +81,10 @@ class IslandSystem:
 def block_velocity(
     matrix: wp.array(dtype=wp.float64), at: int, pitch: int, impulse: wp.array(dtype=wp.float64), row: int
 ) -> wp.vec3d:
-    """Velocities [m/s] along three rows, whose matrix entries begin at ``at``, by the impulses of their block, which begin
-    at ``row``."""
+    """Returns the velocities [m/s] along three rows by the impulses of their block.
+
+    The matrix entries of the rows begin at ``at``, the impulses at ``row``.
+    """
     ...
 
 
@@ -92,7 +100,7 @@ def add_rigid_velocity(
     first: int,
     count: int,
 ) -> wp.vec3d:
-    """Add the velocities [m/s] along three rows by those of ``count`` degrees of freedom."""
+    """Returns ``value`` plus the velocities [m/s] along three rows by those of ``count`` degrees of freedom."""
     ...
 
 
@@ -113,13 +121,13 @@ def push_rigid_bodies(
 
 @wp.func
 def three(row: int, values: wp.array(dtype=wp.float64)):
-    """Three numbers from ``row`` on."""
+    """Returns three consecutive numbers, the first at ``row``."""
     return wp.vec3d(values[row], values[row + 1], values[row + 2])
 
 
 @wp.func
 def set_three(row: int, value: wp.vec3d, values_out: wp.array(dtype=wp.float64)):
-    """Set three numbers from ``row`` on."""
+    """Write three consecutive numbers, the first at ``row``."""
     values_out[row] = value[0]
     values_out[row + 1] = value[1]
     values_out[row + 2] = value[2]
@@ -127,31 +135,31 @@ def set_three(row: int, value: wp.vec3d, values_out: wp.array(dtype=wp.float64))
 
 @wp.func
 def block_pitch(block: int, islands: Islands):
-    """Rows of a block, those that fill it up included: the pitch of its matrix."""
+    """Returns the number of rows of a block, padding included. This is the pitch of its matrix."""
     return islands.row_start[block + 1] - islands.row_start[block]
 
 
 @wp.func
 def contact_row(place: int, block: int, islands: Islands):
-    """First of the three rows of a contact."""
+    """Returns the first of the three rows of a contact."""
     return islands.row_start[block] + 3 * (place - islands.block_start[block])
 
 
 @wp.func
 def island_dofs(island: int, islands: Islands):
-    """Degrees of freedom of the rigid bodies of an island."""
+    """Returns the number of degrees of freedom of the rigid bodies in an island."""
     return islands.first_dof[island + 1] - islands.first_dof[island]
 
 
 @wp.func
 def rigid_entry(place: int, island: int, islands: Islands):
-    """Where the rigid Jacobian of a contact begins."""
+    """Returns the first entry of a contact's rigid Jacobian."""
     return islands.rigid_start[island] + (place - islands.start[island]) * island_dofs(island, islands)
 
 
 @wp.func
 def solution_entry(place: int, island: int, islands: Islands):
-    """Where the solution of a contact begins, a column longer than its rigid Jacobian."""
+    """Returns the first entry of a contact's solution, which is a column longer than its rigid Jacobian."""
     return rigid_entry(place, island, islands) + place
 
 
@@ -159,7 +167,7 @@ def solution_entry(place: int, island: int, islands: Islands):
 def contact_velocity(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system: IslandSystem
 ):
-    """Velocities [m/s] along the rows of a contact by all impulses of its island."""
+    """Returns the velocities [m/s] along the rows of a contact by all impulses of its island."""
     pitch = block_pitch(block, islands)
     k = 3 * (place - islands.block_start[block])
     start = islands.row_start[block]
@@ -178,7 +186,10 @@ def contact_velocity(
 def contact_residual(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system: IslandSystem
 ):
-    """The same with velocity without impulses, bias and compliance: what is 0 along rows that press or stick."""
+    """Returns the residual velocities [m/s] along the rows of a contact. They are 0 along rows that press or stick.
+
+    The residual is the velocity by all impulses plus the velocity without impulses, the bias and the compliance term.
+    """
     row = contact_row(place, block, islands)
     value = three(row, system.free) + system.surface[place].compliance * three(row, system.impulse)
     return value + contact_velocity(place, block, island, islands, matrix, system)
@@ -195,7 +206,7 @@ def gather_rigid_rows(
     rows: Rows,
     system_out: IslandSystem,
 ):
-    """Gather J_r and G^T of a contact: zeros, unless its other side is a rigid body that moves."""
+    """Gather J_r and G^T of a contact. They are zero unless its other side is a rigid body that moves."""
     moves = bool(False)
     if contacts.other[c] >= 0:
         moves = geoms.dof[contacts.other[c]] >= 0
@@ -222,7 +233,10 @@ def gather_contact(
     rows: Rows,
     system_out: IslandSystem,
 ):
-    """Gather the numbers of a contact, and compute what it does to itself; its rigid rows must be there."""
+    """Gather the values of a contact and compute its response to its own impulses.
+
+    Its rigid rows must be gathered before.
+    """
     k = 3 * (place - islands.block_start[block])
     row = islands.row_start[block] + k
     pitch = block_pitch(block, islands)
@@ -244,7 +258,7 @@ def gather_contact(
 
 @wp.func
 def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSystem):
-    """Compute the velocities of the rigid bodies of an island anew from all its impulses."""
+    """Compute the velocities of the rigid bodies of an island again, from all its impulses."""
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)
     for k in range(dofs):
@@ -267,7 +281,7 @@ def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSyste
 def gather_island(
     island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows, system_out: IslandSystem
 ):
-    """Gather all contacts of an island, from the impulses in ``rows`` on."""
+    """Gather all contacts of an island, starting from the impulses in ``rows``."""
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
             c = islands.contact[place]
@@ -292,13 +306,13 @@ def add_rigid_force(
     count: int,
     force: wp.array(dtype=wp.float64),
 ):
-    """Add what impulses [N s] along three rows exert on ``count`` degrees of freedom, listed from ``first`` on."""
+    """Add the force of impulses [N s] along three rows on ``count`` degrees of freedom, listed from ``first`` on."""
     ...
 
 
 @wp.func
 def scatter_impulses(island: int, dt: wp.float64, islands: Islands, system_out: IslandSystem, rows_out: Rows):
-    """Write the impulses of an island back to the rows of its contacts, and the force that rigid bodies feel of them."""
+    """Write the impulses of an island back to the rows of its contacts, and their force on rigid bodies."""
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)
     for k in range(dofs):

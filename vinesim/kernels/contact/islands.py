@@ -33,7 +33,7 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 MOST_SIDES = wp.constant(10)
-"""Sides of contacts in a group: thirty rows fill thirty-two columns."""
+"""Number of contact sides in a group: their thirty rows fill thirty-two columns."""
 
 
 @wp.kernel
@@ -44,7 +44,10 @@ def compact_candidates(
     contacts_out: Contacts,
     counters_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all: list the candidates of all trees; what exceeds the capacity is only counted."""
+    """One thread in all.
+
+    List the candidates of all trees. Candidates beyond the capacity are counted but not listed.
+    """
     slots = candidates.feature.shape[1]
     count = int(0)
     overflow = int(0)
@@ -71,7 +74,7 @@ def compact_candidates(
 
 @wp.func
 def island_root(label: wp.array(dtype=wp.int32), contact: int):
-    """The first contact of the island that a contact is in so far."""
+    """Returns the first contact of the island to which a contact belongs so far."""
     root = int(contact)
     while label[root] != root:
         root = label[root]
@@ -80,7 +83,7 @@ def island_root(label: wp.array(dtype=wp.int32), contact: int):
 
 @wp.func
 def rigid_island(other: int, geoms: Geoms, rigid: RigidBodies):
-    """Label of the rigid bodies that feel a force on one of them; -1 for another plant or a static geom."""
+    """Returns the label of the rigid bodies that a force on ``other`` moves; -1 for another plant or a static geom."""
     label = int(-1)
     if other >= 0 and geoms.dof[wp.max(other, 0)] >= 0:
         label = rigid.tree_island[rigid.dof_tree[geoms.dof[other]]]
@@ -89,7 +92,10 @@ def rigid_island(other: int, geoms: Geoms, rigid: RigidBodies):
 
 @wp.func
 def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
-    """Insert a body (none if negative) into a sorted list of ``count``, each once; returns their number."""
+    """Insert a body into a sorted list of ``count`` bodies without duplicates. A negative body is not inserted.
+
+    Returns the new number of bodies.
+    """
     length = count
     if body < 0:
         return length
@@ -106,7 +112,7 @@ def insert_sorted(body: int, count: int, bodies_out: wp.array(dtype=wp.int32)):
 
 @wp.func
 def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
-    """Place of a body in a sorted list of ``count`` that contains it."""
+    """Returns the position of a body in a sorted list of ``count`` bodies that contains it."""
     low = int(0)
     high = int(count) - 1
     while low < high:
@@ -135,7 +141,7 @@ def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
 
 @wp.func
 def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int, label_out: wp.array(dtype=wp.int32)):
-    """Join contact ``c`` with the island of the last contact that was linked at this place, and note it there."""
+    """Join contact ``c`` with the island of the contact that was linked last at ``place``, and store ``c`` there."""
     if last_contact_out[place] >= 0:
         one = island_root(label_out, c)
         two = island_root(label_out, last_contact_out[place])
@@ -145,14 +151,14 @@ def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int
 
 @wp.func
 def flatten_labels(contact_count: int, label_out: wp.array(dtype=wp.int32)):
-    """Let every contact's label be the first contact of its set."""
+    """Set every contact's label to the first contact of its set."""
     for c in range(contact_count):
         label_out[c] = island_root(label_out, c)
 
 
 @wp.func
 def is_listed_before(a: int, b: int, islands: Islands):
-    """Whether contact a comes before contact b in the list: by islands, then by blocks."""
+    """Returns whether contact a comes before contact b in the list, which is sorted by island and then by block."""
     before = islands.label[a] < islands.label[b]
     if islands.label[a] == islands.label[b]:
         before = islands.block_label[a] < islands.block_label[b]
@@ -161,7 +167,7 @@ def is_listed_before(a: int, b: int, islands: Islands):
 
 @wp.func
 def list_contacts(contact_count: int, islands_out: Islands):
-    """List all contacts by islands and blocks. Contacts come by trees, so few move far."""
+    """List all contacts by island and block. Contacts arrive sorted by tree, so few move far."""
     for c in range(contact_count):
         at = int(c)
         while at > 0 and is_listed_before(c, islands_out.contact[wp.max(at - 1, 0)], islands_out):
@@ -174,7 +180,7 @@ def list_contacts(contact_count: int, islands_out: Islands):
 def number_sets(
     contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
 ):
-    """Number islands and blocks in the order of the list."""
+    """Number the islands and blocks in the order of the list."""
     islands = int(-1)
     blocks = int(-1)
     for place in range(contact_count):
@@ -199,7 +205,7 @@ def number_sets(
 
 @wp.func
 def island_of_dof(dof: int, rigid: RigidBodies, contacts: Contacts, islands: Islands):
-    """Island of a degree of freedom; -1 if it has no contact."""
+    """Returns the island of a degree of freedom; -1 if it has no contact."""
     contact = islands.rigid_last_contact[rigid.tree_island[rigid.dof_tree[dof]]]
     island = int(-1)
     if contact >= 0:
@@ -226,20 +232,20 @@ def list_dofs(island_count: int, rigid: RigidBodies, contacts: Contacts, islands
         if island >= 0:
             islands_out.dof[islands_out.first_dof[island]] = dof
             islands_out.first_dof[island] = islands_out.first_dof[island] + 1
-    for k in range(island_count):  # each first place was moved to the next one's
+    for k in range(island_count):  # each start index has moved to the start of the next island
         islands_out.first_dof[island_count - k] = islands_out.first_dof[island_count - k - 1]
     islands_out.first_dof[0] = 0
 
 
 @wp.func
 def padded(size: int):
-    """The multiple of eight that so many numbers fit in."""
+    """Returns ``size`` rounded up to a multiple of eight."""
     return (size + 7) / 8 * 8
 
 
 @wp.func
 def list_side(slot: int, side: int, touched: TouchedBodies, groups_out: SideGroups):
-    """List a side of a contact with those of its tree; none if it has no ``slot``."""
+    """List a side of a contact together with the other sides on its tree. A side without a ``slot`` is not listed."""
     if slot >= 0:
         tree = touched.tree_start[slot]
         groups_out.side[groups_out.listed[tree]] = side
@@ -254,7 +260,7 @@ def group_sides(
     islands: Islands,
     groups_out: SideGroups,
 ):
-    """List the sides of all contacts by trees, part those of each tree into groups, and place the responses to them."""
+    """List the sides of all contacts by tree, divide the sides of each tree into groups, and place their responses."""
     for slot in range(counters_out[BODIES]):
         groups_out.listed[slot] = 0
     for c in range(counters_out[CONTACTS]):
@@ -294,7 +300,7 @@ def group_sides(
 
 @wp.func
 def place_systems(counters_out: wp.array(dtype=wp.int32), islands_out: Islands):
-    """Place what the solver needs for each block and each island one after the other."""
+    """Assign memory to the solver's data for each block and each island, one after the other."""
     rows = int(0)
     entries = int(0)
     for block in range(counters_out[BLOCKS]):
@@ -334,7 +340,7 @@ def build_islands(
     islands_out: Islands,
     groups_out: SideGroups,
 ):
-    """One thread in all: number the plant bodies in contact, sorted, each once; part the contacts into islands."""
+    """One thread in all. List the plant bodies in contact, sorted, each once, and divide the contacts into islands."""
     contact_count = counters_out[CONTACTS]
     slots = candidates.feature.shape[1]
     body_count = int(0)

@@ -1,4 +1,4 @@
-"""Jacobians of the contacts, the velocities along them without contacts, their bias, and the guess of the impulses.
+"""Contact Jacobians, velocities along the rows without contacts, bias velocities, and initial guesses of the impulses.
 
 A contact has three rows: normal n (from the other side to the plant) and two tangents. In each direction there is an
 implicit spring and damper. Along the tangents the spring's stretch is the *anchor*: it remembers where a sticking contact
@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def first_tangent(n: wp.vec3d):
-    """A unit vector across n, the same for the same n."""
+    """Returns a unit vector perpendicular to n. It depends on n only."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     other = wp.vec3d(zero, one, zero)
@@ -69,7 +69,7 @@ def write_rigid_rows(
 
 @wp.func
 def with_wire(surface: Surface, wire_stiffness: wp.float64, parameters: Parameters):
-    """The surface of a contact with the spring of a wire [N/m] behind its own."""
+    """Returns the surface of a contact, with the spring of a wire [N/m] in series with its own."""
     one = wp.float64(1.0)
     surface.stiffness = one / (one / surface.stiffness + one / wire_stiffness)
     surface.damping = parameters.wire_damping_time * surface.stiffness
@@ -81,10 +81,10 @@ def with_wire(surface: Surface, wire_stiffness: wp.float64, parameters: Paramete
 def write_bias(
     c: int, parameters: Parameters, end_gap: wp.float64, contacts: Contacts, warm_start: WarmStart, rows_out: Rows
 ):
-    """Write bias velocities and the guess of the impulses of one contact.
+    """Write the bias velocities and the initial guess of the impulses of one contact.
 
-    The spring of an open gap does not push yet: the gap only must not close further within the step. That of a wire may
-    push what presses on it back as fast as it likes.
+    The spring of an open gap does not push yet: it only keeps the gap from closing further within the step. A wire's
+    spring may push a body back at any speed.
     """
     feature = contacts.feature[c]
     other = contacts.other[c]
@@ -102,7 +102,7 @@ def write_bias(
     count = warm_start.count[0]
     middle = wp.min(c, count - 1)
     looked = int(0)
-    while looked < 2 * count:  # a contact that lasts is near the same place in the list, before or behind it
+    while looked < 2 * count:  # a lasting contact is near the same place in the list, before or after it
         step = (looked + 1) // 2
         k = middle + wp.where(looked % 2 == 1, step, -step)
         looked = looked + 1
@@ -131,7 +131,7 @@ def write_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """Write the three rows of contact ``c``, found as the candidate in a slot of a row of trees."""
+    """Write the three rows of contact ``c``, whose candidate is in a slot of a row of trees."""
     g = contacts_out.other[c]
     n = candidates.normal[tree_row, slot]
     x = candidates.point[tree_row, slot]
@@ -199,8 +199,11 @@ def write_contact_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per contact: its three rows. spans_out: [contact] from which degree of freedom to which its rows of the
-    rigid Jacobian and the rigid response are not 0; others stay as they are."""
+    """One thread per contact. Write its three rows.
+
+    spans_out: [contact] range of degrees of freedom in which its rows of the rigid Jacobian and of the rigid response
+    are not 0. Entries outside of it are not written.
+    """
     c = items[wp.tid()]
     slots = candidates.feature.shape[1]
     span = spans_out[c]
@@ -233,7 +236,7 @@ def write_contact_rows(
 
 @wp.func
 def row_vector(row: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
-    """Three entries of a row, in single precision."""
+    """Returns three entries of a row, in single precision."""
     return wp.vec3(
         wp.float32(jacobian[row, column]), wp.float32(jacobian[row, column + 1]), wp.float32(jacobian[row, column + 2])
     )
@@ -241,7 +244,7 @@ def row_vector(row: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
 
 @wp.func
 def row_columns(c: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
-    """Three entries, from ``column`` on, of each of the three rows of a contact, one row a column."""
+    """Returns three entries, from ``column`` on, of each of the three rows of a contact, one row a column."""
     return wp.matrix_from_cols(
         row_vector(3 * c, column, jacobian),
         row_vector(3 * c + 1, column, jacobian),

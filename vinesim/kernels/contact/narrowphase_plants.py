@@ -1,6 +1,7 @@
-"""Narrowphase of plants among themselves: bunches against the wood of their tree and other bunches, tree against tree.
+"""Narrowphase of plants among themselves: bunches against wood and other bunches of their tree, and tree against tree.
 
-Two capsules that overlap while all plants rest as generated, or are that near, are in contact only from there on.
+Two capsules that overlap while all plants rest as generated, or that are nearly in contact then, are in contact only
+where they come closer than that.
 """
 
 import warp as wp
@@ -26,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def are_adjacent(x: int, y: int, parent: wp.array(dtype=wp.int32)):
-    """Whether two bodies are the same, or at most two joints apart."""
+    """Returns whether two bodies are the same or at most two joints apart."""
     adjacent = x == y
     if x >= 0 and y >= 0:
         x_parent = parent[x]
@@ -49,7 +50,9 @@ def distance_after_step(
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
 ):
-    """:func:`segment_segment_distance` of two capsules' axes at the end of the step if both move on as they do."""
+    """Returns :func:`segment_segment_distance` of two capsules' axes at the end of the step, at their present
+    velocities.
+    """
     none = wp.spatial_vector()
     acceleration = velocity_product_acceleration(body, -1, none, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
     other_acceleration = velocity_product_acceleration(
@@ -81,7 +84,7 @@ def plant_candidate(
     capsules: Capsules,
     capsule_states: CapsuleStates,
 ):
-    """The contact of capsules ``s`` and ``t``, whose axes are ``nearest`` as :func:`segment_segment_distance` says."""
+    """Returns the contact of capsules ``s`` and ``t``. ``nearest``: result of :func:`segment_segment_distance`."""
     zero = wp.float64(0.0)
     half = wp.float64(0.5)
     dt = parameters.dt
@@ -124,14 +127,16 @@ def plant_candidate(
 
 @wp.func
 def may_touch_own_tree(s: int, tree: int, low: wp.vec3, high: wp.vec3, capsules: Capsules, wood_boxes: Aabbs):
-    """Whether a capsule, of which this is the box, may touch another of its tree: bunches touch wood, and later bunches."""
+    """Returns whether a capsule with this box may touch another of its tree: bunches touch wood, and bunches listed
+    later.
+    """
     clear = aabbs_disjoint(low, high, wood_boxes.low[tree], wood_boxes.high[tree])
     return capsules.bunch[s] >= 0 and (not clear or capsules.bunch[s] < capsules.tree_last_bunch[tree])
 
 
 @wp.func
 def may_touch(s: int, t: int, capsules: Capsules, bodies: PlantBodies):
-    """Whether two capsules of one tree collide: of two bunches each pair is looked at once."""
+    """Returns whether two capsules of one tree collide. Each pair of bunches is considered once."""
     pair = not are_adjacent(capsules.body[s], capsules.body[t], bodies.parent)
     if capsules.bunch[t] >= 0:
         pair = pair and capsules.bunch[t] > capsules.bunch[s]
@@ -142,7 +147,7 @@ def may_touch(s: int, t: int, capsules: Capsules, bodies: PlantBodies):
 def touching_candidate(
     s: int, t: int, parameters: Parameters, bodies: PlantBodies, capsules: Capsules, capsule_states: CapsuleStates
 ):
-    """The contact of two capsules whose boxes overlap, if they are near enough."""
+    """Returns the contact of two capsules whose boxes overlap, if they are near enough."""
     nearest = segment_segment_distance(
         to_double(capsule_states.start[s]),
         to_double(capsule_states.end[s]),
@@ -174,9 +179,9 @@ def find_plant_contacts(
     # out
     candidates_out: Candidates,
 ):
-    """One thread per awake tree: its contacts with itself and with the trees behind it in the order of their boxes.
+    """One thread per awake tree. Find its contacts with itself and with the trees after it in the order of their boxes.
 
-    Thread i takes the place ``order[i]`` in that order: the row ``sorted_rows[order[i]]`` of the candidates.
+    Thread i takes position ``order[i]`` in that order: the row ``sorted_rows[order[i]]`` of the candidates.
     """
     place = order[wp.tid()]
     row = sorted_rows[place]

@@ -1,9 +1,10 @@
-"""Narrowphase of plants and rigid geoms: where a tree's capsules touch them, or may touch them before the step ends.
+"""Narrowphase of plants and rigid geoms: where a tree's capsules touch geoms, or may touch them before the step ends.
 
-Two shapes that overlap while all plants rest as generated, or are that near, are in contact only from there on. What was
-cut off may overlap less by as much as it has moved since: what grew about a wire does not fall through it. A deflected wire
-is in contact with what it would press on where it was drawn. A bunch
-that overlaps a tree when it is picked passes through that tree until it is clear of it.
+Two shapes that overlap while all plants rest as generated, or that are nearly in contact then, are in contact only
+where they come closer than that. For a piece that was cut off, this allowed overlap shrinks by the distance that the
+piece has moved since: a shoot that grew around a wire does not fall through it. A deflected wire is in contact with
+what it would press on in its undeflected position. A bunch that overlaps a tree when it is picked passes through that
+tree until it is clear of it.
 """
 
 import warp as wp
@@ -46,21 +47,23 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(wp.float64(1.0e30))
-"""[m] Reach of a search without end."""
+"""[m] Reach of an unlimited search."""
 
 
 @wp.struct
 class Pair:
-    """A capsule and a geom that are nearer than they can come together in the step."""
+    """A capsule and a geom whose distance is smaller than the distance by which they can approach in the step."""
 
     capsule: int
     body: int
-    """plant body."""
+    """Plant body of the capsule."""
     geom: int
     ends: int
-    """2 if a part of the capsule lies along a face of the geom: a contact at each end of it; else 1."""
+    """Number of contacts of the pair: 2, one at each end, if a part of the capsule lies along a face of the geom; else
+    1.
+    """
     rotation: wp.mat33d
-    """of the geom."""
+    """Rotation of the geom."""
 
 
 @wp.func
@@ -75,10 +78,11 @@ def segment_geom_distance(
     b: wp.vec3d,
     reach: wp.float64,
 ):
-    """World normal (0 to 2) and distance (3) [m] from a geom to the segment a b, and where on it (4, 0 to 1).
+    """Returns the world normal (0 to 2) and distance (3) [m] from a geom to the segment a b, and where on it (4, 0 to
+    1).
 
-    Beyond ``reach`` [m] the distance from a hull is a lower bound. ``is_round``, here and below: all geoms are known to be
-    planes, spheres and capsules, for which far less is compiled.
+    Beyond ``reach`` [m] the distance from a hull is a lower bound. ``is_round``, here and below: all geoms are known to
+    be planes, spheres and capsules, so that far less code is compiled.
     """
     found = vec5d()
     if not is_round and geoms.kind[g] == MESH:
@@ -111,11 +115,12 @@ def follow_contact(
     hulls: Hulls,
     geom_states: GeomStates,
 ):
-    """The candidate with normal, point and gap of the whole step: both sides go on as they move now.
+    """Returns the candidate with normal, point and gap of the whole step if both sides keep their present velocities.
 
-    Two ends along a face are followed each for itself; for a single contact the closest points are found anew at the end
-    of the step. ``approach`` [m]: change of distance at constant velocity; ``relative`` [m/s]: ``velocity`` of the
-    capsule at the contact less that of the geom; ``acceleration`` of the body, see :func:`velocity_product_acceleration`.
+    The two ends of a part along a face are followed separately. For a single contact, the closest points are found
+    again at the end of the step. ``approach`` [m]: change of distance at constant velocity. ``relative`` [m/s]:
+    ``velocity`` of the capsule at the contact minus that of the geom. ``acceleration``: of the body, see
+    :func:`velocity_product_acceleration`.
     """
     s = pair.capsule
     body = pair.body
@@ -172,7 +177,10 @@ def rigid_candidate(
     hulls: Hulls,
     geom_states: GeomStates,
 ):
-    """The contact of a pair at ``t`` (0 to 1) on the capsule; ``nearest``: see :func:`segment_primitive_distance`."""
+    """Returns the contact of a pair at ``t`` (0 to 1) on the capsule.
+
+    ``nearest``: see :func:`segment_primitive_distance`.
+    """
     s = pair.capsule
     body = pair.body
     g = pair.geom
@@ -247,7 +255,9 @@ def contact_ends(
     b: wp.vec3d,
     nearest: vec5d,
 ):
-    """Ends (0 to 1) of the part of the segment a b that lies along a face of a geom; the same one twice if none does."""
+    """Returns the ends (0 to 1) of the part of the segment a b along a face of a geom; twice the same if none lies
+    along it.
+    """
     ends = wp.vec2d(nearest[4], nearest[4])
     to_local = wp.transpose(rotation)
     local_a = to_local * (a - center)
@@ -265,8 +275,10 @@ def contact_ends(
 
 @wp.func
 def is_tied(capsule: int, geom: int, capsules: Capsules, is_cut: wp.array(dtype=wp.bool)):
-    """Whether a tie holds a capsule, or a neighbour that it was not cut off, at a geom, by MuJoCo's number: then they
-    do not collide."""
+    """Returns whether a tie prevents collisions of a capsule with a geom, given by its MuJoCo index.
+
+    The tie holds the capsule's body, or a neighbour from which that body was not cut off.
+    """
     tied = bool(False)
     for k in range(capsules.tied_geom.shape[1]):
         if capsules.tied_geom[capsule, k] == geom:
@@ -280,7 +292,7 @@ def is_tied(capsule: int, geom: int, capsules: Capsules, is_cut: wp.array(dtype=
 
 @wp.func
 def clear_slots(row: int, count: int, candidates_out: Candidates):
-    """Mark the slots of a row beyond its candidates as empty."""
+    """Mark the unused slots of a row as empty."""
     slots = candidates_out.feature.shape[1]
     for k in range(wp.min(count, slots), slots):
         candidates_out.feature[row, k] = -1
@@ -305,10 +317,11 @@ def add_pairs(
     geom_states: GeomStates,
     candidates_out: Candidates,
 ):
-    """Add the contacts of pairs of a capsule and a geom, whose boxes overlap, to a row that has ``count`` so far.
+    """Add the contacts of pairs of a capsule and a geom, whose boxes overlap, to a row that already has ``count``
+    contacts.
 
-    Pairs are listed ``pitch`` apart from ``first`` on, by capsules. Returns the number of contacts, and whether one is an
-    impact. One call takes all pairs of a tree, since it copies all structs.
+    The pairs are listed ``pitch`` apart, from ``first`` on, sorted by capsule. Returns the number of contacts, and
+    whether one of them is an impact. One call handles all pairs of a tree, because every call copies all structs.
     """
     is_impact = bool(False)
     total = int(count)
@@ -328,7 +341,7 @@ def add_pairs(
         rotation = rigid.xmat[geoms.id[g]]
         near = wp.dot(between, between) < limit * limit
         if near and not is_round and geoms.kind[g] != PLANE:
-            to_local = wp.transpose(rotation)  # far cheaper than the distance, and decides half of all pairs
+            to_local = wp.transpose(rotation)  # the box test is cheap, and decides half of all pairs
             near = not is_outside_box(geoms.half[g], to_local * (a - center), to_local * (b - center), radius + margin)
         if near:
             nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
@@ -386,7 +399,10 @@ def overlaps_bunch(
     near_geoms: wp.array2d(dtype=wp.int32),
     bunch_of_geom: wp.array(dtype=wp.int32),
 ):
-    """Whether a capsule of a tree overlaps a free bunch; ``near_geoms`` [row, near_count]: those to be looked at."""
+    """Returns whether a capsule of a tree overlaps a free bunch.
+
+    ``near_geoms`` [row, near_count]: the geoms to test.
+    """
     overlaps = bool(False)
     for k in range(near_count):
         g = near_geoms[row, k]
@@ -412,7 +428,7 @@ def overlaps_bunch(
 
 @wp.func
 def is_passing(tree: int, bunch: int, by_tree: wp.array2d(dtype=wp.int32)):
-    """Whether a free bunch (-1: no bunch) passes through a tree."""
+    """Returns whether a free bunch (-1: no bunch) passes through a tree."""
     passing = bool(False)
     if bunch >= 0:
         for k in range(by_tree.shape[1]):
@@ -441,10 +457,10 @@ def find_rigid_contacts(
     passing_out: PassingBunches,
     candidates_out: Candidates,
 ):
-    """One thread per awake tree: its contacts with rigid geoms, in the order of (capsule, geom, end).
+    """One thread per awake tree. Find its contacts with rigid geoms, in the order of (capsule, geom, end).
 
     Thread i takes the tree ``trees.awake[order[i]]`` and writes the row ``order[i]`` of the candidates. Bunches that
-    passed through the tree and are clear of it now do so no longer.
+    passed through the tree and are now clear of it no longer pass through it.
     """
     row = order[wp.tid()]
     tree = trees.awake[row]

@@ -1,9 +1,9 @@
 """Active-set Newton step on the contacts of one island, from the impulses that projected Gauss-Seidel has reached.
 
-Which contacts are open, stick or slide is taken as it is, and the direction in which they slide is linearised: then the
-conditions are a linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid
-bodies. Each block is eliminated by itself; what is left is a system as large as the degrees of freedom of the rigid
-bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
+The step assumes that open, sticking and sliding contacts keep their state, and linearises the direction of sliding. The
+conditions are then a linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid
+bodies. Each block is eliminated by itself. The system that remains is as large as the number of degrees of freedom of
+the rigid bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
 """
 
 import warp as wp
@@ -47,8 +47,10 @@ def gather_row(
     target: int,
     pitch: int,
 ):
-    """Copy the entries of ``count`` contacts, listed from ``start`` on, of a row of a block that begins at ``source``;
-    zeros up to ``pitch``."""
+    """Copy the entries of ``count`` listed contacts from a row of a block, and pad with zeros up to ``pitch``.
+
+    The contacts are listed from ``start`` on; the row of the block begins at ``source``.
+    """
     ...
 
 
@@ -66,7 +68,7 @@ def gather_row(
 """
 )
 def combine_rows(system: wp.array(dtype=wp.float64), at: int, pitch: int, factor: wp.mat22d):
-    """Replace the row that begins at ``at`` and the next by combinations of both, ``factor`` times them."""
+    """Replace two rows, the first of which begins at ``at``, by ``factor`` times them."""
     ...
 
 
@@ -83,10 +85,10 @@ def linearise_friction(
     matrix: wp.array(dtype=wp.float64),
     system_out: IslandSystem,
 ):
-    """Make the friction rows of a sliding contact, which begin at ``at``, of those of a sticking one.
+    """Turn the friction rows at ``at``, written for a sticking contact, into those of a sliding contact.
 
-    x_t - K (x_t - step r_t) - g x_n = 0, see :func:`vinesim.kernels.contact.friction_law.linearise_sliding`. ``number``:
-    of the contact among those that press; ``right``: entries of right-hand sides.
+    x_t - K (x_t - step r_t) - g x_n = 0, see :func:`vinesim.kernels.contact.friction_law.linearise_sliding`.
+    ``number``: index of the contact among the closed contacts. ``right``: number of entries of right-hand sides.
     """
     one = wp.float64(1.0)
     x = three(contact_row(place, block, islands), system_out.impulse)
@@ -106,7 +108,7 @@ def linearise_friction(
 
 @wp.func
 def list_pressed(block: int, islands: Islands, system_out: IslandSystem):
-    """List the contacts of a block that press; returns their number."""
+    """List the closed contacts of a block. Returns their number."""
     start = islands.block_start[block]
     count = int(0)
     for k in range(islands.block_start[block + 1] - start):
@@ -127,10 +129,10 @@ def write_block(
     matrix: wp.array(dtype=wp.float64),
     system_out: IslandSystem,
 ):
-    """Write the linear system of the ``count`` contacts of a block that press: right-hand sides for w = 0 and for each
-    entry of w, then its matrix.
+    """Write the linear system of the ``count`` closed contacts of a block.
 
-    Sticking rows: (B + compliance) x = -free - J_r w. Friction of sliding contacts: see :func:`linearise_friction`.
+    Right-hand sides come first, for w = 0 and for each entry of w, then the matrix. Sticking rows:
+    (B + compliance) x = -free - J_r w. Friction of sliding contacts: see :func:`linearise_friction`.
     """
     start = islands.block_start[block]
     source_pitch = block_pitch(block, islands)
@@ -206,14 +208,17 @@ def write_block(
 """
 )
 def eliminate(system: wp.array(dtype=wp.float64), at: int, size: int, right: int, pitch: int):
-    """Gaussian elimination of ``size`` rows that begin at ``at``, by contacts; solutions replace the first ``right``
-    entries of each row. Without pivoting: B is positive definite, and sliding rows change that little."""
+    """Gaussian elimination, by contacts, of ``size`` rows that begin at ``at``.
+
+    Solutions replace the first ``right`` entries of each row. No pivoting is needed: B is positive definite, and
+    sliding rows change it little.
+    """
     ...
 
 
 @wp.func
 def keep_solution(block: int, island: int, count: int, pitch: int, islands: Islands, system_out: IslandSystem):
-    """Keep the solution of a block for all of its contacts: 0 for those that do not press."""
+    """Store the solution of a block for all of its contacts: 0 for contacts that are not closed."""
     start = islands.block_start[block]
     columns = 1 + island_dofs(island, islands)
     p = int(0)
@@ -245,7 +250,7 @@ def subtract_products(
     entry: int,
     count: int,
 ):
-    """Subtract from ``count`` numbers the products of ``response`` with as many vectors."""
+    """Subtract the products of ``response`` with ``count`` vectors from ``count`` numbers."""
     ...
 
 
@@ -253,7 +258,7 @@ def subtract_products(
 def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
     """Solve (1 - G X) w = G y for the rigid velocities, where x = y + X w and G = H^-1 J_r^T; w replaces column 0.
 
-    With partial pivoting: velocities and angular velocities are mixed.
+    With partial pivoting, because velocities and angular velocities are mixed.
     """
     zero = wp.float64(0.0)
     first = islands.first_dof[island]
@@ -302,7 +307,9 @@ def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
 
 @wp.func
 def newton_step(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
-    """Impulses that fit the present states of all contacts of one island, put back into their friction cones."""
+    """Compute the impulses that fit the present states of all contacts of an island, projected into their friction
+    cones.
+    """
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)
     right = padded(1 + dofs)

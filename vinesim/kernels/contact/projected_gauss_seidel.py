@@ -27,14 +27,14 @@ from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 NEWTON_PERIOD = wp.constant(10)
-"""Sweeps between two further Newton steps of an island that the first ones did not settle. TUNED"""
+"""Number of sweeps between further Newton steps of an island that did not converge with the first ones. TUNED"""
 
 
 @wp.func
 def relax_contact(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem
 ):
-    """One Gauss-Seidel step of a contact; returns how far its impulse has changed [N s]."""
+    """One Gauss-Seidel step of a contact. Returns the size of the change of its impulse [N s]."""
     zero = wp.float64(0.0)
     row = contact_row(place, block, islands)
     before = three(row, system_out.impulse)
@@ -56,8 +56,11 @@ def relax_contact(
 
 @wp.func
 def sweep(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
-    """One Gauss-Seidel step of each contact in turn; returns the largest change of an impulse and the largest normal
-    impulse [N s]."""
+    """One Gauss-Seidel step of each contact in turn. Returns the largest change of an impulse and the largest normal
+    impulse.
+
+    Both are in N s.
+    """
     change = wp.float64(0.0)
     largest = wp.float64(MIN_IMPULSE_SCALE)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
@@ -70,7 +73,7 @@ def sweep(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), sys
 
 @wp.func
 def largest_block(island: int, islands: Islands):
-    """Contacts of the largest block of an island."""
+    """Returns the number of contacts in the largest block of an island."""
     largest = int(0)
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         largest = wp.max(largest, islands.block_start[block + 1] - islands.block_start[block])
@@ -81,7 +84,7 @@ def largest_block(island: int, islands: Islands):
     for (int i = first; i < last; ++i) target.data[i] = source.data[i];
 """)
 def copy_rows(first: int, last: int, source: wp.array(dtype=wp.float64), target: wp.array(dtype=wp.float64)):
-    """Copy the numbers of some rows."""
+    """Copy the values of rows ``first`` to ``last``."""
     ...
 
 
@@ -96,12 +99,13 @@ def solve_island(
     matrix: wp.array(dtype=wp.float64),
     system_out: IslandSystem,
 ):
-    """Solve an island from the guess in ``impulse`` on.
+    """Solve an island, starting from the initial guess in ``impulse``.
 
-    Contacts that depend on each other (two fingers about a bunch) slow Gauss-Seidel down: within a few sweeps it finds
-    which contacts stick, slide or open, and takes a hundred for the rest. So islands of small blocks take a Newton step
-    after every sweep, at first. If these do not settle, sweeps go on from where they began, with conjugate
-    gradients, as they do from the first one on in islands with a large block.
+    Contacts that depend on each other (two fingers around a bunch) slow Gauss-Seidel down: within a few sweeps it finds
+    which contacts stick, slide or open, but it takes a hundred for the rest. So islands of small blocks at first take a
+    Newton step after every sweep. If these steps do not converge, sweeps continue from the impulses before the first
+    Newton step, with conjugate gradients. In islands with a large block, conjugate gradients are used from the first
+    sweep on.
     """
     first = islands_out.row_start[islands_out.first_block[island]]
     last = islands_out.row_start[islands_out.first_block[island + 1]]
@@ -147,7 +151,7 @@ def solve_islands(
     system_out: IslandSystem,
     rows_out: Rows,
 ):
-    """One thread per island: see :func:`solve_island`."""
+    """One thread per island. Solve it; see :func:`solve_island`."""
     island = items[wp.tid()]
     gather_island(island, geoms, contacts, islands_out, rows_out, system_out)
     solve_island(

@@ -1,9 +1,9 @@
 """Response of plants to the rows of contacts: velocities of the bodies in contact by unit impulses along them.
 
-The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3): impulses travel inward along the paths
-to the root, the velocities that they cause travel outward. A contact of two plant bodies has two *sides*, number
-2 * contact and 2 * contact + 1; of one with a rigid geom the second is empty. The sides on one tree travel together, in
-groups of ten: three rows of each are thirty columns, and eight columns are computed at once.
+The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3): impulses travel inward along the
+paths to the root, and the velocities that they cause travel outward. A contact of two plant bodies has two *sides*,
+numbered 2 * contact and 2 * contact + 1; for a contact with a rigid geom the second side is empty. The sides on one
+tree travel together, in groups of ten: three rows of each are thirty columns, and eight columns are computed at once.
 """
 
 import warp as wp
@@ -15,9 +15,9 @@ from vinesim.kernels.plants.structs import ArticulationModel, Factors
 wp.set_module_options({"enable_backward": False})
 
 COLUMNS = wp.constant(32)
-"""Room for the columns of a group in the working memory of a body."""
+"""Number of columns for which a body's working memory has room."""
 BODY_NUMBERS = wp.constant(192)
-"""Working memory of a body: force and moment, then linear and angular velocity, of all columns."""
+"""Number of values in a body's working memory: force and moment, then linear and angular velocity, of all columns."""
 
 
 EIGHT = """
@@ -27,24 +27,24 @@ EIGHT = """
     typedef float Eight __attribute__((vector_size(32), aligned(4)));
 #endif
 """
-"""Native code: eight columns."""
+"""Native code: a vector type for eight columns."""
 
 
 @wp.struct
 class ResponseScratch:
-    """Working memory of one group at a time [row of scratch, body of the tree]."""
+    """Working memory for the groups that are computed at the same time [row of scratch, body of the tree]."""
 
     is_on_path: wp.array(dtype=wp.bool)
-    """whether the body carries another one that is in contact, or is itself."""
+    """Whether the body is in contact or carries a body that is."""
     values: wp.array(dtype=float)
-    """[body, component, column] impulses, then velocities."""
+    """[body, component, column] Impulses, later velocities."""
 
 
 @wp.func_native("""
     for (int i = 0; i < count; ++i) values.data[at + i] = 0.0f;
 """)
 def clear_numbers(values: wp.array(dtype=float), at: int, count: int):
-    """Clear ``count`` numbers from ``at`` on."""
+    """Set ``count`` numbers to zero, from ``at`` on."""
     ...
 
 
@@ -56,7 +56,7 @@ def clear_numbers(values: wp.array(dtype=float), at: int, count: int):
     }
 """)
 def add_side(side: int, number: int, jacobian: wp.array2d(dtype=wp.float64), values: wp.array(dtype=float), at: int):
-    """Add unit impulses along the rows of a side to its body, in the columns of its number in the group."""
+    """Add unit impulses along the rows of a side to its body, in the columns of the side's index in the group."""
     ...
 
 
@@ -100,9 +100,9 @@ def carry_inward(
     lever: wp.vec3,
     root: wp.mat33,
 ):
-    """Carry the impulses at a body to its parent, whose memory begins at ``to``; what its joint takes of them stays.
+    """Carry the impulses at a body to its parent, whose memory begins at ``to``. The joint's share of them stays.
 
-    Without a parent (``to`` < 0) they move it: ``root`` is its inverse mass.
+    Without a parent (``to`` < 0) the impulses move the body; ``root`` is its inverse mass.
     """
     ...
 
@@ -135,7 +135,7 @@ def carry_inward(
 def carry_outward(
     values: wp.array(dtype=float), at: int, from_parent: int, width: int, DJ: wp.mat33, DH: wp.mat33, lever: wp.vec3
 ):
-    """From what a joint takes of impulses, and the velocities of its parent, to those of its body."""
+    """Compute the velocities of a body from its joint's share of the impulses and the velocities of its parent."""
     ...
 
 
@@ -160,14 +160,16 @@ def mark_paths(
     model: ArticulationModel,
     scratch_out: ResponseScratch,
 ):
-    """Mark the touched bodies of a tree, in slots ``start`` to ``end``, and all that carry them; clear their memory."""
+    """Mark the touched bodies of a tree, in slots ``start`` to ``end``, and all bodies that carry them; clear their
+    memory.
+    """
     for k in range(bodies):
         scratch_out.is_on_path[row + k] = False
     for slot in range(start, end):
         body = int(place[touched[slot]])
         while body >= 0:
             at = row + (body - first) / model.pitch
-            known = bool(scratch_out.is_on_path[at])  # as it was before it is written
+            known = bool(scratch_out.is_on_path[at])  # the value before it is overwritten
             if not known:
                 scratch_out.is_on_path[at] = True
                 clear_numbers(scratch_out.values, at * BODY_NUMBERS, BODY_NUMBERS)
@@ -176,7 +178,7 @@ def mark_paths(
 
 @wp.func
 def memory_of(body: int, first: int, row: int, pitch: int):
-    """Where the working memory of a body begins, negative for none."""
+    """Returns where the working memory of a body begins; negative for no body."""
     at = int(-1)
     if body >= 0:
         at = (row + (body - first) / pitch) * BODY_NUMBERS
@@ -203,11 +205,12 @@ def respond_to_groups(
     scratch_out: ResponseScratch,
     response_out: wp.array(dtype=float),
 ):
-    """One thread per group: velocities of the touched bodies of its tree by unit impulses along the rows of its sides.
+    """One thread per group. Compute the velocities of its tree's touched bodies by unit impulses along the sides' rows.
 
-    touched: [slot] bodies in contact, sorted; tree_end: [slot] slot after the last of the same tree. body_slot,
-    other_slot: [contact] of its sides. place: [body] where kernels find it. stride: bodies of the largest tree;
-    scratch_rows: groups that ``scratch_out`` has room for at once.
+    touched: [slot] bodies in contact, sorted. tree_end: [slot] slot after the last slot of the same tree. body_slot,
+    other_slot: [contact] slots of the contact's sides. place: [body] index under which the kernels store the body.
+    stride: number of bodies in the largest tree. scratch_rows: number of groups for which ``scratch_out`` has room at
+    once.
     """
     group = items[wp.tid()]
     start = groups.tree[group]

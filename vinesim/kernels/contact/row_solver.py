@@ -1,11 +1,11 @@
-"""The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU: a thread for each row, and shuffles between them.
+"""The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU, with one thread for each row.
 
-The matrices of trees are small, and their solve is a chain of steps that wait for each other: through memory, even shared
-memory, each of them takes many times what it takes through registers and shuffles. The steps, their order and their
-conditions are those of ``tree_solver``; a Newton step keeps the rows of contacts that do not press as those of an identity.
+The matrices of trees are small, and their solve is a chain of dependent steps. Each step takes many times longer
+through memory, even shared memory, than through registers and shuffles. The steps, their order and their conditions are
+those of ``tree_solver``. A Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
 
-Native code exchanges numbers between the threads of a warp and solves linear systems in registers; it knows nothing of
-contacts. All threads of a warp must call every function that contains native code.
+The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It knows nothing
+of contacts. All threads of a warp must call every function that contains native code.
 """
 
 import warp as wp
@@ -25,18 +25,18 @@ from vinesim.kernels.contact.tree_solver import FIRST_SWEEPS, TreeSystem, slidin
 wp.set_module_options({"enable_backward": False})
 
 MOST_ROWS = wp.constant(30)
-"""Rows of a tree that the threads of a warp solve; fewer threads solve as many rows as they are."""
+"""Largest number of rows of a tree that the threads of a warp solve. Fewer threads solve one row each."""
 
 
 def _on_gpu(code: str, elsewhere: str = "0") -> str:
-    """Native code for a GPU; a CPU compiles what takes its place, but never calls it."""
+    """Returns native code for a GPU. A CPU compiles ``elsewhere`` in its place, but never calls it."""
     about = f"constexpr int ROWS = {int(MOST_ROWS)};\nconstexpr unsigned ALL = 0xffffffffu;"
     return f"#if defined(__CUDA_ARCH__)\n{about}\n{code}\n#else\nreturn {elsewhere};\n#endif\n"
 
 
 @wp.func_native(_on_gpu("return __shfl_sync(ALL, value, source, lanes);"))
 def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
-    """The value of the thread ``source`` among the ``lanes`` of the same tree."""
+    """Returns the value of thread ``source`` among the ``lanes`` threads of the same tree."""
     ...
 
 
@@ -44,19 +44,19 @@ def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
     _on_gpu("return __ballot_sync(ALL, value) >> (threadIdx.x % 32 - lane) & (0xffffffffu >> (32 - lanes));")
 )
 def lanes_where(value: bool, lane: int, lanes: int) -> wp.uint32:
-    """A bit for each thread of the tree: whether its value is true."""
+    """Returns a bit for each thread of the tree: whether its value is true."""
     ...
 
 
 @wp.func_native(_on_gpu("return __any_sync(ALL, value);", "false"))
 def any_of_warp(value: bool) -> bool:
-    """Whether the value of any thread of the warp is true."""
+    """Returns whether the value of any thread of the warp is true."""
     ...
 
 
 @wp.func_native(_on_gpu("return __reduce_max_sync(ALL, value);"))
 def most_of_warp(value: int) -> int:
-    """The largest value of the threads of the warp; the compiler knows that it is the same for all."""
+    """Returns the largest value of the warp's threads. The compiler knows that it is the same for all."""
     ...
 
 
@@ -67,7 +67,7 @@ return value;
 """)
 )
 def sum_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
-    """The sum of the values of the threads of the tree."""
+    """Returns the sum of the values of the tree's threads."""
     ...
 
 
@@ -78,13 +78,13 @@ return value;
 """)
 )
 def largest_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
-    """The largest value of the threads of the tree."""
+    """Returns the largest value of the tree's threads."""
     ...
 
 
 @wp.func
 def of_contact(c: int, value: wp.float64, lanes: int):
-    """The values of the three rows of a contact."""
+    """Returns the values of the three rows of a contact."""
     return wp.vec3d(
         from_lane(value, 3 * c, lanes), from_lane(value, 3 * c + 1, lanes), from_lane(value, 3 * c + 2, lanes)
     )
@@ -92,13 +92,13 @@ def of_contact(c: int, value: wp.float64, lanes: int):
 
 @wp.func
 def component(part: int, of: wp.vec3d):
-    """An entry of a vector, without an index that would move it to memory."""
+    """Returns an entry of a vector, without an index that would move the vector to memory."""
     return wp.where(part == 0, of[0], wp.where(part == 1, of[1], of[2]))
 
 
 @wp.func
 def coupling(j: int, lane: int, size: int, matrix: wp.array2d(dtype=float)):
-    """Entry [1/kg] of the row of a thread, of a symmetric matrix of ``size`` rows; 0 outside of it."""
+    """Returns entry j [1/kg] of a thread's row of a symmetric matrix of ``size`` rows; 0 outside of the matrix."""
     if j < size and lane < size:
         return wp.float64(matrix[j, lane])
     return wp.float64(0.0)
@@ -108,7 +108,9 @@ def coupling(j: int, lane: int, size: int, matrix: wp.array2d(dtype=float)):
 def row_velocity(
     x: wp.float64, outside: wp.float64, lane: int, lanes: int, size: int, most: int, matrix: wp.array2d(dtype=float)
 ):
-    """``outside`` [m/s] and the velocity along the row of a thread by the impulses of all, ``most`` at most."""
+    """Returns ``outside`` [m/s] plus the velocity along a thread's row by the impulses of all rows, at most ``most``
+    rows.
+    """
     v = outside
     for j in range(most):
         v = v + coupling(j, lane, size, matrix) * from_lane(x, j, lanes)
@@ -155,11 +157,11 @@ def solve_combined(
     lanes: int,
     most: int,
 ) -> wp.float64:
-    """Solve a linear system of ``most`` rows at most; returns the entry of this thread.
+    """Solve a linear system of at most ``most`` rows. Returns the entry of this thread.
 
-    Its row is ``own`` times the thread's and ``others`` times that of its partner, in the given columns, with what is added
-    in those of its own contact; ``right`` is its right-hand side. Gauss-Jordan elimination without pivoting: see
-    :func:`vinesim.kernels.contact.tree_solver.solve_newton_system`.
+    The thread's row of the system is ``own`` times its row of the matrix plus ``others`` times its partner's row, in
+    the given columns, plus ``added`` in the columns of its own contact. ``right`` is its right-hand side. Gauss-Jordan
+    elimination without pivoting: see :func:`vinesim.kernels.contact.tree_solver.solve_newton_system`.
     """
     ...
 
@@ -177,7 +179,7 @@ def newton_impulse(
     surface: Surface,
     matrix: wp.array2d(dtype=float),
 ):
-    """The impulse along the row of a thread that fits the present states of all contacts, put back into its cone."""
+    """Returns the impulse along a thread's row that fits the present states of all contacts, projected into its cone."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     c = lane // 3
@@ -220,8 +222,11 @@ def sweep_rows(
     surface: Surface,
     matrix: wp.array2d(dtype=float),
 ):
-    """One sweep; returns impulse and velocity along the row of a thread, how far the impulse of its contact has changed, and
-    the normal one [N s]. Each thread computes for its own contact, and uses it when that one's turn comes."""
+    """One sweep over all contacts.
+
+    Returns the impulse and the velocity along the row of a thread, the size of the change of its contact's impulse, and
+    the normal impulse [N s]. Each thread computes for its own contact, and uses the result at that contact's turn.
+    """
     c = lane // 3
     part = lane % 3
     change = wp.float64(0.0)
@@ -242,8 +247,10 @@ def sweep_rows(
 
 @wp.func
 def further_along(change: wp.float64, direction: wp.float64, gradient: wp.float64, gradient_before: wp.float64):
-    """How much further the impulse of a thread goes in the conjugate direction after a sweep: see
-    :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`."""
+    """Returns how far a thread's impulse moves on in the conjugate direction after a sweep.
+
+    See :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
+    """
     goes = gradient_before > wp.float64(0.0) and gradient <= gradient_before
     return wp.where(goes, gradient / gradient_before * direction, wp.float64(0.0))
 
@@ -258,11 +265,13 @@ def solve_rows(
     tolerance: wp.float64,
     system_out: TreeSystem,
 ):
-    """Solve for the impulses of ``count`` contacts of a tree from its ``lanes`` threads, of which this is number ``lane``;
-    returns the number of sweeps, or -1 where there are more rows than threads: then nothing has happened.
+    """Solve for the impulses of ``count`` contacts of a tree with ``lanes`` threads; this thread has the index
+    ``lane``.
 
-    What the loop assigns under a condition stays in registers from one turn to the next: generated code declares all
-    variables before the loop. So the loop chooses values instead of branching, and computes in functions.
+    Returns the number of sweeps, or -1 if there are more rows than threads; nothing is changed then.
+
+    Variables that the loop assigns under a condition stay in registers from one turn to the next, since generated code
+    declares all variables before the loop. So the loop selects values instead of branching, and computes in functions.
     """
     size = wp.where(3 * count <= wp.min(lanes, MOST_ROWS), 3 * count, 0)
     most = most_of_warp(size)  # all trees of a warp go through the same steps
@@ -312,7 +321,9 @@ def solve_rows(
         largest = largest_of_lanes(wp.max(normal, MIN_IMPULSE_SCALE), lanes)
         sweeps = sweeps + 1
         done = wp.where(busy, sweeps, done)
-        changing = lanes_where(change > tolerance * largest, lane, lanes)  # by all threads, also of trees that are done
+        changing = lanes_where(
+            change > tolerance * largest, lane, lanes
+        )  # all threads call this, also of finished trees
         busy = busy and changing != wp.uint32(0)
     if is_row:
         system_out.impulse[lane] = x

@@ -1,7 +1,7 @@
-"""Sleeping trees that awake ones are about to touch: boxes of blocks, trees and capsules, then the narrowphase.
+"""Sleeping trees that awake trees are about to touch: boxes of blocks, trees and capsules, then the narrowphase.
 
-A capsule that has been compared with all that sleeps around it need not be compared again before it has moved as far
-as it was clear of them: a tree that is awake but hardly moves costs a comparison a capsule.
+A capsule that has been compared with all sleeping trees around it need not be compared again before it has moved as far
+as its clearance. An awake tree that hardly moves therefore costs one comparison for each capsule.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 SEARCH_DISTANCE = wp.constant(0.005)
-"""[m] So far around a capsule sleeping trees are searched. TUNED."""
+"""[m] Distance around a capsule within which sleeping trees are searched. TUNED."""
 
 
 @wp.func
@@ -37,7 +37,10 @@ def list_due_capsules(
     capsule_states: CapsuleStates,
     clearances_out: Clearances,
 ):
-    """Find the capsules of a tree that may touch something before the step ends; returns the box around these."""
+    """Find the capsules of a tree that may touch something before the step ends.
+
+    Returns the box around these capsules.
+    """
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
@@ -72,7 +75,10 @@ def compare_with_sleeping_tree(
     capsule_states: CapsuleStates,
     clearances_out: Clearances,
 ):
-    """Whether the due capsules of a tree will be in contact with another; notes how far they are clear of it."""
+    """Returns whether the due capsules of a tree will be in contact with another tree.
+
+    Stores their clearance from it.
+    """
     reached = bool(False)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):
         reach = clearances_out.reach[s]
@@ -112,10 +118,11 @@ def find_reached_trees(
     clearances_out: Clearances,
     is_reached_out: wp.array(dtype=wp.bool),
 ):
-    """One thread per awake tree: mark the sleeping trees with which it is in contact before the step ends.
+    """One thread per awake tree. Mark the sleeping trees with which it will be in contact before the step ends.
 
-    Thread i takes the tree ``trees.awake[order[i]]``. What overlaps as generated, or is that near, is in contact only
-    beyond that (:func:`plant_candidate`), so that trees that merely stand together do not wake each other.
+    Thread i takes the tree ``trees.awake[order[i]]``. Capsules that overlap as generated, or nearly do, are in contact
+    only where they come closer than that (:func:`plant_candidate`), so that trees that merely stand together do not
+    wake each other.
     """
     tree = trees.awake[order[wp.tid()]]
     low, high = list_due_capsules(

@@ -1,8 +1,8 @@
 """Arrays of the contact kernels, grouped: plants and their capsules, rigid geoms, candidates, contacts, warm start.
 
-Sizes in brackets. Positions and velocities are in world axes; a *capsule* always belongs to a plant and a *geom* to a
-rigid body. One side of a contact is a capsule; the other is a geom (its number) or another plant's capsule (-1 - its
-number).
+Sizes are in brackets. Positions and velocities are in world axes. A *capsule* always belongs to a plant and a *geom*
+to a rigid body. The first side of a contact is a capsule. The other side is a geom (stored as its index) or a capsule
+of another plant (stored as -1 - its index).
 """
 
 import warp as wp
@@ -11,11 +11,11 @@ from vinesim.kernels.contact.friction_law import Surface
 
 wp.set_module_options({"enable_backward": False})
 
-# entries of ``counters``
+# indices into ``counters``; each entry is a count unless its docstring says otherwise
 AWAKE_TREES = wp.constant(0)
 CONTACTS = wp.constant(1)
 OVERFLOW = wp.constant(2)
-"""Contacts beyond what one tree can have at once."""
+"""Contacts that were found beyond the number that one tree can have at once."""
 IMPACTED_TREES = wp.constant(3)
 """Trees with a contact that closes faster than the impact speed."""
 BODIES = wp.constant(4)
@@ -25,15 +25,15 @@ SORT_AXIS = wp.constant(5)
 ISLANDS = wp.constant(6)
 BLOCKS = wp.constant(8)
 MATRIX_ENTRIES = wp.constant(9)
-"""Entries of the matrices of all blocks, or of those of the Newton steps of all islands, whichever are more."""
+"""Entries of the matrices of all blocks, or of the Newton matrices of all islands, whichever is larger."""
 SKIPPED_GEOMS = wp.constant(7)
-"""Static geoms beyond what one tree can be near to."""
+"""Static geoms near a tree that were left out because the tree's list was full."""
 GROUPS = wp.constant(10)
-"""Groups of sides of contacts."""
+"""Groups of contact sides; see :class:`SideGroups`."""
 RESPONSE_NUMBERS = wp.constant(11)
-"""Numbers of the responses to all groups."""
+"""Values in the responses to all groups."""
 HAVE_ROOM = wp.constant(12)
-"""1 if there are contacts, and room for all of them; else 0."""
+"""1 if there are contacts and the arrays have room for all of them, else 0."""
 UNFINISHED = wp.constant(13)
 """Islands whose solve ended at the largest number of sweeps."""
 NEAR_ASLEEP = wp.constant(14)
@@ -41,7 +41,7 @@ NEAR_ASLEEP = wp.constant(14)
 COUNTERS = 15
 
 AABB_BLOCK = wp.constant(32)
-"""So many static boxes share one box around them, and are skipped by one comparison."""
+"""Number of boxes in a block. They share one box around them, so that one comparison can skip them all."""
 
 
 @wp.struct
@@ -49,22 +49,22 @@ class Parameters:
     """Numbers of the contact model, see :class:`vinesim.scene.physics_parameters.PhysicsParameters`."""
 
     dt: wp.float64
-    """[s]"""
+    """[s] Time step."""
     margin: wp.float64
     """[m] Contacts with movable geoms exist from this gap on."""
     static_margin: wp.float64
-    """[m] The same for static geoms and other plants."""
+    """[m] Contacts with static geoms and other plants exist from this gap on."""
     max_separation_speed: wp.float64
-    """[m/s]"""
+    """[m/s] Largest velocity with which a contact pushes overlapping sides apart."""
     impact_speed: wp.float64
     """[m/s] A contact that closes faster is an impact."""
     wire_damping_time: wp.float64
-    """[s] damping of a wire over its stiffness."""
+    """[s] Damping of a wire divided by its stiffness."""
 
 
 @wp.struct
 class Aabbs:
-    """Axis-aligned boxes [box] m; empty where low > high."""
+    """Axis-aligned boxes [box], m. A box is empty where low > high."""
 
     low: wp.array(dtype=wp.vec3)
     high: wp.array(dtype=wp.vec3)
@@ -75,15 +75,15 @@ class Trees:
     """State of all trees; a tree is one kinematic tree of a plant."""
 
     awake: wp.array(dtype=wp.int32)
-    """[k] numbers of the trees that this step is about; as many as the thread count says."""
+    """[k] Indices of the trees that this step handles. The thread count is their number."""
     is_awake: wp.array(dtype=wp.bool)
-    """[tree]"""
+    """[tree] Whether the tree is awake."""
     is_fine: wp.array(dtype=wp.bool)
     """[tree] whether the clusters of its bunches are free to move."""
     is_remote: wp.array(dtype=wp.bool)
     """[tree] whether another client owns its state."""
     bunch_attached: wp.array(dtype=wp.bool)
-    """[bunch]"""
+    """[bunch] Whether the bunch still hangs on its tree."""
 
 
 @wp.struct
@@ -91,17 +91,17 @@ class PlantBodies:
     """Bodies of all plants."""
 
     parent: wp.array(dtype=wp.int32)
-    """[body] -1 for a root."""
+    """[body] Index of the parent body; -1 for a root."""
     tree: wp.array(dtype=wp.int32)
-    """[body]"""
+    """[body] Index of the tree that the body belongs to."""
     is_cut: wp.array(dtype=wp.bool)
-    """[body] whether its joint was cut."""
+    """[body] Whether the body's joint was cut."""
     q: wp.array(dtype=wp.transform)
-    """[body] pose of its origin."""
+    """[body] Pose of the body's origin."""
     qd: wp.array(dtype=wp.spatial_vector)
-    """[body] velocity (linear, angular) of its origin at the start of the step."""
+    """[body] Velocity (linear, angular) of the body's origin at the start of the step."""
     qd_free: wp.array(dtype=wp.spatial_vector)
-    """[body] the same at the end of the step if there were no contacts."""
+    """[body] Velocity (linear, angular) of the body's origin at the end of the step if there were no contacts."""
 
 
 @wp.struct
@@ -111,275 +111,290 @@ class Capsules:
     tree_start: wp.array(dtype=wp.int32)
     """[tree + 1] first capsule of each tree."""
     tree_last_bunch: wp.array(dtype=wp.int32)
-    """[tree] highest number of a bunch in it, -1 for none."""
+    """[tree] Highest index of a bunch on the tree; -1 for none."""
     body: wp.array(dtype=wp.int32)
     bunch: wp.array(dtype=wp.int32)
-    """[capsule] -1 for wood."""
+    """[capsule] Index of the bunch that the capsule belongs to; -1 for wood."""
     level: wp.array(dtype=wp.int32)
-    """[capsule] level of detail of its tree at which it exists: 0 both, 1 coarse, 2 fine."""
+    """[capsule] Level of detail of its tree at which the capsule exists: 0 both, 1 coarse, 2 fine."""
     local_start: wp.array(dtype=wp.vec3)
-    """[capsule] m, in the body's frame."""
+    """[capsule] Start of the axis, m, in the body's frame."""
     local_end: wp.array(dtype=wp.vec3)
     radius: wp.array(dtype=float)
-    """[capsule] m"""
+    """[capsule] Radius, m."""
     material: wp.array(dtype=wp.int32)
-    """[capsule] Material"""
+    """[capsule] Material of the surface (``Material``)."""
     extent: wp.array(dtype=float)
-    """[capsule] m, farthest point from the body's origin."""
+    """[capsule] Distance from the body's origin to the farthest point of the capsule, m."""
     rest_start: wp.array(dtype=wp.vec3)
-    """[capsule] m, in the world while all plants rest as they were generated."""
+    """[capsule] Start of the axis, m, in the world, while all plants rest as they were generated."""
     rest_end: wp.array(dtype=wp.vec3)
     tied_geom: wp.array2d(dtype=wp.int32)
-    """[capsule, k] MuJoCo's numbers of wires that it does not collide with, being tied to them; -1 for none."""
+    """[capsule, k] MuJoCo geom indices of the wires to which the capsule is tied, so that it does not collide with
+    them.
+
+    -1 for none.
+    """
     tied_joint: wp.array2d(dtype=wp.int32)
-    """[capsule, k] body whose joint connects it with the neighbour that is tied there; -1: it is tied itself."""
+    """[capsule, k] Body whose joint connects the capsule's body with the neighbour that is tied to that wire.
+
+    -1 if the capsule's own body is tied.
+    """
 
 
 @wp.struct
 class CapsuleStates:
-    """The capsules at the start of the step [capsule]; of sleeping trees, where they fell asleep."""
+    """The capsules [capsule] at the start of the step. For sleeping trees: where they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
     speed: wp.array(dtype=float)
-    """[m/s] bound of the speed of all its points."""
+    """[m/s] Upper bound of the speed of all points of the capsule."""
     low: wp.array(dtype=wp.vec3)
-    """[m] box of the space that it sweeps in the step."""
+    """[m] Lower corner of the box around the space that the capsule sweeps in the step."""
     high: wp.array(dtype=wp.vec3)
 
 
 @wp.struct
 class Clearances:
-    """How far capsules of awake trees were from contact with sleeping trees when they were last compared [capsule]."""
+    """Distance of each capsule of an awake tree from contact with sleeping trees at their last comparison [capsule]."""
 
     start: wp.array(dtype=wp.vec3)
-    """[m] then."""
+    """[m] Start of the capsule's axis at that comparison."""
     end: wp.array(dtype=wp.vec3)
     distance: wp.array(dtype=float)
-    """[m] that they may move from there; negative if they must be compared in any case."""
+    """[m] Distance that the capsule may move from there without a new comparison. Negative: compare in any case."""
     reach: wp.array(dtype=float)
-    """[m] around the capsule to be searched in this step; 0 for none."""
+    """[m] Distance around the capsule that is searched in this step; 0 for no search."""
 
 
 @wp.struct
 class Geoms:
-    """Rigid geoms that plants collide with [geom]: first those that can move, then static ones."""
+    """Rigid geoms that plants collide with [geom]: first the geoms that can move, then the static geoms."""
 
     count: wp.array(dtype=wp.int32)
-    """[2] number of those that can move, and of all; there is room for more."""
+    """[2] Number of geoms that can move, and number of all geoms. The arrays have room for more."""
     id: wp.array(dtype=wp.int32)
-    """number in MuJoCo's arrays."""
+    """[geom] Index in MuJoCo's arrays."""
     body: wp.array(dtype=wp.int32)
-    """MuJoCo body."""
+    """[geom] Index of the geom's MuJoCo body."""
     root: wp.array(dtype=wp.int32)
-    """root body of its kinematic tree, about whose centre of mass MuJoCo expresses ``cvel`` and ``cdof``."""
+    """[geom] Root body of the geom's kinematic tree.
+
+    MuJoCo expresses ``cvel`` and ``cdof`` about its centre of mass.
+    """
     dof: wp.array(dtype=wp.int32)
-    """last degree of freedom that moves it, -1 for none."""
+    """[geom] Last degree of freedom that moves the geom; -1 for none."""
     kind: wp.array(dtype=wp.int32)
-    """mjtGeom; a mesh is its convex hull."""
+    """[geom] Shape (mjtGeom). A mesh collides as its convex hull."""
     hull: wp.array(dtype=wp.int32)
-    """of a mesh, -1 for other kinds."""
+    """[geom] Index of the mesh's convex hull; -1 for geoms that are not meshes."""
     size: wp.array(dtype=wp.vec3d)
-    """geom_size of MuJoCo."""
+    """[geom] MuJoCo's geom_size."""
     center: wp.array(dtype=wp.vec3d)
-    """[m] in the geom's frame."""
+    """[m] Centre of the geom's box, in the geom's frame."""
     half: wp.array(dtype=wp.vec3d)
-    """[m] half edges of its box, in its own axes."""
+    """[m] Half edges of the geom's box, in the box's axes."""
     radius: wp.array(dtype=wp.float64)
-    """[m] of its bounding sphere."""
+    """[m] Radius of the geom's bounding sphere."""
     material: wp.array(dtype=wp.int32)
-    """Material"""
+    """[geom] Material of the surface (``Material``)."""
     friction: wp.array(dtype=wp.float64)
-    """[1] its own coefficient, whatever it touches; 0: that of the two materials."""
+    """[1] The geom's own friction coefficient, for all contacts. 0: the coefficient of the two materials applies."""
     is_remote: wp.array(dtype=wp.bool)
-    """whether it belongs to the copy of another client's robot or person: that touches remote trees only."""
+    """[geom] Whether the geom belongs to a copy of another client's robot or person. It touches remote trees only."""
 
 
 @wp.struct
 class PassingBunches:
-    """Free bunches that touch nothing of some trees: they overlapped these when they were picked, and still do."""
+    """Free bunches that pass through some trees, because they overlapped them when they were picked and still do."""
 
     by_tree: wp.array2d(dtype=wp.int32)
-    """[tree, k] number of a bunch, -1 for an empty place."""
+    """[tree, k] Index of a bunch that passes through the tree; -1 for an empty place."""
     of_geom: wp.array(dtype=wp.int32)
-    """[geom] bunch that it belongs to, -1 for none."""
+    """[geom] Index of the bunch that the geom belongs to; -1 for none."""
 
 
 @wp.struct
 class Hulls:
-    """Convex hulls of meshes, each in the frame of its geoms, about their centre."""
+    """Convex hulls of meshes. Each is given in the frame of its geoms, relative to their centre."""
 
     first_plane: wp.array(dtype=wp.int32)
-    """[hull + 1]"""
+    """[hull + 1] Index of the hull's first plane."""
     first_edge: wp.array(dtype=wp.int32)
-    """[hull + 1]"""
+    """[hull + 1] Index of the hull's first edge."""
     plane: wp.array(dtype=wp.vec4d)
-    """[plane] outward normal and distance [m] from the centre."""
+    """[plane] Outward normal, and distance [m] from the centre."""
     edge_start: wp.array(dtype=wp.vec3d)
-    """[edge] m"""
+    """[edge] Start, m."""
     edge_end: wp.array(dtype=wp.vec3d)
-    """[edge] m"""
+    """[edge] End, m."""
     edge_left: wp.array(dtype=wp.int32)
-    """[edge] plane on one side of it."""
+    """[edge] Index of the plane on one side of the edge."""
     edge_right: wp.array(dtype=wp.int32)
-    """[edge] plane on the other side."""
+    """[edge] Index of the plane on the other side of the edge."""
 
 
 @wp.struct
 class GeomStates:
-    """The same geoms at the start of the step [geom]."""
+    """Motion of the geoms of :class:`Geoms` at the start of the step [geom]."""
 
     center: wp.array(dtype=wp.vec3d)
     velocity: wp.array(dtype=wp.vec3d)
-    """[m/s] of the centre."""
+    """[m/s] Velocity of the centre."""
     angular_velocity: wp.array(dtype=wp.vec3d)
     """[rad/s]"""
     speed: wp.array(dtype=wp.float64)
-    """[m/s] likely bound of the speed of all its points in the step."""
+    """[m/s] Likely upper bound of the speed of all points of the geom in the step."""
     offset: wp.array(dtype=wp.vec3d)
-    """[m] of a deflected wire: its centre, from where it was drawn."""
+    """[m] Displacement of a deflected wire's centre from the position that the scene gives it."""
     low: wp.array(dtype=wp.vec3)
-    """[m] box of the space that it can sweep in the step."""
+    """[m] Lower corner of the box around the space that the geom can sweep in the step."""
     high: wp.array(dtype=wp.vec3)
 
 
 @wp.struct
 class Actors:
-    """Robots, people, boxes and free bunches [actor]: each a range of the movable geoms."""
+    """Robots, people, boxes and free bunches [actor]. Each actor is a range of the movable geoms."""
 
     count: wp.array(dtype=wp.int32)
-    """[1] number of actors; there is room for more."""
+    """[1] Number of actors. The arrays have room for more."""
     start: wp.array(dtype=wp.int32)
-    """[actor + 1] first geom of each."""
+    """[actor + 1] Index of the actor's first geom."""
     is_remote: wp.array(dtype=wp.bool)
     may_sleep: wp.array(dtype=wp.bool)
-    """Boxes and free bunches wake plants only while MuJoCo has them awake."""
+    """[actor] Whether MuJoCo may put the actor to sleep.
+
+    Boxes and free bunches wake plants only while they are awake.
+    """
 
 
 @wp.struct
 class RigidBodies:
-    """MuJoCo's arrays of the same names, and the velocities of its degrees of freedom."""
+    """MuJoCo arrays under their MuJoCo names, and the velocities of MuJoCo's degrees of freedom."""
 
     xpos: wp.array(dtype=wp.vec3d)
-    """[MuJoCo geom]"""
+    """[MuJoCo geom] Position, m."""
     xmat: wp.array(dtype=wp.mat33d)
-    """[MuJoCo geom]"""
+    """[MuJoCo geom] Rotation."""
     cvel: wp.array2d(dtype=wp.float64)
-    """[MuJoCo body, 6] angular, linear."""
+    """[MuJoCo body, 6] Velocity: angular, linear."""
     cdof: wp.array2d(dtype=wp.float64)
-    """[dof, 6] angular, linear."""
+    """[dof, 6] Motion axis: angular, linear."""
     subtree_com: wp.array(dtype=wp.vec3d)
-    """[MuJoCo body]"""
+    """[MuJoCo body] Centre of mass of the body's subtree, m."""
     dof_parent: wp.array(dtype=wp.int32)
     dof_tree: wp.array(dtype=wp.int32)
     tree_asleep: wp.array(dtype=wp.int32)
-    """[MuJoCo tree] negative while it is awake."""
+    """[MuJoCo tree] Negative while the tree is awake."""
     velocity_free: wp.array(dtype=wp.float64)
-    """[dof] at the end of the step if there were no plants."""
+    """[dof] Velocity at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)
-    """[dof] by which plants changed that prediction in the last step."""
+    """[dof] By how much plants changed that predicted velocity in the last step."""
     correction_before: wp.array(dtype=wp.float64)
-    """[dof] the same in the step before."""
+    """[dof] By how much plants changed the predicted velocity in the step before the last."""
     tree_island: wp.array(dtype=wp.int32)
-    """[MuJoCo tree] label of those that active constraints couple."""
+    """[MuJoCo tree] Label that all trees coupled by active constraints share."""
 
 
 @wp.struct
 class RigidFactors:
-    """MuJoCo's sparse factors L^T D L of the mass matrix M and of M^, which has the implicit servos in it."""
+    """MuJoCo's sparse factors L^T D L of the mass matrix M, and of M^, which is M with the implicit servos added."""
 
     tree_dof: wp.array(dtype=wp.int32)
-    """tree_dofadr"""
+    """MuJoCo's tree_dofadr."""
     tree_dof_count: wp.array(dtype=wp.int32)
     row_start: wp.array(dtype=wp.int32)
-    """M_rowadr"""
+    """MuJoCo's M_rowadr."""
     row_count: wp.array(dtype=wp.int32)
-    """M_rownnz"""
+    """MuJoCo's M_rownnz."""
     column: wp.array(dtype=wp.int32)
-    """M_colind"""
+    """MuJoCo's M_colind."""
     implicit: wp.array(dtype=wp.float64)
-    """qH"""
+    """MuJoCo's qH: factor of M^."""
     implicit_inverse: wp.array(dtype=wp.float64)
-    """qHDiagInv; 0 if nothing is implicit in the whole world: then M^ is M."""
+    """MuJoCo's qHDiagInv. 0 if nothing in the whole world is implicit: M^ then equals M."""
     plain: wp.array(dtype=wp.float64)
-    """qLD"""
+    """MuJoCo's qLD: factor of M."""
     plain_inverse: wp.array(dtype=wp.float64)
-    """qLDiagInv"""
+    """MuJoCo's qLDiagInv."""
 
 
 @wp.struct
 class Candidates:
-    """What the narrowphase finds, by awake tree and slot [awake tree, slot]."""
+    """Candidate contacts that the narrowphase finds [awake tree, slot]."""
 
     count: wp.array(dtype=wp.int32)
-    """[awake tree] found; those beyond the number of slots are only counted."""
+    """[awake tree] Number of candidates found. Candidates beyond the number of slots are counted but not stored."""
     is_impact: wp.array(dtype=wp.bool)
-    """[awake tree] whether one of them is an impact."""
+    """[awake tree] Whether one of the tree's candidates is an impact."""
     near_geoms: wp.array2d(dtype=wp.int32)
-    """[awake tree, k] scratch: geoms whose box overlaps that of the tree."""
+    """[awake tree, k] Scratch: geoms whose box overlaps the tree's box."""
     near_pairs: wp.array(dtype=wp.vec2i)
-    """[awake tree * room + k] scratch: capsules and geoms whose boxes overlap."""
+    """[awake tree * room + k] Scratch: pairs of a capsule and a geom whose boxes overlap."""
     skipped_geoms: wp.array(dtype=wp.int32)
-    """[awake tree] static geoms whose box overlaps it as well, for which ``near_geoms`` has no room."""
+    """[awake tree] Number of static geoms whose box overlaps the tree's but for which ``near_geoms`` had no room."""
     feature: wp.array2d(dtype=wp.int32)
-    """2 * capsule + end of the part along a face; -1 for an empty slot."""
+    """[awake tree, slot] 2 * capsule, plus 1 for the second contact point along a face; -1 for an empty slot."""
     other: wp.array2d(dtype=wp.int32)
-    """geom, or -1 - capsule of another plant."""
+    """[awake tree, slot] Index of the geom, or -1 - capsule of another plant."""
     gap: wp.array2d(dtype=wp.float64)
-    """[m] at the start of the step."""
+    """[m] Gap at the start of the step."""
     end_gap: wp.array2d(dtype=wp.float64)
-    """[m] ``gap`` with what the curvature of the motion adds to it in the step; that of the velocity is not in it."""
+    """[m] ``gap`` plus its change by the curvature of the motion in the step, without its change by the velocity."""
     normal: wp.array2d(dtype=wp.vec3d)
-    """from the other side to the capsule."""
+    """[awake tree, slot] Unit vector from the other side to the capsule."""
     point: wp.array2d(dtype=wp.vec3d)
-    """[m]"""
+    """[m] Contact point."""
 
 
 @wp.struct
 class Contacts:
-    """Contacts of the step [contact], one after the other."""
+    """Contacts of the step in one list [contact]."""
 
     source: wp.array(dtype=wp.int32)
-    """awake tree * slots + slot of its candidate."""
+    """[contact] Index of the contact's candidate: awake tree * slots + slot."""
     feature: wp.array(dtype=wp.int32)
     other: wp.array(dtype=wp.int32)
     body: wp.array(dtype=wp.int32)
-    """plant body."""
+    """[contact] Plant body."""
     body_slot: wp.array(dtype=wp.int32)
-    """place of ``body`` in the list of bodies in contact."""
+    """[contact] Index of ``body`` in the list of bodies in contact (:class:`TouchedBodies`)."""
     other_body: wp.array(dtype=wp.int32)
-    """the other plant body, -1 for a geom."""
+    """[contact] The other plant body; -1 if the other side is a geom."""
     other_slot: wp.array(dtype=wp.int32)
-    """the same of the other plant body, -1 for a geom."""
+    """[contact] Index of ``other_body`` in the list of bodies in contact; -1 if the other side is a geom."""
     gap: wp.array(dtype=wp.float64)
     surface: wp.array(dtype=Surface)
-    """what its two materials make of it; with the friction of a geom that has its own, and the spring of a wire."""
+    """[contact] Contact properties of the two materials, with the friction of a geom that has its own and a wire's
+    spring.
+    """
     wire_stiffness: wp.array(dtype=wp.float64)
-    """[N/m] of the wire that is its other side; 0: of none, or one that does not give."""
+    """[N/m] Stiffness of the wire that is the contact's other side; 0 if it is no wire or a rigid one."""
     wire_shift: wp.array(dtype=wp.float64)
-    """[m] gap to that wire without load, less that to its geom."""
+    """[m] Gap to the unloaded wire minus the gap to the wire's geom."""
     point: wp.array(dtype=wp.vec3d)
     axes: wp.array(dtype=wp.mat33d)
-    """rows: normal, first and second tangent."""
+    """[contact] Rows: normal, first tangent, second tangent."""
     island: wp.array(dtype=wp.int32)
     block: wp.array(dtype=wp.int32)
     place: wp.array(dtype=wp.int32)
-    """place in the list of the islands."""
+    """[contact] Index of the contact in ``Islands.contact``."""
     force: wp.array(dtype=wp.vec3d)
-    """[N] on the plant."""
+    """[N] Force on the plant."""
 
 
 @wp.struct
 class TouchedBodies:
-    """Plant bodies in contact [slot], sorted, each once: those of one tree are neighbours."""
+    """Plant bodies in contact [slot], sorted, each listed once. The bodies of one tree are neighbours in the list."""
 
     body: wp.array(dtype=wp.int32)
     tree_start: wp.array(dtype=wp.int32)
-    """[slot] first slot of the same tree."""
+    """[slot] First slot of the slot's tree."""
     tree_end: wp.array(dtype=wp.int32)
-    """[slot] slot after the last of the same tree."""
+    """[slot] Slot after the last slot of the slot's tree."""
     last_contact: wp.array(dtype=wp.int32)
-    """[slot] scratch: the contact of the tree that begins here that was linked last."""
+    """[slot] Scratch, for the first slot of a tree: the contact of this tree that was linked last."""
 
 
 @wp.struct
@@ -387,17 +402,23 @@ class SideGroups:
     """Sides of contacts on plants, in groups of at most ten on one tree: see :mod:`vinesim.kernels.contact.row_response`."""
 
     side: wp.array(dtype=wp.int32)
-    """[place] 2 * contact, and 1 more for the other plant body, by trees; in the order of the list of islands."""
+    """[place] 2 * contact, plus 1 for the side of the other plant body.
+
+    Sorted by trees, then as in ``Islands.contact``.
+    """
     start: wp.array(dtype=wp.int32)
-    """[group + 1] first place of each in ``side``."""
+    """[group + 1] Index in ``side`` of the group's first side."""
     tree: wp.array(dtype=wp.int32)
-    """[group + 1] slot of the first touched body of its tree; -1 after the last group."""
+    """[group + 1] Slot of the first touched body of the group's tree; -1 after the last group."""
     response: wp.array(dtype=wp.int32)
-    """[group] first number of its response: by touched bodies of the tree, linear and angular velocity, columns."""
+    """[group] Index of the first value of the group's response.
+
+    Its dimensions: touched body of the tree, component (linear and angular velocity), column.
+    """
     first: wp.array(dtype=wp.int32)
-    """[slot] first group of the tree whose touched bodies begin there."""
+    """[slot] First group of the tree whose touched bodies begin at this slot."""
     listed: wp.array(dtype=wp.int32)
-    """[slot] scratch: where the next side of that tree is listed."""
+    """[slot] Scratch: index at which the next side of that tree is listed."""
 
 
 @wp.struct
@@ -408,31 +429,34 @@ class Islands:
     """
 
     start: wp.array(dtype=wp.int32)
-    """[island + 1] first place of each in ``contact``."""
+    """[island + 1] Index in ``contact`` of the island's first contact."""
     first_block: wp.array(dtype=wp.int32)
-    """[island + 1]"""
+    """[island + 1] Index of the island's first block."""
     block_start: wp.array(dtype=wp.int32)
-    """[block + 1] first place of each in ``contact``."""
+    """[block + 1] Index in ``contact`` of the block's first contact."""
     row_start: wp.array(dtype=wp.int32)
-    """[block + 1] first row of each in :class:`vinesim.kernels.contact.island_system.IslandSystem`: a multiple of eight."""
+    """[block + 1] First row of the block in :class:`vinesim.kernels.contact.island_system.IslandSystem`.
+
+    A multiple of eight.
+    """
     matrix_start: wp.array(dtype=wp.int32)
-    """[block + 1] first entry of its matrix in ``Rows.delassus``."""
+    """[block + 1] Index in ``Rows.delassus`` of the first entry of the block's matrix."""
     rigid_start: wp.array(dtype=wp.int32)
-    """[island + 1] first entry of its rigid Jacobian in the same system."""
+    """[island + 1] Index in ``IslandSystem`` of the first entry of the island's rigid Jacobian."""
     system_start: wp.array(dtype=wp.int32)
-    """[island + 1] first entry of its Newton steps in the same system."""
+    """[island + 1] Index in ``IslandSystem`` of the first entry of the island's Newton matrices."""
     contact: wp.array(dtype=wp.int32)
-    """[place] contacts, island by island and block by block."""
+    """[place] Contacts, sorted by island and then by block."""
     label: wp.array(dtype=wp.int32)
-    """[contact] scratch: the first contact of the same island."""
+    """[contact] Scratch: the first contact of the contact's island."""
     block_label: wp.array(dtype=wp.int32)
-    """[contact] scratch: the first contact of the same block."""
+    """[contact] Scratch: the first contact of the contact's block."""
     first_dof: wp.array(dtype=wp.int32)
-    """[island + 1] first place of each in ``dof``."""
+    """[island + 1] Index in ``dof`` of the island's first degree of freedom."""
     dof: wp.array(dtype=wp.int32)
-    """[place] degrees of freedom of the rigid bodies, island by island."""
+    """[place] Degrees of freedom of the rigid bodies, sorted by island."""
     rigid_last_contact: wp.array(dtype=wp.int32)
-    """[label of rigid bodies] scratch: the contact with these rigid bodies that was linked last."""
+    """[label of rigid bodies] Scratch: the contact with the rigid bodies of this label that was linked last."""
     sweeps: wp.array(dtype=wp.int32)
     """[island] Gauss-Seidel sweeps of the last solve."""
 
@@ -442,33 +466,35 @@ class Rows:
     """Three rows for each contact [row]: normal, first and second tangent."""
 
     plant_jacobian: wp.array2d(dtype=wp.float64)
-    """[row, 12] of the body and of the other plant body, each linear and angular."""
+    """[row, 12] Jacobian of the body (linear, angular), then of the other plant body (linear, angular)."""
     rigid_jacobian: wp.array2d(dtype=wp.vec3d)
-    """[contact, dof] of its three rows"""
+    """[contact, dof] Jacobian of the contact's three rows."""
     rigid_response: wp.array2d(dtype=wp.vec3d)
-    """[contact, dof] M^-1 J^T: change of velocity of the rigid world for unit impulses along them."""
+    """[contact, dof] M^-1 J^T: change of the rigid world's velocity by unit impulses along the contact's three rows."""
     delassus: wp.array(dtype=wp.float64)
-    """J M^-1 J^T of the plants [entry], a matrix for each block, whose rows are filled up with zeros to a multiple of
-    eight."""
+    """[entry] J M^-1 J^T of the plants: one matrix for each block.
+
+    Its rows are padded with zeros to a multiple of eight.
+    """
     velocity_free: wp.array(dtype=wp.float64)
-    """[row] m/s along the row at the end of the step without contacts."""
+    """[row] Velocity along the row at the end of the step without contacts, m/s."""
     bias: wp.array(dtype=wp.float64)
-    """[row] m/s"""
+    """[row] Velocity that the solver adds to the residual of the row, m/s."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] N s"""
+    """[row] Impulse, N s."""
 
 
 @wp.struct
 class WarmStart:
-    """What the next step starts from [contact of the last step]."""
+    """Values from which the next step's solve starts [contact of the last step]."""
 
     count: wp.array(dtype=wp.int32)
-    """[1]"""
+    """[1] Number of contacts."""
     feature: wp.array(dtype=wp.int32)
-    """-1 if the contact did not press."""
+    """[contact] As in :class:`Contacts`; -1 if the contact carried no force."""
     other: wp.array(dtype=wp.int32)
     normal_impulse: wp.array(dtype=wp.float64)
     friction_impulse: wp.array(dtype=wp.vec3d)
-    """world axes."""
+    """[N s] In world axes."""
     anchor: wp.array(dtype=wp.vec3d)
-    """[m] stretch of the tangential spring since the contact began to stick, world axes."""
+    """[m] Stretch of the tangential spring since the contact began to stick, world axes."""

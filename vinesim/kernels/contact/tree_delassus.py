@@ -1,6 +1,6 @@
-"""The Delassus matrices of trees that touch what does not move: how the impulses of a tree's contacts move its contacts.
+"""The Delassus matrices of trees that touch static geoms: the velocities at a tree's contacts by its contact impulses.
 
-From what the joints were factored into, in one pass outward for the tree and one inward for each contact: see
+They are computed from the factored joints, in one pass outward for the tree and one inward for each contact: see
 :func:`respond_at_contacts` and :func:`write_delassus`.
 """
 
@@ -19,8 +19,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyCompliances:
-    """The velocity of a body by an impulse on it (a, alpha) = [[P, Q], [Q^T, R]] (force, moment) [body], where a tree
-    branches."""
+    """Velocity of a body by an impulse on it, at bodies where a tree branches [body].
+
+    (a, alpha) = [[P, Q], [Q^T, R]] (force, moment).
+    """
 
     P: wp.array(dtype=wp.mat33)
     """[1/kg]"""
@@ -32,7 +34,7 @@ class BodyCompliances:
 
 @wp.struct
 class ResponseRows:
-    """Velocity of a contact's body by unit impulses along its three rows, one a column [slot * trees + tree]."""
+    """Velocity of a contact's body by unit impulses along its three rows, one column each [slot * trees + tree]."""
 
     a: wp.array(dtype=wp.mat33)
     """[1/kg] linear."""
@@ -55,12 +57,13 @@ def respond_at_contacts(
     compliances_out: BodyCompliances,
     response_out: ResponseRows,
 ):
-    """One thread per tree: from the root to the last contact, how a body answers to impulses on itself.
+    """One thread per tree. Compute the response of each body to impulses on itself, from the root to the last contact.
 
-    The inverse of its articulated inertia, seen from the root: the operational-space recursion (Featherstone 2008,
-    section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992), of trees that stand. With a = a' - l x alpha' carried from the
-    parent along the lever l, alpha = (1 - DJ) alpha' - DH a, and D moment on the joint itself. Contacts are in the order
-    of their bodies. is_branching: [body] whether a body is the parent of another than the next one.
+    This is the inverse of the body's articulated inertia, seen from the root, by the operational-space recursion
+    (Featherstone 2008, section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992), for trees that stand. With a = a' - l x
+    alpha' carried from the parent along the lever l, alpha = (1 - DJ) alpha' - DH a + D moment for a moment on the
+    joint itself. Contacts are in the order of their bodies. is_branching: [body] whether a body is the parent of a body
+    other than the next one.
     """
     tree = wp.tid()
     count = tree_contacts.count[tree]
@@ -74,7 +77,7 @@ def respond_at_contacts(
     at = int(0)
     touched = int(contacts.body[0])
     for k in range(model.tree_first[tree], contacts.body[count - 1] + 1, model.pitch):
-        # all that a body needs is read before anything is asked: a GPU then waits for memory once
+        # all values of a body are read before the first branch, so that a GPU waits for memory once
         parent = model.body_parent[k]
         branches = is_branching[k]
         lever = factors.lever[k]
@@ -114,7 +117,7 @@ def respond_at_contacts(
 
 @wp.func
 def carry_to_parent(k: int, factors: Factors, force: wp.mat33, moment: wp.mat33):
-    """Impulses on body k, a column each, as those that its parent feels: the joint takes its share."""
+    """Returns the impulses that the parent feels by impulses on body k, one column each: the joint takes its share."""
     lever = factors.lever[k]
     DH = factors.DH[k]
     DJ = factors.DJ[k]
@@ -137,7 +140,11 @@ def common_body_response(
     force: wp.mat33,
     moment: wp.mat33,
 ):
-    """Velocities along the rows of contact ``other``, on ``body``, by impulses on body ``at``, on another branch."""
+    """Returns the velocities along the rows of contact ``other`` by impulses on body ``at``, on another branch of the
+    tree.
+
+    Contact ``other`` is on ``body``.
+    """
     force_other = row_columns(other, 0, jacobian)
     moment_other = row_columns(other, 3, jacobian)
     here = int(at)
@@ -173,11 +180,10 @@ def write_delassus(
     # out
     system_out: TreeSystem,
 ):
-    """One thread per slot of a tree: its part of what is to be solved, with the velocities along the rows of all contacts
-    up to its own by impulses along it.
+    """One thread per slot of a tree. Write its part of the system, and the velocities that impulses along it cause.
 
-    Its impulses go inward; what they do at a body with another contact, that one's response says, both being one
-    symmetric matrix.
+    These are the velocities along the rows of all contacts up to its own. Its impulses are carried inward. Where they
+    reach a body with another contact, the response of that contact gives their effect, as the matrix is symmetric.
     """
     tree, c = tree_and_entry(wp.tid(), width / 3)
     if tree >= trees or c >= tree_contacts.count[wp.min(tree, trees - 1)]:

@@ -1,10 +1,10 @@
-"""Contacts of many trees that touch rigid geoms which do not move, and not each other: a tree is an island of its own.
+"""Contacts of many trees that touch static geoms and not each other: each tree is an island of its own.
 
-On a GPU a tree is a thread, or each of its contacts. The arrays of contacts hold all trees side by side: entry ``i`` of a
-tree lies at ``i * trees + tree``, so that threads in step read one stretch of memory. A *view* of an array has an offset
-and a pitch that show one tree all of its own entries and nothing else: with views, narrowphase and rows are the functions
-of a vineyard's. Time goes by what is read from memory: one kernel finds, one solves, and between them each body's record
-is read once outward for the tree, and once inward for each contact beyond it.
+A GPU uses one thread for each tree, or one for each contact. The arrays of contacts interleave the trees: entry ``i``
+of a tree is at ``i * trees + tree``, so that threads in step read contiguous memory. A *view* of an array has an offset
+and a pitch that show one tree all of its own entries and nothing else. With views, narrowphase and rows use the same
+functions as a vineyard. The time is spent on reading memory. One kernel finds contacts and one solves them; between
+these, each body's record is read once outward for the tree, and once inward for each contact beyond it.
 """
 
 import warp as wp
@@ -81,7 +81,10 @@ def predict_impacted_trees(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread predicts one tree anew with phi = 1 if it is about to suffer an impact and was not predicted so."""
+    """One thread per tree.
+
+    Predict it again with phi = 1 if it is about to suffer an impact and was predicted otherwise.
+    """
     tree = wp.tid()
     if is_impact[tree] and tree_phi_out[tree] < 1.0:
         tree_euler_steps_out[tree] = wp.max(tree_euler_steps_out[tree], onset_steps)
@@ -108,7 +111,7 @@ def write_tree_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per slot of a tree: the rows of its contact."""
+    """One thread per slot of a tree. Write the rows of its contact."""
     tree, c = tree_and_entry(wp.tid(), slots)
     if tree < trees and c < tree_contacts.count[wp.min(tree, trees - 1)]:
         contacts = view_contacts(contacts_out, tree, trees)
@@ -136,7 +139,7 @@ def write_tree_rows(
 
 @wp.func
 def wrench_at(pose: wp.transform, point: wp.vec3d, force: wp.vec3d):
-    """Force and moment [N, N m] at a body's origin of a force at a point [m]."""
+    """Returns the force and the moment [N, N m] at a body's origin of a force at a point [m]."""
     lever = point - to_double(wp.transform_get_translation(pose))
     return wp.spatial_vector(to_single(force), to_single(wp.cross(lever, force)))
 
@@ -155,10 +158,11 @@ def apply_loaded_wrenches(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Add to the prediction of one standing tree what wrenches on its ``count`` loaded bodies, in order, do over a step.
+    """Add the effect of wrenches over a step to the prediction of one standing tree.
 
-    :func:`vinesim.kernels.plants.impulse_response.apply_tree_wrenches` with little traffic to memory: sums go on in
-    registers from a body to the next, and through records where the tree branches.
+    The wrenches act on the tree's ``count`` loaded bodies, in order. This is
+    :func:`vinesim.kernels.plants.impulse_response.apply_tree_wrenches` with little memory traffic: sums stay in
+    registers from one body to the next, and go through records where the tree branches.
     """
     first = model.tree_first[tree]
     last = loaded[count - 1]
@@ -171,7 +175,7 @@ def apply_loaded_wrenches(
     touched = int(last)
     for i in range((last - first) / model.pitch + 1):
         k = last - i * model.pitch
-        # all that a body needs is read before anything is asked: a GPU then waits for memory once
+        # all values of a body are read before the first branch, so that a GPU waits for memory once
         parent = model.body_parent[k]
         branches = is_branching[k]
         lever = factors.lever[k]
@@ -230,13 +234,13 @@ def apply_loaded_wrenches(
 
 @wp.func
 def last_newton_sweep(count: int, max_newton_steps: int, max_newton_contacts: int):
-    """Sweep up to which Newton steps are taken; 0 for none."""
+    """Returns the last sweep that is followed by a Newton step; 0 for no Newton steps."""
     return wp.where(count > wp.min(max_newton_contacts, MOST_NEWTON_CONTACTS), 0, max_newton_steps)
 
 
 @wp.func
 def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out: TreeSystem):
-    """Copy what the contacts of one tree must fulfil, and where their impulses stand."""
+    """Copy the system that the contacts of one tree must fulfil, and their present impulses."""
     for row in range(lane, size, lanes):
         for k in range(size):
             target_out.matrix[k, row] = source.matrix[k, row]
@@ -262,7 +266,7 @@ def begin_trees(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """One thread of a CPU per tree: two sweeps for its impulses; trees that need more are listed."""
+    """One thread of a CPU per tree. Take two sweeps for its impulses, and list the tree if it needs more."""
     tree = wp.tid()
     count = tree_contacts_out.count[tree]
     if count > 0:
@@ -292,8 +296,10 @@ def solve_small_trees(
     tree_contacts_out: TreeContacts,
     system_out: TreeSystem,
 ):
-    """``lanes`` threads of a GPU per tree solve for its impulses, in full warps; nothing happens with trees of more rows, see
-    :func:`vinesim.kernels.contact.row_solver.solve_rows`."""
+    """``lanes`` threads of a GPU per tree, in full warps. Solve for the tree's impulses.
+
+    Trees with more rows are skipped; see :func:`vinesim.kernels.contact.row_solver.solve_rows`.
+    """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
     count = int(0)
@@ -324,9 +330,10 @@ def solve_busy_trees(
     dense_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """``lanes`` threads for each tree that needs more sweeps, one tree after the other in so many ``groups`` of threads.
+    """``lanes`` threads for each tree that needs more sweeps. Each of ``groups`` groups of threads takes tree after
+    tree.
 
-    dense_out: scratch, the system of each group's tree in one stretch of memory.
+    dense_out: scratch, the system of each group's tree in contiguous memory.
     """
     group = wp.tid() // lanes
     lane = wp.tid() % lanes
@@ -380,10 +387,10 @@ def apply_tree_impulses(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread per tree: what the impulses of its contacts add to its prediction, and what the next step starts from.
+    """One thread per tree. Add the effect of its contact impulses to its prediction, and store the next warm start.
 
-    was_in_contact_out: [tree] whether it was in contact in the last step; brought up to date. A tree whose contact begins
-    takes ``onset_steps`` backward Euler steps, this one included.
+    was_in_contact_out: [tree] whether the tree was in contact in the last step; updated here. A tree whose contact
+    begins takes ``onset_steps`` backward Euler steps, this one included.
     """
     tree = wp.tid()
     loaded = view_int(tree_contacts_out.loaded, tree, trees)

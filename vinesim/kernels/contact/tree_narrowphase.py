@@ -1,8 +1,8 @@
-"""Narrowphase of trees that are worlds of their own with geoms that do not move: pairs, contacts of each, their numbers.
+"""Narrowphase for trees that are worlds of their own, with geoms that do not move: pairs and contacts of each tree.
 
-Contacts are found in a kernel for geoms of any kind, and in a far shorter one for planes, spheres and capsules alone: a GPU
-whose threads are at many places of a long kernel waits for instructions more than for anything else. The number of a
-contact in its tree follows from the pairs before its own, so that it is the same in every run.
+Contacts are found by a kernel for geoms of any kind, or by a far shorter kernel for planes, spheres and capsules only.
+A GPU whose threads are at many places of a long kernel mostly waits for instructions. The index of a contact in its
+tree follows from the pairs before its own, so that it is the same in every run.
 """
 
 import warp as wp
@@ -28,34 +28,34 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TreeContacts:
-    """What is kept of each tree's contacts [tree] from step to step."""
+    """Data about each tree's contacts that is kept from step to step [tree]."""
 
     count: wp.array(dtype=wp.int32)
-    """of this step."""
+    """[tree] Number of contacts in this step."""
     near: wp.array(dtype=wp.vec2i)
-    """[k] scratch: capsules and geoms whose boxes overlap, those of all trees in any order."""
+    """[k] Scratch: pairs of a capsule and a geom whose boxes overlap, of all trees in any order."""
     near_place: wp.array(dtype=wp.int32)
-    """[k] which pair of its tree each is."""
+    """[k] Index of the pair in its tree."""
     near_total: wp.array(dtype=wp.int32)
-    """[1] number of these pairs."""
+    """[1] Number of pairs in ``near``."""
     near_count: wp.array(dtype=wp.int32)
-    """of them."""
+    """[tree] Number of the tree's pairs in ``near``."""
     found: wp.array(dtype=wp.int32)
-    """[i * trees + tree] scratch: contacts of such a pair, 0 to 2."""
+    """[i * trees + tree] Scratch: number of contacts of pair i of the tree, 0 to 2."""
     busy_count: wp.array(dtype=wp.int32)
-    """[1] number of trees that need more threads or sweeps than most."""
+    """[1] Number of trees that need more threads or sweeps than most trees."""
     busy: wp.array(dtype=wp.int32)
-    """[i] these trees, in any order."""
+    """[i] Trees that need more threads or sweeps than most trees, in any order."""
     is_impact: wp.array(dtype=wp.bool)
-    """[tree]"""
+    """[tree] Whether one of the tree's contacts is an impact."""
     dropped: wp.array(dtype=wp.int32)
-    """left out since the start, for want of room."""
+    """[tree] Number of contacts left out since the start because the tree had no room for them."""
     sweeps: wp.array(dtype=wp.int32)
-    """of the last solve."""
+    """[tree] Number of sweeps in the last solve."""
     loaded_count: wp.array(dtype=wp.int32)
-    """bodies that the wrenches of the last contacts act on."""
+    """[tree] Number of bodies on which the wrenches of the last contacts act."""
     loaded: wp.array(dtype=wp.int32)
-    """[i * trees + tree] these bodies."""
+    """[i * trees + tree] Bodies on which the wrenches of the last contacts act."""
 
 
 @wp.func
@@ -70,8 +70,10 @@ def list_near_geoms(
     static_blocks: Aabbs,
     tree_contacts_out: TreeContacts,
 ):
-    """List the geoms whose boxes overlap that of capsule ``s``; returns how many pairs its tree has then. More than there
-    is ``room`` for are only counted."""
+    """List the geoms whose boxes overlap the box of capsule ``s``. Returns the number of pairs that the tree then has.
+
+    Pairs for which there is no ``room`` are counted but not listed.
+    """
     for block in range(static_blocks.low.shape[0]):
         if not aabbs_disjoint(low, high, static_blocks.low[block], static_blocks.high[block]):
             for g in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, geoms.count[1])):
@@ -99,9 +101,11 @@ def list_near_pairs(
     capsule_states_out: CapsuleStates,
     tree_contacts_out: TreeContacts,
 ):
-    """One thread per tree: pairs of a capsule and a geom whose boxes overlap, and where these capsules are.
+    """One thread per tree. List the pairs of a capsule and a geom whose boxes overlap, and compute the capsules'
+    states.
 
-    Capsule i of a tree is ``i * trees + tree``; one without a body is none. Pairs beyond their room count as dropped.
+    Capsule i of a tree is at ``i * trees + tree``; an entry without a body is no capsule. Pairs for which there is no
+    room count as dropped.
     """
     tree = wp.tid()
     if tree == 0:
@@ -147,7 +151,10 @@ def find_contacts_of_pairs(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """Contacts of every so-manieth near pair: those of pair i of a tree are its candidates 2 i and 2 i + 1."""
+    """Find the contacts of every n-th near pair.
+
+    Contacts of pair i of a tree are the tree's candidates 2 i and 2 i + 1.
+    """
     for k in range(thread, tree_contacts_out.near_total[0], threads):
         tree = tree_contacts_out.near[k][0] % trees
         i = tree_contacts_out.near_place[k]
@@ -192,7 +199,7 @@ def find_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """``threads`` threads: :func:`find_contacts_of_pairs` with geoms of any kind."""
+    """``threads`` threads. :func:`find_contacts_of_pairs` for geoms of any kind."""
     find_contacts_of_pairs(
         wp.tid(),
         False,
@@ -229,7 +236,7 @@ def find_round_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """``threads`` threads: :func:`find_contacts_of_pairs` where all geoms are planes, spheres and capsules."""
+    """``threads`` threads. :func:`find_contacts_of_pairs` if all geoms are planes, spheres or capsules."""
     find_contacts_of_pairs(
         wp.tid(),
         True,
@@ -258,9 +265,11 @@ def number_tree_contacts(
     tree_contacts_out: TreeContacts,
     source_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per tree: its contacts in the order of (capsule, geom, end). What exceeds the slots is only counted.
+    """One thread per tree. List its contacts in the order of (capsule, geom, end). Contacts beyond the slots are
+    counted.
 
-    few: trees with more contacts are listed as busy. source_out: [slot * trees + tree] which candidate each contact is.
+    few: trees with more contacts than this are listed as busy. source_out: [slot * trees + tree] candidate of each
+    contact.
     """
     tree = wp.tid()
     if tree == 0:

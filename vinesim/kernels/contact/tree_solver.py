@@ -1,11 +1,12 @@
-"""The impulses of one tree's contacts with what does not move: the conditions and steps of the solver of islands, dense.
+"""Solves the contacts of one tree with static geoms by the conditions and steps of the island solver, as a dense
+system.
 
-:mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, and finds its
-way through lists of them. The contacts of a tree alone are one matrix, and nothing else moves: then a row is a sum. On a
-GPU :mod:`vinesim.kernels.contact.row_solver` does the same with a thread a row, and what is here solves the trees that have too
-many contacts for that, a warp each, whose threads share the rows and all take the same decisions from the same numbers. On
-a CPU one thread has all rows. The matrix is in single precision, as the impulse response is that it comes from; all else is
-in double precision.
+:mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, and finds
+its way through lists of them. The contacts of a single tree form one matrix, and nothing else moves, so the velocity
+along a row is one sum. On a GPU, :mod:`vinesim.kernels.contact.row_solver` does the same with one thread for each row.
+This module solves the trees with too many contacts for that, with one warp for each tree. The threads of a warp share
+the rows and take the same decisions from the same numbers. On a CPU one thread has all rows. The matrix is in single
+precision, like the impulse response from which it is computed. All else is in double precision.
 """
 
 import warp as wp
@@ -28,35 +29,35 @@ wp.set_module_options({"enable_backward": False})
 
 
 LANES_ACROSS = wp.constant(16)
-"""Threads that share the columns of a row when a system is solved; two rows at once."""
+"""Number of threads that share the columns of a row in the solution of a linear system. A warp takes two rows at once."""
 FIRST_SWEEPS = wp.constant(2)
-"""Sweeps after which a tree is listed as one that needs more; impulses as they are then are what the search returns to."""
+"""Number of sweeps after which a tree is listed as one that needs more. The search can return to the impulses then."""
 MOST_NEWTON_CONTACTS = wp.constant(16)
-"""Contacts whose numbers fit into one word: trees with more take no Newton steps."""
+"""Largest number of contacts whose indices fit into one word. Trees with more contacts take no Newton steps."""
 
 
 @wp.struct
 class TreeSystem:
-    """Contacts of one tree: what their impulses must fulfil, and scratch of the search."""
+    """Contacts of one tree: the system that their impulses must fulfil."""
 
     matrix: wp.array2d(dtype=float)
     """[row, row] Delassus matrix, 1/kg."""
     free: wp.array(dtype=wp.float64)
     """[row] m/s without impulses, bias included."""
     surface: wp.array(dtype=Surface)
-    """[contact]"""
+    """[contact] Contact properties of the pair of materials."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] N s, the guess at first."""
+    """[row] Impulse, N s. Holds the initial guess at first."""
     velocity: wp.array(dtype=wp.float64)
-    """[row] m/s with the impulses, bias included, without compliance."""
+    """[row] Velocity with the impulses, bias included, without compliance, m/s."""
 
 
 @wp.struct
 class TreeSearch:
-    """What the search for the impulses of one tree works with after its first sweeps."""
+    """Scratch of the search for the impulses of one tree after its first sweeps."""
 
     factor: wp.array2d(dtype=wp.float64)
-    """[row, row + 1] the linear system of a Newton step, right-hand side last."""
+    """[row, row + 1] Linear system of a Newton step; the last column is the right-hand side."""
     first: wp.array(dtype=wp.float64)
     """[row] impulses before the first Newton step."""
     before: wp.array(dtype=wp.float64)
@@ -74,16 +75,16 @@ if (lanes > 1) {
 #endif
 """)
 def synchronize_lanes(lanes: int):
-    """Wait until all threads that share the tree have come here; each then sees what the others wrote.
+    """Wait until all threads that share the tree have come here. Each thread then sees what the others wrote.
 
-    They are neighbours of one warp; ``lanes`` divides 32.
+    The threads are neighbours in one warp; ``lanes`` divides 32.
     """
     ...
 
 
 @wp.func
 def update_velocities(lane: int, lanes: int, size: int, system_out: TreeSystem):
-    """Compute the velocities along all rows anew from the impulses."""
+    """Compute the velocities along all rows again from the impulses."""
     for row in range(lane, size, lanes):
         value = system_out.free[row]
         for j in range(size):  # the matrix is symmetric: along its row, threads in step read one stretch
@@ -94,7 +95,7 @@ def update_velocities(lane: int, lanes: int, size: int, system_out: TreeSystem):
 
 @wp.func
 def steps_of_contact(c: int, system: TreeSystem):
-    """The steps of Gauss-Seidel of a contact."""
+    """Returns the step sizes of a contact's Gauss-Seidel step."""
     own = wp.mat33d()
     for r in range(3):
         for k in range(3):
@@ -105,7 +106,10 @@ def steps_of_contact(c: int, system: TreeSystem):
 
 @wp.func
 def relax_contact(c: int, lane: int, lanes: int, size: int, system_out: TreeSystem):
-    """One Gauss-Seidel step of a contact: its normal impulse and how far its impulse has changed [N s]."""
+    """Take one Gauss-Seidel step of a contact.
+
+    Returns its normal impulse and the size of the change of impulse [N s].
+    """
     zero = wp.float64(0.0)
     n = 3 * c
     surface = system_out.surface[c]
@@ -130,7 +134,7 @@ def relax_contact(c: int, lane: int, lanes: int, size: int, system_out: TreeSyst
 
 @wp.func
 def list_pressing(count: int, system: TreeSystem):
-    """Numbers of the contacts that press, four bits each, and how many they are."""
+    """Returns the indices of the closed contacts, four bits each, and their number."""
     listed = wp.int64(0)
     found = int(0)
     for c in range(count):
@@ -142,7 +146,7 @@ def list_pressing(count: int, system: TreeSystem):
 
 @wp.func
 def row_of(listed: wp.int64, i: int):
-    """Row of entry ``i`` of the linear system, which has the rows of listed contacts only."""
+    """Returns the row of entry ``i`` of the linear system, which contains the rows of listed contacts only."""
     return 3 * int((listed >> wp.int64(4 * (i // 3))) & wp.int64(15)) + i % 3
 
 
@@ -166,7 +170,7 @@ def sliding_row(part: int, x: wp.vec3d, velocity: wp.vec3d, steps: Steps, surfac
 
 @wp.func
 def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, search_out: TreeSearch):
-    """Write a friction row of a sliding contact: see :func:`sliding_row`."""
+    """Write a friction row of a sliding contact; see :func:`sliding_row`."""
     n = row_of(listed, i - i % 3)
     c = n // 3
     by, added = sliding_row(
@@ -185,7 +189,7 @@ def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, s
 
 @wp.func
 def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, system: TreeSystem, search_out: TreeSearch):
-    """The linear system of the present states of the listed contacts, which press; others have no impulse.
+    """Write the linear system for the present states of the listed contacts. These are closed; others have no impulse.
 
     Sticking rows: (A + compliance) x = -velocity. Friction of sliding contacts: see :func:`write_sliding_row`.
     """
@@ -206,7 +210,7 @@ def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, syst
 def solve_newton_system(
     listed: wp.int64, lane: int, lanes: int, size: int, system_out: TreeSystem, search_out: TreeSearch
 ):
-    """Gaussian elimination without pivoting: the matrix is positive definite, and sliding rows change that little."""
+    """Gaussian elimination without pivoting: the matrix is positive definite, and sliding rows change it little."""
     across = wp.min(lanes, LANES_ACROSS)
     down = wp.max(lanes / LANES_ACROSS, 1)
     for k in range(size):
@@ -229,7 +233,7 @@ def solve_newton_system(
 
 @wp.func
 def take_newton_step(lane: int, lanes: int, count: int, system_out: TreeSystem, search_out: TreeSearch):
-    """Impulses that fit the present states of all contacts, put back into their friction cones."""
+    """Compute the impulses that fit the present states of all contacts, and project them into their friction cones."""
     listed, found = list_pressing(count, system_out)
     synchronize_lanes(lanes)
     write_newton_system(listed, lane, lanes, 3 * found, system_out, search_out)
@@ -240,7 +244,7 @@ def take_newton_step(lane: int, lanes: int, count: int, system_out: TreeSystem, 
 
 @wp.func
 def project_into_cones(lane: int, lanes: int, count: int, system_out: TreeSystem):
-    """Put the impulses back into their friction cones, where the guess about a contact was wrong."""
+    """Project the impulses into their friction cones, where the assumed state of a contact was wrong."""
     for c in range(lane, count, lanes):
         x = project_into_cone(three(3 * c, system_out.impulse), system_out.surface[c])
         set_three(3 * c, x, system_out.impulse)
@@ -251,9 +255,9 @@ def project_into_cones(lane: int, lanes: int, count: int, system_out: TreeSystem
 def follow_conjugate_direction(
     gradient_before: wp.float64, lane: int, lanes: int, size: int, system_out: TreeSystem, search_out: TreeSearch
 ):
-    """Go on in the conjugate direction after a sweep; returns the square of the gradient [N^2 s^2].
+    """Continue in the conjugate direction after a sweep. Returns the square of the gradient [N^2 s^2].
 
-    As :func:`vinesim.kernels.contact.conjugate_gradient.follow_conjugate_direction`.
+    See :func:`vinesim.kernels.contact.conjugate_gradient.follow_conjugate_direction`.
     """
     zero = wp.float64(0.0)
     gradient = wp.float64(0.0)
@@ -298,7 +302,7 @@ def search_on(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """What comes between two sweeps; returns the square of the gradient."""
+    """Do the work between two sweeps: a Newton step or a conjugate direction. Returns the square of the gradient."""
     size = 3 * count
     if sweeps == newton_end + 1 and newton_end > 0:
         copy_rows(lane, lanes, size, search_out.first, system_out.impulse)
@@ -312,7 +316,10 @@ def search_on(
 
 @wp.func
 def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, system_out: TreeSystem):
-    """One sweep over all contacts of a tree; returns whether it changed more than ``tolerance`` of the largest impulse."""
+    """One sweep over all contacts of a tree.
+
+    Returns whether it changed more than ``tolerance`` of the largest impulse.
+    """
     change = wp.float64(0.0)
     largest = wp.float64(MIN_IMPULSE_SCALE)
     for c in range(count):
@@ -334,11 +341,13 @@ def solve_tree(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """Solve for the impulses of ``count`` contacts of a tree that has had so many ``sweeps``; returns their number then, and
-    whether the last one changed more than ``tolerance``.
+    """Solve for the impulses of ``count`` contacts of a tree for which ``sweeps`` sweeps have been done.
 
-    As :func:`vinesim.kernels.contact.projected_gauss_seidel.solve_island` does, but with a Newton step after every
-    sweep up to ``newton_end``, in which the direction of sliding is linearised. ``lane``: which of the ``lanes`` threads that share the tree this one is.
+    Returns the number of sweeps done then, and whether the last sweep changed more than ``tolerance``.
+
+    The method is that of :func:`vinesim.kernels.contact.projected_gauss_seidel.solve_island`, but with a Newton step
+    after every sweep up to ``newton_end``, in which the direction of sliding is linearised. ``lane``: index of this
+    thread among the ``lanes`` threads that share the tree.
     """
     gradient = wp.float64(0.0)
     busy = bool(True)

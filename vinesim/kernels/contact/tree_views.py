@@ -1,6 +1,6 @@
-"""Views of the arrays of contacts: with an offset and a pitch they show one tree all of its own entries, and nothing else.
+"""Views of the contact arrays. Their offset and pitch show one tree all of its own entries, and nothing else.
 
-Entry ``i`` of a tree lies at ``i * trees + tree``: see :mod:`vinesim.kernels.contact.tree_islands`.
+Entry ``i`` of a tree is at ``i * trees + tree``; see :mod:`vinesim.kernels.contact.tree_islands`.
 """
 
 import warp as wp
@@ -67,21 +67,22 @@ def part_table(a: wp.array2d(dtype=wp.float64), first: int) -> wp.array2d(dtype=
 
 
 GROUP = wp.constant(32)
-"""Trees whose entries neighbouring threads take: a warp of a GPU."""
+"""Number of trees whose entries neighbouring threads take: a warp of a GPU."""
 
 
 @wp.func
 def tree_and_entry(thread: int, entries: int):
-    """Which tree, and which of its ``entries``, a thread takes: all entries of 32 trees before those of the next ones.
+    """Returns the tree, and the index among its ``entries``, that a thread takes.
 
-    Then threads of one block of a GPU read the same bodies, from a cache. The last trees may be beyond the number of all.
+    All entries of 32 trees come before those of the next 32 trees, so that the threads of a GPU's block read the same
+    bodies from a cache. The returned tree may be beyond the last tree.
     """
     return thread // (GROUP * entries) * GROUP + thread % GROUP, thread // GROUP % entries
 
 
 @wp.func
 def view_contacts(s: Contacts, tree: int, trees: int):
-    """The contacts of one tree. All are in one island and one block."""
+    """Returns views of the contacts of one tree. All are in one island and one block."""
     return Contacts(
         view_int(s.source, tree, trees),
         view_int(s.feature, tree, trees),
@@ -105,7 +106,7 @@ def view_contacts(s: Contacts, tree: int, trees: int):
 
 @wp.func
 def view_rows(s: Rows, tree: int, trees: int):
-    """The rows of one tree's contacts."""
+    """Returns views of the rows of one tree's contacts."""
     return Rows(
         view_table(s.plant_jacobian, tree, trees, 12),
         s.rigid_jacobian,
@@ -119,7 +120,7 @@ def view_rows(s: Rows, tree: int, trees: int):
 
 @wp.func
 def view_warm_start(s: WarmStart, tree: int, trees: int):
-    """What one tree's contacts start from."""
+    """Returns views of the warm start of one tree's contacts."""
     return WarmStart(
         view_int(s.count, tree, trees),
         view_int(s.feature, tree, trees),
@@ -132,7 +133,7 @@ def view_warm_start(s: WarmStart, tree: int, trees: int):
 
 @wp.func
 def view_system(s: TreeSystem, tree: int, trees: int, width: int):
-    """What the contacts of one tree must fulfil, with so many rows at most."""
+    """Returns views of the system that one tree's contacts must fulfil; its matrix has ``width`` columns."""
     return TreeSystem(
         view_matrix(s.matrix, tree, trees, width),
         view_double(s.free, tree, trees),
@@ -144,7 +145,7 @@ def view_system(s: TreeSystem, tree: int, trees: int, width: int):
 
 @wp.func
 def view_search(s: TreeSearch, tree: int, trees: int, columns: int):
-    """What the search of one tree works with; its matrix has so many columns."""
+    """Returns views of the arrays that the search for one tree uses; its matrix has ``columns`` columns."""
     return TreeSearch(
         view_table(s.factor, tree, trees, columns),
         view_double(s.first, tree, trees),
@@ -155,7 +156,7 @@ def view_search(s: TreeSearch, tree: int, trees: int, columns: int):
 
 @wp.func
 def part_of_system(s: TreeSystem, first: int):
-    """The same of arrays in which each tree has a stretch of its own, from row ``first`` on."""
+    """Returns views of the system from row ``first`` on, for arrays in which each tree's rows are contiguous."""
     return TreeSystem(
         part_matrix(s.matrix, first),
         part_double(s.free, first),
@@ -167,7 +168,7 @@ def part_of_system(s: TreeSystem, first: int):
 
 @wp.func
 def part_of_search(s: TreeSearch, first: int):
-    """What the search of one such tree works with."""
+    """Returns views of the search from row ``first`` on, for arrays in which each tree's rows are contiguous."""
     return TreeSearch(
         part_table(s.factor, first),
         part_double(s.first, first),

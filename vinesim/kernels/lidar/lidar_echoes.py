@@ -1,4 +1,4 @@
-"""What comes back of a laser shot, and what a lidar makes of it."""
+"""Echoes of a laser shot, and the returns that a lidar reports for them."""
 
 import warp as wp
 
@@ -7,25 +7,25 @@ from vinesim.kernels.raster.primitives import Shapes, normal_at
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 RayValues = wp.types.vector(length=8, dtype=wp.float32)
-"""One number for each ray of a shot; an echo is (signal, range, brightness, which ray shows most of it)."""
+"""One number for each ray of a shot; an echo is (signal, range, brightness, index of the ray that contributes most)."""
 
 
 @wp.struct
 class Receiver:
-    """What a lidar makes of what comes back."""
+    """Properties of a lidar's receiver."""
 
     rays: int
-    """Of one shot, the first one in its middle."""
+    """Number of rays in one shot. The first ray is in the middle of the shot."""
     used: int
-    """Of these, how many count, from the first on."""
+    """Number of rays that count, from the first ray on."""
     reflectance: wp.array(dtype=wp.float32)
-    """[organ]"""
+    """[organ] Reflectance."""
     nearest: float
     farthest: float
     merge: float
     separation: float
     returns: int
-    """0 the strongest, 1 the last, 2 both."""
+    """Which echoes are reported: 0 the strongest, 1 the last, 2 both."""
     noise: float
     weak_noise: float
     step: float
@@ -35,7 +35,7 @@ class Receiver:
 
 @wp.func
 def measured_range(r: Receiver, echo: wp.vec4, noise: float) -> float:
-    """Range of an echo [m]: noise grows as the signal comes near the weakest that is noticed."""
+    """Returns the range of an echo [m]. Noise grows as the signal approaches the weakest one that is detected."""
     sigma = r.noise
     if r.weakest > 0.0:
         sigma = wp.max(sigma, r.weak_noise * wp.sqrt(r.weakest / echo[0]))
@@ -47,7 +47,7 @@ def measured_range(r: Receiver, echo: wp.vec4, noise: float) -> float:
 
 @wp.func
 def label_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
-    """Label of what a ray has met."""
+    """Returns the label of the primitive that a ray has hit."""
     if primitive < 0:
         return ground_label
     return label[primitive]
@@ -62,7 +62,7 @@ class SortedRays:
     brightness: RayValues
     """Reflectance times cosine, over the number of rays that count."""
     ray: RayValues
-    """Which ray it was."""
+    """Index of the ray in its shot."""
     count: int
 
 

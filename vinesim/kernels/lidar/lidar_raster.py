@@ -46,34 +46,34 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 ELEVATION_SLOTS = wp.constant(1024)
-"""Into so many parts the way from straight down to straight up is cut to find rows."""
+"""Number of slots into which elevations from straight down to straight up are divided, to find rows."""
 BALL_SPACING = wp.constant(0.02)
-"""A slender thing is bound by balls about this far apart [rad]."""
+"""[rad] Approximate distance between the balls that bound a slender primitive."""
 
 
 @wp.struct
 class LidarHead:
-    """Where the head is, its rows in the order of elevation, and which columns are fired."""
+    """Pose of the lidar's head, its rows in the order of elevation, and the columns that are fired."""
 
     eye: wp.vec3
     rotation: wp.mat33
     """Rows: forward, left, up, in the world."""
     tangent: wp.array(dtype=wp.float32)
-    """Of the elevation [row]."""
+    """[row] Tangent of the row's elevation."""
     azimuth: wp.array(dtype=wp.float32)
-    """Of the ray in column 0 [row] rad."""
+    """[row] Azimuth of the row's ray in column 0, rad."""
     row_index: wp.array(dtype=wp.int32)
-    """Place within a column [row]."""
+    """[row] Index of the row within a column."""
     row_slots: wp.array(dtype=wp.int32)
-    """First row in each slot or above it [slot]."""
+    """[slot] First row in the slot or above it."""
     direction: wp.array2d(dtype=wp.float32)
     """Unit vectors in the head's frame [column * row, 3]."""
     step: float
-    """From column to column [rad]."""
+    """Angle from column to column [rad]."""
     azimuth_middle: wp.vec2
     """Forward and left component of the middle of the azimuths that are fired."""
     azimuth_half_range: wp.vec2
-    """Cosine and sine of how far they reach to either side; cosine -1 for all around."""
+    """Cosine and sine of half the range of fired azimuths; cosine -1 for a full turn."""
     first_column: int
     end_column: int
     max_range: float
@@ -179,12 +179,12 @@ def bounding_balls(shapes: Shapes, i: int, kind: int, head: LidarHead) -> BallCh
 
 @wp.struct
 class AngularBound:
-    """Azimuths and elevations, in the head's frame, that hold a primitive."""
+    """Ranges of azimuth and elevation, in the head's frame, that contain a primitive."""
 
     azimuth: float
-    """[rad] Its middle."""
+    """[rad] Middle of the azimuths."""
     half: float
-    """[rad] How far it reaches to either side; pi for all around."""
+    """[rad] Half of the range of azimuths; pi for a full turn."""
     low: float
     high: float
     """Tangents of the elevations."""

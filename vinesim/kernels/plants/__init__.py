@@ -9,27 +9,27 @@ the *metric* phi dt (phi dt K + D) and stiffness cannot make the step unstable. 
 K and D are diagonal in a joint's *middle axes*, turned from the joint's by half of its rotation, and the torque is the
 gradient of theta^T K theta / 2 (:func:`vinesim.kernels.plants.forces.spring_torque`).
 
-A step slows a mode of rate w by (w dt)^2 / 12. A tree whose first mode turns by more than 0.3 rad in it takes substeps
-instead while nothing touches it: ``tree_steps`` says how many, :mod:`vinesim.kernels.plants.first_mode` why.
-docs/decisions/integrator.md has the figures.
+A step slows a mode of rate w by (w dt)^2 / 12. While nothing touches it, a tree whose first mode turns by more than
+0.3 rad in a step takes substeps instead: ``tree_steps`` holds their number, :mod:`vinesim.kernels.plants.first_mode`
+explains why. docs/decisions/integrator.md has the figures.
 
 Loads lend stiffness, too: a force F drawing out a lever d resists turning with (d.F)(1 - dd^T / d.d). Taken explicitly
 it gives a swing of rate w the damping ratio -(1 - phi) dt w / 2 (-0.018 for a bunch on 15 cm), and where a peduncle is
 softer than what it carries it grows without bound. So it enters the inertia with phi^2 dt^2, and the force's moment is taken where
 the lever will be (1 - phi) dt later: a swing then neither gains nor loses. F is weight, load and the last contacts.
 
-That is one half of what a load stiffens a tree by. The other couples bending to twist: a force across a lever turns
-with it, and so does the moment that a spring bears, with the middle of its joint (by half of what parent and body
-turn). In equilibrium both together are symmetric. At phi 1/2, which must keep energy, they are taken whole: without, a
-level cane loses 2 % of a sideways swing in a minute, and with 100 g on its tip it gains forty times its energy in
-twenty seconds. Above phi 1/2 they are left out: they would cost a quarter of the step, and the scheme's own damping
-outweighs them.
+This is one half of the stiffness that a load lends to a tree. The other half couples bending to twist: a force across a
+lever turns with it, and so does the moment of a spring, with the middle of its joint (by half of what parent and body
+turn). In equilibrium both together are symmetric. At phi 1/2, which must keep energy, they are included completely:
+without them, a level cane loses 2 % of a sideways swing in a minute, and with 100 g on its tip it gains forty times its
+energy in twenty seconds. Above phi 1/2 they are left out: they would cost a quarter of the step, and the scheme's own
+damping outweighs them.
 
-A body with parent -1 is a root: it hangs on its tree's pose, or *floats* if it has been cut off (``body_root`` names the
-cut body that everything on it moves with, -1 for what still stands). A floating root has no spring and no lever; what is
-left of its inertia after its rotation is eliminated gives its linear acceleration, ``root_inverse_mass`` times the force left over.
-Where no tie holds it, it *falls* (``body_falls``): weight draws nothing out, and its momentum is corrected after the step
-(``floating_components``). What hangs from a tie is stepped as what stands.
+A body with parent -1 is a root. It hangs on its tree's pose, or *floats* if it has been cut off (``body_root`` names
+the cut body with which a body moves, -1 for bodies that stand). A floating root has no spring and no lever. The inertia
+that remains after its rotation is eliminated gives its linear acceleration: ``root_inverse_mass`` times the remaining
+force. Where no tie holds it, it *falls* (``body_falls``): weight draws nothing out, and its momentum is corrected after
+the step (``floating_components``). Components that hang from a tie are stepped like trees that stand.
 
 Ties and air drag are forces at a point c of a body that grow against its velocity. Taken implicitly they look like a
 mass W at c: W = phi dt (phi dt k + c) for a spring and damper, dt c for drag.
@@ -45,9 +45,10 @@ at the origin, moment about it). The inertia of a body or subtree about the body
 
 and after elimination of its joint a body keeps only D = (J + metric)^-1, D J and D H.
 
-Bodies are numbered by their place in memory: those of a tree ``pitch`` apart, from ``tree_first`` on, children behind parents.
-One after the other (pitch 1) suits a CPU; a GPU reads neighbouring trees at once if their bodies are neighbours. Sums
-over children are read and stored, not added in place: that would be an atomic operation, in a GPU's far cache.
+Bodies are numbered by their place in memory: the bodies of a tree are ``pitch`` apart, from ``tree_first`` on, children
+after parents. Consecutive bodies (pitch 1) suit a CPU. A GPU reads neighbouring trees at once if their bodies are
+neighbours in memory. Sums over children are read and stored, not added in place, which would be an atomic operation in
+a GPU's far cache.
 
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
 ``body_dynamics`` (one body and its joint), ``prediction`` (the three passes over one tree), ``eight_trees`` and ``lane_records`` (over

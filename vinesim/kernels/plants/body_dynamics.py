@@ -1,8 +1,9 @@
-"""Dynamics of one body and its joint within a prediction, from numbers to numbers.
+"""Dynamics of one body and its joint within a prediction, as functions of plain values.
 
-The steps of the articulated-body algorithm (Featherstone 2008, table 7.1) that a walk over a tree takes at each body:
-:mod:`vinesim.kernels.plants.prediction` tree by tree, :mod:`vinesim.kernels.plants.eight_trees` with eight at
-once. Both give the same bits: nothing here has a branch, and of symmetric matrices only the upper triangle counts.
+They are the steps of the articulated-body algorithm (Featherstone 2008, table 7.1) at each body of a tree:
+:mod:`vinesim.kernels.plants.prediction` calls them tree by tree, :mod:`vinesim.kernels.plants.eight_trees` for eight
+trees at once. Both give the same bits: no function has a branch, and only the upper triangle of symmetric matrices
+counts.
 """
 
 import warp as wp
@@ -67,8 +68,10 @@ def own_terms(
 
 @wp.func
 def drag_terms(p: SolverParameters, phi: float, area: float, air: wp.vec3, motion: wp.spatial_vector, com: wp.vec3):
-    """What the drag of the air at its centre of mass adds to the J, H, M, bias and tension of one body: as a mass there
-    and its force. air: [m/s] its velocity.
+    """Returns the J, H, M, bias and tension of air drag on one body: of an added mass at its centre of mass, and its
+    force.
+
+    air: [m/s] velocity of the air.
     """
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
@@ -94,8 +97,10 @@ def tie_terms(
     origin: wp.vec3,
     motion: wp.spatial_vector,
 ):
-    """What a tie at ``point`` [m from the origin, world axes] adds to the J, H, M, bias and tension of one body: spring
-    and damper as a mass there, and their force. anchor, origin: [m] in the world; anchor_velocity: [m/s].
+    """Returns the J, H, M, bias and tension of a tie at ``point`` [m from the origin, world axes] of one body.
+
+    Spring and damper act as an added mass at the point, and by their force. anchor, origin: [m] in the world.
+    anchor_velocity: [m/s].
     """
     omega = wp.spatial_bottom(motion)
     stretch = origin + point - anchor
@@ -122,7 +127,8 @@ def joint_terms(
     turning: wp.vec3,
     omega: wp.vec3,
 ):
-    """Metric of a joint [kg m^2], what drives it [N m] but the bias of its subtree, torque of its spring [N m].
+    """Returns a joint's metric [kg m^2], its driving torque without the bias of its subtree [N m], and its spring
+    torque [N m].
 
     turning, omega: [rad/s] of the parent and of the body. All in world axes.
     """
@@ -177,7 +183,7 @@ def terms_left(
     DH: wp.mat33,
     Du: wp.vec3,
 ):
-    """What is left of a subtree's J, H, M and bias, its joint eliminated, for its parent."""
+    """Returns the J, H, M and bias that a subtree passes to its parent, with its joint eliminated."""
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     J_left = metric * DJ  # = J - J D J without the cancellation; the same for H

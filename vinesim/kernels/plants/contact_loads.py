@@ -7,13 +7,13 @@ wp.set_module_options({"enable_backward": False})
 LOADED = wp.constant(0)
 """Index in ``numbers``: number of bodies that the last step loaded."""
 GIVEN = wp.constant(1)
-"""Index: number of bodies that are loaded now."""
+"""Index in ``numbers``: number of bodies that are loaded now."""
 TICK = wp.constant(2)
-"""Index: number of this step."""
+"""Index in ``numbers``: number of this step."""
 ONSET_STEPS = wp.constant(3)
-"""Index: number of steps with phi = 1 at the begin of a contact, the first one included."""
+"""Index in ``numbers``: number of steps with phi = 1 at the beginning of a contact, including the first one."""
 REFUSED = wp.constant(4)
-"""Index: the first given body that cannot be loaded, counted from 1; 0 if all can be loaded."""
+"""Index in ``numbers``: the first given body that cannot be loaded, counted from 1; 0 if all can be loaded."""
 NUMBERS = 5
 
 
@@ -36,13 +36,14 @@ def load_bodies(
     last_contact_out: wp.array(dtype=wp.int64),
     tree_euler_steps_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all: replace the wrenches of the last step by those of this one, and list the trees touched.
+    """One thread in all. Replace the wrenches of the last step by those of this one, and list the trees touched.
 
-    Nothing happens if a body cannot be loaded: its tree was not in the last prediction (is_stepped [tree]), or it is not
-    among the first tree_moving [tree] bodies of that. place_in_tree: [body] from 0 on.
-    body, wrench: [k] a body may be given several times. loaded_out: [k] the bodies of the last call, then those of this
-    one. body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once; touched_count_out: [1] how many.
-    last_contact_out: [tree] step in which it was touched last. tree_euler_steps_out: [tree] raised where contact begins.
+    Nothing happens if a body cannot be loaded: its tree was not in the last prediction (is_stepped [tree]), or it is
+    not among the first tree_moving [tree] bodies of its tree. place_in_tree: [body] index in the tree, from 0 on. body,
+    wrench: [k] a body may be given several times. loaded_out: [k] bodies of the last call, then of this call.
+    body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once; touched_count_out: [1] number of touched
+    trees. last_contact_out: [tree] step in which it was touched last. tree_euler_steps_out: [tree] raised where contact
+    begins.
     """
     given = int(numbers_out[GIVEN])
     numbers_out[REFUSED] = wp.int64(0)

@@ -1,7 +1,7 @@
-"""Records of eight trees: for each body 8 x :data:`RECORD` numbers, in which a number of all eight lies side by side.
+"""Records of eight trees: for each body 8 x :data:`RECORD` numbers, with each number stored side by side for all eight.
 
-One lane of a record is one tree. What is known of a tree is copied into its lane before a walk, and results out of it
-afterwards; see :mod:`vinesim.kernels.plants.eight_trees`.
+One lane of a record is one tree. The inputs of a tree are copied into its lane before a walk, and its results are
+copied out afterwards; see :mod:`vinesim.kernels.plants.eight_trees`.
 """
 
 import warp as wp
@@ -32,20 +32,20 @@ from vinesim.kernels.plants.structs import (
 )
 
 LANES = 8
-"""Trees in a vector."""
+"""Number of trees in a vector."""
 
-# Where the numbers of a record begin. Kinematics: 20 of them.
+# Where the numbers of a record begin. Kinematics: 20 numbers.
 POSE = wp.constant(LANES * 0)
 MOTION = wp.constant(LANES * 7)
 AXES = wp.constant(LANES * 13)
 LEVER = wp.constant(LANES * 17)
-# Implicit inertia and bias of a subtree: 30. Of symmetric matrices the upper triangle.
+# Implicit inertia and bias of a subtree: 30 numbers. Symmetric matrices are stored as their upper triangle.
 TERMS = wp.constant(LANES * 20)
-# Factors: 27.
+# Factors: 27 numbers.
 FACTORS = wp.constant(LANES * 50)
-# End of the step: 15.
+# End of the step: 15 numbers.
 END = wp.constant(LANES * 77)
-# What is given: model, joints, forces.
+# Inputs: model, joints, forces.
 OFFSET = wp.constant(LANES * 92)
 REST = wp.constant(LANES * 95)
 JOINT_Q = wp.constant(LANES * 99)
@@ -60,7 +60,7 @@ CONTACT = wp.constant(LANES * 123)
 STIFFNESS = wp.constant(LANES * 126)
 DAMPING = wp.constant(LANES * 129)
 RECORD = 132
-"""Numbers of one body of one tree."""
+"""Number of values for one body of one tree."""
 STRIDE = wp.constant(LANES * RECORD)
 
 Floats = wp.array(dtype=float)
@@ -68,13 +68,13 @@ Floats = wp.array(dtype=float)
 
 @wp.func_native("a.data += at; a.strides[0] = sizeof(*a.data); return a;")
 def record(a: wp.array(dtype=float), at: int) -> wp.array(dtype=float):
-    """The same array from number ``at`` on."""
+    """Returns a view of the array from number ``at`` on."""
     ...
 
 
 @wp.func_native("const float* const p = a.data + i; return wp::vec3(p[0], p[8], p[16]);")
 def vec3_at(a: wp.array(dtype=float), i: int) -> wp.vec3:
-    """A vector of one lane, its first number at i."""
+    """Returns a vector of one lane; its first number is at i."""
     ...
 
 

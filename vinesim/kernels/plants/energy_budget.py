@@ -1,21 +1,22 @@
-"""Energy budget: what only weight, springs and ties at rest act on does not gain energy.
+"""Energy budget: a tree does not gain energy while only weight, springs and fixed ties act on it.
 
 The step is linear about its start. In modes that it does not resolve (w dt from 3 to 100: twist, high bending) its
 error feeds energy; docs/decisions/integrator.md has the figures. So the energy of a tree, kinetic and potential, is
-measured at the end of a step, and may not be above the least of the past by more than a band. If it is, the rates are
+measured at the end of a step, and may not exceed its least past value by more than a band. If it does, the rates are
 filtered at fixed pose,
 
     (M + c K) v' = M v,    c = 0.1 dt^2,
 
-which takes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and all of those far beyond. Kinetic energy
-can only fall. What is still too much is taken from all rates alike, and the next step is taken with phi = 1. A pose that
-alone has too much is one that the step went too far to: the tree is led back towards where the step began.
+which removes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and nearly all of modes far beyond. The
+filter can only reduce kinetic energy. Any excess that remains is removed from all rates alike, and the next step is
+taken with phi = 1. If the pose alone has too much energy, the step went too far: the tree is moved back towards its
+pose at the start of the step.
 
-The budget begins anew with whatever does work from outside: contacts, loads, moving air, ties that are moved, and
-changes of state or model between steps. Trees with a floating root or on wires have none, nor has a solver without
-geometric stiffness, which is there to be compared with others.
+The budget begins again whenever anything outside does work on the tree: contacts, loads, moving air, ties that are
+moved, and changes of state or model between steps. Trees with a floating root or on wires have no budget, nor does a
+solver without geometric stiffness, which exists to be compared with others.
 
-Trees that can gain much within one step are watched closely, others seldom: :func:`choose_budget`.
+Trees that can gain much energy within one step are watched closely, others seldom: :func:`choose_budget`.
 """
 
 import warp as wp
@@ -49,27 +50,35 @@ from vinesim.kernels.plants.tree_energy import is_pushed, state_mark, tree_energ
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 BAND = wp.constant(0.01)
-"""Share of the kinetic energy, the largest of the last seconds, by which energy may exceed its budget. Of motion that the
-step resolves, it varies by less. TUNED"""
+"""Share of the kinetic energy (its largest value in the last seconds) by which energy may exceed its budget.
+
+The energy of motion that the step resolves varies by less. TUNED
+"""
 
 FADE = wp.constant(0.998)
-"""What a check leaves of that largest kinetic energy. TUNED: 5 s at 100 checks a second"""
+"""Factor by which each check reduces the stored largest kinetic energy. TUNED: 5 s at 100 checks a second"""
 
 ROUNDING = wp.constant(1.0e-6)
 """[1] Rounding errors of an energy as a share of its terms: eight units in the last place of a float. DERIVED"""
 
 FILTER = wp.constant(0.1)
-"""c / dt^2. TUNED: 0.03 to 1 serve as well"""
+"""c / dt^2 of the filter. TUNED: 0.03 to 1 serve as well"""
 
 CLOSE_STEPS = wp.constant(32)
-"""Steps that are all checked after the energy was found to rise, and in a tree that is watched closely after its budget
-began; else every so-manieth. TUNED"""
+"""Number of steps that are all checked, after the energy was found to rise or, in a tree that is watched closely, after
+its budget began.
+
+Otherwise one step in :data:`CHECK_PERIOD` is checked. TUNED
+"""
 
 NO_BUDGET = 0
 CLOSELY = 1
 NOW_AND_THEN = 2
-"""How the energy of a tree is watched. Closely: the budget is kept in every step. Now and then: energy is looked at; when it
-has risen, the tree is watched closely until :data:`CLOSE_STEPS` steps have gone by without a rise."""
+"""How the energy of a tree is watched.
+
+CLOSELY: the budget is kept in every step. NOW_AND_THEN: energy is checked periodically; when it has risen, the tree is
+watched closely until :data:`CLOSE_STEPS` steps have passed without a rise.
+"""
 
 CHECK_PERIOD = wp.constant(8)
 """[launch] Period of checks of a quiet tree. On a CPU there is one launch in eight steps while no tree is watched closely.
@@ -79,7 +88,7 @@ CHECK_RATE = wp.constant(2.0)
 """[rad/s] Every step of a tree with a faster joint is checked, if it is watched closely. TUNED"""
 
 MIN_DAMPING = wp.constant(0.5)
-"""Least damping of a joint over its stiffness, in steps, in trees that are checked seldom. MEASURED, as is
+"""Least damping of a joint divided by its stiffness, in steps, in trees that are checked seldom. MEASURED, like
 :data:`MAX_SAG`: docs/decisions/integrator.md"""
 
 MAX_SAG = wp.constant(4.0)
@@ -87,10 +96,10 @@ MAX_SAG = wp.constant(4.0)
 were linear and the tree kept the shape of its relaxed springs, level."""
 
 MIN_PHI = wp.constant(0.549)
-"""A tree of which less is asked is watched closely: phi does not damp what the step does not resolve."""
+"""A tree with a smaller phi is watched closely, because phi does not damp the modes that the step cannot resolve."""
 
 BACKTRACKS = wp.constant(8)
-"""Times that the turn of a step may be halved. DERIVED: then 0.4 % of it is left."""
+"""Largest number of times that the turn of a step is halved. DERIVED: 0.4 % of it is then left."""
 
 NO_LIMIT = wp.constant(1.0e30)
 """[J] Limit of a tree whose budget has not begun."""
@@ -108,10 +117,11 @@ def choose_budget(
     scratch_out: Scratch,
     tree_budget_out: wp.array(dtype=wp.int32),
 ):
-    """One thread chooses how the energy of one tree is watched: closely if it is limp or hardly damped.
+    """One thread per tree. Choose how its energy is watched: closely if the tree is limp or hardly damped.
 
-    trees: [thread] which tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or :data:`NO_BUDGET` with
-    a floating root or without geometric stiffness. scratch_out holds nothing that is needed later.
+    trees: [thread] index of the tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or
+    :data:`NO_BUDGET` with a floating root or without geometric stiffness. scratch_out holds nothing that is needed
+    later.
     """
     if wp.tid() >= count[0]:
         return
@@ -156,13 +166,13 @@ def choose_budget(
 
 @wp.func
 def is_close(budget: int, phi: float):
-    """Whether the energy of a tree with this phi is checked in every step."""
+    """Returns whether the energy of a tree with this phi is checked in every step."""
     return budget == CLOSELY or phi < MIN_PHI
 
 
 @wp.func
 def is_watched(budget: int, phi: float, tree: int, budgets: EnergyBudget):
-    """Whether a tree's budget is kept in this step."""
+    """Returns whether a tree's budget is kept in this step."""
     return is_close(budget, phi) or budgets.limit[tree] >= NO_LIMIT or budgets.watch[tree] > 0
 
 
@@ -182,11 +192,11 @@ def begin_budget(
     budget_out: EnergyBudget,
     bodies_out: BodyState,
 ):
-    """Before an integration: one thread begins the budget of one tree, if work was done on it since the last step.
+    """One thread per tree, before an integration. Begin the tree's budget if work was done on it since the last step.
 
-    trees: [thread] which tree; nothing happens with a tree_budget [tree] of :data:`NO_BUDGET`. tree_phi: [tree] phi asked for. forces:
-    of this step. joints: at its start. budget_out: the limit is :data:`NO_LIMIT` while outer forces act. bodies_out:
-    scratch.
+    trees: [thread] index of the tree; nothing happens with a tree_budget [tree] of :data:`NO_BUDGET`. tree_phi: [tree]
+    requested phi. forces: forces of this step. joints: joints at its start. budget_out: the limit is :data:`NO_LIMIT`
+    while external forces act. bodies_out: scratch.
     """
     if wp.tid() >= count[0]:
         return
@@ -233,10 +243,10 @@ def filter_rates(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """(M + c K)^-1 M v into ``joint_qd_free``, with v the joint rates [rad/s]; c in s^2.
+    """Write (M + c K)^-1 M v into ``joint_qd_free``, with v the joint rates [rad/s]; c in s^2.
 
-    The articulated-body algorithm at rest: v' - v is the acceleration by the joint torques -c K v if c K is added to
-    the inertia of the joints.
+    This is the articulated-body algorithm at rest: v' - v is the acceleration by the joint torques -c K v if c K is
+    added to the inertia of the joints.
     """
     unloaded = SolverParameters(1.0, p.fast_rate, p.max_rate, p.fault_rate, p.contact_steps, 0.0, p.gravity)
     first = model.tree_first[tree]
@@ -286,7 +296,7 @@ def filter_rates(
 
 @wp.func
 def is_due(rate: float, close: bool, tree: int, budget_out: EnergyBudget):
-    """Whether this step of a tree is to be checked; counts it."""
+    """Returns whether this step of a tree is to be checked. Counts the step."""
     watch = budget_out.watch[tree] - 1
     due = watch >= 0 or (close and rate > CHECK_RATE)
     if watch <= -CHECK_PERIOD:
@@ -307,7 +317,10 @@ def lead_back(
     joints_out: JointState,
     bodies_out: BodyState,
 ):
-    """Stop a tree and halve the way that its joints went in the step until its energy, returned, is at most ``goal``."""
+    """Stop a tree and halve the turns of its joints in the step until its energy is at most ``goal``.
+
+    Returns the energy.
+    """
     first = model.tree_first[tree]
     energy = wp.vec4(0.0, wp.float32(NO_LIMIT), 0.0, 0.0)
     halved = wp.int32(0)
@@ -337,7 +350,7 @@ def take_energy(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Take from a tree what energy it has above ``goal`` [J], or above ``pose_goal`` if its pose alone has so much.
+    """Remove a tree's energy above ``goal`` [J], or above ``pose_goal`` if its pose alone has so much.
 
     Returns its kinetic and potential energy.
     """
@@ -382,12 +395,12 @@ def keep_budget(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """After an integration: one thread takes from one tree the energy that is beyond its budget.
+    """One thread per tree, after an integration. Remove the tree's energy in excess of its budget.
 
-    trees: [thread] which tree; nothing happens without a limit or with tree_rate [tree] above ``p.fault_rate``.
-    tree_budget: [tree] how its energy is watched. tree_phi: [tree] phi asked for. tree_steps: [tree] substeps that the step
-    is divided into; this is one of them. joints_out: at its end, slower where energy was taken; tree_euler_steps_out:
-    [tree] then at least 1. All that follows is scratch.
+    trees: [thread] index of the tree; nothing happens without a limit or with tree_rate [tree] above ``p.fault_rate``.
+    tree_budget: [tree] how its energy is watched. tree_phi: [tree] requested phi. tree_steps: [tree] substeps that the
+    step is divided into; this is one of them. joints_out: joints at the end of the step, slower where energy was
+    removed; tree_euler_steps_out: [tree] then at least 1. All arguments that follow are scratch.
     """
     if wp.tid() >= count[0]:
         return
@@ -412,10 +425,10 @@ def keep_budget(
         gain = total - budget_out.last[tree]
         if total > limit + band and not watched:
             budget_out.watch[tree] = CLOSE_STEPS
-            budget_out.limit[tree] = NO_LIMIT  # it may have been pushed since
+            budget_out.limit[tree] = NO_LIMIT  # the tree may have been pushed since
             return
         if total > limit + band and gain > rounding:
-            goal = limit + 0.5 * band - gain  # less by what the next step may gain again
+            goal = limit + 0.5 * band - gain  # minus the energy that the next step may gain again
             total = take_energy(
                 p,
                 p.dt / float(tree_steps[tree]),

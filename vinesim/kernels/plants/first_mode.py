@@ -1,6 +1,6 @@
-"""Slowest mode of each tree, and into how many substeps a step must be divided to show its frequency.
+"""Slowest mode of each tree, and the number of substeps that a step needs to reproduce its frequency.
 
-The trapezoidal rule slows a mode of rate w by (w dt)^2 / 12, and errs in its damping alike.
+The trapezoidal rule slows a mode of rate w by (w dt)^2 / 12, with a similar error in its damping.
 """
 
 import math
@@ -13,24 +13,29 @@ from vinesim.kernels.plants.structs import ArticulationModel, Scratch, WrenchScr
 wp.set_module_options({"enable_backward": False})
 
 MAX_ANGLE = 0.3
-"""[rad] by which the first mode may turn in a substep. DERIVED: it is then 0.75 % slow, and 1 % with a damping ratio of
-0.12. At 10 ms modes above 4.8 Hz take substeps."""
+"""[rad] Largest angle by which the first mode may turn in a substep.
+
+DERIVED: the mode is then 0.75 % slow, and 1 % with a damping ratio of 0.12. At 10 ms, modes above 4.8 Hz take substeps.
+"""
 
 MAX_SUBSTEPS = 4
-"""DERIVED: 19 Hz at 10 ms, beyond the 16 Hz for which the frequency is promised."""
+"""Largest number of substeps.
+
+DERIVED: enough for 19 Hz at 10 ms, above the 16 Hz for which the frequency is promised.
+"""
 
 ITERATIONS = wp.constant(4)
-"""Inverse iterations: the error falls with (w1 / w2)^4 in each. For a cane, whose modes are 6.3 apart, one would do."""
+"""Number of inverse iterations. The error falls with (w1 / w2)^4 in each. For a cane (modes 6.3 apart) one would do."""
 
 
 def substeps_for(frequency: float, dt: float) -> int:
-    """Substeps of a step dt [s] of a tree with a first mode of this frequency [Hz]."""
+    """Returns the number of substeps in a step of dt [s] for a tree with this first frequency [Hz]."""
     return min(max(math.ceil(2.0 * math.pi * frequency * dt / MAX_ANGLE), 1), MAX_SUBSTEPS)
 
 
 @wp.func
 def compliance(stiffness: wp.vec3, torque: wp.vec3):
-    """Angle by a torque on a spring; none about an axis without stiffness."""
+    """Returns the angle by a torque on a spring; 0 about an axis without stiffness."""
     angle = wp.vec3()
     for i in range(3):
         if stiffness[i] > 0.0:
@@ -40,7 +45,7 @@ def compliance(stiffness: wp.vec3, torque: wp.vec3):
 
 @wp.func
 def place_relaxed(model: ArticulationModel, k: int, scratch_out: Scratch):
-    """Axes of body k in its tree (in ``J``), and the lever to it (``tension``), with all springs relaxed."""
+    """Compute the axes of body k in its tree (in ``J``) and the lever to it (``tension``), with all springs relaxed."""
     parent = model.body_parent[k]
     axes = wp.quat_to_matrix(model.body_rest[k])
     lever = wp.vec3()
@@ -53,7 +58,7 @@ def place_relaxed(model: ArticulationModel, k: int, scratch_out: Scratch):
 
 @wp.func
 def inertial_wrench(model: ArticulationModel, k: int, axes: wp.mat33, acceleration: wp.spatial_vector):
-    """Wrench at its origin that accelerates body k from rest."""
+    """Returns the wrench at body k's origin that accelerates the body from rest."""
     com = axes * model.body_com[k]
     alpha = wp.spatial_bottom(acceleration)
     force = model.body_mass[k] * (wp.spatial_top(acceleration) + wp.cross(alpha, com))
@@ -76,14 +81,15 @@ def count_substeps(
     work_out: WrenchScratch,
     tree_substeps_out: wp.array(dtype=wp.int32),
 ):
-    """One thread finds the slowest mode of one tree, and into how many substeps the tree's step is to be divided.
+    """One thread per tree. Find its slowest mode, and the number of substeps for its step.
 
-    Inverse iteration x -> K^-1 M x in joint coordinates, where K is diagonal, about the relaxed shape: it depends on the
-    model and on what has been cut off or refined, but not on the pose. Weight and ties, which also stiffen a tree, are
-    left out, and what a floating root would do if free. x^T M x / x^T M K^-1 M x bounds w^2 from above.
+    Inverse iteration x -> K^-1 M x in joint coordinates about the relaxed shape, where K is diagonal. The result
+    depends on the model and on which bodies have been cut off or refined, but not on the pose. It ignores weight and
+    ties, which also stiffen a tree, and the free motion of a floating root. x^T M x / x^T M K^-1 M x bounds w^2 from
+    above.
 
-    trees: [thread] which tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the mode turns by at most
-    ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last prediction stay.
+    trees: [thread] index of the tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the mode turns by at
+    most ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last prediction are kept.
     """
     if wp.tid() >= count[0]:
         return
@@ -144,9 +150,10 @@ def begin_substep(
     tree_count_out: wp.array(dtype=wp.int32),
     root_count_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all: how many trees and floating roots the next substep is of.
+    """One thread in all. Set the number of trees and of floating roots that take part in the next substep.
 
-    levels: [substep, 2] these numbers. level_out: [1] which substep is next; after the last of level_count [1] the first.
+    levels: [substep, 2] these numbers. level_out: [1] index of the next substep; 0 again after the last of level_count
+    [1].
     """
     level = level_out[0]
     tree_count_out[0] = levels[level, 0]

@@ -1,14 +1,16 @@
-"""Floating components: what has been cut off and falls keeps the momentum and the path that outer forces leave it.
+"""Floating components: bodies that were cut off and fall keep the momentum and the path that external forces give them.
 
-The integration of joints errs in the momentum of a free tree by some dt^2; here root pose and rate are corrected after
-it, so that linear and angular momentum and the centre of mass come out exact.
+The integration of joints errs in the momentum of a free tree by about dt^2. The root's pose and rate are corrected
+after it, so that linear and angular momentum and the centre of mass are exact.
 
-Its centre of mass moves, and its root turns, at the mean of the rates before and after the step. What hits something is the
-exception: the contact solve lets it come as near as its rate after the step allows, and by the mean of both it would
-go half of what it did before into what it hits: through a wire, from 1.5 m/s on.
+The component's centre of mass moves, and its root turns, at the mean of the rates before and after the step. A
+component that hits something is the exception: the contact solve lets it come as near as its rate after the step
+allows. By the mean of both rates it would move half of its previous motion into what it hits, and through a wire from
+1.5 m/s on.
 
-What a tie holds is left out. The force of a stiff tie turns with what hangs from it; momentum would take it as it is at
-the start of the step, which is Euler's explicit method for a pendulum: (w dt)^2 of its kinetic energy are gained a step.
+Components held by a tie are left out. The force of a stiff tie turns with the bodies that hang from it; the momentum
+balance would take the force at the start of the step. This is Euler's explicit method for a pendulum, which gains (w
+dt)^2 of its kinetic energy in each step.
 """
 
 import warp as wp
@@ -30,8 +32,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def least_change(inertia: wp.mat33, momentum: wp.vec3, missing: wp.vec3, dt: float):
-    """The x of the least change of pose, momentum x dt times x, and of rate, inertia / dt times x, that adds what is
-    missing to an angular momentum. A rate counts by what it turns in a step, so a thin rod is rather turned than spun.
+    """Returns the x of the least change that adds the ``missing`` angular momentum.
+
+    The change of pose is momentum x dt times x, the change of rate inertia / dt times x. A change of rate is measured
+    by the turn that it makes in a step, so a thin rod is turned rather than spun.
     """
     stiff = inertia / dt
     A = stiff * stiff + (wp.dot(momentum, momentum) * wp.identity(n=3, dtype=float) - wp.outer(momentum, momentum))
@@ -52,10 +56,10 @@ def component_before(
     phi: float,
     scratch_out: FloatingScratch,
 ):
-    """Sums over a component at the start of the step, about its root and against it.
+    """Returns sums over a component at the start of the step, about its root and relative to the root's motion.
 
-    Returns mass [kg], mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, force [N], moment
-    [N m] of everything but gravity over the step, and whether contacts are part of it.
+    They are mass [kg], mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, force [N] and
+    moment [N m] of everything but gravity over the step, and whether contacts are part of it.
     """
     tree = model.body_tree[root]
     mass = float(0.0)
@@ -70,7 +74,7 @@ def component_before(
             is_pressed = is_pressed or wp.length_sq(forces.body_wrench[k]) > 0.0
             arm = wp.vec3()
             velocity = wp.vec3()
-            if k > root:  # not from world positions and velocities, whose digits go into the fall
+            if k > root:  # not from world positions and velocities, which lose digits to the fall
                 above = model.body_parent[k]
                 arm = wp.spatial_top(scratch_out.before[above]) + lever[k]
                 velocity = wp.spatial_bottom(scratch_out.before[above])
@@ -97,10 +101,11 @@ def component_before(
 
 @wp.func
 def component_after(model: ArticulationModel, joints: JointState, root: int, last: int, scratch_out: FloatingScratch):
-    """The same sums with the joints as they are now, and the moment of inertia of the component, its joints locked.
+    """Returns sums as :func:`component_before` with the joints as they are now, and the moment of inertia with locked
+    joints.
 
-    Returns mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, inertia [kg m^2], all about the
-    root and against it.
+    They are mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, inertia [kg m^2], all about
+    the root and relative to its motion.
     """
     mass_com = wp.vec3()
     linear = wp.vec3()
@@ -135,9 +140,10 @@ def component_after(model: ArticulationModel, joints: JointState, root: int, las
 
 @wp.func
 def angular_correction(locked: wp.mat33, angular: wp.vec3, goal: wp.vec3, dt: float):
-    """Rotation and rate [rad/s] to add to a component so that its angular momentum becomes the goal [N m s].
+    """Returns the rotation and rate [rad/s] that give a component the ``goal`` angular momentum [N m s] when added to
+    it.
 
-    Newton's method, since angular momentum and inertia turn along.
+    Newton's method, as angular momentum and inertia turn with the component.
     """
     rotation = wp.quat_identity()
     rate = wp.vec3()
@@ -171,12 +177,13 @@ def correct_floating_momentum(
     scratch_out: FloatingScratch,
     joints_out: JointState,
 ):
-    """One thread gives one floating component the momentum and the path of its centre of mass that outer forces leave it.
+    """One thread per floating component. Correct its momentum and the path of its centre of mass for the external
+    forces.
 
-    roots: [thread] the cut body, of a component that no tie holds; nothing happens in a tree with tree_rate [tree] above ``p.fault_rate``. tree_steps:
-    [tree] substeps that the step is divided into; this corrects one of them. bodies: at the
-    start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; lever: [body] m. joints_out: joints at the end
-    of the step; rotation, rates and place of the root are corrected.
+    roots: [thread] the cut body of a component that no tie holds; nothing happens in a tree with tree_rate [tree] above
+    ``p.fault_rate``. tree_steps: [tree] substeps that the step is divided into; this corrects one of them. bodies: at
+    the start of the step. body_acceleration: [body] m/s^2, rad/s^2 over the step. lever: [body] m. joints_out: joints
+    at the end of the step; rotation, rates and position of the root are corrected.
     """
     if wp.tid() >= count[0]:
         return
@@ -188,7 +195,7 @@ def correct_floating_momentum(
         return
     last = model.tree_first[tree] + model.tree_moving[tree] * model.pitch
 
-    # what momentum and path must be
+    # the required momentum and path
     place = wp.transform_get_translation(bodies.body_q[root])
     velocity = wp.spatial_top(bodies.body_qd[root])
     mass, mass_com, linear, angular, force, moment, is_pressed = component_before(
@@ -203,7 +210,7 @@ def correct_floating_momentum(
         turned = exponential(dt * joints_out.joint_qd[root]) * wp.transform_get_rotation(bodies.body_q[root])
         joints_out.joint_q[root] = wp.normalize(turned)
 
-    # what they are, and the difference
+    # the present momentum and path, and the difference
     moved = joints_out.joint_x[root] - place
     mass_com_now, linear_now, angular_now, locked = component_after(model, joints_out, root, last, scratch_out)
     com_now = mass_com_now / mass

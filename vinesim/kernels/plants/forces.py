@@ -1,4 +1,4 @@
-"""Forces on single bodies: springs and the stiffness that loads lend to levers, ties, drag of the air."""
+"""Forces on single bodies: springs, the stiffness that loads lend to levers, ties, and air drag."""
 
 import warp as wp
 
@@ -12,7 +12,7 @@ AIR_DENSITY = wp.constant(1.2)
 
 @wp.func
 def tension_stiffness(lever: wp.vec3, force: wp.vec3):
-    """Stiffness [N m/rad] against turning that a steady force lends to a lever it draws out; none if it pushes."""
+    """Returns the rotational stiffness [N m/rad] that a steady force lends to a lever it draws out; 0 if it pushes."""
     along_lever = wp.max(wp.dot(lever, force), 0.0)
     share = along_lever / wp.max(wp.dot(lever, lever), 1.0e-30)
     return along_lever * wp.identity(n=3, dtype=float) - share * wp.outer(lever, lever)
@@ -20,7 +20,9 @@ def tension_stiffness(lever: wp.vec3, force: wp.vec3):
 
 @wp.func
 def shear_stiffness(lever: wp.vec3, force: wp.vec3):
-    """The rest of the symmetric part of (d.F) 1 - d F^T, beside :func:`tension_stiffness`: of pushing, and of shear."""
+    """Returns the symmetric part of (d.F) 1 - d F^T without :func:`tension_stiffness`: the parts of pushing and of
+    shear.
+    """
     return (
         wp.dot(lever, force) * wp.identity(n=3, dtype=float)
         - 0.5 * (wp.outer(lever, force) + wp.outer(force, lever))
@@ -30,10 +32,11 @@ def shear_stiffness(lever: wp.vec3, force: wp.vec3):
 
 @wp.func
 def middle_axes_scale(q: wp.quat):
-    """How rates in the middle axes of a rotation q change its rotation vector theta: by s w + (1 - s) n n^T w, with n
-    along theta and s the ratio of |theta| / 2 to its sine.
+    """Returns coefficients of the relation between rates in the middle axes of a rotation q and its rotation vector
+    theta.
 
-    Returns s, (s - 1) / v^2, and v = theta / (2 s); see :func:`in_middle_axes`.
+    A rate w in the middle axes changes theta by s w + (1 - s) n n^T w, with n along theta and s the ratio of |theta| /
+    2 to its sine. Returns s, (s - 1) / v^2, and v = theta / (2 s); see :func:`in_middle_axes`.
     """
     v = wp.vec3(q[0], q[1], q[2])
     v = wp.where(q[3] < 0.0, -1.0, 1.0) * v
@@ -51,18 +54,21 @@ def middle_axes_scale(q: wp.quat):
 
 @wp.func
 def in_middle_axes(s: float, excess: float, v: wp.vec3, a: wp.vec3):
-    """s a + (1 - s) n n^T a: of a rate in the middle axes that of theta, of a gradient by theta that by a turn."""
+    """Returns s a + (1 - s) n n^T a.
+
+    It turns a rate in the middle axes into the rate of theta, and a gradient by theta into a gradient by a turn.
+    """
     return s * a - excess * wp.dot(v, a) * v
 
 
 @wp.func
 def spring_torque(stiffness: wp.vec3, q: wp.quat):
-    """Torque [N m] that a spring holds against a rotation q, in the joint's middle axes.
+    """Returns the torque [N m] with which a spring resists a rotation q, in the joint's middle axes.
 
-    The gradient of theta^T K theta / 2 by a turn of the joint, theta being the rotation vector of q. The middle axes are
-    turned from the joint's by half of q; in them it is s K theta + (1 - s) n n^T K theta, with n along theta and s the
-    ratio of |theta| / 2 to its sine. K theta itself is no gradient unless K is isotropic: it does work around a cycle of
-    bending and twist.
+    It is the gradient of theta^T K theta / 2 by a turn of the joint, with theta the rotation vector of q. The middle
+    axes are turned from the joint's axes by half of q. In them the torque is s K theta + (1 - s) n n^T K theta, with n
+    along theta and s the ratio of |theta| / 2 to its sine. K theta itself is no gradient unless K is isotropic: it does
+    work around a cycle of bending and twist.
     """
     s, excess, v = middle_axes_scale(q)
     return in_middle_axes(s, excess, v, wp.cw_mul(stiffness, 2.0 * s * v))
@@ -70,20 +76,25 @@ def spring_torque(stiffness: wp.vec3, q: wp.quat):
 
 @wp.func
 def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
-    """Damping [N s/m] that is left to add when the scheme damps a spring as if beta were larger by (2 phi - 1) dt."""
+    """Returns the damping [N s/m] that remains to be added.
+
+    The scheme damps a spring as if its damping time (damping / stiffness) were larger by (2 phi - 1) dt.
+    """
     return wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, 0.0)
 
 
 @wp.func
 def tie_force(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3, phi: float, dt: float):
-    """Force [N] of a tie whose point moves on at its present ``speed`` against the anchor; ``damping`` is the residual
-    one."""
+    """Returns the force [N] of a tie whose point keeps its present ``speed`` relative to the anchor.
+
+    ``damping``: the residual damping.
+    """
     return -stiffness * (stretch + phi * dt * speed) - damping * speed
 
 
 @wp.func
 def drag_coefficient(area: float, wind: wp.vec3):
-    """Drag per relative speed [N s/m] of a drag area Cd A [m^2] in a wind [m/s] relative to it."""
+    """Returns the drag per relative speed [N s/m] for a drag area Cd A [m^2] in a wind [m/s] relative to it."""
     return 0.5 * AIR_DENSITY * area * wp.length(wind)
 
 
@@ -99,9 +110,9 @@ def tie_and_drag_wrench(
     motion: wp.spatial_vector,
     acceleration: wp.spatial_vector,
 ):
-    """What ties and air did to body k in the last step: force [N], moment about its origin [N m].
+    """Returns the force [N] of ties and air on body k in the last step, and its moment about the body's origin [N m].
 
-    The same forces as in the implicit solve, evaluated with the acceleration that it found.
+    These are the forces of the implicit solve, evaluated with the acceleration that it found.
     """
     velocity = wp.spatial_top(motion)
     omega = wp.spatial_bottom(motion)

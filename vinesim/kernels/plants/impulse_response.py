@@ -1,4 +1,4 @@
-"""Impulse response: velocities of bodies by unit impulses on them, and what given wrenches add to a prediction.
+"""Impulse response: velocities of bodies by unit impulses on them, and the effect of given wrenches on a prediction.
 
 Both reuse the factors of :mod:`vinesim.kernels.plants.prediction`: an impulse travels inward along the path to the
 root, the velocities it causes travel outward (Featherstone 2008, section 7.3, with forces only at the touched
@@ -29,7 +29,7 @@ def propagate_impulses_inward(
     factors: Factors,
     columns_out: ResponseColumns,
 ):
-    """Carry three unit forces and three unit moments at a body along its path to the root; zero beside the path."""
+    """Carry three unit forces and three unit moments at a body along its path to the root. They are 0 off the path."""
     zero = wp.mat33()
     force_f = wp.identity(n=3, dtype=float)
     force_m = wp.mat33()
@@ -62,7 +62,7 @@ def propagate_impulses_inward(
 def propagate_velocities_outward(
     first: int, last: int, shift: int, model: ArticulationModel, factors: Factors, columns_out: ResponseColumns
 ):
-    """From what each joint takes of the impulses to the velocities of all bodies from the root to the last."""
+    """Compute the velocities of all bodies, from the root to the last, from the joints' shares of the impulses."""
     for k in range(first, last + 1, model.pitch):
         parent = model.body_parent[k]
         a_f = columns_out.a_by_force[shift + k]
@@ -98,12 +98,12 @@ def impulse_response(
     columns_out: ResponseColumns,
     response_out: wp.array4d(dtype=float),
 ):
-    """One thread applies six unit impulses to one body and writes the velocities of all bodies up to it in the list.
+    """One thread per body in the list. Apply six unit impulses to it, and write the velocities of all bodies up to it.
 
-    bodies: [thread] which body; those of one tree are neighbours in the list. response_out: [u, 6, t, 6] velocity of
-    body u of the list by a unit impulse wrench on the t-th listed body of its tree, linear before angular, in 1/kg,
-    1/(kg m), 1/(kg m^2); each thread writes its columns and, the matrix being symmetric, their transpose. columns_out:
-    [thread * stride + body of the tree] scratch, ``stride`` being the extent of the largest tree.
+    bodies: [thread] index of the body; those of one tree are neighbours in the list. response_out: [u, 6, t, 6]
+    velocity of body u of the list by a unit impulse wrench on the t-th listed body of its tree, linear before angular,
+    in 1/kg, 1/(kg m), 1/(kg m^2). Each thread writes its columns and, because the matrix is symmetric, their transpose.
+    columns_out: [thread * stride + body of the tree] scratch; ``stride`` is the extent of the largest tree.
     """
     slot = wp.tid()
     if slot >= count[0]:
@@ -154,7 +154,7 @@ def apply_tree_wrenches(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Add to the prediction of one tree what the wrenches on its bodies do over a step: see :func:`apply_wrenches`."""
+    """Add the effect over a step of the wrenches on a tree's bodies to its prediction; see :func:`apply_wrenches`."""
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     for k in range(first, first + size * model.pitch, model.pitch):
@@ -206,10 +206,11 @@ def apply_wrenches(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread adds to the prediction of one tree what the wrenches on its bodies do over a step.
+    """One thread per tree. Add the effect over a step of the wrenches on its bodies to its prediction.
 
-    trees: [thread] which tree. body_wrench: [body] N, N m at the origin, world axes; with dt = 1 an impulse, N s, N m s.
-    prediction_out: accelerations and joint rates grow; ``body_qd_free`` stays. work_out, scratch_out.Du: scratch.
+    trees: [thread] index of the tree. body_wrench: [body] N, N m at the origin, world axes; with dt = 1 it is an
+    impulse, N s, N m s. prediction_out: accelerations and joint rates are increased; ``body_qd_free`` is not. work_out,
+    scratch_out.Du: scratch.
     """
     if wp.tid() >= count[0]:
         return

@@ -1,4 +1,4 @@
-"""Integration: joints move to the end of the step; faulty trees stay where the step began."""
+"""Integration: joints move to the end of the step. Faulty trees keep their state from the start of the step."""
 
 import warp as wp
 
@@ -9,14 +9,17 @@ from vinesim.kernels.plants.structs import ArticulationModel, JointState, Predic
 wp.set_module_options({"enable_backward": False})
 
 EULER_ON = wp.constant(0.1)
-"""Share of ``max_rate``: a tree with phi = 1 of which a joint turns faster keeps it, until all are slower than
-``EULER_OFF``. Thrown, a limp thread under a heavy load gains energy at any other phi and would thrash for ever. TUNED"""
+"""Share of ``max_rate``. A tree with phi = 1 keeps it if one of its joints turns faster than this, until all are slower
+than ``EULER_OFF``.
+
+With any other phi, a limp thread under a heavy load that was thrown gains energy and would thrash for ever. TUNED
+"""
 
 EULER_OFF = wp.constant(0.06)
 """Share of ``max_rate`` below which all joints of such a tree must turn for ``EULER_DURATION``. TUNED"""
 
 EULER_DURATION = wp.constant(1.0)
-"""[s] TUNED"""
+"""[s] How long all joints must turn slower than ``EULER_OFF``. TUNED"""
 
 
 @wp.kernel
@@ -37,13 +40,15 @@ def integrate(
     tree_euler_steps_out: wp.array(dtype=wp.int32),
     joints_out: JointState,
 ):
-    """One thread moves the joints of one tree to the end of the step; a faulty tree stays where the step began.
+    """One thread per tree. Move its joints to the end of the step. A faulty tree keeps its state from the start of the
+    step.
 
-    trees: [thread] which tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] as :func:`predict` used it.
-    tree_steps: [tree] substeps that the step is divided into; a tree that one of them stopped takes no other.
-    tree_rate_out: [tree] rad/s of the fastest joint and m/s of the fastest floating root, as a length; NaN or above
-    ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps and substeps still to be taken with phi = 1,
-    counted down here. joints_out: [body] rotations by the exponential map of the mean rate; may be ``joints``.
+    trees: [thread] index of the tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] as :func:`predict`
+    used it. tree_steps: [tree] substeps that the step is divided into; a tree that is stopped in one of them takes no
+    other. tree_rate_out: [tree] rad/s of the fastest joint and m/s of the fastest floating root, combined as a length;
+    NaN or above ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps and substeps still to be
+    taken with phi = 1, counted down here. joints_out: [body] rotations by the exponential map of the mean rate; may be
+    ``joints``.
     """
     if wp.tid() >= count[0]:
         return
@@ -81,7 +86,7 @@ def integrate(
     if turning > p.max_rate:
         slower = 0.5 * p.max_rate / turning
     for k in range(first, first + size * pitch, pitch):
-        # all that a body needs is read before anything is asked: a GPU then waits for memory once
+        # all values of a body are read before the first branch, so that a GPU waits for memory once
         parent = model.body_parent[k]
         root = model.body_root[k]
         free = prediction.joint_qd_free[k]

@@ -9,8 +9,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def max_joint_rate(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch: int):
-    """Fastest of some joint rates [rad/s]; NaN enters, and stays. (A function, since an adjoint does not repeat the
-    loops of its kernel before it goes back, but calls functions.)
+    """Returns the largest of some joint rates [rad/s]. NaN is passed on.
+
+    This is a function because Warp's adjoint does not repeat the loops of a kernel before it goes back, but does call
+    functions.
     """
     most = float(0.0)
     for k in range(first, first + size * pitch, pitch):
@@ -31,7 +33,10 @@ def max_rate_and_speed(
     size: int,
     pitch: int,
 ):
-    """Fastest of some joint rates [rad/s], and of the floating roots [m/s]; NaN, in a place too, enters and stays."""
+    """Returns the largest joint rate [rad/s] and the largest speed of floating roots [m/s].
+
+    NaN, also in a position, is kept.
+    """
     turning = float(0.0)
     falling = float(0.0)
     for k in range(first, first + size * pitch, pitch):
@@ -69,7 +74,9 @@ def body_kinematics(
 
 @wp.func
 def parent_kinematics(k: int, tree: int, model: ArticulationModel, joints: JointState, bodies: BodyState):
-    """Pose and velocity of what body k hangs on: its parent, the tree's pose, or nothing for a floating root."""
+    """Returns pose and velocity of the frame on which body k hangs: its parent's, the tree's, or none for a floating
+    root.
+    """
     parent = model.body_parent[k]
     pose = model.tree_pose[tree]
     velocity = wp.spatial_vector()
@@ -93,12 +100,12 @@ def forward_kinematics(
     # out
     bodies_out: BodyState,
 ):
-    """One thread puts the bodies of one tree where its joints say, clusters of a coarse tree included.
+    """One thread per tree. Compute the poses of its bodies from the joints, clusters of a coarse tree included.
 
     The outward pass of the recursive Newton-Euler algorithm (Featherstone 2008, section 5.3), velocities only.
 
-    trees: [thread] which tree. joints, bodies_out: [body] see their structs; nothing else is written, so this may run
-    between a prediction and its integration.
+    trees: [thread] index of the tree. joints, bodies_out: [body] see their structs. Nothing else is written, so this
+    may run between a prediction and its integration.
     """
     if wp.tid() >= count[0]:
         return

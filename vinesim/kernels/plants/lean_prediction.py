@@ -1,11 +1,12 @@
-"""Prediction for GPUs: the three passes of :mod:`vinesim.kernels.plants.prediction` with little traffic to memory.
+"""Prediction for GPUs: the three passes of :mod:`vinesim.kernels.plants.prediction` with little memory traffic.
 
-There, what is left of a subtree is added to its parent's record and read again; on a GPU, where every tree is a thread and
-none of these records stays in a cache, that is most of the time. Here a body's own inertia is made when its joint is
-eliminated, and what is left goes on in registers to the parent, which mostly is the body before; records serve branches
-alone. The functions of one body and the order of sums are the same, but where two branches or more leave one body.
+In that module, the remaining inertia of a subtree is added to its parent's record and read again. On a GPU, where every
+tree is a thread and no record stays in a cache, this takes most of the time. In this module, a body's own inertia is
+computed when its joint is eliminated, and the rest goes on in registers to the parent, which mostly is the previous
+body. Records are used at branches only. The functions of one body and the order of sums are the same, except where two
+branches or more leave one body.
 
-What a loop carries in registers Warp's adjoint does not restore: gradients go through the passes of the other module.
+Warp's adjoint does not restore values that a loop carries in registers: gradients use the passes of the other module.
 """
 
 import warp as wp
@@ -53,7 +54,7 @@ def place_bodies(
     motion = wp.spatial_vector()
     end = first + model.tree_moving[tree] * model.pitch
     for k in range(first, end, model.pitch):
-        # all that a body needs is read before anything is asked: a GPU then waits for memory once
+        # all values of a body are read before the first branch, so that a GPU waits for memory once
         parent = model.body_parent[k]
         offset = model.body_offset[k]
         rest = model.body_rest[k]
@@ -307,10 +308,10 @@ def predict_lean(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread solves the motion of one tree: :func:`vinesim.kernels.plants.prediction.predict`.
+    """One thread per tree. Solve its motion; see :func:`vinesim.kernels.plants.prediction.predict`.
 
-    is_branching: [body] whether a body is the parent of another than the next one. Conservative trees take the passes of
-    that kernel.
+    is_branching: [body] whether a body is the parent of a body other than the next one. Conservative trees take the
+    passes of that kernel.
     """
     if wp.tid() >= count[0]:
         return

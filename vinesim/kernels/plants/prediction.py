@@ -36,7 +36,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def is_conservative(p: SolverParameters, phi: float):
-    """Whether a step must keep energy, and couples bending with twist for it."""
+    """Returns whether a step must keep energy, so that bending and twist are coupled."""
     return p.geometric_stiffness > 0.0 and phi == 0.5
 
 
@@ -44,7 +44,7 @@ def is_conservative(p: SolverParameters, phi: float):
 def add_terms(
     k: int, J: wp.mat33, H: wp.mat33, M: wp.mat33, bias: wp.spatial_vector, tension: wp.vec3, scratch_out: Scratch
 ):
-    """Add what acts on body k besides its inertia and weight, or hangs on it."""
+    """Add terms to the inertia, bias and tension of body k: of its children, ties, drag, load and contacts."""
     scratch_out.J[k] = scratch_out.J[k] + J
     scratch_out.H[k] = scratch_out.H[k] + H
     scratch_out.M[k] = scratch_out.M[k] + M
@@ -64,7 +64,7 @@ def assemble_bodies(
     factors_out: Factors,
     scratch_out: Scratch,
 ):
-    """From the root to the tips of one tree: pose and velocity of each body, its own implicit inertia, bias, tension."""
+    """From the root to the tips of one tree: compute each body's pose, velocity, implicit inertia, bias and tension."""
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     conservative = is_conservative(p, phi)
     first = model.tree_first[tree]
@@ -143,10 +143,10 @@ def couple_bending_and_twist(
     DH: wp.mat33,
     scratch_out: Scratch,
 ):
-    """Hand on to the parent that a lever bears a force across, and a joint a moment.
+    """Add to the parent the coupling by a force across a lever and by a moment that a joint bears.
 
-    Beside its spring, the joint asks alpha x moment of a parent's acceleration alpha, and its own acceleration asks as
-    much of the parent (DJ holds the first).
+    In addition to its spring's torque, the joint takes alpha x moment for an acceleration alpha of the parent, and the
+    joint's own acceleration acts on the parent with the same coupling (DJ contains the first part).
     """
     H_more = wp.skew(-moment) * DH
     H_arm = cross_rows(H_more, lever)
@@ -174,7 +174,7 @@ def eliminate_joints(
     factors_out: Factors,
     scratch_out: Scratch,
 ):
-    """From the tips to the root of one tree: factor each joint's implicit inertia and hand the rest to the parent."""
+    """From the tips to the root of one tree: factor each joint's implicit inertia and pass the rest to the parent."""
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     conservative = is_conservative(p, phi)
@@ -245,7 +245,7 @@ def accelerate_bodies(
     tree: int,
     prediction_out: Prediction,
 ):
-    """From the root to the tips of one tree: accelerations, and the rates and velocities they lead to."""
+    """From the root to the tips of one tree: compute accelerations, and the resulting rates and velocities."""
     first = model.tree_first[tree]
     for k in range(first, first + model.tree_moving[tree] * model.pitch, model.pitch):
         parent = model.body_parent[k]
@@ -284,7 +284,7 @@ def accelerate_bodies(
 def chosen_phi(
     p: SolverParameters, model: ArticulationModel, joints: JointState, tree: int, asked: float, euler_steps: int
 ):
-    """phi of this step of a tree: as ``asked``, but 1 while a joint is fast or ``euler_steps`` are left."""
+    """Returns phi of this step of a tree: ``asked``, but 1 while a joint is fast or ``euler_steps`` are left."""
     fastest = max_joint_rate(joints.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch)
     phi = asked
     if fastest > p.fast_rate or euler_steps > 0:
@@ -305,7 +305,7 @@ def predict_tree(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """The three passes over one tree."""
+    """Run the three passes over one tree."""
     assemble_bodies(p, model, forces, joints, tree, phi, bodies_out, factors_out, scratch_out)
     eliminate_joints(p, model, joints, bodies_out, tree, phi, factors_out, scratch_out)
     accelerate_bodies(p.dt, model, joints, bodies_out, factors_out, scratch_out, tree, prediction_out)
@@ -331,15 +331,15 @@ def predict(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread solves the motion of one tree over a step without new contacts, and keeps the factors it used.
+    """One thread per tree. Solve its motion over a step without new contacts, and keep the factors for later use.
 
     The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
 
-    trees: [thread] which tree. tree_phi: [tree] phi asked for, 1/2 to 1; tree_phi_out: [tree] phi used, 1 for a tree
-    with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps that the
-    step is divided into; this is one of them. bodies_out: poses and velocities
-    at the start of the step. prediction_out: accelerations over it and velocities at its end. scratch_out holds nothing
-    that is needed later.
+    trees: [thread] index of the tree. tree_phi: [tree] requested phi, 1/2 to 1. tree_phi_out: [tree] phi used, 1 for a
+    tree with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps
+    that the step is divided into; this is one of them. bodies_out: poses and velocities at the start of the step.
+    prediction_out: accelerations over the step and velocities at its end. scratch_out holds nothing that is needed
+    later.
     """
     if wp.tid() >= count[0]:
         return

@@ -1,11 +1,11 @@
 """Residual motion: how fast a tree still moves, and how far it still is from the pose in which it will rest.
 
-The displacement to that pose follows from one step of the articulated-body algorithm that starts at zero velocity, has no
-damping and is so long that springs outweigh inertia: it solves (M + (T/2)^2 K) a = u for the generalized force u that
-is not in balance, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the tangent stiffness at the present
-pose, loads and ties included; a tie to a wire, and a root's spring on an arm, is as soft as it is when the awake trees
-of the wire or arm all move as one: none of them is then further from rest than it would be alone. Where K is not positive definite the pose is no stable equilibrium, and the tree no nearer
-to rest than anywhere else.
+The displacement to that pose follows from one step of the articulated-body algorithm that starts at zero velocity, has
+no damping, and is so long that springs outweigh inertia. The step solves (M + (T/2)^2 K) a = u for the unbalanced
+generalised force u, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the tangent stiffness at the present
+pose, including loads and ties. A tie to a wire, and a root's spring on an arm, is taken as soft as it is when all awake
+trees of the wire or arm move as one; none of them is then further from rest than it would be alone. Where K is not
+positive definite, the pose is no stable equilibrium, and the tree counts as far from rest.
 """
 
 import warp as wp
@@ -33,12 +33,12 @@ hertz. TUNED"""
 
 
 FAR = wp.constant(1.0e30)
-"""[m] Distance from rest of what stands where it cannot stay."""
+"""[m] Distance from rest that is reported for a tree at an unstable pose."""
 
 
 @wp.func
 def is_positive_definite(a: wp.mat33):
-    """Whether the symmetric part of a matrix is positive definite, by its leading minors (Sylvester)."""
+    """Returns whether the symmetric part of a matrix is positive definite, by its leading minors (Sylvester)."""
     trace = a[0, 0] + a[1, 1] + a[2, 2]
     positive = trace > 0.0
     if positive:
@@ -49,7 +49,7 @@ def is_positive_definite(a: wp.mat33):
 
 @wp.func
 def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far: float):
-    """The larger of ``so_far`` and the displacements of both ends of a body; NaN enters, and stays."""
+    """Returns the largest of ``so_far`` and the displacements of both ends of a body. NaN is passed on."""
     most = wp.max(wp.length(linear), wp.length(linear + wp.cross(angular, arm)))
     if most <= so_far or so_far != so_far:
         most = so_far
@@ -58,7 +58,9 @@ def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far
 
 @wp.func
 def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: Scratch):
-    """Take ``mass`` off at ``point`` of body k, across ``axis``: by so much less does a tie hold whose wire gives."""
+    """Subtract ``mass`` at ``point`` of body k, across ``axis``: the tie is softer by this much because its wire
+    deflects.
+    """
     across = mass * (wp.identity(n=3, dtype=float) - wp.outer(axis, axis))
     arm = wp.skew(point)
     scratch_out.J[k] = scratch_out.J[k] + arm * across * arm
@@ -68,8 +70,10 @@ def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: 
 
 @wp.func
 def soften_root(k: int, axes: wp.quat, q: wp.quat, softening: wp.vec3, mass: float, scratch_out: Scratch):
-    """Take ``mass`` times the square of ``softening``, in joint axes, off the inertia of root k, since the arm gives. (What
-    a root stands on has no acceleration, so this is as good as less stiffness.)
+    """Subtract ``mass`` times the square of ``softening``, in joint axes, from the inertia of root k, as the arm
+    twists.
+
+    The body on which a root stands has no acceleration, so this has the same effect as less stiffness.
     """
     s, excess, v = middle_axes_scale(q)
     gradient = wp.quat_rotate(axes * half_rotation(q), in_middle_axes(s, excess, v, softening))
@@ -164,5 +168,5 @@ def residual_motion(
             angular = angular - whole
         arm = wp.quat_rotate(wp.transform_get_rotation(pose), wp.vec3(body_length[k], 0.0, 0.0))
         distance = largest_displacement(linear, angular, arm, distance)
-    # what bears a tree in contact is not in K
+    # the bodies that support a tree in contact are not in K
     distance_out[tree] = wp.where(is_stable or not is_free, 0.25 * p.dt * p.dt * distance, FAR)

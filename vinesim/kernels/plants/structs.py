@@ -12,26 +12,26 @@ import warp as wp
 
 
 def fields(struct: Any) -> dict[str, Any]:
-    """Names of a struct's fields, and Warp's variables with their types."""
+    """Returns the names of a struct's fields, with Warp's variables that hold their types."""
     return struct.vars
 
 
 @wp.struct
 class SolverParameters:
-    """Numbers that hold for all trees."""
+    """Parameters that hold for all trees."""
 
     dt: float  # [s] duration of a step
     fast_rate: float  # [rad/s] faster joints: phi = 1; faster bodies feel drag
     max_rate: float  # [rad/s] no joint is integrated faster
     fault_rate: float  # [rad/s] a tree with a faster joint is not integrated
     contact_steps: int  # a count of backward Euler steps above this is not from a contact
-    geometric_stiffness: float  # 1: the stiffness that loads lend to levers is in the implicit solve; 0: it is not
+    geometric_stiffness: float  # 1: the implicit solve includes the stiffness that loads lend to levers; 0: it does not
     gravity: wp.vec3  # [m/s^2]
 
 
 @wp.func
 def substep_parameters(p: SolverParameters, steps: int):
-    """The same numbers for one of so many substeps."""
+    """Returns the parameters for one substep of a step that is divided into ``steps`` substeps."""
     return SolverParameters(
         p.dt / float(steps),
         p.fast_rate,
@@ -45,28 +45,28 @@ def substep_parameters(p: SolverParameters, steps: int):
 
 @wp.struct
 class ArticulationModel:
-    """Topology, inertia, springs and ties: what no step changes."""
+    """Topology, inertia, springs and ties: values that no step changes."""
 
-    pitch: int  # from one body of a tree to the next
-    tree_first: wp.array(dtype=wp.int32)  # the first body
-    tree_size: wp.array(dtype=wp.int32)  # bodies
-    tree_moving: wp.array(dtype=wp.int32)  # bodies that move: without the berry clusters of a coarse tree
-    tree_pose: wp.array(dtype=wp.transform)  # [m, xyzw] on which bodies without a parent stand
+    pitch: int  # distance in memory from one body of a tree to the next
+    tree_first: wp.array(dtype=wp.int32)  # index of the tree's first body
+    tree_size: wp.array(dtype=wp.int32)  # number of bodies
+    tree_moving: wp.array(dtype=wp.int32)  # number of bodies that move: without the berry clusters of a coarse tree
+    tree_pose: wp.array(dtype=wp.transform)  # [m, xyzw] pose on which the bodies without a parent stand
     body_tree: wp.array(dtype=wp.int32)
     body_parent: wp.array(dtype=wp.int32)  # -1: none
-    body_root: wp.array(dtype=wp.int32)  # the floating root that a body moves with, -1 for what stands
-    body_falls: wp.array(dtype=wp.bool)  # whether it moves with a floating root and no tie holds what does
-    body_offset: wp.array(dtype=wp.vec3)  # [m] of the origin in the parent
-    body_rest: wp.array(dtype=wp.quat)  # joint frame in the parent
+    body_root: wp.array(dtype=wp.int32)  # the floating root that the body moves with; -1 for bodies that stand
+    body_falls: wp.array(dtype=wp.bool)  # whether it moves with a floating root and no tie holds any body of this root
+    body_offset: wp.array(dtype=wp.vec3)  # [m] body's origin in the parent's frame
+    body_rest: wp.array(dtype=wp.quat)  # joint frame in the parent's frame
     body_mass: wp.array(dtype=float)  # [kg]
-    body_com: wp.array(dtype=wp.vec3)  # [m] in the body
+    body_com: wp.array(dtype=wp.vec3)  # [m] centre of mass in the body's frame
     body_inertia: wp.array(dtype=wp.vec3)  # [kg m^2] xx, yy, zz about the centre of mass, body axes
-    body_product: wp.array(dtype=wp.vec3)  # [kg m^2] yz, zx, xy of the same
+    body_product: wp.array(dtype=wp.vec3)  # [kg m^2] products of inertia yz, zx, xy, about the same point and axes
     body_drag: wp.array(dtype=float)  # [m^2] drag area Cd A
     joint_stiffness: wp.array(dtype=wp.vec3)  # [N m/rad] in joint axes
     joint_damping: wp.array(dtype=wp.vec3)  # [N m s/rad] in joint axes
     tie_span: wp.array(dtype=wp.vec2i)  # [body] first tie of a body, and the one after its last
-    tie_point: wp.array(dtype=wp.vec3)  # [m] in the body
+    tie_point: wp.array(dtype=wp.vec3)  # [m] in the body's frame
     tie_stiffness: wp.array(dtype=float)  # [N/m]
     tie_damping: wp.array(dtype=float)  # [N s/m]
 
@@ -77,7 +77,7 @@ class JointState:
 
     joint_x: wp.array(dtype=wp.vec3)  # [m] origin of a floating root
     joint_xd: wp.array(dtype=wp.vec3)  # [m/s]
-    joint_q: wp.array(dtype=wp.quat)  # rotation against the rest frame
+    joint_q: wp.array(dtype=wp.quat)  # rotation relative to the rest frame
     joint_qd: wp.array(dtype=wp.vec3)  # [rad/s] in joint axes
 
 
@@ -91,27 +91,27 @@ class BodyState:
 
 @wp.struct
 class AppliedForces:
-    """What acts on bodies from outside."""
+    """External forces on bodies, and motions that are imposed on them."""
 
     tree_air: wp.array(dtype=wp.vec3)  # [m/s] velocity of the air
-    root_turn: wp.array(dtype=wp.vec3)  # [tree] rad by which the arm turns the rest of the root's spring, joint axes
+    root_turn: wp.array(dtype=wp.vec3)  # [tree] rad by which the arm turns the root spring's rest, joint axes
     root_turn_rate: wp.array(dtype=wp.vec3)  # [tree] rad/s
-    tie_anchor: wp.array(dtype=wp.vec3)  # [m] where ties are held
-    tie_anchor_velocity: wp.array(dtype=wp.vec3)  # [m/s] how fast that place moves
-    body_load: wp.array(dtype=wp.spatial_vector)  # [N, N m] lasting, at the origin
-    body_wrench: wp.array(dtype=wp.spatial_vector)  # [N, N m] of contacts, at the origin
+    tie_anchor: wp.array(dtype=wp.vec3)  # [m] point at which the tie is held
+    tie_anchor_velocity: wp.array(dtype=wp.vec3)  # [m/s] velocity of that point
+    body_load: wp.array(dtype=wp.spatial_vector)  # [N, N m] lasting load, at the body's origin
+    body_wrench: wp.array(dtype=wp.spatial_vector)  # [N, N m] wrench of contacts, at the body's origin
 
 
 @wp.struct
 class Factors:
-    """What :func:`predict` leaves for impulse responses: the factored implicit inertia (Featherstone 2008, section 7.3)."""
+    """The factored implicit inertia that :func:`predict` keeps for impulse responses (Featherstone 2008, section 7.3)."""
 
     axes: wp.array(dtype=wp.quat)  # joint frame in the world
     lever: wp.array(dtype=wp.vec3)  # [m] from the parent's origin to the body's
     D: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (J + metric)^-1
     DJ: wp.array(dtype=wp.mat33)  # [1]
     DH: wp.array(dtype=wp.mat33)  # [1/m]
-    root_inverse_mass: wp.array(dtype=wp.mat33)  # [1/kg] acceleration of a floating root by force; 0 for what stands
+    root_inverse_mass: wp.array(dtype=wp.mat33)  # [1/kg] acceleration of a floating root by force; 0 if it stands
 
 
 @wp.struct
@@ -123,14 +123,14 @@ class Scratch:
     M: wp.array(dtype=wp.mat33)  # [kg]
     bias: wp.array(dtype=wp.spatial_vector)  # [N, N m]
     tension: wp.array(dtype=wp.vec3)  # [N] steady force of the subtree on its lever
-    Du: wp.array(dtype=wp.vec3)  # [rad/s^2] D times what drives the joint
+    Du: wp.array(dtype=wp.vec3)  # [rad/s^2] D times the torque that drives the joint
 
 
 @wp.struct
 class Prediction:
-    """The end of the step if nothing more touches the tree."""
+    """Motion of the tree over the step if nothing more touches it."""
 
-    body_acceleration: wp.array(dtype=wp.spatial_vector)  # [m/s^2, rad/s^2] over the step
+    body_acceleration: wp.array(dtype=wp.spatial_vector)  # [m/s^2, rad/s^2] mean over the step
     joint_xd_free: wp.array(dtype=wp.vec3)  # [m/s]
     joint_qd_free: wp.array(dtype=wp.vec3)  # [rad/s]
     body_qd_free: wp.array(dtype=wp.spatial_vector)  # [m/s, rad/s]
@@ -138,21 +138,21 @@ class Prediction:
 
 @wp.struct
 class EnergyBudget:
-    """What energy each tree may have [tree] unless said otherwise; see :mod:`vinesim.kernels.plants.energy_budget`."""
+    """Energy that each tree may have. [tree] unless said otherwise; see :mod:`vinesim.kernels.plants.energy_budget`."""
 
-    limit: wp.array(dtype=float)  # [J] least energy since something did work on the tree from outside
-    last: wp.array(dtype=float)  # [J] energy that the last check left
+    limit: wp.array(dtype=float)  # [J] least energy since an external force last did work on the tree
+    last: wp.array(dtype=float)  # [J] energy after the last check
     scale: wp.array(dtype=float)  # [J] largest kinetic energy of the last checks
-    mark: wp.array(dtype=wp.int32)  # checksum of the state that the last step left
-    held: wp.array(dtype=float)  # checksum of where its ties are held
-    watch: wp.array(dtype=wp.int32)  # steps that are all checked, or minus the steps since the last check
-    filtered: wp.array(dtype=wp.int32)  # steps so far at whose end energy was taken
-    start_q: wp.array(dtype=wp.quat)  # [body] rotations of joints at the start of the step, of trees watched closely
+    mark: wp.array(dtype=wp.int32)  # checksum of the state after the last step
+    held: wp.array(dtype=float)  # checksum of the points at which the tree's ties are held
+    watch: wp.array(dtype=wp.int32)  # steps left that are all checked, or minus the steps since the last check
+    filtered: wp.array(dtype=wp.int32)  # number of steps so far at whose end energy was removed
+    start_q: wp.array(dtype=wp.quat)  # [body] rotations of joints at the start of the step, for trees watched closely
 
 
 @wp.struct
 class ResponseColumns:
-    """Velocities of the bodies on a path by unit impulses [slot * stride + body]; a matrix holds three impulses."""
+    """Velocities of the bodies on a path by unit impulses [slot * stride + body]. Each matrix holds three impulses."""
 
     a_by_force: wp.array(dtype=wp.mat33)  # [1/kg]
     a_by_moment: wp.array(dtype=wp.mat33)  # [1/(kg m)]
@@ -162,7 +162,7 @@ class ResponseColumns:
 
 @wp.struct
 class WrenchScratch:
-    """What :func:`apply_wrenches` works with."""
+    """Scratch of :func:`apply_wrenches`."""
 
     subtree_wrench: wp.array(dtype=wp.spatial_vector)  # [N, N m]
     added_acceleration: wp.array(dtype=wp.spatial_vector)  # [m/s^2, rad/s^2]
@@ -170,8 +170,8 @@ class WrenchScratch:
 
 @wp.struct
 class FloatingScratch:
-    """Bodies of a floating component, seen from its root."""
+    """Motion of the bodies of a floating component, relative to its root."""
 
-    before: wp.array(dtype=wp.spatial_vector)  # [m, m/s] place and velocity at the start of the step
-    after_q: wp.array(dtype=wp.transform)  # [m, xyzw] at its end
-    after_qd: wp.array(dtype=wp.spatial_vector)  # [m/s, rad/s]
+    before: wp.array(dtype=wp.spatial_vector)  # [m, m/s] position and velocity at the start of the step
+    after_q: wp.array(dtype=wp.transform)  # [m, xyzw] pose at the end of the step
+    after_qd: wp.array(dtype=wp.spatial_vector)  # [m/s, rad/s] velocity at the end of the step

@@ -1,7 +1,7 @@
-"""Sway of trees in the wind: where a tree that is not simulated is drawn, from the pose in which it rests.
+"""Sway of trees in the wind: the drawn pose of a tree that is not simulated, computed from its rest pose.
 
-Each joint turns by what the steady wind turns it, and by a linear answer to what the gusts add to the pressure of the
-air. Gusts reach the tree through the transfer function of an oscillator, as a sum over the plane waves of the wind.
+Each joint turns by its angle in the steady wind, plus a linear response to the pressure of the gusts. Gusts reach the
+tree through the transfer function of an oscillator, as a sum over the plane waves of the wind.
 """
 
 import warp as wp
@@ -9,12 +9,12 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 JOINT_GAP = wp.constant(0.005)
-"""[m] A body that is further than this from its joint was cut off, and lies where it lies."""
+"""[m] A body farther than this from its joint was cut off, and keeps its pose."""
 
 
 @wp.func
 def steady_share(pressure: wp.vec3, mean: wp.vec3):
-    """How much of the deflection in the mean wind belongs to a pressure v |v| [m^2/s^2]: its part along the mean's."""
+    """Returns the share of the mean wind's deflection for a pressure v |v| [m^2/s^2]: its component along the mean's."""
     square = wp.dot(mean, mean)
     share = float(0.0)
     if square > 0.0:

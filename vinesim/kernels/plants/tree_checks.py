@@ -21,10 +21,11 @@ def count_quiet_steps(
     seen_tick_out: wp.array(dtype=wp.int64),
     longest_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per listed tree: a step more, or none if a joint was not slower than the limit (or not a number).
+    """One thread per listed tree. Count a step in which it was slow; restart from 0 if a joint reached the limit or is
+    NaN.
 
     limit: [1] rad/s. tree_rate: [tree] rad/s. A tree that moves is not at rest, and was not seen still (-1) before.
-    longest_out: [1] most steps of all.
+    longest_out: [1] the largest count of all trees.
     """
     if wp.tid() >= count[0]:
         return
@@ -38,7 +39,7 @@ def count_quiet_steps(
         seen_tick_out[tree] = wp.int64(-1)
 
 
-# The fastest of some trees.
+# The rate of the fastest of the listed trees.
 
 
 @wp.kernel
@@ -50,9 +51,9 @@ def find_fastest(
     # out
     fastest_out: wp.array(dtype=float),
 ):
-    """One thread per listed tree: the largest rate of all, infinite if one is not a number.
+    """One thread per listed tree. Find the largest rate of all, infinite if one is not a number.
 
-    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, raised to that.
+    tree_rate: [tree] rad/s. fastest_out: [1] rad/s, raised to the largest rate.
     """
     if wp.tid() >= count[0]:
         return
@@ -82,10 +83,11 @@ def count_overloaded_steps(
     overloaded_steps_out: wp.array(dtype=wp.int32),
     longest_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per listed bunch: a step more if its peduncle is pulled or bent beyond its strength, none otherwise.
+    """One thread per listed bunch. Count a step in which its peduncle is overloaded; restart from 0 if it is not.
 
-    bunch_pull, bunch_bend: [bunch] N, N m. carried: [thread] force and moment of its joint, N, N m. is_attached: [bunch];
-    is_remote: [tree]; picked bunches and those of remote trees are left out. longest_out: [1] most steps of all.
+    A peduncle is overloaded if it is pulled or bent beyond its strength. bunch_pull, bunch_bend: [bunch] N, N m.
+    carried: [thread] force and moment of its joint, N, N m. is_attached: [bunch]. is_remote: [tree]. Picked bunches and
+    those of remote trees are left out. longest_out: [1] the largest count of all bunches.
     """
     i = wp.tid()
     if i >= count[0]:

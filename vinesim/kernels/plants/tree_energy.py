@@ -1,4 +1,7 @@
-"""Energy of trees: kinetic, of springs, ties and weight; and whether their state or what acts on them was changed."""
+"""Energy of trees: kinetic energy, and that of springs, ties and weight.
+
+Also detects changes of state and of forces.
+"""
 
 import warp as wp
 
@@ -31,10 +34,10 @@ def body_energy(
     pose: wp.transform,
     motion: wp.spatial_vector,
 ):
-    """Kinetic and potential energy of one body, the size of the terms that these are sums of [J], and a checksum of
-    where its ties are held.
+    """Returns kinetic and potential energy of one body, the size of the terms of their sums [J], and a checksum.
 
-    Potential is its weight's, its joint's spring and its ties. pose: [m] against ``origin`` [m], world axes.
+    The checksum is of the points at which the body's ties are held. The potential energy is that of its weight, its
+    joint's spring and its ties. pose: [m] relative to ``origin`` [m], world axes.
     """
     com = model.body_com[k]
     mass = model.body_mass[k]
@@ -72,8 +75,10 @@ def tree_energy(
     tree: int,
     bodies_out: BodyState,
 ):
-    """:func:`body_energy` of a whole tree, its bodies put where the joints say: against the tree's origin, so that far
-    from the world's no digits are lost."""
+    """Returns :func:`body_energy` of a whole tree, with its bodies placed according to the joints.
+
+    Positions are relative to the tree's origin, so that no digits are lost far from the world's origin.
+    """
     energy = wp.vec4()
     first = model.tree_first[tree]
     origin = wp.transform_get_translation(model.tree_pose[tree])
@@ -89,7 +94,7 @@ def tree_energy(
         if parent < 0:
             pose = standing
             motion = wp.spatial_vector()
-        elif parent != k - model.pitch:  # else the last body is the parent
+        elif parent != k - model.pitch:  # otherwise the last body is the parent
             pose = bodies_out.body_q[parent]
             motion = bodies_out.body_qd[parent]
         _axes, _lever, pose, motion = body_kinematics(pose, motion, offset, rest, q, qd)
@@ -121,7 +126,7 @@ for (int row = 0; row < (pitch == 1 ? 1 : count); ++row) {
 return (int)(sum >> 32) ^ (int)sum;
 """)
 def state_mark(q: wp.array(dtype=wp.quat), qd: wp.array(dtype=wp.vec3), first: int, count: int, pitch: int) -> int:
-    """Checksum of the bits of so many joints, ``pitch`` apart."""
+    """Returns a checksum of the bits of ``count`` joints, ``pitch`` apart."""
     ...
 
 
@@ -152,5 +157,5 @@ def is_pushed(
     count: int,
     pitch: int,
 ) -> bool:
-    """Whether a load or a contact acts on one of so many bodies: one bit besides a sign is set."""
+    """Returns whether a load or a contact acts on one of ``count`` bodies: any bit other than a sign is set."""
     ...

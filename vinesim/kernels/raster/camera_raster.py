@@ -1,4 +1,4 @@
-"""Which primitive each pixel of a pinhole camera sees: culling, boxes and meshes, and keys resolved to depth and labels.
+"""Finds the primitive that each pixel of a pinhole camera sees: culling, boxes and meshes, depth and labels from keys.
 
 Each primitive visits the pixels inside a conservative bound of its outline, intersects each pixel's ray in closed form
 and keeps the nearest hit (:mod:`vinesim.kernels.raster.pinhole`).
@@ -62,7 +62,7 @@ def cull_clusters(
 
 @wp.func
 def tangent(across: float, ahead: float, behind: float) -> float:
-    """Across over ahead, or ``behind`` for a direction that is not ahead."""
+    """Returns across / ahead, or ``behind`` for a direction that is not ahead."""
     return wp.where(ahead > 0.0, across / wp.max(ahead, 1.0e-9), behind)
 
 
@@ -90,7 +90,7 @@ def hull_tangents(box: OrientedBox, k: int) -> wp.vec2:
         low_ahead = ahead - low * across
         high_ahead = ahead - high * across
         if low_ahead <= 0.0 and high_ahead <= 0.0:
-            out = wp.vec2(UNBOUND, -UNBOUND)  # all of it is behind
+            out = wp.vec2(UNBOUND, -UNBOUND)  # the whole box is behind
         else:
             out[0] = tangent(across + low * ahead, low_ahead, -UNBOUND)
             out[1] = tangent(across + high * ahead, high_ahead, UNBOUND)

@@ -97,18 +97,18 @@ def raster_spheroids(
 
 @wp.struct
 class ConeBounds:
-    """Where in the picture a cone can be: inside a box and, if ``banded``, in a slanted band of every row."""
+    """Region of the picture that contains a cone: a box and, if ``banded``, a slanted band of every row."""
 
     box: wp.vec4i
     """First and last + 1 column, first and last + 1 row."""
     banded: int
     x: float
     y: float
-    """A point of the middle line of the band [pixel]."""
+    """[pixel] ``x`` and ``y``: a point of the band's middle line."""
     slope: float
-    """Columns per row."""
+    """Slope of the band, columns per row."""
     half_width: float
-    """[pixel]"""
+    """[pixel] Half of the band's width."""
 
 
 @wp.func
@@ -230,7 +230,7 @@ class LeafBounds:
     sums: wp.vec4
     """Lowest and highest x + y, lowest and highest x - y."""
     depth: float
-    """No point of it is nearer [m]."""
+    """[m] Lower bound of the depth of the blade's points."""
 
 
 @wp.func

@@ -1,9 +1,9 @@
 """The rasteriser for GPUs: primitives are cut into pieces of a few pixels, and every piece is drawn by some threads.
 
-One leaf may fill the picture and a thousand berries a single pixel each. One thread a primitive would let the whole
-GPU wait for that leaf, so a first kernel only bounds primitives and lists pieces of at most SIDE x SIDE pixels of
-their bounds, and a second one draws the pieces, all of about the same work. It intersects as the ray caster does.
-No kernel asks the host how long the lists have become: a frame is two launches.
+One leaf may fill the picture while a thousand berries cover one pixel each. With one thread for each primitive the
+whole GPU would wait for that leaf. So a first kernel only bounds primitives and lists pieces of at most SIDE x SIDE
+pixels of their bounds, and a second kernel draws the pieces, which all take about the same work. Intersections are
+computed as in the ray caster. No kernel asks the host for the length of the lists: a frame is two launches.
 """
 
 import warp as wp
@@ -38,19 +38,22 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 TILE_SIZE = wp.constant(16)
-"""Of a piece [pixel]; twice that for what is larger than LARGE, since one thread lists all pieces of a primitive."""
+"""[pixel] Side of a piece.
+
+It is twice that for primitives larger than LARGE, as one thread lists a primitive's pieces.
+"""
 LARGE_PRIMITIVE = wp.constant(256)
 TILE_LISTS = wp.constant(64)
-"""Pieces are kept in so many lists: threads that append to one must take turns."""
+"""Number of lists in which pieces are kept. Threads that append to the same list must take turns."""
 EMPTY_BOUNDS = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
-"""Bound of what is not in the picture [pixel]."""
+"""[pixel] Bounds of a primitive that is not in the picture."""
 UNBOUNDED_STRIP = wp.constant(wp.vec3(0.0, -1.0e6, 1.0e6))
-"""A strip that holds every pixel: slope, low, high."""
+"""A strip that contains every pixel: slope, low, high."""
 
 
 @wp.struct
 class Outline:
-    """Where in the picture one primitive can be: inside a box and inside two strips ``low <= x - slope y <= high``."""
+    """Region of the picture that contains a primitive: a box and two strips ``low <= x - slope y <= high``."""
 
     box: wp.vec4i
     """First and last + 1 column, first and last + 1 row."""
@@ -58,12 +61,12 @@ class Outline:
     """Slope, low, high [pixel]."""
     falling: wp.vec3
     depth: float
-    """No point of it is nearer [m]."""
+    """[m] Lower bound of the depth of the primitive's points."""
 
 
 @wp.func
 def extend_bounds(lens: Pinhole, bound: wp.vec4, p: wp.vec3) -> wp.vec4:
-    """Lowest and highest x and y [pixel], widened to hold the picture of a point in front of the camera."""
+    """Returns the lowest and highest x and y [pixel], widened to include the image of a point in front of the camera."""
     x = p[0] / p[2] * lens.fx + lens.cx
     y = p[1] / p[2] * lens.fy + lens.cy
     return wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
@@ -196,7 +199,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
 
 @wp.func
 def outline_of(s: Shapes, i: int, lens: Pinhole) -> Outline:
-    """Where primitive ``i`` can be; its box is empty if it is behind the camera or beside the picture."""
+    """Returns the region that contains primitive ``i``; its box is empty if it is behind the camera or off the picture."""
     kind = s.kind[i]
     o = Outline()
     if kind == LEAF:
@@ -226,7 +229,7 @@ def column_span(o: Outline, top: int, bottom: int) -> wp.vec2i:
 
 @wp.func
 def draw_tile(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, keys_out: wp.array(dtype=wp.int64)):
-    """Every ``lanes``-th pixel of one piece: primitive, corner and size (x + 65536 y), least depth [um]."""
+    """Draw every ``lanes``-th pixel of a piece: primitive, corner and size (x + 65536 y), least depth [um]."""
     i = piece[0]
     left = piece[1] & 0xFFFF
     top = piece[1] >> 16
@@ -263,7 +266,10 @@ def list_tiles(
     pieces_out: wp.array2d(dtype=wp.vec4i),
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread lists the pieces of every ``lanes``-th primitive of one cluster; what finds no room it draws itself."""
+    """One thread lists the pieces of every ``lanes``-th primitive of a cluster.
+
+    It draws pieces for which there is no room.
+    """
     k, lane = wp.tid()
     cluster = which[k]
     r = ball[cluster][3]

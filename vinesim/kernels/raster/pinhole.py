@@ -1,4 +1,4 @@
-"""Pinhole projection, bounds of what is projected, and the depth test of all rasterisers.
+"""Pinhole projection, bounds of projected shapes, and the depth test of all rasterisers.
 
 A pixel keeps its nearest hit by ``atomic_min`` on a 64-bit key: depth [um] above, number of the primitive below. Depth
 runs along the optical axis. There is no near plane: whatever is in front of the pinhole is seen.
@@ -12,13 +12,16 @@ EMPTY_KEY = wp.constant(wp.int64(1 << 62))
 """Key of a pixel that sees no primitive."""
 PRIMITIVE_MASK = wp.constant(wp.int64(0x7FFFFFFF))
 UNBOUND = wp.constant(1.0e6)
-"""A tangent beyond any picture."""
+"""A tangent larger than any in a picture, for an unlimited bound."""
 NEAR_DEPTH = wp.constant(0.05)
-"""Nearer than this [m] bounds are taken from spheres, which know no plane."""
+"""[m] At smaller depths, bounds are taken from spheres, which need no near plane."""
 BATCH = wp.constant(64)
-"""Pixels of a row that are taken at once; loops over them are written so that LLVM takes eight at a time."""
+"""Number of pixels of a row that are handled together.
+
+Loops over them are written so that LLVM vectorises them by eight.
+"""
 SMOOTH_SIZE = wp.constant(120.0)
-"""From this size in pixels on a leaf's outline is interpolated between texels."""
+"""Size of a leaf in pixels from which its outline is interpolated between texels."""
 
 
 FloatBatch = wp.types.vector(length=64, dtype=wp.float32)
@@ -30,7 +33,7 @@ IntBatch = wp.types.vector(length=64, dtype=wp.int32)
 
 @wp.struct
 class Pinhole:
-    """Where a camera is and how it projects. Pixel centres have whole coordinates (sensor_msgs/CameraInfo)."""
+    """Pose and projection of a camera. Pixel centres have whole coordinates (sensor_msgs/CameraInfo)."""
 
     eye: wp.vec3
     rotation: wp.mat33
@@ -42,13 +45,13 @@ class Pinhole:
     width: int
     height: int
     first_row: int
-    """Only rows from this one on are drawn, ..."""
+    """First row that is drawn. Threads share a picture by rows."""
     end_row: int
-    """... to the one before this: threads share a picture by rows."""
+    """Row after the last row that is drawn."""
     max_depth: float
     """Farthest depth that is drawn [m]."""
     near_radius: float
-    """Radius of a ball around the eye that holds all of the view within the depth CLOSE [m]."""
+    """[m] Radius of a ball around the eye that contains the whole view within the depth CLOSE."""
 
 
 @wp.func
@@ -59,20 +62,23 @@ def pixel_ray(lens: Pinhole, x: int, y: int) -> wp.vec3:
 
 @wp.func
 def depth_key(t: float, i: int) -> wp.int64:
-    """What a hit is kept as: the least is the nearest."""
+    """Returns the key under which a hit is stored. The smallest key belongs to the nearest hit."""
     return (wp.int64(int(t * 1.0e6)) << wp.int64(32)) | wp.int64(i)
 
 
 @wp.func
 def depth_test(pixel: int, t: float, i: int, reach: float, keys_out: wp.array(dtype=wp.int64)):
-    """Enter a hit."""
+    """Store a hit in its pixel if it is the nearest so far."""
     if t < reach:
         wp.atomic_min(keys_out, pixel, depth_key(t, i))
 
 
 @wp.func
 def circle_tangents(x: float, z: float, r: float) -> wp.vec2:
-    """Both tangents (x / z) from the origin to a circle; beyond +-90 degrees they are unbound, with the right sign."""
+    """Returns both tangents (x / z) from the origin to a circle.
+
+    Beyond +-90 degrees they are UNBOUND, with the right sign.
+    """
     free = x * x + z * z - r * r
     low = -UNBOUND
     high = UNBOUND

@@ -35,7 +35,7 @@ TRIANGLE = wp.constant(6)
 FAR = wp.constant(1.0e30)
 TINY = wp.constant(1.0e-20)
 HIDDEN_HEIGHT = wp.constant(-1.0e6)
-"""Height at which things that are gone lie for the ray caster [m]."""
+"""[m] Height at which removed primitives are placed for the ray caster."""
 
 
 @wp.struct
@@ -61,7 +61,7 @@ class Clusters:
     size: wp.array(dtype=wp.int32)
     kind: wp.array(dtype=wp.int32)
     shown: wp.array(dtype=wp.int32)
-    """0 for what is gone: a picked bunch."""
+    """[cluster] 0 if the cluster was removed, such as a picked bunch."""
 
 
 @wp.func
@@ -94,7 +94,7 @@ def scale_along(v: wp.vec3, axis: wp.vec3, k: float) -> wp.vec3:
 OUTLINE_TEXELS = wp.constant(128.0)
 """Texels of a leaf's outline per leaf unit: 256 texels over u in [-1, 1], v in [-0.75, 1.25]."""
 LEAF_BOUND_MARGIN = wp.constant(1.0e-3)
-"""By how much bounds of a blade are wider than they need be, leaf units."""
+"""Margin that is added to the bounds of a blade, leaf units."""
 
 
 @wp.func
@@ -123,10 +123,11 @@ def leaf_extent(hull: wp.array2d(dtype=wp.vec2), number: int) -> wp.vec3:
 
 @wp.func
 def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> wp.vec2:
-    """How far a blade rises above, and falls below, the hull of its points over the corners of its octagon, leaf units.
+    """Returns how far a blade rises above, and falls below, the hull of its points over the octagon's corners, leaf
+    units.
 
-    A quadratic deviates from its interpolation by at most its curvature times (range / 2)^2. Each half of a blade is
-    one; corners 3 and 7 lie at the midrib, or near it.
+    A quadratic deviates from its interpolation by at most its curvature times (range / 2)^2. Each half of a blade is a
+    quadratic; corners 3 and 7 are at the midrib, or near it.
     """
     extent = leaf_extent(hull, number)
     wide = 0.5 * extent[0]
@@ -141,7 +142,7 @@ def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> w
 
 @wp.func
 def inside_outline(outline: wp.array3d(dtype=wp.int8), number: int, u: float, v: float, smooth: int) -> bool:
-    """Whether a point of the leaf's plane belongs to the blade."""
+    """Returns whether a point of the leaf's plane belongs to the blade."""
     x = (u + 1.0) * OUTLINE_TEXELS - 0.5
     y = (v + 0.75) * OUTLINE_TEXELS - 0.5
     i = wp.clamp(int(x), 0, 254)
@@ -188,7 +189,7 @@ def hit_leaf(
 
 @wp.func
 def within_leaf_rectangle(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> float:
-    """``t`` if a ray is then over the half of ``sign`` of a blade's rectangle, else :data:`FAR`."""
+    """Returns ``t`` if the ray is then over the half of a blade's rectangle given by ``sign``, else :data:`FAR`."""
     u = sign * (o[0] + t * d[0])
     v = o[1] + t * d[1]
     return wp.where(u >= -1.0e-5 and u < extent[0] and v > extent[1] and v < extent[2] and t > 0.0, t, FAR)
@@ -210,9 +211,10 @@ def leaf_surface_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, 
 
 @wp.func
 def hit_leaf_rectangle(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -> float:
-    """First hit with the rectangle |u| < x, y < v < z that a blade is cut from; negative if there are several hits.
+    """Returns the first hit with the rectangle |u| < x, y < v < z that contains a blade; negative if there are several
+    hits.
 
-    Without a branch, so that a compiler can take several rays at once.
+    The code has no branch, so that a compiler can vectorise it over several rays.
     """
     right = leaf_surface_roots(bend, extent, 1.0, o, d)
     left = leaf_surface_roots(bend, extent, -1.0, o, d)
@@ -418,7 +420,7 @@ def normal_at(s: Shapes, i: int, p: wp.vec3) -> wp.vec3:
     return wp.normalize(n)
 
 
-# The box around a primitive, in the frame of whatever sees it: bounds that stay narrow beside the eye.
+# The box around a primitive, in the frame of the camera or lidar: bounds that stay narrow next to the eye.
 
 
 @wp.struct

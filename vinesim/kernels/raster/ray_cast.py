@@ -1,7 +1,7 @@
 """Rays against the primitives through a bounding volume hierarchy: lidars, and the oracle of the rasteriser.
 
-Plants and links have one hierarchy each, asked one after the other: plants only sway, so theirs stays good for ever
-under refits, and a robot that drives through the rows does not stretch it.
+Plants and links have one hierarchy each, and a ray is tested against both. Plants only sway, so refits never degrade
+their hierarchy, and a robot that drives through the rows does not stretch it.
 """
 
 import warp as wp
@@ -19,19 +19,19 @@ class Hierarchies:
     plants: wp.uint64
     rigid: wp.uint64
     first_rigid: int
-    """Negative where there are no links."""
+    """Index of the first primitive of a link. Negative if there are no links."""
 
 
 @wp.struct
 class Hit:
     t: float
     primitive: int
-    """-2 the ground, -1 nothing."""
+    """Index of the primitive that was hit; -2 the ground, -1 nothing."""
 
 
 @wp.func
 def needs_smooth_outline(s: Shapes, i: int, depth_scale: float, forward: wp.vec3, eye: wp.vec3) -> int:
-    """Whether a leaf's outline is interpolated, by the rasteriser's rule; never without a focal length."""
+    """Returns whether a leaf's outline is interpolated, by the rasteriser's rule. False without a focal length."""
     a4 = s.a[i]
     smooth = wp.int32(0)
     if s.kind[i] == LEAF and depth_scale > 0.0:

@@ -1,4 +1,4 @@
-"""Primitives carried from the frames of their bodies into the world, and bounds around them and their clusters."""
+"""Transforms primitives from the frames of their bodies into the world, and bounds them and their clusters."""
 
 import warp as wp
 
@@ -35,7 +35,10 @@ class PosedPrimitive:
 
 @wp.func
 def pose_leaf(local: Shapes, i: int, pose: wp.transform) -> PosedPrimitive:
-    """Blade ``i`` carried by ``pose``; its box holds the octagon around its outline, raised by its curvatures."""
+    """Returns blade ``i`` moved by ``pose``.
+
+    Its box contains the octagon around its outline, raised by its curvatures.
+    """
     q = wp.transform_get_rotation(pose)
     s = PosedPrimitive()
     a = wp.transform_point(pose, xyz(local.a[i]))
@@ -61,7 +64,7 @@ def pose_leaf(local: Shapes, i: int, pose: wp.transform) -> PosedPrimitive:
 
 @wp.func
 def pose_solid(local: Shapes, i: int, kind: int, pose: wp.transform) -> PosedPrimitive:
-    """Primitive ``i``, of any kind but a leaf, carried by ``pose``."""
+    """Returns primitive ``i``, of any kind but a leaf, moved by ``pose``."""
     q = wp.transform_get_rotation(pose)
     s = PosedPrimitive()
     a = wp.transform_point(pose, xyz(local.a[i]))
@@ -116,10 +119,11 @@ def pose_clusters(
     upper_out: wp.array(dtype=wp.vec3),
     ball_out: wp.array(dtype=wp.vec4),
 ):
-    """One thread carries one cluster from its bodies' frames into the world, and bounds it.
+    """One thread per dirty cluster. Transform it from its bodies' frames into the world, and bound it.
 
     local: [primitive] in the frames of their carriers; carrier: [primitive] row of ``poses``; dirty: [thread] clusters
-    to carry; lower, upper: [primitive] m; ball: [cluster] centre and radius [m], radius -1 where it is hidden.
+    to transform; lower, upper: [primitive] m; ball: [cluster] centre and radius [m], radius -1 where the cluster is
+    hidden.
     """
     cluster = dirty[wp.tid()]
     kind = clusters.kind[cluster]

@@ -24,7 +24,7 @@ def orientation(poses: wp.array2d(dtype=wp.float64), i: int):
 
 @wp.func
 def perpendicular(v: wp.vec3d, axis: wp.vec3d):
-    """Unit vector along what of ``v`` is perpendicular to the unit vector ``axis``."""
+    """Returns the unit vector along the part of ``v`` that is perpendicular to the unit vector ``axis``."""
     return wp.normalize(v - wp.dot(v, axis) * axis)
 
 
@@ -37,7 +37,7 @@ def rotation_from_axes(x: wp.vec3d, z: wp.vec3d):
 
 @wp.func
 def write_pose(at: wp.vec3d, q: wp.quatd, i: int, poses_out: wp.array2d(dtype=wp.float64)):
-    """Put a pose into its row."""
+    """Write a pose into its row."""
     for k in range(3):
         poses_out[i, k] = at[k]
     for k in range(4):
@@ -91,7 +91,7 @@ def pose_torso_and_legs(
 
 @wp.func
 def rotate_by_pose(poses: wp.array2d(dtype=wp.float64), i: int, v: wp.vec3d):
-    """A vector of a pose's frame, in the world."""
+    """Returns a vector, given in a pose's frame, in the world frame."""
     return wp.quat_rotate(orientation(poses, i), v)
 
 
@@ -115,7 +115,7 @@ def pose_arms_and_fingers(
     limbs_out: wp.array2d(dtype=wp.float64),
 ):
     """One thread hangs the neck (0), the left or right arm (1, 2) or a finger (3 to 12) between chest, head and hands."""
-    # ``held``: chest, head, left and right hand. Left things are given; right ones mirror them. A shoulder gives way
+    # ``held``: chest, head, left and right hand. Left shapes are given; right ones mirror them. A shoulder gives way
     # when the hand is out of the arm's reach, by a fifth of the upper arm at most.
     thread = wp.tid()
     zero = wp.float64(0.0)

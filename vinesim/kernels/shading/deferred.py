@@ -26,26 +26,26 @@ from vinesim.kernels.shading.solid_materials import solid_surface
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 WHITE_POINT = wp.constant(3.0)
-"""Light, after exposure, that the tone curve shows as nearly white."""
+"""Radiance, after exposure, that the tone curve shows as nearly white."""
 MIN_METERED_LUMINANCE = wp.constant(0.02)
 MAX_METERED_LUMINANCE = wp.constant(2.0)
-"""What is darker or brighter counts as this when light is metered."""
+"""Limits of the luminance in light metering: darker pixels count as the first, brighter pixels as the second."""
 
 
 @wp.struct
 class Light:
-    """Sun, sky and exposure."""
+    """Colours and directions of sun and sky light, shadow sampling, and exposure."""
 
     sun: wp.vec3
     sun_colour: wp.vec3
     sky_colour: wp.vec3
     ground_colour: wp.vec3
-    """From the ground."""
+    """Colour of the light from the ground."""
     canopy_colour: wp.vec3
-    """Through the canopy."""
+    """Colour of the light through the canopy."""
     haze_colour: wp.vec3
     shadow_taps: int
-    """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
+    """Number of shadow samples for each pixel. 0: a smooth filter of two widths; -1: a smooth filter of one width."""
     sample_spiral: wp.array(dtype=wp.vec2)
     """[taps] Vogel's spiral in the unit disc."""
     sample_rotations: wp.array(dtype=wp.vec2)
@@ -91,7 +91,7 @@ def ambient_light(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
 
 @wp.func
 def reflected_light(materials: Materials, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
-    """What a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
+    """Returns the radiance that a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
     t = sample_bilinear(materials.noise_texture, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
     hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
     above = mix(light.canopy_colour * 0.4, light.sky_colour * 1.3, hole)
@@ -201,8 +201,10 @@ def shade_surface(
 def seen_surface(
     shapes: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3, footprint: float, slant: float
 ) -> Surface:
-    """The surface of primitive ``i`` (-2: the ground) at ``p``, seen along the unit ray ``d``; ``footprint`` and ``slant``
-    are the lengths that one pixel covers across and along the line of sight [m]."""
+    """Returns the surface of primitive ``i`` (-2: the ground) at ``p``, seen along the unit ray ``d``.
+
+    ``footprint`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m].
+    """
     s = Surface()
     if i >= 0:
         kind = shapes.kind[i]
@@ -291,7 +293,7 @@ def shade_pixels(
             y = top + (c >> half)
             if x < lens.width and y < lens.height:
                 i = primitive[y * lens.width + x]
-                for k in range(c):  # the first corner that shows a primitive stands for all that show it
+                for k in range(c):  # the first corner that shows a primitive stands for all corners that show it
                     if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
                         i = -3
             if i != -3:

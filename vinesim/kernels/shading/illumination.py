@@ -1,6 +1,7 @@
-"""How much light falls on what each pixel sees, without its colour: for cameras whose bands are not red, green and blue.
+"""Illumination of what each pixel sees, without its colour, for cameras whose bands are not red, green and blue.
 
-The light is that of the RGB picture, its three colours averaged, beside what a level white panel in the open gets.
+It is the light of the RGB picture, averaged over its three colours, relative to the light on a level white panel in the
+open.
 """
 
 import warp as wp
@@ -15,7 +16,10 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SOIL_RATIO = wp.constant(0.72)
 SOD_RATIO = wp.constant(1.45)
-"""Green over red of the picture's ground: up to the first it is bare soil, from the second on sod. GUESSED."""
+"""Ratio of green to red of the picture's ground.
+
+Up to the first value it is bare soil, from the second on sod. GUESSED.
+"""
 
 
 @wp.func
@@ -41,11 +45,12 @@ def illuminate_pixels(
     light_out: wp.array(dtype=wp.float32),
     sod_out: wp.array(dtype=wp.float32),
 ):
-    """One thread finds the light on what ``run`` neighbouring pixels see, from the first row that ``lens`` draws on.
+    """One thread computes the light on what ``run`` neighbouring pixels see, from the first row that ``lens`` draws on.
 
     primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; near, far: shadow maps;
-    transmission: light that a leaf lets through over what it reflects; light: [pixel] over that on a level white panel in
-    the open, 1 for the sky; sod: [pixel] share of sod where the ground is seen, 0 elsewhere.
+    transmission: light that a leaf lets through divided by the light that it reflects; light: [pixel] relative to the
+    light on a level white panel in the open, 1 for the sky; sod: [pixel] share of sod where the ground is seen, 0
+    elsewhere.
     """
     panel = grey(light.sun_colour) * wp.max(light.sun[2], 0.05) + grey(light.sky_colour)
     back = wp.transpose(lens.rotation)

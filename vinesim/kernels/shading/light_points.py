@@ -22,7 +22,7 @@ BLADES = wp.constant(2)
 BERRIES = wp.constant(3)
 OTHERS = wp.constant(4)
 CLASS_COUNT = 5
-"""Classes of points: the sky, the ground, leaves and grass, berries, all others."""
+"""Number of classes of points: the sky, the ground, leaves and grass, berries, all others."""
 
 
 @wp.struct
@@ -37,11 +37,12 @@ class Points:
     """Mean depth [m]."""
     primitive: wp.array(dtype=wp.int32)
     pixels: wp.array(dtype=wp.int32)
-    """Upper left pixel of the block times 16, plus one bit for each of its pixels that the point stands for."""
+    """Upper left pixel of the block times 16, plus one bit for each pixel of the block to which the point's light goes.
+    """
     count: wp.array2d(dtype=wp.int32)
-    """[list, class]"""
+    """[list, class] Number of points."""
     capacity: int
-    """Places of each class in a list."""
+    """Number of points of each class for which a list has room."""
 
 
 @wp.struct
@@ -64,7 +65,7 @@ class FloatTables:
     sky_table: wp.array2d(dtype=wp.float32)
     """[texel, 3]"""
     ground_sky: wp.array(dtype=wp.float32)
-    """[cell] the sky that the ground sees, flat"""
+    """[cell] Share of the sky that the ground sees, flattened."""
 
 
 @wp.struct
@@ -79,7 +80,7 @@ class ShadowMaps:
 
 @wp.func
 def point_class(shapes: Shapes, materials: Materials, i: int) -> int:
-    """The class of a point on primitive ``i`` (-1: the sky, -2: the ground)."""
+    """Returns the class of a point on primitive ``i`` (-1: the sky, -2: the ground)."""
     if i < 0:
         return wp.where(i == -1, SKY, GROUND)
     kind = shapes.kind[i]
@@ -170,7 +171,7 @@ def unit(v: wp.vec3) -> wp.vec3:
 
 @wp.func
 def write_light(code: int, width: int, colour: wp.vec3, radiance_out: wp.array(dtype=wp.vec3)):
-    """Give its light to the pixels that a point stands for (:attr:`Points.pixels`)."""
+    """Write a point's light to the pixels that it stands for (:attr:`Points.pixels`)."""
     first = code >> 4
     if code & 1 != 0:
         radiance_out[first] = colour

@@ -33,12 +33,12 @@ class Materials:
     material: wp.array(dtype=wp.int32)
     tint: wp.array(dtype=wp.vec3)
     sky: wp.array(dtype=wp.float32)
-    """Share of the sky each primitive sees through the canopy."""
+    """[primitive] Share of the sky that the primitive sees through the canopy."""
     leaf_texture: wp.array3d(dtype=wp.vec4)
     noise_texture: wp.array2d(dtype=wp.vec4)
     soil_texture: wp.array2d(dtype=wp.vec4)
     rows: wp.vec2
-    """Where the first row of vines stands, and their spacing [m], along y."""
+    """Position of the first row of vines, and the spacing of rows [m], along y."""
     ground_sky: wp.array2d(dtype=wp.float32)
     ground_x: float
     ground_y: float
@@ -80,16 +80,16 @@ def sample_nearest(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.v
 
 @wp.struct
 class Surface:
-    """What one point reflects."""
+    """Reflection properties of a surface at one point."""
 
     normal: wp.vec3
     geometric_normal: wp.vec3
     """Normal of the shape, without relief."""
     albedo: wp.vec3
     transmission: wp.vec3
-    """Colour of the light that passes."""
+    """Colour of the light that passes through the surface."""
     wrap: wp.vec3
-    """How far light creeps round the terminator, by colour."""
+    """How far light reaches beyond the terminator, for each colour."""
     sky: float
     occlusion: float
     specular: float

@@ -1,4 +1,4 @@
-"""What sun and sky reach: depths seen from the sun, and the share of the sky that comes through the leaves."""
+"""Visibility of sun and sky: depths seen from the sun, and the share of the sky's light that passes through the leaves."""
 
 import warp as wp
 
@@ -25,11 +25,11 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SUN_DISTANCE = wp.constant(100.0)
-"""Depths of a shadow map count from this far towards the sun of its corner [m]."""
+"""[m] Depths of a shadow map are measured from a point this far from the map's corner towards the sun."""
 SHADOW_MARGIN = wp.constant(2.0)
-"""What is drawn may reach so far beyond the bound of its cluster [texel]."""
+"""[texel] How far a drawn primitive may extend beyond the bound of its cluster."""
 SUN_RADIUS = wp.constant(0.0047)
-"""Half of the sun's angle [rad]."""
+"""[rad] Half of the angle that the sun subtends."""
 
 
 @wp.struct

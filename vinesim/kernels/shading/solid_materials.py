@@ -1,4 +1,4 @@
-"""Materials of what is solid: canes, bark, posts and wires; plastic, cloth, skin, paint, metal and glass."""
+"""Materials of solids: canes, bark, posts and wires; plastic, cloth, skin, paint, metal and glass."""
 
 import warp as wp
 
@@ -63,7 +63,7 @@ def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
 
 @wp.struct
 class SolidPoint:
-    """One point of a solid: what its material draws on."""
+    """Properties of one point of a solid that its material uses."""
 
     normal: wp.vec3
     grain: wp.vec3
@@ -172,7 +172,7 @@ def woody_surface(
 
 @wp.func
 def made_surface(materials: Materials, s: Surface, material: int, grain: wp.vec3, seed: float, pixel: float) -> Surface:
-    """What is manufactured, and skin: gloss, colour and folds by material."""
+    """Returns the surface of manufactured things, and of skin: gloss, colour and folds by material."""
     tint = s.albedo
     n = s.normal
     near = pixel < 0.004

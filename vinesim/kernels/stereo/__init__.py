@@ -1,1 +1,1 @@
-"""What a sensor measures of exact depth: stereo matching, lidar echoes."""
+"""Kernels that compute a sensor's measurements from exact depth: stereo matching."""

@@ -1,4 +1,4 @@
-"""What a stereo camera measures of what it sees: disparity by windows, what the second imager misses, noise, steps.
+"""Depth measured by a stereo camera: disparity by windows, areas the second imager misses, noise, steps.
 
 Disparity d = f B / z, in pixels of the imagers, which may be coarser than the picture that the depth is aligned to.
 """
@@ -10,14 +10,15 @@ from vinesim.kernels.raster.pinhole import Pinhole, pixel_ray
 wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 25})
 
 WindowDisparities = wp.types.vector(length=25, dtype=wp.float32)
-"""Disparities [px] in 5 x 5 places of a window; first 3 x 3 are looked at, which is enough where there is no edge."""
+"""Disparities [px] at 5 x 5 points of a window. First 3 x 3 are evaluated, which is enough where there is no edge."""
 SURFACE_GAP = wp.constant(1.0)
-"""Surfaces whose disparities differ by more than this [px], and by more than slant explains, are two to a matcher."""
+"""[px] The matcher separates two surfaces whose disparities differ by more than this and by more than slant explains.
+"""
 
 
 @wp.struct
 class Stereo:
-    """One kind of stereo camera (:class:`vinesim.sensors.camera.stereo.StereoSpec`)."""
+    """Parameters of one kind of stereo camera (:class:`vinesim.sensors.camera.stereo.StereoSpec`)."""
 
     focal_baseline: float
     """Focal length times baseline [px m]: disparity = focal_baseline / depth."""
@@ -25,11 +26,11 @@ class Stereo:
     scale: float
     """Imager pixels along one pixel of the picture, at most 1: a picture may be finer than what is measured."""
     stride: int
-    """Between two places of a window [px of the picture]."""
+    """Distance between two points of a window [px of the picture]."""
     sigma: float
-    """Of disparity [px]."""
+    """Standard deviation of the disparity's noise [px]."""
     step: float
-    """Of disparity [px]."""
+    """Quantisation step of the disparity [px]."""
     nearest: float
     farthest: float
     fattening: float
@@ -37,9 +38,9 @@ class Stereo:
     slant_kept: float
     """Cosine of the angle between ray and normal from which on every surface is measured."""
     slant_lost: float
-    """Up to this cosine none is."""
+    """Cosine of the angle between ray and normal up to which no surface is measured."""
     slope: float
-    """How much disparity changes within a window, as a share of it, on a surface that is just measured for certain."""
+    """Relative change of disparity within a window on a surface that is just measured for certain."""
     contrast: float
     projector: float
     saturation: float
@@ -47,7 +48,7 @@ class Stereo:
 
 @wp.func
 def surface_gap(slope: float, d: float) -> float:
-    """From which difference [px] on two disparities near ``d`` are those of two surfaces."""
+    """Returns the difference [px] from which on two disparities near ``d`` belong to two surfaces."""
     return SURFACE_GAP + slope * d
 
 

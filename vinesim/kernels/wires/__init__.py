@@ -1,1 +1,1 @@
-"""Kernels of wires and arms: how they couple their shoots, what presses on them, and where they are seen."""
+"""Kernels of wires and arms: the coupling of their shoots, the contacts with wires, and the shapes of deflected wires."""

@@ -1,17 +1,19 @@
 """Elastic supports of shoots: taut wires, which their ties deflect, and arms of a cordon, which they twist.
 
-A support is light beside the shoots, or far stiffer than a step follows, so that it is always in balance. With springs in
-series between its nodes, the places where shoots hold it (of a wire T / l, with tension T and free length l; of an arm
-G J / l), K u = f, where K is tridiagonal. The force of node i is f_i = k_i (s_i - u_i): of a tie with stiffness k and
-displacement s of its point across the wire, or the moment along the arm of the spring of a root's joint. With the rest of
-that spring turned by u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint (theta - u e) / 2, so that
-k = e^T K_joint e and k s = e^T K_joint (theta - theta_drawn). What shoots feel is (K^-1 + k^-1)^-1 s: symmetric, and less stiff than ties
-and joints alone. What else presses on a wire (*loads*) adds to f. Along itself a wire does not give. It ends at posts; an arm is clamped at the trunk and free at its end.
+A support is light compared with the shoots, or far stiffer than a step can follow, so it is always in balance. Its
+nodes are the places where shoots hold it, with springs in series between them: T / l for a wire, with tension T and
+free length l; G J / l for an arm. In balance K u = f, where K is tridiagonal and u are the deflections. The force of
+node i is f_i = k_i (s_i - u_i). For a wire, k is the stiffness of a tie and s the displacement of its point across the
+wire. For an arm, f is the moment along the arm of the spring of a root's joint. With the rest of that spring turned by
+u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint (theta - u e) / 2, so that k =
+e^T K_joint e and k s = e^T K_joint (theta - theta_drawn). The shoots feel the force (K^-1 + k^-1)^-1 s: its stiffness
+is symmetric and less than that of ties and joints alone. Other forces on a wire (*loads*) add to f. A wire does not
+stretch along itself. It ends at posts; an arm is clamped at the trunk and free at its end.
 
-Ties and joints are implicit in the prediction of each tree, with anchors and rest on the support; that follows the trees'
-state at the start of the step, and moves on as fast as they do. Against a solve of all trees of a support at once only
-k K'^-1 k times the acceleration is left out, K' = K + k: a positive semidefinite mass, (phi dt)^2 k at most, with which
-the scheme stays as stable as without supports, whatever K and k are.
+Ties and joints are implicit in the prediction of each tree, with anchors and rests on the support. The support follows
+the trees' state at the start of the step, and moves on as fast as they do. Compared with a solve of all trees of a
+support at once, only k K'^-1 k times the acceleration is left out, K' = K + k. This is a positive semidefinite mass,
+(phi dt)^2 k at most, with which the scheme stays as stable as without supports, whatever K and k are.
 """
 
 import warp as wp
@@ -24,45 +26,43 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SupportNodes:
-    """Where shoots hold supports, support by support from its start to its end. [node] unless said otherwise."""
+    """Places where shoots hold supports, support by support from its start to its end. [node] unless said otherwise."""
 
-    first: wp.array(dtype=wp.int32)  # [support + 1] its first node
-    is_arm: wp.array(dtype=wp.bool)  # [support] whether it is an arm
-    last_stiffness: wp.array(dtype=wp.float64)  # [support] N/m, N m/rad of what is behind its last node; 0: a free end
-    stiffness: wp.array(
-        dtype=wp.float64
-    )  # [N/m, N m/rad] of what is between this node and the one before, or the start
+    first: wp.array(dtype=wp.int32)  # [support + 1] the support's first node
+    is_arm: wp.array(dtype=wp.bool)  # [support] whether the support is an arm
+    last_stiffness: wp.array(dtype=wp.float64)  # [support] N/m, N m/rad: stiffness behind its last node; 0: a free end
+    stiffness: wp.array(dtype=wp.float64)  # [N/m, N m/rad] stiffness between this node and the one before, or the start
     axis: wp.array(dtype=wp.vec3d)  # unit vector along a wire, in the world; along an arm, in joint axes
-    body: wp.array(dtype=wp.int32)  # that the tie holds; the root on an arm
-    tree: wp.array(dtype=wp.int32)  # of that body
-    number: wp.array(dtype=wp.int32)  # of the tie among those of its body
-    point: wp.array(dtype=wp.vec3d)  # [m] of the tie in the body
+    body: wp.array(dtype=wp.int32)  # body that the tie holds; on an arm, the root
+    tree: wp.array(dtype=wp.int32)  # tree of that body
+    number: wp.array(dtype=wp.int32)  # index of the tie among the ties of its body
+    point: wp.array(dtype=wp.vec3d)  # [m] point of the tie in the body
     origin: wp.array(
         dtype=wp.vec3d
     )  # [m] anchor of the tie, [rad] rotation vector of the joint, while nothing has moved
-    wake_distance: wp.array(dtype=wp.float64)  # [m, rad] by which it may move under a sleeping tree
+    wake_distance: wp.array(dtype=wp.float64)  # [m, rad] distance that the node may move under a sleeping tree
 
 
 @wp.struct
 class SupportState:
-    """How supports lie, and what the solve needs on its way. [node]"""
+    """Deflections of the supports, and intermediate values of the solve. [node]"""
 
-    load: wp.array(dtype=wp.vec3d)  # [N] on a wire at the node, but for ties; in the world
+    load: wp.array(dtype=wp.vec3d)  # [N] force on a wire at the node, without the ties; in the world
     deflection: wp.array(dtype=wp.vec3d)  # [m] in the world; [rad, 0, 0] for an arm
-    reference: wp.array(dtype=wp.vec3d)  # the deflection when the node's tree was last awake or put somewhere
-    ratio: wp.array(dtype=wp.float64)  # [1] of a node's deflection to that of the next
+    reference: wp.array(dtype=wp.vec3d)  # the deflection when the node's tree was last awake or was last placed
+    ratio: wp.array(dtype=wp.float64)  # [1] ratio of a node's deflection to that of the next node
     velocity: wp.array(dtype=wp.vec3d)  # [m/s], [rad/s, 0, 0]
-    share: wp.array(dtype=wp.float64)  # [1] deflection if all awake trees move as one, by the same
+    share: wp.array(dtype=wp.float64)  # [1] deflection by a common displacement of all awake trees, per unit of it
 
 
 @wp.struct
 class Wires:
     """Pieces of wire under tension. [piece], of all fixed pieces, unless said otherwise."""
 
-    tension: wp.array(dtype=wp.float64)  # [N]
-    length: wp.array(dtype=wp.float64)  # [m]
-    support: wp.array(dtype=wp.int32)  # its number; -1: no tie is bound to it
-    node_along: wp.array(dtype=wp.float64)  # [node] m from the start of its piece
+    tension: wp.array(dtype=wp.float64)  # [N] tension
+    length: wp.array(dtype=wp.float64)  # [m] length
+    support: wp.array(dtype=wp.int32)  # index of the piece's support; -1: no tie is bound to the piece
+    node_along: wp.array(dtype=wp.float64)  # [node] m, distance from the start of the node's piece
 
 
 @wp.struct
@@ -78,9 +78,9 @@ class SupportedBodies:
 
 @wp.struct
 class SupportedSprings:
-    """Ties and rests of root springs as supports write them. ``span`` and ``stiffness`` are read."""
+    """Ties and rests of root springs that the kernels of supports write. They only read ``span`` and ``stiffness``."""
 
-    span: wp.array(dtype=wp.vec2i)  # [body] first tie, and the one after the last
+    span: wp.array(dtype=wp.vec2i)  # [body] first tie of the body, and the one after the last
     stiffness: wp.array(dtype=float)  # [tie] N/m
     anchor: wp.array(dtype=wp.vec3)  # [tie] m
     anchor_velocity: wp.array(dtype=wp.vec3)  # [tie] m/s
@@ -92,19 +92,21 @@ class SupportedSprings:
 
 @wp.func
 def vec3d(v: wp.vec3):
-    """The same in double precision."""
+    """Returns the vector in double precision."""
     return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
 
 @wp.func
 def vec3f(v: wp.vec3d):
-    """The same in single precision."""
+    """Returns the vector in single precision."""
     return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 
 @wp.func
 def pull_of_tie(i: int, stiffness: wp.float64, nodes: SupportNodes, bodies: SupportedBodies):
-    """Stiffness k [N/m] of a tie, k s [N] and its rate [N/s] for the displacement s of its point across the wire."""
+    """Returns a tie's stiffness k [N/m], and k s [N] and its rate [N/s], with s the displacement of its point across
+    the wire.
+    """
     axis = nodes.axis[i]
     body = nodes.body[i]
     pose = bodies.body_q[body]
@@ -120,7 +122,10 @@ def pull_of_tie(i: int, stiffness: wp.float64, nodes: SupportNodes, bodies: Supp
 
 @wp.func
 def pull_of_root(i: int, nodes: SupportNodes, bodies: SupportedBodies):
-    """Stiffness k [N m/rad] of a root's spring about the arm, k s [N m, 0, 0] and its rate for the turn s of the shoot."""
+    """Returns the stiffness k [N m/rad] of a root's spring about the arm, and k s [N m, 0, 0] and its rate.
+
+    s is the turn of the shoot.
+    """
     body = nodes.body[i]
     s, excess, v = middle_axes_scale(bodies.joint_q[body])
     rate = wp.quat_rotate_inv(half_rotation(bodies.joint_q[body]), bodies.joint_qd[body])
@@ -167,11 +172,12 @@ def balance_supports(
     is_moved_out: wp.array(dtype=wp.bool),
     moved_count_out: wp.array(dtype=wp.int32),
 ):
-    """One thread brings one support to balance with the trees that it holds, by elimination along it.
+    """One thread per support. Bring it to balance with the trees that it holds, by elimination along it.
 
-    supports: [thread] which. is_placed: [tree] sleeping trees that were put somewhere since the last step. state_out,
-    springs_out: of this support's nodes. is_moved_out: [tree] set for sleeping trees under which the support has moved
-    further than ``wake_distance`` since they fell asleep; moved_count_out: [1] raised for each.
+    supports: [thread] index of the support. is_placed: [tree] sleeping trees that were placed since the last step.
+    state_out, springs_out: of this support's nodes. is_moved_out: [tree] set for sleeping trees under which the support
+    has moved further than ``wake_distance`` since they fell asleep; moved_count_out: [1] raised by one for each of
+    them.
     """
     if wp.tid() >= count[0]:
         return
@@ -236,7 +242,7 @@ def balance_supports(
 
 @wp.func
 def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: SupportedSprings):
-    """Stiffness k [N/m] of the tie of a wire's node, and k s [N]; see :func:`pull_of_tie`."""
+    """Returns the stiffness k [N/m] of the tie of a wire's node, and k s [N]; see :func:`pull_of_tie`."""
     stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
     stiffness, moved, _ = pull_of_tie(i, stiffness, nodes, bodies)
     return stiffness, moved
@@ -244,7 +250,7 @@ def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: 
 
 @wp.func
 def in_series(a: wp.float64, b: wp.float64):
-    """Stiffness of two springs in series."""
+    """Returns the stiffness of two springs in series."""
     return a * b / (a + b)
 
 
@@ -259,11 +265,11 @@ def wire_spring(
     springs: SupportedSprings,
     loads: wp.array(dtype=wp.vec3d),
 ):
-    """The spring that a wire is ``x`` [m] from its start, across itself, while its shoots stay where they are.
+    """Returns the spring with which a wire resists, ``x`` [m] from its start, while its shoots stay where they are.
 
-    Its stiffness [N/m]; where the point is without loads [m], from where it was drawn; and by how much the ``loads``
-    [node] N move it from there [m], but for those between its own two nodes. ``least_share``: of the length, the least
-    distance from a post or a node.
+    Its stiffness across the wire [N/m]; the offset of the point without loads [m] from its undeflected position; and by
+    how much the ``loads`` [node] N move it from there [m], without the loads between its own two nodes.
+    ``least_share``: least distance from a post or a node, as a share of the length.
     """
     tension = wires.tension[piece]
     length = wires.length[piece]
@@ -277,7 +283,7 @@ def wire_spring(
     left = tension / wp.max(x, least)
     left_rest = wp.vec3d()
     left_deflection = wp.vec3d()
-    behind = wp.float64(0.0)  # stiffness of all up to a node, its tie included
+    behind = wp.float64(0.0)  # stiffness of all springs up to a node, its tie included
     right_first = end
     for i in range(first, end):
         if wires.node_along[i] < x:

@@ -1,7 +1,7 @@
-"""Contacts with wires that give: the springs at which they end, what presses on wires, and where their geoms are.
+"""Contacts with wires that deflect: their springs, the forces that press on wires, and the positions of wire geoms.
 
-Each kernel is run by one thread: few contacts are with wires, and every one of them depends on all others of its wire. See
-:mod:`vinesim.wires.deflected_wires` for what it is about.
+Each kernel is run by one thread: few contacts are with wires, and each of them depends on all other contacts of its
+wire. :mod:`vinesim.wires.deflected_wires` describes the model.
 """
 
 import warp as wp
@@ -13,15 +13,15 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class WireNumbers:
-    """Numbers of the model, see :mod:`vinesim.wires.deflected_wires`."""
+    """Parameters of the model; see :mod:`vinesim.wires.deflected_wires`."""
 
     dt: wp.float64
     followed: wp.float64
     extrapolated: wp.float64
-    forgetting: wp.float64  # [1] dt over the time of the means
-    recovery: wp.float64  # [1] share of its deflection that a wire keeps in a step when it is let go
+    forgetting: wp.float64  # [1] dt divided by the time constant of the means
+    recovery: wp.float64  # [1] share of its deflection that a released wire keeps in a step
     least_weight: wp.float64
-    least_share: wp.float64  # [1] of a wire's length: least distance between its nodes
+    least_share: wp.float64  # [1] least distance between a wire's nodes, as a share of its length
     least_spread: wp.float64
     least_deflection: wp.float64
     max_deflection: wp.float64
@@ -33,15 +33,15 @@ class WireNumbers:
 
 @wp.struct
 class WireGeoms:
-    """The wires as shapes. [piece], of all fixed pieces."""
+    """Shapes of the wires. [piece], of all fixed pieces."""
 
-    start: wp.array(dtype=wp.vec3d)  # [m] where they were drawn
+    start: wp.array(dtype=wp.vec3d)  # [m] start, undeflected
     axis: wp.array(dtype=wp.vec3d)  # unit vector to the end
-    offset: wp.array2d(dtype=wp.vec3d)  # [piece, 2] m by which both ends are away from there
+    offset: wp.array2d(dtype=wp.vec3d)  # [piece, 2] m, displacement of both ends from their undeflected positions
     is_held: wp.array(dtype=wp.bool)  # whether something presses on it, or is near
-    deflected: wp.array(dtype=wp.int32)  # [k] those whose offset is not 0, in the order in which they were pressed
-    count: wp.array(dtype=wp.int32)  # [2] number of those, and of the supports that are loaded
-    loaded: wp.array(dtype=wp.int32)  # [k] these supports, in the order in which they were pressed
+    deflected: wp.array(dtype=wp.int32)  # [k] pieces whose offset is not 0, in the order in which they were pressed
+    count: wp.array(dtype=wp.int32)  # [2] number of deflected pieces, and number of loaded supports
+    loaded: wp.array(dtype=wp.int32)  # [k] supports that are loaded, in the order in which they were pressed
 
 
 @wp.struct
@@ -50,44 +50,46 @@ class WireContacts:
 
     count: wp.array(dtype=wp.int32)  # [1]
     piece: wp.array(dtype=wp.int32)
-    key: wp.array(dtype=wp.int64)  # number of the pair of shapes
-    tree: wp.array(dtype=wp.int32)  # the tree that presses, or -1 less the kinematic tree of the rigid world
+    key: wp.array(dtype=wp.int64)  # identifies the pair of shapes
+    tree: wp.array(dtype=wp.int32)  # the tree that presses, or -1 minus the kinematic tree of the rigid world
     point: wp.array(dtype=wp.vec3d)  # [m]
     normal: wp.array(dtype=wp.vec3d)  # from the wire to the other side
-    gap: wp.array(dtype=wp.float64)  # [m] to the wire's geom
-    closing: wp.array(dtype=wp.float64)  # [m/s] how fast the gap would get smaller without the contacts
+    gap: wp.array(dtype=wp.float64)  # [m] gap to the wire's geom
+    closing: wp.array(dtype=wp.float64)  # [m/s] speed with which the gap would close without the contacts
     force: wp.array(dtype=wp.float64)  # [N] found by the solve
     velocity: wp.array(dtype=wp.float64)  # [m/s] along the normal, found by the solve
-    along: wp.array(dtype=wp.float64)  # [m] from the wire's start
+    along: wp.array(dtype=wp.float64)  # [m] distance from the wire's start
     stiffness: wp.array(dtype=wp.float64)  # [N/m] of the spring
-    shift: wp.array(dtype=wp.float64)  # [m] gap at which the spring is at rest, less that to the geom
-    geom: wp.array(dtype=wp.vec3d)  # [m] by which the geom is away there from where it was drawn
-    place: wp.array(dtype=wp.vec3d)  # [m] the same of the wire, under the forces of the last step
-    last: wp.array(dtype=wp.int32)  # which press of the last step it was, -1 if it is new
-    last_force: wp.array(dtype=wp.float64)  # [N] of that, extrapolated
-    weight: wp.array(dtype=wp.float64)  # [N] mean of it
-    others: wp.array(dtype=wp.float64)  # [m] mean deflection by the others, along the normal
+    shift: wp.array(dtype=wp.float64)  # [m] gap at which the spring is at rest, minus the gap to the geom
+    geom: wp.array(dtype=wp.vec3d)  # [m] displacement of the geom at this point from its undeflected position
+    place: wp.array(dtype=wp.vec3d)  # [m] displacement of the wire at this point, under the forces of the last step
+    last: wp.array(dtype=wp.int32)  # index of the same press in the last step, -1 if it is new
+    last_force: wp.array(dtype=wp.float64)  # [N] force of that press, extrapolated
+    weight: wp.array(dtype=wp.float64)  # [N] mean of that force
+    others: wp.array(dtype=wp.float64)  # [m] mean deflection by the other presses, along the normal
 
 
 @wp.struct
 class WirePresses:
-    """What presses on wires. [press]"""
+    """Forces that press on wires, one for each contact. [press]"""
 
     count: wp.array(dtype=wp.int32)  # [1]
     piece: wp.array(dtype=wp.int32)
     key: wp.array(dtype=wp.int64)
     tree: wp.array(dtype=wp.int32)
-    along: wp.array(dtype=wp.float64)  # [m]
+    along: wp.array(dtype=wp.float64)  # [m] distance from the wire's start
     normal: wp.array(dtype=wp.vec3d)
-    place: wp.array(dtype=wp.vec3d)  # [m] where the wire is, from where it was drawn
-    force: wp.array(dtype=wp.float64)  # [N] as expected in the next step
+    place: wp.array(dtype=wp.vec3d)  # [m] displacement of the wire from its undeflected position
+    force: wp.array(dtype=wp.float64)  # [N] force expected in the next step
     weight: wp.array(dtype=wp.float64)
     others: wp.array(dtype=wp.float64)
 
 
 @wp.func
 def interval_of(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes):
-    """The node behind a point of a wire, and where [m] the stretch between its two nodes, or posts, begins and ends."""
+    """Returns the node behind a point of a wire, and where [m] the stretch between its two nodes, or posts, begins and
+    ends.
+    """
     low = wp.float64(0.0)
     high = wires.length[piece]
     node = int(0)
@@ -105,7 +107,7 @@ def interval_of(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes):
 
 @wp.func
 def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes, presses: WirePresses):
-    """By how much loads between the two nodes of a point deflect it [m] from the line between these."""
+    """Returns the deflection [m] of a point from the line between its two nodes by the loads between these nodes."""
     zero = wp.float64(0.0)
     _, low, high = interval_of(piece, x, wires, nodes)
     found = wp.vec3d()
@@ -120,7 +122,7 @@ def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNo
 
 @wp.func
 def last_press(i: int, same_place: wp.float64, contacts: WireContacts, presses: WirePresses):
-    """The press of the last step that a contact was: of those with its key the nearest; -1 if it is new."""
+    """Returns the index of a contact's press in the last step, the nearest of those with its key; -1 if it is new."""
     best = int(-1)
     nearest = same_place
     for j in range(presses.count[0]):
@@ -134,7 +136,7 @@ def last_press(i: int, same_place: wp.float64, contacts: WireContacts, presses: 
 
 @wp.func
 def string_ratio(x: wp.float64, y: wp.float64, length: wp.float64):
-    """Deflection of a string at x by a force at y, over that by the same force at x."""
+    """Returns the deflection of a string at x by a force at y, divided by the deflection at x by the same force at x."""
     least = wp.float64(1.0e-3) * length
     here = wp.clamp(x, least, length - least)
     ratio = y / here
@@ -145,13 +147,13 @@ def string_ratio(x: wp.float64, y: wp.float64, length: wp.float64):
 
 @wp.func
 def is_reached(i: int, numbers: WireNumbers, contacts: WireContacts):
-    """Whether a new contact is touched before the step ends."""
+    """Returns whether a new contact closes before the step ends."""
     return contacts.last[i] < 0 and contacts.gap[i] - numbers.dt * contacts.closing[i] < numbers.touching
 
 
 @wp.func
 def sharing(i: int, numbers: WireNumbers, wires: Wires, contacts: WireContacts, presses: WirePresses):
-    """By how much less stiff a wire is taken to be for a contact than for it alone."""
+    """Returns the factor by which a wire is softer for a contact than it would be for that contact alone."""
     zero = wp.float64(0.0)
     piece = contacts.piece[i]
     x = contacts.along[i]
@@ -188,7 +190,7 @@ def find_wire_springs(
     # out
     contacts_out: WireContacts,
 ):
-    """One thread in all: the springs at which contacts end. loads: [node] N; presses: of the last step."""
+    """One thread in all. Find the springs of the contacts. loads: [node] N. presses: those of the last step."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     count = contacts_out.count[0]
@@ -203,7 +205,7 @@ def find_wire_springs(
         weight = wp.float64(1.0e-9)
         if last >= 0:
             weight = presses.weight[last]
-        else:  # taken to press as hard as any
+        else:  # assumed to press as hard as the hardest of the others
             for j in range(presses.count[0]):
                 if presses.piece[j] == piece:
                     weight = wp.max(weight, presses.weight[j])
@@ -227,7 +229,7 @@ def find_wire_springs(
         geom = (one - share) * geoms.offset[piece, 0] + share * geoms.offset[piece, 1]
         shift = wp.dot(geom - rest, normal) - numbers.followed * now - (one - numbers.followed) * mean
         if contacts_out.gap[i] > numbers.touching:
-            shift = zero  # another holds the wire off it
+            shift = zero  # another press holds the wire away from it
         if wp.abs(wp.dot(normal, geoms.axis[piece])) > numbers.max_normal_along_wire:
             # with its axis inside a box, the nearest way out may be along it, where a wire does not push
             shift = numbers.out_of_reach
@@ -248,7 +250,7 @@ def add_presses(
     # out
     found_out: WirePresses,
 ):
-    """One thread in all: add what a solve has found for its contacts; what there is no room for is left out."""
+    """One thread in all. Add the forces and velocities that a solve found for its contacts, as far as there is room."""
     zero = wp.float64(0.0)
     for i in range(contacts.count[0]):
         k = found_out.count[0]
@@ -300,7 +302,10 @@ def load_nodes(
     loads_out: wp.array(dtype=wp.vec3d),
     is_loaded_out: wp.array(dtype=wp.bool),
 ):
-    """Put a press on the two nodes beside it, by its shares of the distance; ``sign`` 0: clear these nodes instead."""
+    """Add a press to the loads of its two neighbouring nodes, by the lever rule.
+
+    ``sign`` 0: clear these nodes instead.
+    """
     piece = presses.piece[j]
     support = wires.support[piece]
     if support >= 0:
@@ -316,8 +321,10 @@ def load_nodes(
 
 @wp.func
 def rod_through(piece: int, first: int, numbers: WireNumbers, wires: Wires, presses: WirePresses, geoms_out: WireGeoms):
-    """Move the geom of a wire as a rod through the points displaced by what presses on it; if these are near each other,
-    by their mean. ``first``: one of its presses."""
+    """Move the geom of a wire like a rod through the points that the presses displace.
+
+    If these points are near each other, the geom moves by their mean. ``first``: one of the wire's presses.
+    """
     zero = wp.float64(0.0)
     presses_hard = bool(False)
     for j in range(presses.count[0]):
@@ -363,10 +370,11 @@ def deflect_wires(
     is_loaded_out: wp.array(dtype=wp.bool),
     geoms_out: WireGeoms,
 ):
-    """One thread in all: keep what sleepers pressed with, load the supports, and move the geoms.
+    """One thread in all. Keep the presses of sleeping trees, load the supports, and move the geoms.
 
-    rigid_asleep: [kinematic tree] not negative while it sleeps. found_out: of this step, its count is cleared.
-    presses_out: those of the last step, then of this. loads_out: [node] N. is_loaded_out: [support].
+    rigid_asleep: [kinematic tree] not negative while the tree sleeps. found_out: presses of this step; their count is
+    cleared. presses_out: presses of the last step at first, then of this step. loads_out: [node] N. is_loaded_out:
+    [support].
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -394,7 +402,7 @@ def deflect_wires(
                 loaded = loaded + 1
         load_nodes(j, one, wires, nodes, presses_out, loads_out, is_loaded_out)
     kept = int(0)
-    for k in range(geoms_out.count[0]):  # decay; those that are held follow below
+    for k in range(geoms_out.count[0]):  # decay; the wires that are held follow below
         piece = geoms_out.deflected[k]
         for end in range(2):
             geoms_out.offset[piece, end] = numbers.recovery * geoms_out.offset[piece, end]

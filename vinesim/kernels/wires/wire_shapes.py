@@ -1,4 +1,4 @@
-"""Where the segments of wires are, for pictures and scans: between their shoots, and deflected by what presses on them."""
+"""Positions of the wires' segments for pictures and scans, between their shoots and deflected by contacts."""
 
 import warp as wp
 
@@ -8,17 +8,17 @@ from vinesim.kernels.wires.wire_contacts import WireGeoms, WirePresses, deflecti
 wp.set_module_options({"enable_backward": False})
 
 LEAST_SHOWN = wp.constant(wp.float64(1.0e-4))
-"""[m] A segment whose ends are both nearer to where they were drawn is not moved."""
+"""[m] A segment is not moved if both its ends are displaced by less than this."""
 
 
 @wp.struct
 class SegmentShapes:
-    """Segments of wires, of each piece one after the other, and where they are. [segment]"""
+    """Segments of wires, piece by piece, and their poses. [segment]"""
 
     first: wp.array(dtype=wp.int32)  # [piece + 1] first segment of each fixed piece
-    start: wp.array(dtype=wp.float64)  # [1] where they begin on their piece
+    start: wp.array(dtype=wp.float64)  # [1] where the segment begins on its piece, as a share of the piece's length
     end: wp.array(dtype=wp.float64)
-    rest_q: wp.array(dtype=wp.transformd)  # middle as drawn
+    rest_q: wp.array(dtype=wp.transformd)  # pose of the segment's middle, undeflected
     q: wp.array(dtype=wp.transformf)
     is_moved: wp.array(dtype=wp.bool)  # whether q is not rest_q
 
@@ -32,7 +32,7 @@ def deflection_at(
     deflection: wp.array(dtype=wp.vec3d),
     presses: WirePresses,
 ):
-    """By how much a point of a wire, ``x`` [m] from its start, is away from where it was drawn [m]."""
+    """Returns the displacement [m] of a wire's point, ``x`` [m] from its start, from its undeflected position."""
     node, low, high = interval_of(piece, x, wires, nodes)
     at_low = wp.vec3d()
     at_high = wp.vec3d()
