@@ -36,7 +36,7 @@ class Row:
 
     about: str
     seconds: float
-    """How long it takes on two cores [s]."""
+    """Duration of the measurement on two cores [s]."""
     measure: Callable[[], Iterator[Measurement]]
 
 
@@ -79,7 +79,7 @@ def measure_camera() -> Iterator[Measurement]:
 
 
 def measure_lidar() -> Iterator[Measurement]:
-    """The same with the lidar."""
+    """As :func:`measure_camera`, with the lidar."""
     run = run_client((), (CLOCK, RGB, DEPTH, LIDAR), RUN_TIME)
     yield from _client_rows("client, camera and lidar", run, camera=10.0)
     yield at_least("client, camera and lidar: /lidar/points", _hz(run.topics, LIDAR), "Hz", 9.8)

@@ -27,7 +27,7 @@ BUDGETS = {
     "each further viewpoint of --path": 0.25,
     "vinesim client: start, first picture, one step, end": 3.0,
 }
-"""[s]"""
+"""Budget of each case [s]."""
 VIEWPOINTS = 9
 
 _PARTS = """

@@ -26,7 +26,7 @@ from vinesim.tune.start import start_values
 from vinesim.tune.tuning import STEP_PHASE
 
 AS_GOOD = 1.0
-"""A peer is done when its loss, half a chi square, is less than so much above that of our minimum."""
+"""A peer is done when its loss, half a chi square, is less than this much above that of our minimum."""
 MOST_SECONDS = 30.0
 """[s] CPU time after which a peer that restarts gives up."""
 STEIN_SEGMENTS = 3
@@ -36,7 +36,7 @@ STEIN_ITERATIONS = 120
 
 
 class PlainProblem:
-    """The same loss and the same simulator, for methods that know neither derivatives nor features."""
+    """Our loss and simulator, for methods that know neither derivatives nor features."""
 
     def __init__(self, specimen: Specimen, track: Trajectory) -> None:
         features = extract_features(track)
@@ -51,13 +51,13 @@ class PlainProblem:
         self.losses(self.plain[None])  # loads every kernel
 
     def losses(self, thetas: np.ndarray) -> np.ndarray:
-        """[n] of parameters [n, 8], all of one launch."""
+        """[n] Losses of the parameters [n, 8], all computed in one launch."""
         problem = self.problem
         x, _ = problem.samples(thetas, np.array([problem.row(theta) for theta in thetas]))
         return np.array([problem.loss(theta, y, self.noise) for theta, y in zip(thetas, x, strict=True)])
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Of one candidate, priors included, for scipy."""
+        """Residuals of one candidate, priors included, for scipy."""
         problem = self.problem
         x, _ = problem.samples(theta[None], problem.row(theta)[None])
         off = (x[0] - problem.observed)[problem.seen] / self.noise
@@ -191,9 +191,9 @@ class _Sides:
     """One method over several tracks."""
 
     error: np.ndarray
-    """[track, 2] relative, of modulus and damping."""
+    """[track, 2] Relative errors of modulus and damping."""
     covered: np.ndarray
-    """[track, 2] whether the 90 % interval holds the truth."""
+    """[track, 2] Whether the 90 % interval contains the true value."""
     seconds: float
 
 

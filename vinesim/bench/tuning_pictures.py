@@ -34,15 +34,15 @@ STEP = 2.5e-4
 """[s] Of the swing that is filmed: in steps of 1 ms it is slow by 0.007 to 0.02 % of the modulus, as much as a track
 from pictures tells."""
 PIECES = 16
-"""Straight pieces of which the cane is drawn."""
+"""Number of straight pieces with which the cane is drawn."""
 HEIGHT = 1.2
-"""[m] Of the base above the ground."""
+"""[m] Height of the base above the ground."""
 AWAY = 0.8
-"""[m] Of the camera from the plane of the swing."""
+"""[m] Distance of the camera from the plane of the swing."""
 RADIUS = 0.012
-"""[m] Of the marker."""
+"""[m] Radius of the marker."""
 PAINT = (0.85, 0.05, 0.35)
-"""sRGB of the marker: a pink that no vineyard has."""
+"""sRGB colour of the marker: a pink that no vineyard has."""
 
 
 def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ...]]:
@@ -54,7 +54,7 @@ def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ..
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FilmedSwing:
-    """A track from pictures, and what it should be."""
+    """A track from pictures, and its error."""
 
     track: Trajectory
     error: np.ndarray

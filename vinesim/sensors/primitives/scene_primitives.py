@@ -435,8 +435,8 @@ class Primitives:
 
 
 def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
-    """Whether each cluster is to be drawn [cluster] int32, by the bunch that it belongs to (-1 for none) [cluster]: not
-    those of bunches that no longer hang."""
+    """[cluster] int32 Whether each cluster is to be drawn. It is not if the bunch [cluster] that it belongs to (-1 for
+    none) no longer hangs."""
     if not len(attached):
         return np.ones(len(bunch), np.int32)
     return ((bunch < 0) | attached[bunch]).astype(np.int32)

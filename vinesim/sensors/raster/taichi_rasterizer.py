@@ -139,7 +139,7 @@ class TaichiRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """The nearest primitive of every pixel, of all clusters or of some [k]."""
+        """Find the nearest primitive of every pixel among all clusters, or among some [k]."""
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
         mine = {number: which[kind == number] for number in KERNEL_FUNCTIONS}
@@ -159,7 +159,7 @@ class TaichiRasterizer:
     def _rasterize_on_gpu(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
-        """On a GPU: depths, then numbers; what has not moved stays there."""
+        """Draw on a GPU: first depths, then numbers. Arrays of primitives are copied there again only after motion."""
         if self._of != (primitives, primitives.pose_version):
             s = primitives.shapes
             self._of = (primitives, primitives.pose_version)
