@@ -36,7 +36,7 @@ OF_CAMERAS = OnlyFor(("robot", "spectator"))
 
 @dataclasses.dataclass(frozen=True)
 class ClientOptions:
-    """What stands on the command line of one client; fields have the names of the options and the order of the help."""
+    """The options of one client on the command line; fields have the names of the options and the order of the help."""
 
     role: Annotated[str, typer.Option(help="robot, human or spectator.")] = "robot"
     name: Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given, alone ROLE.")] = None

@@ -77,7 +77,7 @@ def run(
 
 
 def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
-    """The description, from a scene file, of the only vineyard that is to be recorded."""
+    """Scene name, seed and digest of the only vineyard that is to be recorded, from a scene file."""
     if scene is None:
         if seed is not None:
             raise UsageError(f"--seed {seed}: a seed is of a scene, give --scene too")

@@ -120,8 +120,8 @@ def _pacing(options: ClientOptions, description: RobotDescription) -> SensorPaci
 
 
 def complete_report(report: dict[str, Any], processes: Mapping[str, RobotProcesses]) -> dict[str, Any]:
-    """A client's report with that of the first robot's processes. If there are several robots, their reports are listed
-    by name."""
+    """A client's report with that of the first robot's processes. If there are several robots, the reports of
+    all their processes are listed by robot name too."""
     reports = {name: one.report() for name, one in processes.items()}
     complete = report | next(iter(reports.values()))
     if len(reports) > 1:
