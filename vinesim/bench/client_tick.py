@@ -91,7 +91,7 @@ class TickTimes:
 
 
 def client_measurements() -> Iterator[Measurement]:
-    """Whole ticks and their parts, paced and back to back, each beside its budget where there is one."""
+    """Whole ticks and their parts, paced and back to back, each with its budget if it has one."""
     robot = load_description("vinebot")
     for case in CASES:
         scene = load_scene(case.scene)

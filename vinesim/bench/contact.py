@@ -62,7 +62,7 @@ def contact_measurements() -> Iterator[Measurement]:
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
-    """One gripper and the vine it holds, beside MuJoCo; then the shipped block with one ``robot`` and with ten.
+    """One gripper and the vine it holds, compared with MuJoCo; then the shipped block with one ``robot`` and with ten.
 
     The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
     on the headland. All swing their joints.

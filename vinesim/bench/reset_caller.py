@@ -162,7 +162,7 @@ def disturb_and_reset(caller: ResetCaller, robot: str, start: np.ndarray, entiti
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Reset so many times; 0 if all could be done."""
+    """Reset the world a number of times; returns 0 if all resets could be done."""
     parser = argparse.ArgumentParser(prog="python -m vinesim.bench.reset_caller", description="Reset a robot's world.")
     parser.add_argument("--resets", type=int, default=20)
     given = parser.parse_args(arguments)

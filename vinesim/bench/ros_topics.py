@@ -102,7 +102,7 @@ def delay_ms(messages: Arrivals, clock: Arrivals, memory: int = 100) -> np.ndarr
 
 
 def share_on_time(delays: np.ndarray, seconds: float) -> float:
-    """Percent of the messages that were due in so many ``seconds`` that came within a period; at most 100."""
+    """Percentage of the messages due in a time of ``seconds`` [s] that came within a period; at most 100."""
     return min(100.0, 100.0 * np.count_nonzero(delays <= 1e3 * PERIOD) / round(seconds / PERIOD))
 
 

@@ -151,7 +151,7 @@ def picture_rows(cases: list[Case]) -> Iterator[Measurement]:
 
 def tuning(announce: Callable[[str], None], seeds: int = SEEDS) -> Iterator[Measurement]:
     """Recovery over seeds from tracks of vinesim, of pictures, of MuJoCo and of PyElastica; CPU time and calibration
-    beside peers.
+    compared with peers.
 
     ``announce`` takes a line about what is left out.
     """

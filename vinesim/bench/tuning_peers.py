@@ -1,4 +1,5 @@
-"""Fits by others beside ours, same data and same simulator: scipy's least squares, CMA-ES, Stein particles.
+"""Fits by other methods compared with ours, on the same data with the same simulator: scipy's least squares, CMA-ES,
+Stein particles.
 
 All begin where the user does, with modulus and damping up to five times off; release and pull are given to the peers,
 as ours finds them. Time is CPU time of the process.
@@ -130,7 +131,7 @@ def until_as_good(
 
 
 def peer_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measurement]:
-    """CPU time of a fit that is as good as ours, beside scipy and CMA-ES."""
+    """CPU time of our fit, and of fits as good as ours by scipy and CMA-ES."""
     peers: dict[str, Callable[[PlainProblem], Any]] = {
         "scipy with finite differences": lambda p: lambda start, _: fit_by_scipy(p, start),
         "CMA-ES": lambda p: lambda start, seed: fit_by_cma(p, start, seed),
@@ -244,7 +245,8 @@ def _ours(cases: list[Case], tracks: list[Trajectory]) -> _Sides:
 
 
 def stein_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measurement]:
-    """Time and calibration of the posterior beside Stein particles on spring abstractions (arXiv 2306.03410)."""
+    """Time and calibration of the posterior, compared with Stein particles on spring abstractions (arXiv
+    2306.03410)."""
     ours = _ours(cases, tracks)
     for name, from_features in (("SVGD", False), ("SVGD from our start values", True)):
         peer = _stein(cases, tracks, from_features)

@@ -177,7 +177,7 @@ class ClientOptions:
         typer.Option(help="Of a human: what it wears: orange, yellow, green, ...; follows from its name unless given."),
     ] = None
     real_time_factor: RealTimeFactor = None
-    """Of a client without a server; None: as the client can follow."""
+    """Real-time factor of a client without a server; None: as fast as the client can follow."""
     world: World = DEFAULT_WORLD
     standby: Annotated[
         bool,
