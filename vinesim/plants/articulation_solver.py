@@ -1559,10 +1559,10 @@ class StepRunner:
         tree_budget: [tree] how closely each tree's energy is watched.
         whole: [tree] bool, trees on wires, whose steps are never divided.
         tree_rate: [tree] each tree's fastest rate, which the kernels write.
-        lists: int32 lists that the kernels read. ``stepping`` [tree]: all trees. ``divided`` [tree]: again those of
-            them with more than one substep. ``groups`` [tree, 2]: first place in the list and number of trees of each
-            group. ``floating``, ``divided_floating`` [body]: floating roots of trees with one step, and with more.
-            ``levels`` [substep, 2]: number of trees and of roots that take each substep.
+        lists: int32 lists that the kernels read. ``stepping`` [tree] has all trees, ``divided`` [tree] has once more
+            those with more than one substep, and ``groups`` [tree, 2] has first place in the list and number of trees
+            of each group. ``floating`` and ``divided_floating`` [body] have the floating roots of trees with one step,
+            and with more. ``levels`` [substep, 2] has the number of trees and of roots that take each substep.
         counts: [:data:`_COUNTS`] int32, the number of entries of each list that the kernels take.
         topologies: topologies of the trees.
     """
