@@ -1,7 +1,8 @@
 """The physics of one vineyard and its step: an ordered list of named stages, see :meth:`Physics.step`.
 
 Both solvers predict velocities without the contacts between them, the contacts are solved for both at once, and both
-integrate with the resulting forces. What detaches or falls asleep is decided afterwards, from the new state.
+integrate with the resulting forces. Afterwards the new state decides which bunches and pieces of wood detach, and which
+trees fall asleep.
 """
 
 from __future__ import annotations
@@ -64,7 +65,7 @@ class Physics:
         model: constants of the vineyard.
         parameters: all numbers of the physics.
         device: ``"cpu"`` or ``"cuda"``, see :class:`ArticulationSolver`.
-        threads: of the CPU that share the contacts of plants, see :class:`ArticulationSolver`.
+        threads: number of CPU threads that share the contacts of plants, see :class:`ArticulationSolver`.
         detachment: whether bunches detach when they are pulled too hard.
         """
         p = parameters
@@ -89,15 +90,17 @@ class Physics:
         self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
-        """The wind, None for calm; may be set at any time between steps, and then begins or ends in two seconds."""
+        """The wind; None for calm. It may be set at any time between steps; the wind then rises or dies down in two
+        seconds."""
         self.wind_time_offset = 0.0
-        """[s] Time of the wind minus :attr:`time`: makes gusts those of other clients."""
+        """[s] Time of the wind minus :attr:`time`. With it, gusts come at the same time as at other clients."""
         self.wind_on_plants = WindOnPlants(self.plants, p)
-        """Which trees feel the wind."""
+        """Applies the wind to the trees that feel it."""
         self.detachments: tuple[Detachment, ...] = ()
-        """What left its plant in the last step, or by command before it; sorted by body."""
+        """Bunches and pieces of wood that left their plants in the last step, or by command before it; sorted by
+        body."""
         self.remotely_posed = np.zeros(0, np.int32)
-        """[k] Trees that were posed by :meth:`apply_remote_rest`; the reader of snapshots clears it."""
+        """[k] Trees that :meth:`apply_remote_rest` has posed. Whoever reads the snapshots clears this array."""
         self.tick = 0
         """Number of steps so far."""
         self._detachment = detachment
@@ -136,7 +139,7 @@ class Physics:
 
     @property
     def faults(self) -> dict[str, int]:
-        """How often something was stopped or left out so far, by what it was."""
+        """Number of times so far that something was stopped, slowed, dropped, skipped or refused, by kind."""
         return {
             "trees_stopped": int(self.fault_guard.count.sum()),
             "trees_slowed": self.fault_guard.slowed,
@@ -156,7 +159,7 @@ class Physics:
 
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
-        if len(coarsened):  # those that sleep collide with other shapes now
+        if len(coarsened):  # sleeping trees among them collide with other shapes now
             self.contact_solver.update_tree_bounds(coarsened)
 
     def _update_elastic_supports(self) -> None:
@@ -270,18 +273,20 @@ class Physics:
         self.rigid.add_robot(spec)
 
     def remove_robot(self, name: str) -> None:
-        """See :meth:`RigidWorld.remove_robot`; its blades go with it."""
+        """See :meth:`RigidWorld.remove_robot`. The robot's blades are removed as well."""
         self.rigid.remove_robot(name)
         self._remove_blades_of(name)
 
     def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
-        """See :meth:`RigidWorld.add_human`; a remote one touches only trees whose state its own client sends."""
+        """See :meth:`RigidWorld.add_human`. A remote person touches only trees whose state that person's client
+        sends."""
         self.rigid.add_human(spec, is_remote=is_remote)
         if is_remote:
             self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
-        """See :meth:`RigidWorld.remove_human`; what the hands held is released, and its blades go with it."""
+        """See :meth:`RigidWorld.remove_human`. The hands release what they held; the person's blades are removed as
+        well."""
         self.rigid.remove_human(name)
         self._remove_blades_of(name)
         self.grasp_manager.remove_ties_of(name)
@@ -308,18 +313,21 @@ class Physics:
         self._body_q = None
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Apply that another client has picked a bunch; see :meth:`DetachmentMonitor.apply_remote_pick`."""
+        """Pick a bunch that another client has picked; see :meth:`DetachmentMonitor.apply_remote_pick`."""
         self.detachment_monitor.apply_remote_pick(bunch, pose, velocity)
         self._body_q = None
 
     def apply_remote_cut(self, body: int) -> None:
-        """Apply that another client has cut a piece of wood off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
+        """Cut off a piece of wood that another client has cut off; see :meth:`DetachmentMonitor.apply_remote_cut`."""
         self.detachment_monitor.apply_remote_cut(body)
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
-        """Apply in which pose trees rest at their owner, without waking them: ``joint_q`` [body of the tree, 4]
-        each. Of a tree that is named several times the last pose counts."""
+        """Put trees into the pose in which they rest at the client that owns them, without waking them.
+
+        ``joint_q`` has the joint rotations [body of the tree, 4] of each tree. If a tree is named several times, its
+        last pose counts.
+        """
         for tree, rotations in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))
         resting = np.unique(trees).astype(np.int32)
@@ -335,7 +343,8 @@ class Physics:
         self.level_of_detail.set_focus(points, radius)
 
     def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
-        """Give a link of an actor a cutter: ``pose`` [7] of its mouth in the link, ``half`` [3] its half edges [m].
+        """Give a link of an actor a cutter with a box-shaped mouth: ``pose`` [7] in the link, half edges ``half`` [3]
+        m.
 
         x runs along the blades, y from one to the other. :meth:`Blade.close` cuts what passes through the mouth.
         """

@@ -1,8 +1,8 @@
-"""``vinesim bench camera``: depth, labels and pictures beside Open3D's ray caster (Embree), in one process.
+"""``vinesim bench camera``: depth, labels and pictures compared with Open3D's ray caster (Embree), in one process.
 
 Both see the same vineyard; Open3D gets it meshed (berries as icospheres of 80 triangles, canes as prisms, leaves as
-quads), about 0.9 million triangles. Cases alternate, medians of CPU time of the whole process are compared: it does not
-matter who uses how many cores.
+quads), about 0.9 million triangles. Cases alternate. Medians of CPU time of the whole process are compared, so the
+number of cores that each uses does not matter.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     first = 0
 
     def add(points: np.ndarray, triangles: np.ndarray) -> None:
-        """``points`` [thing, vertex, 3] and one list of triangles for all of them."""
+        """Add ``points`` [thing, vertex, 3], with one list of triangles for every thing."""
         nonlocal first
         count, each = points.shape[:2]
         vertices.append(points.reshape(-1, 3))
@@ -147,7 +147,7 @@ def camera() -> Iterator[Measurement]:
 
 
 def live_camera() -> Iterator[Measurement]:
-    """What one live D435 picture with depth costs, part by part, each beside its budget."""
+    """Cost of one live D435 picture with depth, part by part, each with its budget."""
     model = generate(load_scene("demo"))
     primitives = Primitives(model)
     spec = CameraSpec.load("d435")

@@ -1,7 +1,7 @@
 """``vinesim bench tick``: the whole tick of a robot client with the push job, paced as users have it and in a loop.
 
 A paced client sleeps until each step is due, 100 times a second. Its caches are cold then, and a step takes two to five
-times as long as back to back. So the paced figures count; those of a loop stand beside them.
+times as long as back to back. So the paced figures count; the figures of a loop are given in addition.
 
 The real client steps on a clock that advances by one step a tick, so that it sends as many messages a tick as in real
 time. Its bus is in memory. Where a case has subscribers, it writes the records, true poses and snapshots that its ROS
@@ -47,12 +47,12 @@ MEASURED_TICKS = 1000
 PARTS = ("receive", "control", "step", "sense", "send")
 """Parts of a tick, in their order."""
 TRUTH_PERIOD = 0.1
-"""Simulated time between two true poses of all bunches, as the ROS process asks for them unless set [s]."""
+"""Simulated time between two true poses of all bunches [s]: the default with which the ROS process asks for them."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One client that is measured, and its budgets [ms, p50]."""
+    """One client that is measured, with its budgets [ms, median]."""
 
     scene: str
     robots: int = 1
@@ -62,7 +62,7 @@ class Case:
     """Whether all topics of the first robot have subscribers."""
     tick_budget: float | None = None
     step_budget: float | None = None
-    """Of a step of the physics, back to back."""
+    """Budget of a step of the physics, back to back."""
 
     @property
     def text(self) -> str:
@@ -85,13 +85,13 @@ class TickTimes:
     """Times of ticks [s]."""
 
     cpu: np.ndarray
-    """[tick, part + 1] processor time of the thread in each part, and of the whole tick."""
+    """[tick, part + 1] Processor time of the thread in each part, and in the whole tick."""
     wall: np.ndarray
-    """[tick, part + 1] the same in wall time."""
+    """[tick, part + 1] Wall time of each part, and of the whole tick."""
 
 
 def client_measurements() -> Iterator[Measurement]:
-    """Whole ticks and their parts, paced and back to back, each beside its budget where there is one."""
+    """Whole ticks and their parts, paced and back to back, each with its budget if it has one."""
     robot = load_description("vinebot")
     for case in CASES:
         scene = load_scene(case.scene)
@@ -126,7 +126,7 @@ class PushingClient:
             self._visitor = self._add_client(scene, model, robot, "visitor", behind, stack)
         self._drain: Callable[[], int] = lambda: 0
         self.taken_steps = 0
-        """Records of steps that the subscribers have taken."""
+        """Number of records of steps that the subscribers have taken."""
         if has_subscribers:
             self._drain = _subscribe_to_all(client, scene, model, robot, stack)
         rest = client.physics.state.body_q[model.bunch_body[bunch]].copy()
@@ -172,7 +172,7 @@ class PushingClient:
         return np.concatenate([self._marks[1::2] - self._marks[::2], [whole]])
 
     def measure(self, ticks: int, *, is_paced: bool) -> TickTimes:
-        """Times of so many ticks, each begun when it is due in real time, or back to back."""
+        """Times of a number of ticks, which begin when they are due in real time, or back to back."""
         loop = RateLoop(self.client.physics.dt)
         times = np.zeros((ticks, len(PARTS) + 1, 2))
         for row in times:
@@ -185,7 +185,8 @@ class PushingClient:
 
 
 class _Demand:
-    """Stands for a process of the client that runs and whose topics all have subscribers; it takes what is written."""
+    """Stands for a running process of the client whose topics all have subscribers. It takes the messages that are
+    written."""
 
     is_ready = True
     pid = 0
@@ -208,14 +209,14 @@ class _Demand:
         self.process = types.SimpleNamespace(pid=os.getpid())
 
     def current(self) -> _Demand:
-        """As of a worker process; here it is the run too."""
+        """The present run, as of a worker process."""
         return self
 
     def send(self, kind: str, value: Any = None) -> None:
         """Take a message."""
 
     def wait_until_ready(self, timeout: float) -> None:
-        """It always is."""
+        """A real process may not be ready; this one always is."""
 
     def raise_failure(self) -> None:
         """There is none."""
@@ -228,8 +229,8 @@ class _Demand:
 def _subscribe_to_all(
     client: Client, scene: Scene, model: Model, robot: RobotDescription, stack: contextlib.ExitStack
 ) -> Callable[[], int]:
-    """Ask the client for all that the topics of its first robot need; a function that takes the records of steps, and
-    returns how many there were."""
+    """Ask the client for all records that the topics of its first robot need. Returns a function that takes the records
+    of steps and returns their number."""
     with mock.patch.object(ros_process, "WorkerProcess", _Demand):
         ros = stack.enter_context(ros_process.RosProcess(client.name, model, robot))
     with mock.patch.object(sensor_process, "WorkerProcess", _Demand):
@@ -252,7 +253,7 @@ def _subscribe_to_all(
 
 
 def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) -> Iterator[Measurement]:
-    """Rows of one case."""
+    """The rows of one case."""
     with contextlib.ExitStack() as stack:
         pushing = PushingClient(
             scene,
@@ -281,7 +282,7 @@ def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: f
 
 
 def _row(case: str, value: float, budget: float | None = None) -> Measurement:
-    """A row, beside its budget if it has one."""
+    """One row, with its budget if it has one."""
     if budget is None:
         return Measurement("tick", case, value, "ms/tick")
     return Measurement("tick", case, value, "ms/tick", "budget", budget, budget / value)

@@ -1,6 +1,6 @@
-"""Time of contacts beside MuJoCo: the same canes, grippers and bar in both, in one process, in turns.
+"""Time of contacts, compared with MuJoCo: the same canes, grippers and bar in both, in one process, in turns.
 
-And the time of a whole step of a vineyard with one robot and with ten, twenty trees awake and ten thousand bunches, by
+Also the time of a whole step of a vineyard with one robot and with ten, twenty trees awake and ten thousand bunches, by
 stages.
 """
 
@@ -27,14 +27,15 @@ from vinesim.world import Physics
 
 CANE_COUNTS = (64, 256)
 STEPS_PER_ROUND = (20, 5)
-"""Steps of a turn, for each of the numbers of canes: 50 ms of MuJoCo, since every turn begins with cold caches."""
+"""Number of steps of a turn, for each number of canes: 50 ms of MuJoCo, since every turn begins with cold caches."""
 LIFTED_CANES = 12
 HELD_CANES = (14, 20, 26, 32)
 """Numbers of the canes whose bunch a gripper holds."""
 COMBS = ((2, 10, 50), (4, 32, 12), (8, 64, 5))
-"""Bars of two combs and the canes between them: so many contacts, bars times canes, in one island; steps of a turn."""
+"""Bars of two combs, canes between them, steps of a turn. The number of contacts in the one island is bars times
+canes."""
 SETTLE_STEPS = 150
-"""Steps before the measurement: the grippers close, bar and grippers lift."""
+"""Number of steps before the measurement, in which the grippers close, and bar and grippers lift."""
 SCENE = "tendone"
 ROBOT_COUNTS = (1, 10)
 ROBOT_POSITION = (15.5, 17.2)
@@ -61,7 +62,7 @@ def contact_measurements() -> Iterator[Measurement]:
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
-    """One gripper and the vine it holds, beside MuJoCo; then the shipped block with one ``robot`` and with ten.
+    """One gripper and the vine it holds, compared with MuJoCo; then the shipped block with one ``robot`` and with ten.
 
     The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
     on the headland. All swing their joints.
@@ -180,7 +181,7 @@ def _compare_with_mujoco(
 
 
 def _pressing(physics: Physics) -> int:
-    """Contacts with plants that press."""
+    """Number of contacts with plants that press."""
     solver = physics.contact_solver
     return int(np.count_nonzero(solver.impulses.rows.impulse[: 3 * solver.count : 3]))
 

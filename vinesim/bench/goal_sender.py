@@ -36,25 +36,25 @@ CONTROLLERS = {
     "arm_left_controller": "arm_left_",
     "arm_right_controller": "arm_right_",
 }
-"""Trajectory controllers of vinebot, and how the names of their joints begin."""
+"""Trajectory controllers of vinebot, and the beginning of the names of their joints."""
 REACH = 0.3
-"""Targets are so far at most from where the joints were in the beginning [rad, m]."""
+"""Largest distance of targets from where the joints were in the beginning [rad, m]."""
 SPEED_SHARE = 0.4
 """Fastest motion as a share of the joints' limits."""
 TOLERANCE = 0.01
-"""Of the goals, for each joint [rad, m]."""
+"""Tolerance of the goals for each joint [rad, m]."""
 DELAY = 0.8
-"""From now to the start of a trajectory [s]."""
+"""Time from the sending of a goal to the start of its trajectory [s]."""
 FORGOTTEN = 60.0
 """[s] A goal that a server still knows so long after its end is kept for good.
 
 A server keeps a result for 10 s and, like any of rcl_action, forgets it within 20: whenever a goal ends, the timer
-starts anew with the period that it had before.
+starts again with the period that it had before.
 """
 PLACE_STEP = 0.001
-"""Between two places of the splines that are compared with a message [s]."""
+"""Time between two points of the splines that are compared with a message [s]."""
 MOMENT = 0.4
-"""After a trajectory's start, when it is cancelled or preempted [s]."""
+"""Time after a trajectory's start at which it is cancelled or preempted [s]."""
 UNKNOWN = 0
 SUCCEEDED = 4
 CANCELED = 5
@@ -123,7 +123,7 @@ def plan(random: np.random.Generator, controller: str, joints: dict[str, Joint],
 
 @dataclasses.dataclass
 class Joint:
-    """What is known of a joint."""
+    """Properties of a joint, from the robot description."""
 
     lower: float
     upper: float
@@ -132,7 +132,7 @@ class Joint:
 
 
 class GoalSender:
-    """The node: what the robot says, and its trajectory controllers."""
+    """The node: it receives the robot's state and sends goals to its trajectory controllers."""
 
     def __init__(self) -> None:
         from control_msgs.action import FollowJointTrajectory
@@ -141,7 +141,7 @@ class GoalSender:
         self.stamp = 0.0
         """Time of the robot's world [s]."""
         self.history: list[tuple[float, np.ndarray, np.ndarray]] = []
-        """Stamp [s], positions and velocities of all joints, since the last goal was sent."""
+        """Stamp [s], positions and velocities of all joints in each message since the last goal was sent."""
         self.names: list[str] = []
         self.urdf = ""
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -185,7 +185,7 @@ class GoalSender:
         self.stamp = message.clock.sec + 1e-9 * message.clock.nanosec
 
     def positions(self, joints: list[str]) -> np.ndarray:
-        """[joint] The newest."""
+        """[joint] The newest positions."""
         return self.history[-1][1][[self.names.index(name) for name in joints]]
 
     def until(self, done: Callable[[], object], what: str) -> None:
@@ -202,14 +202,14 @@ class GoalSender:
         self.until(lambda: self.stamp >= end and self.history[-1][0] >= end, "the robot's time")
 
     def now(self) -> float:
-        """Time of the robot's world [s], by a message of /clock that comes from now on."""
+        """Time of the robot's world [s], from a message of /clock that arrives from now on."""
         for _ in range(2):  # one may have waited
             before = self.stamp
             self.until(lambda before=before: self.stamp != before, "the robot's time")
         return self.stamp
 
     def send(self, one: Plan) -> tuple[Any, float]:
-        """Send a goal; its accepted handle, and the stamp of its start [s]."""
+        """Send a goal. Returns its accepted handle, and the stamp of its start [s]."""
         from control_msgs.action import FollowJointTrajectory
         from control_msgs.msg import JointTolerance
 

@@ -1,4 +1,5 @@
-"""``vinesim bench lidar``: rays of a revolution beside Open3D's ray caster (Embree), standing and with moving plants.
+"""``vinesim bench lidar``: rays of a revolution compared with Open3D's ray caster (Embree), with plants at rest and
+moving.
 
 The scene and the way of measuring are those of ``vinesim bench camera``.
 """

@@ -1,4 +1,4 @@
-"""``vinesim bench live``: the programs as their users start them, each figure beside its budget, in one run.
+"""``vinesim bench live``: the programs as their users start them, each figure with its budget, in one run.
 
 Clients, demo and commands are real processes on this machine; a stock ROS node counts pictures and small topics.
 """
@@ -36,7 +36,7 @@ class Row:
 
     about: str
     seconds: float
-    """How long it takes on two cores [s]."""
+    """Duration of the measurement on two cores [s]."""
     measure: Callable[[], Iterator[Measurement]]
 
 
@@ -79,7 +79,7 @@ def measure_camera() -> Iterator[Measurement]:
 
 
 def measure_lidar() -> Iterator[Measurement]:
-    """The same with the lidar."""
+    """As :func:`measure_camera`, with the lidar."""
     run = run_client((), (CLOCK, RGB, DEPTH, LIDAR), RUN_TIME)
     yield from _client_rows("client, camera and lidar", run, camera=10.0)
     yield at_least("client, camera and lidar: /lidar/points", _hz(run.topics, LIDAR), "Hz", 9.8)
@@ -138,7 +138,7 @@ ROWS = {
     "tick": Row("whole ticks, paced and back to back, of one robot and of ten", 110.0, measure_tick),
     "cold": Row("client alone with empty caches: compiles every kernel", 180.0, measure_cold),
 }
-"""By the name that ``--row`` takes, in the order in which they are measured."""
+"""Rows by the name that ``--row`` takes, in the order in which they are measured."""
 
 
 def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measurement]:
@@ -170,7 +170,7 @@ def run_command(*arguments: str) -> float:
 
 
 def _client_rows(case: str, run: LiveRun, camera: float) -> Iterator[Measurement]:
-    """Rates and ages of pictures, at least ``camera`` [Hz], and the tick beside them."""
+    """Rates and ages of pictures, whose rate must be at least ``camera`` [Hz], and the tick at the same time."""
     for topic in (RGB, DEPTH):
         yield at_least(f"{case}: {topic}", _hz(run.topics, topic), "Hz", camera)
         yield from _age_rows(f"{case}: {topic}", run.topics[topic])

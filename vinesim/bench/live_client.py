@@ -1,4 +1,5 @@
-"""One client as its users start it, and a stock ROS node: how soon, how often and how old its messages come."""
+"""One client as its users start it, and a stock ROS node that measures when, how often and how late its messages
+come."""
 
 from __future__ import annotations
 
@@ -34,12 +35,12 @@ class RosMissing(RuntimeError):
 
 @dataclasses.dataclass(frozen=True)
 class LiveRun:
-    """What was measured of a client."""
+    """Measurements of a client."""
 
     first: dict[str, float]
     """Time from its start to the first message of each topic [s]."""
     topics: TopicReport
-    """Statistics of each topic, from when all had a message."""
+    """Statistics of each topic, from the time at which all had a message."""
     loop: dict[str, float]
     """Rate and work of its ticks in the same span of time: see :meth:`TickLog.between`."""
     status: dict[str, Any]

@@ -76,7 +76,7 @@ def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[
 
 
 PLANT_IMPEDANCE = (0.925, 0.97, 0.001, 0.5, 2)
-"""Of the contacts of plants (MuJoCo's solimp), whatever they touch: about as soft as vinesim's 2e4 N/m."""
+"""Impedance of the contacts of plants (MuJoCo's solimp), whatever they touch: about as soft as vinesim's 2e4 N/m."""
 
 
 class MujocoScene:
@@ -174,6 +174,6 @@ class MujocoScene:
 
 
 def copy_state_to_mujoco(state: State, data: mujoco.MjData) -> None:
-    """Our joints into MuJoCo, whose ball rates are in the moved body's axes."""
+    """Copy our joints into MuJoCo, whose ball joint rates are in the axes of the moved body."""
     data.qpos[:] = frames.to_wxyz(state.joint_q).ravel()
     data.qvel[:] = frames.rotate(frames.conjugate(state.joint_q), state.joint_qd).ravel()

@@ -1,4 +1,4 @@
-"""Time of plants without contacts beside MuJoCo on the same scene, in one process, in turns: medians.
+"""Median time of plants without contacts, compared with MuJoCo on the same scene, in one process, in turns.
 
 The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch of 0.5 kg on its tip.
 """

@@ -26,21 +26,21 @@ class ProcessSample:
     """One process at one time."""
 
     memory: float
-    """Proportional set size [MB]: resident memory, of which pages that n processes share count 1/n."""
+    """Proportional set size [MB]: resident memory, where pages that n processes share count 1/n."""
     own: float
-    """What of it is no copy of a file [MB]: heap, arrays and shared memory. Libraries count more for a process when
-    another one that has loaded them ends; this does not."""
+    """Part of the memory that is no copy of a file [MB]: heap, arrays and shared memory. Unlike the proportional set
+    size, it does not grow when another process that has loaded the same libraries ends."""
     threads: int
     handles: int
-    """Open file descriptors."""
+    """Number of open file descriptors."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ProcessHistory:
-    """Samples of one process, one after the other."""
+    """Successive samples of one process."""
 
     times: list[float]
-    """[s], of a monotonic clock."""
+    """Times of the samples [s], of a monotonic clock."""
     samples: list[ProcessSample]
 
     def since(self, time: float) -> ProcessHistory:
@@ -111,11 +111,11 @@ class ProcessSampler:
         """Kind and id of each process that has no parent among them."""
         self._roots = roots
         self.histories: dict[tuple[str, int], ProcessHistory] = {}
-        """By kind and id; the kind of a descendant is its name."""
+        """History of each process, by kind and id; the kind of a descendant is its name."""
         self._sampled_at = 0.0
 
     def memory(self) -> float:
-        """Of all processes that ran at the last sample [MB]."""
+        """Memory of all processes that ran at the last sample [MB]."""
         return sum(one.samples[-1].memory for one in self.histories.values() if one.times[-1] == self._sampled_at)
 
     def sample(self, time: float) -> None:

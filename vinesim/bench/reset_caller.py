@@ -32,15 +32,15 @@ SENSORS = {"/head_front_camera/rgb/image_raw": Image, "/lidar/points": PointClou
 """Topics of vinebot's sensors, which must come back."""
 ABORTED = 6
 TRAVEL = 0.1
-"""The robot is driven so far from its start before each reset [m]."""
+"""Distance from its start to which the robot is driven before each reset [m]."""
 AT_START = 0.02
-"""Farthest from its start after a reset [m]."""
+"""Largest distance from its start after a reset [m]."""
 STANDS = 1e-3
 """Farthest that a robot that has stopped moves between two looks [m]."""
 
 
 class ResetCaller:
-    """The node."""
+    """The node that disturbs the world and resets it."""
 
     def __init__(self) -> None:
         import simulation_interfaces.srv as services
@@ -50,7 +50,7 @@ class ResetCaller:
         self.newest: dict[str, float] = {}
         """Newest stamp by topic [s]."""
         self.back = 0
-        """Messages whose stamp was older than that of the one before."""
+        """Number of messages whose stamp was older than that of the message before."""
         for topic, kind in ({"/clock": Clock, "/joint_states": JointState} | SENSORS).items():
             self.node.create_subscription(kind, topic, lambda m, topic=topic: self._take(topic, m), 10)
         self._drive = self.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 1)
@@ -87,12 +87,12 @@ class ResetCaller:
         return response
 
     def place(self, robot: str) -> np.ndarray:
-        """Where the robot is [2] m."""
+        """Position of the robot [2] m."""
         point = self.call("get_entity_state", entity=robot).state.pose.position
         return np.array([point.x, point.y])
 
     def graph(self) -> dict[str, int]:
-        """How many nodes, publishers and services others have."""
+        """Number of nodes, publishers and services of others."""
         node = self.node
         topics = [name for name, _ in node.get_topic_names_and_types()]
         names = [name for name, _ in node.get_node_names_and_namespaces() if name != node.get_name()]
@@ -162,7 +162,7 @@ def disturb_and_reset(caller: ResetCaller, robot: str, start: np.ndarray, entiti
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Reset so many times; 0 if all could be done."""
+    """Reset the world a number of times; returns 0 if all resets could be done."""
     parser = argparse.ArgumentParser(prog="python -m vinesim.bench.reset_caller", description="Reset a robot's world.")
     parser.add_argument("--resets", type=int, default=20)
     given = parser.parse_args(arguments)

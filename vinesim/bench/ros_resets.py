@@ -21,7 +21,7 @@ GRAPH = ("nodes", "publishers", "services")
 
 
 def measure_resets(group: ProcessGroup, resets: int = RESETS, *options: str) -> Iterator[Measurement]:
-    """Rows of so many resets of a client that is started with these further options."""
+    """Rows of a number of resets of a client that is started with these further options."""
     client = group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
     caller = group.start("reset caller", "-m", "vinesim.bench.reset_caller", "--resets", str(resets))
     sampler = ProcessSampler([("client", client.child.pid)])
@@ -78,5 +78,5 @@ def growth_by_reset(history: ProcessHistory) -> float:
 
 
 def at_most_none(case: str, value: float, unit: str) -> Measurement:
-    """A count of which there may be none."""
+    """A row for a count that must be 0."""
     return Measurement("ros", case, value, unit, "bar, at most", 0.0, None)

@@ -28,7 +28,7 @@ from vinesim.ros import middleware
 from vinesim.scene.values import Measurement
 
 PERIOD = 0.01
-"""Of the measured topics, and the delay after which a message is late [s]."""
+"""Period of the measured topics, and the delay after which a message is late [s]."""
 TOPICS = (
     CLOCK,
     "/joint_states",
@@ -39,13 +39,13 @@ TOPICS = (
     "/wrist_right_ft/wrench",
     "/vine/contacts",
 )
-"""Topics of every step of vinebot."""
+"""Topics that vinebot publishes in every step."""
 JOINTS = 21
-"""In a message of the stock publisher; vinebot has as many."""
+"""Number of joints in a message of the stock publisher; vinebot has as many."""
 WINDOW = 20.0
 """Measured time before and after the other subscriber is stopped [s]."""
 SETTLING = 3.0
-"""From the first messages to the measured time, and after the stop [s]."""
+"""Time from the first messages to the measured time, and again after the stop [s]."""
 POLL_PERIOD = 0.05
 ON_TIME = 98.0
 LATENCY = 10.0
@@ -56,7 +56,7 @@ PREEMPTS = 10
 ACTION_TIMEOUT = 180.0
 """Longest time of one goal [s]."""
 GOAL_TOLERANCE = 0.01
-"""[rad, m]"""
+"""Tolerance of the goals [rad, m]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,27 +64,27 @@ class Arrivals:
     """The messages of one topic as a subscriber received them, each [message] int64."""
 
     arrival: np.ndarray
-    """[ns] since the epoch"""
+    """[ns] Time of arrival since the epoch."""
     sent: np.ndarray
-    """[ns] since the epoch"""
+    """[ns] Time of sending since the epoch."""
     stamp: np.ndarray
-    """[ns]"""
+    """[ns] Stamp of the message."""
     number: np.ndarray
     """The publisher's count of its messages, from 1 on."""
 
     def between(self, since: float, until: float) -> Arrivals:
-        """Those that arrived in a span of time [s since the epoch]."""
+        """The messages that arrived in a span of time [s since the epoch]."""
         part = slice(*np.searchsorted(self.arrival, (round(since * 1e9), round(until * 1e9))))
         return Arrivals(self.arrival[part], self.sent[part], self.stamp[part], self.number[part])
 
     @property
     def lost(self) -> int:
-        """Messages between the first and the last that did not arrive."""
+        """Number of messages between the first and the last that did not arrive."""
         return 0 if len(self.number) == 0 else int(self.number[-1] - self.number[0]) + 1 - len(self.number)
 
 
 def load_arrivals(path: pathlib.Path) -> dict[str, Arrivals]:
-    """What ``topic_monitor --arrivals`` wrote, by topic."""
+    """The arrivals that ``topic_monitor --arrivals`` wrote, by topic."""
     with np.load(path) as archive:
         return {topic: Arrivals(*archive[topic].T) for topic in archive.files}
 
@@ -102,7 +102,7 @@ def delay_ms(messages: Arrivals, clock: Arrivals, memory: int = 100) -> np.ndarr
 
 
 def share_on_time(delays: np.ndarray, seconds: float) -> float:
-    """Percent of the messages that were due in so many ``seconds`` that came within a period; at most 100."""
+    """Percentage of the messages due in a time of ``seconds`` [s] that came within a period; at most 100."""
     return min(100.0, 100.0 * np.count_nonzero(delays <= 1e3 * PERIOD) / round(seconds / PERIOD))
 
 
@@ -203,7 +203,7 @@ def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Mea
 
 
 def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
-    """Topics beside a subscriber that reads, then beside one that stopped reading."""
+    """Measure topics next to a subscriber that reads, then next to one that has stopped reading."""
     arrivals = folder / "arrivals.npz"
     log = folder / "ticks.npz"
     listener = RosListener(group, (*TOPICS, stock_publisher.TOPIC), arrivals=arrivals)

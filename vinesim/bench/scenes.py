@@ -19,11 +19,11 @@ from vinesim.scene.values import Drive, RobotSpec
 from vinesim.world import Physics
 
 SPACING = 0.15
-"""[m] Between canes."""
+"""[m] Distance between canes."""
 HEIGHT = 2.0
-"""[m] Of the canes above ground."""
+"""[m] Height of the canes above ground."""
 BUNCH_CENTER = 0.085
-"""[m] From the bunch's stalk to its middle."""
+"""[m] Distance from the bunch's stalk to its middle."""
 
 
 def cane_with_bunch(side: float) -> TreeBuilder:

@@ -1,4 +1,4 @@
-"""``vinesim bench start``: what a user waits for before the first step and the first picture, caches warm.
+"""``vinesim bench start``: the time that a user waits for the first step and the first picture, caches warm.
 
 Each case runs in fresh processes, three times after one that fills the caches; the median of the wall time counts.
 Compiling kernels on a machine that has none takes half a minute and is not measured here.
@@ -27,7 +27,7 @@ BUDGETS = {
     "each further viewpoint of --path": 0.25,
     "vinesim client: start, first picture, one step, end": 3.0,
 }
-"""[s]"""
+"""Budget of each case [s]."""
 VIEWPOINTS = 9
 
 _PARTS = """
@@ -63,7 +63,7 @@ print(json.dumps(parts))
 
 
 def start_measurements() -> Iterator[Measurement]:
-    """All cases, each beside its budget where there is one."""
+    """All cases, each with its budget if it has one."""
     for scene in SCENES:
         runs = [json.loads(_run("-c", _PARTS, scene)[1]) for _ in range(RUNS + 1)][1:]
         for part in runs[0]:

@@ -18,7 +18,7 @@ TOPIC = "/stock/joint_states"
 
 
 def main(joints: int, period: float) -> int:
-    """Publish messages of so many ``joints`` every ``period`` [s] until SIGINT."""
+    """Publish messages with a number of ``joints`` every ``period`` [s] until SIGINT."""
     rclpy.init(args=[])
     node = rclpy.create_node("stock_publisher")
     publisher = node.create_publisher(JointState, TOPIC, QoSProfile(depth=100))

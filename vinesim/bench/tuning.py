@@ -32,23 +32,23 @@ from vinesim.tune.specimen import build_tree
 
 SEEDS = 50
 SPEED_SEEDS = 3
-"""Tracks on which peers are timed."""
+"""Number of tracks on which peers are timed."""
 STEIN_SEEDS = 4
-"""Tracks of which Stein particles give the posterior."""
+"""Number of tracks for which Stein particles compute the posterior."""
 PICTURE_SEEDS = 20
-"""Swings that are filmed."""
+"""Number of swings that are filmed."""
 ROD_SEEDS = 5
-"""Tracks from PyElastica, each of some 700,000 steps: 20 s of CPU."""
+"""Number of tracks from PyElastica, each of some 700,000 steps: 20 s of CPU."""
 MUJOCO_SEEDS = 6
 MUJOCO_SEGMENTS = 32
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Recovery:
-    """Fits of several seeds."""
+    """Results of fits, one for each seed."""
 
     modulus_error: np.ndarray
-    """[seed] Relative."""
+    """[seed] Relative error of the modulus."""
     damping_error: np.ndarray
     covered: np.ndarray
     """[seed, 2] Whether the 90 % interval of modulus and damping holds the truth."""
@@ -59,13 +59,13 @@ class Recovery:
 
     @property
     def silent(self) -> int:
-        """Fits beyond a bar that say nothing of it."""
+        """Number of fits with errors beyond the bar that do not report a failure."""
         beyond = (np.abs(self.modulus_error) > MODULUS_BAR) | (np.abs(self.damping_error) > DAMPING_BAR)
         return int((beyond & ~self.refused).sum())
 
 
 def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recovery:
-    """Fit each case's track, its own measurement unless given."""
+    """Fit the track of each case, by default its own measurement."""
     rows = []
     for i, case in enumerate(cases):
         track = measure(case.truth, case.experiment) if tracks is None else tracks[i]
@@ -151,7 +151,7 @@ def picture_rows(cases: list[Case]) -> Iterator[Measurement]:
 
 def tuning(announce: Callable[[str], None], seeds: int = SEEDS) -> Iterator[Measurement]:
     """Recovery over seeds from tracks of vinesim, of pictures, of MuJoCo and of PyElastica; CPU time and calibration
-    beside peers.
+    compared with peers.
 
     ``announce`` takes a line about what is left out.
     """

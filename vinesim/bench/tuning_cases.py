@@ -25,7 +25,7 @@ class Case:
 
     truth: Specimen
     guess: Specimen
-    """What the user begins with."""
+    """Start values that the user gives."""
     experiment: Experiment
 
 

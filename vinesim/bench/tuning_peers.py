@@ -1,4 +1,5 @@
-"""Fits by others beside ours, same data and same simulator: scipy's least squares, CMA-ES, Stein particles.
+"""Fits by other methods compared with ours, on the same data with the same simulator: scipy's least squares, CMA-ES,
+Stein particles.
 
 All begin where the user does, with modulus and damping up to five times off; release and pull are given to the peers,
 as ours finds them. Time is CPU time of the process.
@@ -26,7 +27,7 @@ from vinesim.tune.start import start_values
 from vinesim.tune.tuning import STEP_PHASE
 
 AS_GOOD = 1.0
-"""A peer is done when its loss, half a chi square, is less than so much above that of our minimum."""
+"""A peer is done when its loss, half a chi square, is less than this much above that of our minimum."""
 MOST_SECONDS = 30.0
 """[s] CPU time after which a peer that restarts gives up."""
 STEIN_SEGMENTS = 3
@@ -36,7 +37,7 @@ STEIN_ITERATIONS = 120
 
 
 class PlainProblem:
-    """The same loss and the same simulator, for methods that know neither derivatives nor features."""
+    """Our loss and simulator, for methods that know neither derivatives nor features."""
 
     def __init__(self, specimen: Specimen, track: Trajectory) -> None:
         features = extract_features(track)
@@ -51,13 +52,13 @@ class PlainProblem:
         self.losses(self.plain[None])  # loads every kernel
 
     def losses(self, thetas: np.ndarray) -> np.ndarray:
-        """[n] of parameters [n, 8], all of one launch."""
+        """[n] Losses of the parameters [n, 8], all computed in one launch."""
         problem = self.problem
         x, _ = problem.samples(thetas, np.array([problem.row(theta) for theta in thetas]))
         return np.array([problem.loss(theta, y, self.noise) for theta, y in zip(thetas, x, strict=True)])
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Of one candidate, priors included, for scipy."""
+        """Residuals of one candidate, priors included, for scipy."""
         problem = self.problem
         x, _ = problem.samples(theta[None], problem.row(theta)[None])
         off = (x[0] - problem.observed)[problem.seen] / self.noise
@@ -130,7 +131,7 @@ def until_as_good(
 
 
 def peer_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measurement]:
-    """CPU time of a fit that is as good as ours, beside scipy and CMA-ES."""
+    """CPU time of our fit, and of fits as good as ours by scipy and CMA-ES."""
     peers: dict[str, Callable[[PlainProblem], Any]] = {
         "scipy with finite differences": lambda p: lambda start, _: fit_by_scipy(p, start),
         "CMA-ES": lambda p: lambda start, seed: fit_by_cma(p, start, seed),
@@ -191,9 +192,9 @@ class _Sides:
     """One method over several tracks."""
 
     error: np.ndarray
-    """[track, 2] relative, of modulus and damping."""
+    """[track, 2] Relative errors of modulus and damping."""
     covered: np.ndarray
-    """[track, 2] whether the 90 % interval holds the truth."""
+    """[track, 2] Whether the 90 % interval contains the true value."""
     seconds: float
 
 
@@ -244,7 +245,8 @@ def _ours(cases: list[Case], tracks: list[Trajectory]) -> _Sides:
 
 
 def stein_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measurement]:
-    """Time and calibration of the posterior beside Stein particles on spring abstractions (arXiv 2306.03410)."""
+    """Time and calibration of the posterior, compared with Stein particles on spring abstractions (arXiv
+    2306.03410)."""
     ours = _ours(cases, tracks)
     for name, from_features in (("SVGD", False), ("SVGD from our start values", True)):
         peer = _stein(cases, tracks, from_features)

@@ -29,24 +29,25 @@ from vinesim.tune.marker_track import track_marker
 from vinesim.tune.specimen import TIP, build_tree
 
 SEGMENTS = 192
-"""Of the chain that is filmed: one of 64 swings 0.01 % slowly, which tracks as exact as these show."""
+"""Number of segments of the chain that is filmed. A chain of 64 segments swings 0.01 % too slowly, which tracks as
+exact as these would show."""
 STEP = 2.5e-4
-"""[s] Of the swing that is filmed: in steps of 1 ms it is slow by 0.007 to 0.02 % of the modulus, as much as a track
-from pictures tells."""
+"""[s] Step of the simulated swing that is filmed. In steps of 1 ms the swing is slow by 0.007 to 0.02 % of the modulus,
+as much as a track from pictures tells."""
 PIECES = 16
-"""Straight pieces of which the cane is drawn."""
+"""Number of straight pieces with which the cane is drawn."""
 HEIGHT = 1.2
-"""[m] Of the base above the ground."""
+"""[m] Height of the base above the ground."""
 AWAY = 0.8
-"""[m] Of the camera from the plane of the swing."""
+"""[m] Distance of the camera from the plane of the swing."""
 RADIUS = 0.012
-"""[m] Of the marker."""
+"""[m] Radius of the marker."""
 PAINT = (0.85, 0.05, 0.35)
-"""sRGB of the marker: a pink that no vineyard has."""
+"""sRGB colour of the marker: a pink that no vineyard has."""
 
 
 def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ...]]:
-    """The specimen with markers at the ends of so many equal pieces, and their names from the base to the tip."""
+    """The specimen with markers at the ends of equal pieces, and the markers' names from the base to the tip."""
     names = tuple(f"node {i}" for i in range(1, pieces))
     along = {name: specimen.length.value * (i + 1) / pieces for i, name in enumerate(names)}
     return msgspec.structs.replace(specimen, markers=along), (*names, TIP)
@@ -54,7 +55,7 @@ def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ..
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FilmedSwing:
-    """A track from pictures, and what it should be."""
+    """A track from pictures, and its error."""
 
     track: Trajectory
     error: np.ndarray

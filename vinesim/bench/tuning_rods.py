@@ -27,19 +27,19 @@ from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.experiment import pull_for
 
 ELEMENTS = 32
-"""Of the rod; the cane is half an element shorter."""
+"""Number of elements of the rod; the cane is half an element shorter."""
 FINE = 64
 """Segments of vinesim's chain whose equilibrium is the rod's at the start, and whose first mode is damped."""
 SHEAR = 16.0
 """[1] Young's modulus over the shear modulus."""
 STEP_PHASE = 1.6
-"""[rad] Of an element's rotation against its own shear in a step; PyElastica's is unstable from 2 on."""
+"""[rad] Rotation of an element against its own shear in a step; PyElastica's scheme is unstable from 2 on."""
 PICTURE_STEP = 1e-3
-"""[s] Between the positions that are kept."""
+"""[s] Time between the positions that are kept."""
 
 
 def is_installed() -> bool:
-    """Whether there is PyElastica."""
+    """Whether PyElastica is installed."""
     return importlib.util.find_spec("elastica") is not None
 
 

@@ -1,4 +1,4 @@
-"""``vinesim bench``: measurements beside a peer, one JSON object a line."""
+"""``vinesim bench``: measurements compared with a peer, one JSON object a line."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ class NoSuchBench(ValueError):
 
 
 def print_measurement(one: Measurement, as_json: bool) -> None:
-    """One line on standard output."""
+    """Print one measurement as one line on standard output."""
     if as_json:
         print(json.dumps(dataclasses.asdict(one)), flush=True)
         return

@@ -23,7 +23,7 @@ STATUS_FORMATS = ("text", "json", "none")
 
 @dataclasses.dataclass(frozen=True)
 class OnlyFor:
-    """The roles that an option belongs to; all have one that does not say it."""
+    """The roles that an option belongs to. An option without this annotation belongs to all roles."""
 
     roles: tuple[str, ...]
 
@@ -36,7 +36,7 @@ OF_CAMERAS = OnlyFor(("robot", "spectator"))
 
 @dataclasses.dataclass(frozen=True)
 class ClientOptions:
-    """What stands on the command line of one client; fields have the names of the options and the order of the help."""
+    """The options of one client on the command line; fields have the names of the options and the order of the help."""
 
     role: Annotated[str, typer.Option(help="robot, human or spectator.")] = "robot"
     name: Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given, alone ROLE.")] = None
@@ -79,7 +79,7 @@ class ClientOptions:
         OF_ROBOT,
         typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly."),
     ] = None
-    """Hidden, as all that the clients of a demo or of a benchmark are told to do."""
+    """Hidden, like all options with which a demo or a benchmark directs its clients."""
     job: Annotated[
         str | None, OF_ROBOT, typer.Option(help="Of a robot: do a job and stop: pick, exchange or meet.")
     ] = None
@@ -177,7 +177,7 @@ class ClientOptions:
         typer.Option(help="Of a human: what it wears: orange, yellow, green, ...; follows from its name unless given."),
     ] = None
     real_time_factor: RealTimeFactor = None
-    """Of a client without a server; None: as the client can follow."""
+    """Real-time factor of a client without a server; None: as fast as the client can follow."""
     world: World = DEFAULT_WORLD
     standby: Annotated[
         bool,
@@ -191,13 +191,14 @@ class ClientOptions:
 
     @property
     def is_for_page(self) -> bool:
-        """Whether it is a person without a script, or a spectator that writes no pictures: of use by its page only."""
+        """Whether the client is used through its page only: a person without a script, or a spectator that writes no
+        pictures."""
         is_person = self.role == "human" and self.walk is None and self.reach is None
         return is_person or (self.role == "spectator" and self.out is None)
 
 
 def check_role(role: str, given: Collection[str]) -> None:
-    """:class:`UsageError` unless there is such a role and it has all the options ``given`` on the command line."""
+    """:class:`UsageError` unless the role exists and has all the options ``given`` on the command line."""
     if role not in ROLES:
         raise UsageError(f"role {role!r} is none of {', '.join(ROLES)}; give one of them")
     hints = get_type_hints(ClientOptions, include_extras=True)
@@ -210,13 +211,13 @@ def check_role(role: str, given: Collection[str]) -> None:
 
 
 def check_status(status: str) -> None:
-    """:class:`UsageError` unless there is such a format of status lines."""
+    """:class:`UsageError` unless this format of status lines exists."""
     if status not in STATUS_FORMATS:
         raise UsageError(f"--status {status!r}: give text, json or none")
 
 
 def check_options(options: ClientOptions) -> None:
-    """Refuse what can be refused before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
+    """Refuse wrong options before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
     from vinesim.scene.values import SensorMode
 
     check_status(options.status)

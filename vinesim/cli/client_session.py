@@ -1,4 +1,4 @@
-"""What the processes of all client roles have in common: bus, loop, status lines, report, and their orderly end."""
+"""The common part of the processes of all client roles: bus, loop, status lines, report, and an orderly end."""
 
 from __future__ import annotations
 
@@ -35,13 +35,14 @@ from vinesim.scene.spec import load_scene, with_seed
 from vinesim.web import page_files
 
 SWITCH_INTERVAL = 2e-4
-"""How long another thread may hold the interpreter lock when the loop wants it [s]; Python's own is 5 ms."""
+"""Longest time for which another thread may hold the interpreter lock when the loop needs it [s]; Python's own is 5
+ms."""
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
 FIRST_STATUS = 0.1
 """Wall time from the first step to the first status line [s]: shows early that the client runs."""
 CLOCK_TIMEOUT = 2.0
-"""How long the first step waits for the server's clock [s]."""
+"""Longest time for which the first step waits for the server's clock [s]."""
 TRACE_CAPACITY = 1 << 17
 """Steps that a trace of one bunch can hold: 22 minutes."""
 
@@ -49,7 +50,8 @@ T = TypeVar("T")
 
 
 class ClientSession:
-    """One client process: its scene, its buses and its loop. A context; leaving it closes everything in order."""
+    """One client process: its scene, its buses and its loop. It is a context manager; leaving it closes everything in
+    order."""
 
     def __init__(self, options: ClientOptions) -> None:
         """Check the options and generate the vineyard; errors of the scene and :class:`UsageError` come from here."""
@@ -80,7 +82,7 @@ class ClientSession:
         self._stack.__exit__(*exception)
 
     def enter(self, context: contextlib.AbstractContextManager[T]) -> T:
-        """Enter a context that is left with the session."""
+        """Enter a context manager that is left together with the session."""
         return self._stack.enter_context(context)
 
     def bus(self, name: str) -> Bus:
@@ -93,7 +95,7 @@ class ClientSession:
         return self.enter(ZenohBus(name, connect=options.connect, world=options.world, certificates=options.tls))
 
     def client_options(self, name: str | None = None) -> dict[str, Any]:
-        """Keyword arguments that :class:`Client` takes for every role; ``name`` instead of the session's."""
+        """Keyword arguments of :class:`Client` for every role; ``name`` replaces the session's name."""
         options = self.options
         return {
             "name": name or self.name,
@@ -105,11 +107,11 @@ class ClientSession:
         }
 
     def leave_at_end(self, client: Client) -> None:
-        """Let a client take its leave before its buses close."""
+        """Let a client announce that it leaves, before its buses close."""
         self._stack.callback(client.leave)
 
     def trace(self, client: Client, bunch: int) -> Trace:
-        """Record force on and displacement of a bunch from now on."""
+        """Record the force on a bunch and its displacement from now on."""
         client.trace = start_trace(client, self.model, bunch)
         return client.trace
 
@@ -224,7 +226,7 @@ def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
 
 
 def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form: str, stop: threading.Event) -> None:
-    """Every second hand the status to ``publish`` and print it as text or JSON; runs until ``stop``."""
+    """Every second, give the status to ``publish`` and print it as text or JSON. Runs until ``stop`` is set."""
     period = FIRST_STATUS
     try:
         while not stop.wait(period):

@@ -28,7 +28,7 @@ from vinesim.sensors.export.files import remove_partial_files
 from vinesim.sensors.raster import renderer_selection
 
 CONNECT_TIMEOUT = 10.0
-"""[s] To reach a scheduler."""
+"""[s] Longest time to reach a scheduler."""
 _RENDERING = threading.Lock()
 
 
@@ -120,7 +120,7 @@ def _finish(out: pathlib.Path, images: int, new: int) -> int:
 
 
 def _by_vineyard(wanted: list[int]) -> list[list[int]]:
-    """Images of one vineyard each."""
+    """Images grouped by vineyard."""
     vineyards: dict[int, list[int]] = {}
     for image in wanted:
         vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
@@ -128,7 +128,8 @@ def _by_vineyard(wanted: list[int]) -> list[list[int]]:
 
 
 def _shares(wanted: list[int], workers: int) -> list[list[int]]:
-    """Images for each worker, whole vineyards where possible: generating one costs more than rendering it."""
+    """The images of each worker, in whole vineyards where possible: generating a vineyard costs more than rendering an
+    image."""
     shares: list[list[int]] = [[] for _ in range(workers)]
     for group in _by_vineyard(wanted):
         min(shares, key=len).extend(group)
@@ -140,7 +141,7 @@ def _render_on_cluster(
 ) -> None:
     """Render images by the workers of a Dask scheduler, a vineyard a task; ``advance`` takes the images of each.
 
-    What a killed worker had goes to another one. All machines must see ``out`` at the same path.
+    The images of a killed worker go to another worker. All machines must see ``out`` at the same path.
     """
     if importlib.util.find_spec("distributed") is None:
         raise DaskMissing("Dask is not installed; run: pip install 'vinesim[dask]'")
@@ -168,7 +169,8 @@ def _render_on_cluster(
 
 
 def _render_share(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> int:
-    """By a worker of a cluster: render images; how many. One share at a time in a process, whatever its threads."""
+    """Task of a worker of a cluster: render images and return their number. A process renders one share at a time,
+    whatever its number of threads."""
     with _RENDERING:
         return sum(1 for _ in dataset.render_images(plan, out, share))
 
@@ -183,7 +185,7 @@ def _start_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> Wor
 
 
 def _run_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int], pipe: Connection) -> None:
-    """In a process of its own: render images and report each; ends when the parent process has ended."""
+    """Main function of a worker process: render images and report each. It ends when the parent process has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the parent, which ends its workers
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
@@ -196,7 +198,7 @@ def _run_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int], pipe: Co
 
 
 def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
-    """Call ``advance`` for each image until all workers are done; raises what stopped one of them."""
+    """Call ``advance`` for each image until all workers are done. Raises the error that stopped a worker."""
     working = {pipe: process for process, pipe in workers}
     while working:
         for pipe in wait(list(working)):

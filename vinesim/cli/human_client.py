@@ -23,12 +23,12 @@ GIVING_HEIGHT = 0.70
 LIFTED = 0.08
 STILL_SPEED = 0.03
 HOLDS_STILL = 1.0
-"""A box that is raised by so much [m], and slower than this [m/s] for so long [s], is held out. GUESSED."""
+"""A box is held out if it is raised by this height [m], and slower than this speed [m/s] for this time [s]. GUESSED."""
 
 
 def run(options: ClientOptions) -> int:
-    """Be the person in front of the page, or by a script walk, reach for a bunch, hold it, pull at it, let go; until a
-    signal; then write report.json; the exit code."""
+    """Act as the person in front of the page; or by a script walk, reach for a bunch, hold it, pull at it and let go.
+    At a signal write report.json. Returns the exit code."""
     gestures = None if options.gestures is None else Gestures.load(options.gestures)
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)

@@ -17,7 +17,7 @@ from vinesim.net.recording.mcap_writer import RecordingWriter, free_path
 from vinesim.net.transport.zenoh_bus import ZenohBus
 
 POLL = 0.004
-"""Between two looks at what arrived [s]."""
+"""Wall time between two checks for new messages [s]."""
 
 
 def run(
@@ -77,7 +77,7 @@ def run(
 
 
 def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
-    """What a scene file says of the only vineyard that is to be recorded."""
+    """Scene name, seed and digest of the only vineyard that is to be recorded, from a scene file."""
     if scene is None:
         if seed is not None:
             raise UsageError(f"--seed {seed}: a seed is of a scene, give --scene too")
@@ -90,7 +90,7 @@ def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
 
 
 def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
-    """One line that is written over, on a terminal; nothing into a file."""
+    """One line that is overwritten on a terminal; nothing is written to a file."""
     if not sys.stderr.isatty():
         return
     trouble = recorder.bus.status_message

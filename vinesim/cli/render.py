@@ -34,7 +34,7 @@ class Viewpoint:
     target: np.ndarray
     """[3] m"""
     place: str
-    """Where the user gave it, for messages."""
+    """Place in the user's input where the viewpoint was given, for messages."""
 
     def __post_init__(self) -> None:
         for name, point in (("position", self.eye), ("target", self.target)):
@@ -156,12 +156,12 @@ class _Stage:
     spec: CameraSpec
     info: CameraInfo
     time: float
-    """[s] Simulated, for the sun."""
+    """[s] Simulated time; it sets the sun."""
     sensors: tuple[RenderedMount, ...]
-    """Which look as well, from the camera's place."""
+    """Further sensors that look from the camera's place."""
 
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
-        """The picture from a viewpoint, and in words what is in sight."""
+        """The picture from a viewpoint, and a description in words of what is in sight."""
         from vinesim.scene.camera_geometry import depth_millimetres
         from vinesim.sensors import ground_truth
         from vinesim.sensors.camera.camera import Camera
@@ -239,8 +239,8 @@ _COLUMNS = ("x", "y", "z", "look_x", "look_y", "look_z")
 
 
 def _read_path(path: pathlib.Path) -> list[Viewpoint]:
-    """Viewpoints of a CSV file with the columns x, y, z, look_x, look_y, look_z [m], or of a JSON list of objects with
-    those keys; :class:`UsageError` if there are none or one is wrong."""
+    """Viewpoints from a CSV file with the columns x, y, z, look_x, look_y, look_z [m], or from a JSON list of objects
+    with those keys. :class:`UsageError` if there are none or one is wrong."""
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as bad:

@@ -1,4 +1,4 @@
-"""``vinesim replay``: let a recording happen again."""
+"""``vinesim replay``: play a recording again."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from vinesim.scene.spec import Scene
 
 POLL = 0.004
-"""Between two looks at what is due [s]."""
+"""Wall time between two checks for messages that are due [s]."""
 
 
 def run(
@@ -123,7 +123,7 @@ def _look(
     start: float,
     end: float | None,
 ) -> int:
-    """Play to a spectator in this process, as fast as it can look; the same pictures every time."""
+    """Play to a spectator in this process, as fast as it can take pictures. The pictures are the same every time."""
     from vinesim.client.spectator import PictureWriter
 
     spectator, bus = _spectator(tape, pose, scene, seed, start, end)
@@ -146,7 +146,7 @@ def make_page_replay(
     start: float = 0.0,
     end: float | None = None,
 ) -> PageReplay:
-    """A recording for pages; arguments as of :func:`run`."""
+    """A recording that pages can play; arguments as for :func:`run`."""
     from vinesim.client.page.page_replay import PageReplay
 
     plan, model = _vineyard(tape, scene, seed)
@@ -168,7 +168,7 @@ def _show(
     start: float,
     end: float | None,
 ) -> int:
-    """Play to a spectator in this process and show it in browsers, which pause it and go to other times."""
+    """Play to a spectator in this process and show it in browsers, which can pause it and go to other times."""
     from vinesim.web import page_files
 
     page_files.check()
@@ -199,7 +199,7 @@ def _publish(
     start: float,
     end: float | None,
 ) -> int:
-    """Play to a spectator in this process in real time, and publish what it has as ROS topics."""
+    """Play to a spectator in this process in real time, and publish its view as ROS topics."""
     from vinesim.ros import middleware
 
     if (reason := middleware.unavailable_reason()) is not None:
@@ -231,13 +231,13 @@ def _spectator(
     start: float,
     end: float | None,
 ) -> tuple[Spectator, ReplayBus]:
-    """A spectator of a recording that stands at a ``pose``, unless given behind the first robot; and its bus."""
+    """A spectator of a recording, and its bus. It stands at a ``pose``, or unless given behind the first robot."""
     plan, model = _vineyard(tape, scene, seed)
     return _spectator_in(tape, plan, model, _eyes(tape, model, pose), start, end)
 
 
 def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Scene, Model]:
-    """The scene that a recording is of, and its model."""
+    """The scene of a recording, and its model."""
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import SceneError, load_scene, with_seed
 
@@ -272,7 +272,7 @@ def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None
 def _spectator_in(
     tape: Recording, plan: Scene, model: Model, eyes: np.ndarray, start: float, end: float | None
 ) -> tuple[Spectator, ReplayBus]:
-    """A spectator at a time of a recording, and its bus."""
+    """A spectator at some time of a recording, and its bus."""
     from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import Spectator
 
@@ -292,7 +292,7 @@ def _step(spectator: Spectator, bus: ReplayBus, speed: float, *, follow: bool) -
 
 
 def _first_pose(tape: Recording) -> np.ndarray:
-    """Where the first robot stood [7] when it was first heard of, or if there is none, the first person."""
+    """Pose [7] at which the first robot appears in the recording; without robots, that of the first person."""
     for kind in ("robot", "human"):
         such = {
             sender_of(entry.key)

@@ -82,7 +82,7 @@ def run(options: ClientOptions) -> int:
 def _start_sensors(
     session: ClientSession, names: list[str], descriptions: list[RobotDescription]
 ) -> list[RobotProcesses]:
-    """Processes for each robot; of several robots each publishes under its own namespace."""
+    """Start the sensor processes of each robot. If there are several robots, each publishes in its own namespace."""
     options = session.options
     processes = []
     for i, (name, description) in enumerate(zip(names, descriptions, strict=True)):
@@ -109,7 +109,8 @@ def _start_sensors(
 
 
 def _pacing(options: ClientOptions, description: RobotDescription) -> SensorPacing:
-    """What the command line says of sensors and simulated time, and of the rest what the robot's file says."""
+    """Settings of sensors and simulated time from the command line; the robot's file gives those that are missing
+    there."""
     pacing = description.sensor_pacing
     if options.sensors is not None:
         pacing = dataclasses.replace(pacing, mode=SensorMode(options.sensors))
@@ -119,7 +120,8 @@ def _pacing(options: ClientOptions, description: RobotDescription) -> SensorPaci
 
 
 def complete_report(report: dict[str, Any], processes: Mapping[str, RobotProcesses]) -> dict[str, Any]:
-    """A client's report with that of the first robot's processes; of several robots, those of each under its name."""
+    """A client's report with that of the first robot's processes. If there are several robots, the reports of
+    all their processes are listed by robot name too."""
     reports = {name: one.report() for name, one in processes.items()}
     complete = report | next(iter(reports.values()))
     if len(reports) > 1:

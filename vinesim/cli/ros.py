@@ -45,7 +45,7 @@ def build(quiet: bool, wheel: pathlib.Path | None) -> int:
 
 
 def record(path: pathlib.Path, topics: list[str], seconds: float | None) -> int:
-    """Record topics until Ctrl-C or for so many ``seconds``; the exit code."""
+    """Record topics until Ctrl-C or for ``seconds`` [s]; returns the exit code."""
     if (reason := middleware.unavailable_reason()) is not None:
         print(f"ROS 2 is not usable here: {reason}")
         return 3

@@ -17,7 +17,7 @@ from vinesim.net.server.server import Server
 from vinesim.net.transport.endpoints import check_exposure, default_listen
 
 STATUS_PERIOD = 1.0
-"""Between two status lines [s]."""
+"""Wall time between two status lines [s]."""
 
 
 def run(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 LEAST_CHROMA = 0.2
-"""[1] Of a marker's colour: largest less least of red, green and blue, over the largest."""
+"""[1] Least chroma of a marker's colour: largest minus least of red, green and blue, over the largest."""
 
 
 class ScipyMissing(RuntimeError):

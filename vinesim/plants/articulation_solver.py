@@ -9,7 +9,8 @@ move and ``coarsen()`` locks them again. ``cut()`` makes a body the floating roo
 called between steps, after ``integrate()`` and before the next ``predict()``.
 
 The scheme (:mod:`vinesim.kernels.plants`) damps as if every joint's beta (damping / stiffness) were larger by
-``(2 phi - 1) dt``, so the solver takes that off what the model asks, down to nothing: what is asked is what is seen.
+``(2 phi - 1) dt``, so the solver subtracts that amount from the model's damping, down to zero: trees then show the
+damping that the model asks for.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
-# Places in the array of counts: how many entries of each list kernels take.
+# Places in the array of counts. A count is the number of entries that kernels take from a list.
 _STEPPING = 0
 _SUBSET = 1
 _GROUPS = 2
@@ -68,7 +69,7 @@ _DIVIDED_FLOATING = 6
 _NEXT_LEVEL = 7
 _LEVELS = 8
 _COUNTS = 9
-"""How many counts there are. :data:`_NEXT_LEVEL`: which substep is next; :data:`_LEVELS`: how many there are."""
+"""Number of counts. :data:`_NEXT_LEVEL` holds the substep that is next, :data:`_LEVELS` the number of substeps."""
 
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
@@ -77,25 +78,27 @@ _NO_WRENCHES = np.zeros((0, 6), np.float32)
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
-    ``predict()`` chooses each tree's phi: 1 while a joint turns faster than ``fast_rate``, and if that was faster than
-    a tenth of ``max_rate`` until all have been slower than 0.06 ``max_rate`` for a second; 1 for a while after contact
-    began (``contact_onset_duration``); ``phi`` otherwise. ``impulse_response()`` and ``integrate()`` belong to the
-    ``predict()`` before them.
+    ``predict()`` chooses each tree's phi. It is 1 while a joint turns faster than ``fast_rate``; if a joint turned
+    faster than a tenth of ``max_rate``, it stays 1 until all joints have been slower than 0.06 ``max_rate`` for a
+    second. It is 1 for a while after contact began (``contact_onset_duration``), and ``phi`` otherwise.
+    ``impulse_response()`` and ``integrate()`` belong to the ``predict()`` before them.
 
     Args:
         model: constants; :class:`ValueError` in words if a tree cannot be simulated.
         state: its arrays are read and written in place.
-        parameters: numbers of the scheme; those that follow replace single ones and may be infinite.
+        parameters: numbers of the scheme; the arguments that follow replace single numbers and may be infinite.
         dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
-        threads: on a CPU, so many threads share the contacts (the result is the same to the bit).
+        threads: number of threads that share the contacts on a CPU (the result is the same to the bit).
         fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
             ``PhysicsParameters``, and :mod:`vinesim.plants.fault_guard`.
-        geometric_stiffness: take the stiffness that weight and pull lend to what hangs into the implicit solve. Without
-            it a heavy bunch on a soft peduncle gains energy every step; off only to compare with solvers without it.
-        substeps: divide the step of trees whose first mode is too fast for it; off only to compare with other solvers.
-        buffers: where arrays live, instead of what ``device`` says."""
+        geometric_stiffness: include in the implicit solve the stiffness that weight and pull give to hanging bodies.
+            Without it a heavy bunch on a soft peduncle gains energy every step. Switch it off only to compare with
+            solvers without it.
+        substeps: divide the step of trees whose first mode is too fast for it. Switch it off only to compare with other
+            solvers.
+        buffers: memory in which arrays live; chosen by ``device`` unless given."""
 
     def __init__(
         self,
@@ -131,10 +134,10 @@ class ArticulationSolver:
         self.max_rate = p.max_joint_rate if max_rate is None else max_rate
         self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
         self.buffers = buffers
+        """The memory in which arrays live, for NumPy and for kernels."""
         self.threads = threads
-        """Where arrays live, for NumPy and for kernels."""
         self.tick = 0
-        """Integrations so far."""
+        """Number of integrations so far."""
         self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
         self.root_rests = RootRests(model)
         self._allocate(phi)
@@ -144,9 +147,9 @@ class ArticulationSolver:
         """Threads that share the launches of contacts."""
         weakref.finalize(self, self.launch_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
-        self.onset_steps = numbers["contact_steps"] - 1  # with phi = 1 after contact began
+        self.onset_steps = numbers["contact_steps"] - 1  # steps with phi = 1 after contact began
         self.launches = KernelLaunches(self, numbers, MAX_SUBSTEPS if substeps else 1)
-        """Kernels on these arrays."""
+        """The solver's kernels, with these arrays as arguments."""
         self._runner = StepRunner(
             buffers,
             self.launches,
@@ -182,37 +185,42 @@ class ArticulationSolver:
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self.berry_clusters = BerryClusters(self)
-        """Locks and unlocks berry clusters; for what leaves the tree, see :class:`DetachmentMonitor`."""
+        """Locks and unlocks berry clusters. :class:`DetachmentMonitor` handles bunches that leave their tree."""
 
     @property
     def dt(self) -> float:
-        """[s] Duration of a step. Fixed: kernels, damping and counts of steps follow from it at the start."""
+        """[s] Duration of a step. It is fixed: kernels, damping and counts of steps are derived from it at the
+        start."""
         return self._dt
 
     def _allocate(self, phi: float) -> None:
-        """Arrays of the solver beside model and state."""
+        """Allocate the arrays that the solver has in addition to those of model and state."""
         model = self.model
         state = self.state
         trees = len(self.model.tree_first)
         bodies = len(self.model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """phi asked for each tree [tree]; set it as you like. 1 where a tie is stiff (``stiff_tie_mass``)."""
+        """[tree] phi asked for each tree; callers may set it. It is 1 where a tie is stiff (``stiff_tie_mass``)."""
         self.phi_used = np.zeros(trees, np.float32)
         """phi of each tree's last ``predict()`` [tree]."""
         self.awake_list = np.zeros(trees, np.int32)
         self.awake_count = np.zeros(1, np.int32)
-        """Its first entries are :attr:`awake`: for kernels, which stay bound to it [tree], and how many [1]."""
+        """[1] Number of entries of ``awake_list`` [tree] that are in use; they are :attr:`awake`. Kernels stay bound to
+        both."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """Fastest joint of the last step [tree] rad/s, m/s of what falls; NaN or above ``fault_rate``: stopped."""
+        """[tree] Length of (fastest joint rate [rad/s], fastest speed of a floating root [m/s]) in the last step. NaN
+        or above ``fault_rate``: the tree was stopped."""
         self._fastest = np.zeros(1, np.float32)
         self.tree_substeps = np.ones(trees, np.int32)
-        """Into how many substeps the step of each awake tree is divided while nothing holds it [tree]."""
+        """[tree] Number of substeps into which the step of each awake tree is divided while nothing holds the tree."""
         self.tree_budget = np.zeros(trees, np.int32)
-        """How the energy of each awake tree is watched [tree]: :mod:`vinesim.kernels.plants.energy_budget`."""
+        """[tree] How closely the energy of each awake tree is watched: see
+        :mod:`vinesim.kernels.plants.energy_budget`."""
         self.tree_air = np.zeros((trees, 3), np.float32)
         """Velocity of the air around each tree [tree, 3] m/s; see :mod:`vinesim.wind.plant_wind`."""
         self.body_load = np.zeros((bodies, 6), np.float32)
-        """Wrenches that last until changed (wind, a rope): force [N], moment about the body's origin [N m], world."""
+        """[body, 6] Wrenches that last until they are changed (wind, a rope): force [N] and moment about the body's
+        origin [N m], world axes."""
         self.velocity_free = np.zeros((bodies, 6), np.float32)
         """Velocity of each body of an awake tree at the end of the step if nothing touches it [body, 6]."""
         self.acceleration = np.zeros((bodies, 6), np.float32)
@@ -221,28 +229,30 @@ class ArticulationSolver:
         self.body_com = model.body_com.copy()
         self.body_inertia = model.body_inertia.copy()
         self.body_drag = model.body_drag.copy()
-        """What moves now, in the model's units: the body of a bunch is its compound while the tree is coarse, its head
-        while it is fine; a picked bunch is a stub."""
+        """``body_mass`` to ``body_drag``: mass, centre of mass, inertia and drag of what moves now, in the model's
+        units. The body of a bunch stands for the whole compound while its tree is coarse, and for the bunch's head
+        while the tree is fine; a picked bunch is a stub."""
         self.body_product = np.zeros((bodies, 3), np.float32)
-        """Entries yz, zx, xy of the inertia in the body's axes [body, 3] kg m^2: a compound is not symmetric."""
+        """[body, 3] kg m^2: entries yz, zx, xy of the inertia in the body's axes. The inertia of a compound is not
+        diagonal."""
         self.joint_stiffness = model.joint_stiffness.copy()
         self.joint_damping = model.joint_damping.copy()
-        """The model's, but none where a body has been cut off; if ties hold that, the damping is how they resist that
-        it turns."""
+        """The model's damping, but zero where a body has been cut off. If ties hold the cut-off part, the entry is the
+        damping with which the ties resist its rotation."""
         self.tree_moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
-        """Bodies of each tree that move [tree]: all, or all but the clusters."""
+        """[tree] Number of bodies of each tree that move: all bodies, or all except the berry clusters."""
         self.body_impulse = np.zeros((bodies, 6), np.float32)
-        """Impulses of a plastic impact while it is solved [body, 6] N s, N m s."""
+        """[body, 6] N s, N m s: impulses of a plastic impact while it is solved."""
         self.joint_xd_free = np.zeros((bodies, 3), np.float32)
         self.joint_qd_free = np.zeros((bodies, 3), np.float32)
-        """Predicted rates of roots and joints [body, 3] m/s, rad/s."""
+        """[body, 3] rad/s: predicted rates of joints; ``joint_xd_free`` [body, 3] m/s: of floating roots."""
         self._place_in_tree = (np.arange(bodies) - model.tree_first[model.body_tree]).astype(np.int32)
-        # as the kernels see the trees: a cut body has no parent and no lever
+        # the trees as the kernels see them: a cut-off body has no parent and no lever
         self._parent = model.body_parent.copy()
         self._root = np.full(bodies, -1, np.int32)
         self._offset = model.body_offset.copy()
         self._rest = model.body_rest.copy()
-        self._falls = np.zeros(bodies, np.bool_)  # of a floating component that no tie holds
+        self._falls = np.zeros(bodies, np.bool_)  # whether no tie holds the body's floating component
         self._floating, self._divided_floating = (np.zeros(bodies, np.int32) for _ in range(2))
         self._falling_roots = np.zeros(0, np.int32)
         self._wrench = np.zeros((bodies, 6), np.float32)
@@ -254,7 +264,7 @@ class ArticulationSolver:
         self._counts = np.zeros(_COUNTS, np.int32)
 
     def _pin_arrays(self) -> None:
-        """Move the arrays of solver, ties and state to where the device can reach them."""
+        """Move the arrays of solver, ties and state to memory that the device can reach."""
         for owner in (self, self.ties, self.root_rests, self.state):
             for name, value in vars(owner).items():
                 if isinstance(value, np.ndarray):
@@ -367,7 +377,7 @@ class ArticulationSolver:
         self.awake_list[: len(self._awake)] = self._awake
 
     def awake_trees(self) -> list[wp.array]:
-        """How many trees are awake [1], and which [tree]: for kernels on a CPU, which stay bound to both."""
+        """Number of awake trees [1] and their list [tree], for kernels on a CPU, which stay bound to both arrays."""
         return [share(self.awake_count, wp.int32), share(self.awake_list, wp.int32)]
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
@@ -377,27 +387,30 @@ class ArticulationSolver:
     # ------------------------------------------------------------------ topology and mass
 
     def refine(self, trees: np.ndarray | int) -> None:
-        """Let the clusters of these trees' bunches move, from where they ride and as fast as what they ride on.
+        """Let the clusters of these trees' bunches move. They start where they are, as fast as the bunch that carries
+        them.
 
-        Pose, velocity and momentum go on. Nothing happens to trees that are fine or have no clusters; none wakes.
-        :class:`ValueError` if there is no such tree.
+        Pose, velocity and momentum are continuous. Trees that are fine or have no clusters stay as they are. No tree
+        wakes. :class:`ValueError` if there is no such tree.
         """
         self.berry_clusters.refine(trees)
 
     def coarsen(self, trees: np.ndarray | int) -> None:
         """Lock the clusters of these trees' bunches where they are: each bunch becomes one compound.
 
-        Nothing changes its pose. The clusters' motion against their bunch ends in a plastic impact that lasts a step.
-        A bunch keeps its angular momentum about its origin; what its joint must take sets the rest of the tree moving,
-        against springs as in any step (free of them, a light peduncle would be flung about). A floating tree keeps all
-        momentum. Kinetic energy does not grow, as the scheme counts it: with the rates squared times the metric.
+        No pose changes. The clusters' motion against their bunch ends in a plastic impact that lasts a step. A bunch
+        keeps its angular momentum about its origin. The impulse that its joint must take sets the rest of the tree
+        moving, against springs as in any step (without the springs a light peduncle would be flung about). A floating
+        tree keeps all momentum. Kinetic energy does not grow, measured as the scheme does: the squared rates weighted
+        with the metric.
         """
         self.berry_clusters.coarsen(trees)
 
     def cut(self, body: int) -> None:
         """Cut a body off its parent: it and what grows on it fall, from where they are and as fast as they are.
 
-        Its tree wakes; the rest of it goes on as before. Numbers never change. :class:`ValueError` if it cannot be cut.
+        Its tree wakes; the rest of the tree goes on as before. Indices of bodies never change. :class:`ValueError` if
+        the body cannot be cut.
         """
         model = self.model
         state = self.state
@@ -417,7 +430,7 @@ class ArticulationSolver:
         self.wake(tree)
 
     def _detach_joints(self, bodies: np.ndarray) -> None:
-        """Take over which of the bodies of some whole trees have been cut off."""
+        """Update which bodies of some whole trees are cut off, from the state."""
         cut = bodies[self.state.body_cut[bodies]]
         self._parent[cut] = -1
         self._offset[cut] = 0.0
@@ -431,7 +444,8 @@ class ArticulationSolver:
         self._find_falling(bodies)
 
     def _find_falling(self, bodies: np.ndarray) -> None:
-        """Note which floating components of some whole trees no tie holds; ties resist that the others turn."""
+        """Note which floating components of some whole trees no tie holds; where ties hold one, they damp its
+        rotation."""
         root = self._root[bodies]
         is_cut = self.state.body_cut[bodies]
         tied = np.isin(bodies, self.ties.tied_bodies)
@@ -445,7 +459,8 @@ class ArticulationSolver:
     def set_mass(self, body: int, mass: float) -> None:
         """Give one body another mass [kg] (a picked bunch, a pruned leaf); its inertia scales along.
 
-        A bunch with clusters is meant as a whole, fine or coarse: head and clusters keep their shares.
+        For a bunch with clusters ``mass`` is that of the whole bunch, fine or coarse: head and clusters keep their
+        shares.
         """
         if not 0.0 < mass < math.inf:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
@@ -456,7 +471,7 @@ class ArticulationSolver:
     def predict(self, trees: np.ndarray | None = None) -> None:
         """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
 
-        ``trees`` [k]: only these, woken or given another phi after the prediction of all.
+        ``trees`` [k]: predict only these trees, which were woken or given another phi after all trees were predicted.
         """
         launches = self.launches
         self._runner.list_trees(self._awake)
@@ -483,7 +498,7 @@ class ArticulationSolver:
     def integrate(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
         """End the step: wrenches (N, N m, world, at the bodies' origins) act over it, joints move.
 
-        ``bodies`` [n] may name one body several times; ``wrenches`` is [n, 6].
+        ``bodies`` [n] may name one body several times; ``wrenches`` has the shape [n, 6].
         """
         launches = self.launches
         touched = _NO_TREES
@@ -499,13 +514,14 @@ class ArticulationSolver:
         self.tick += 1
 
     def fastest_rate(self) -> float:
-        """Of :attr:`tree_rate` of the last ``integrate()`` the largest, or more; infinite if one is not a number."""
+        """The largest entry of :attr:`tree_rate` of the last ``integrate()``, or an upper bound of it; infinite if an
+        entry is not a number."""
         if self.buffers.has_copies:
             return float(np.nan_to_num(self.tree_rate[self._awake], nan=math.inf).max(initial=0.0))
         return float(self._fastest[0])
 
     def _load(self, bodies: np.ndarray, wrenches: np.ndarray) -> np.ndarray:
-        """Let wrenches [n, 6] on bodies [n] act instead of those of the last step; returns the trees touched [k]."""
+        """Replace the wrenches of the last step by ``wrenches`` [n, 6] on bodies [n]; returns the trees touched [k]."""
         touched = self._loads.replace(bodies, wrenches, self.tick)
         if self.buffers.has_copies:
             self.launches.upload_wrenches(len(self._runner.stepped))
@@ -513,7 +529,7 @@ class ArticulationSolver:
         return touched
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
-        """The floating roots that this step moves: where kernels find them, and their trees."""
+        """The floating roots that move in this step: their places in the kernels' arrays, and their trees."""
         if len(self._falling_roots) == 0:
             return _NO_TREES, _NO_TREES
         tree = self.model.body_tree[self._falling_roots]
@@ -521,11 +537,11 @@ class ArticulationSolver:
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
-        """Many steps of the awake trees: no sleep, no fault guard, no contacts but what ``between`` launches.
+        """Take many steps of the awake trees, without sleep, fault guard, or contacts other than ``between`` launches.
 
-        A GPU works on its own copies meanwhile: :meth:`upload` before and
-        :meth:`download` after, and between two of those nothing crosses the bus. ``velocity_free``, ``acceleration``
-        are of the last step; a tree that went wrong stays where it was (``tree_rate`` NaN or above ``fault_rate``).
+        A GPU works on its own copies meanwhile: call :meth:`upload` before and :meth:`download` after; in between
+        nothing crosses the bus. Afterwards ``velocity_free`` and ``acceleration`` are those of the last step. A tree
+        whose motion became invalid stays where it was (``tree_rate`` NaN or above ``fault_rate``).
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
@@ -540,23 +556,25 @@ class ArticulationSolver:
         self.tick += steps
 
     def upload(self) -> None:
-        """Bring the device's copies of the awake trees up to the host's arrays; on a CPU there is nothing to bring."""
+        """Copy the host's arrays of the awake trees to the device; on a CPU there is nothing to copy."""
         self._runner.list_trees(self._awake)
         self.launches.upload_step(len(self._runner.stepped))
         self.buffers.synchronize()
 
     def download(self) -> None:
-        """Bring the host's arrays of the awake trees up to the device's, as ``predict()`` and ``integrate()`` do."""
+        """Copy the device's arrays of the awake trees to the host, as ``predict()`` and ``integrate()`` do."""
         self.launches.download_prediction(len(self._runner.stepped))
         self.launches.download_joints(len(self._runner.stepped))
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 for ``contact_onset_duration``: trees about to be touched (``integrate()`` sees to touched)."""
+        """Use phi = 1 for ``contact_onset_duration`` on trees that are about to be touched; ``integrate()`` does so for
+        trees that are touched."""
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self.onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
-        """Bring ``body_q`` and ``body_qd`` of trees (the awake ones unless given) up to their joints; no step."""
+        """Update ``body_q`` and ``body_qd`` of trees (of the awake ones unless given) from their joints, without a
+        step."""
         trees = self._awake if trees is None else np.atleast_1d(trees)
         self.list_subset(trees)
         self.launches.upload_changed()
@@ -575,24 +593,25 @@ class ArticulationSolver:
         self._loads.require_stepped(np.asarray(bodies))
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
-        """Move one tree towards a state elsewhere: rotations [k, 4] by ``blend`` of the way, rates [k, 3] fully."""
+        """Move one tree towards the state that it has elsewhere: rotations [k, 4] by the share ``blend`` of the
+        difference, rates [k, 3] completely."""
         blend_towards(self, tree, joint_q, joint_qd, blend)
 
     # ------------------------------------------------------------------ ties, wrenches, damping
 
     @property
     def tie_anchor(self) -> np.ndarray:
-        """Where ties are held [tie, 3] m, in the world; move them as you like. See :meth:`add_tie`."""
+        """[tie, 3] m, in the world: the points at which ties are held; callers may move them. See :meth:`add_tie`."""
         return self.ties.anchor
 
     @property
     def tie_stiffness(self) -> np.ndarray:
-        """N/m [tie]; a tie of zero does nothing."""
+        """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
         return self.ties.stiffness
 
     @property
     def tie_damping(self) -> np.ndarray:
-        """N s/m [tie]."""
+        """[tie] N s/m damping."""
         return self.ties.damping
 
     @property
@@ -603,8 +622,8 @@ class ArticulationSolver:
     def add_tie(self, body: int, point: np.ndarray, stiffness: float, damping: float) -> int:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
 
-        It pulls to ``tie_anchor`` of that tie, which starts where the point is; move it as you like.
-        :class:`TieLimitError` if too many bodies are held, or this one in too many places; :class:`ValueError` for a
+        The spring pulls the point to the tie's ``tie_anchor``, which starts at the point; callers may move it.
+        :class:`TieLimitError` if too many bodies are held, or this body in too many places; :class:`ValueError` for a
         berry cluster and for numbers that are not finite.
         """
         body = checked_index("body", body, len(self.model.body_mass))
@@ -623,12 +642,13 @@ class ArticulationSolver:
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
         """Force [N] and moment [N m, about the body's origin, world axes] on bodies from their parents [n, 6].
 
-        Of the last step, and only for bodies of trees that were awake in it. At rest it carries what hangs below.
+        They are those of the last step, and valid only for bodies of trees that were awake in it. At rest a joint
+        carries the weight of what hangs below.
         """
         return self.launches.joint_wrench(bodies)
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
-        """Least damping ratio that a first mode of this frequency [Hz] can show: pi f (2 phi - 1) dt / substeps."""
+        """Least damping ratio that a first mode of this frequency [Hz] can have: pi f (2 phi - 1) dt / substeps."""
         phi = float(self.phi.max(initial=0.5)) if phi is None else phi
         return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)
 
@@ -656,22 +676,22 @@ class BerryClusters:
         order = np.argsort(tree, kind="stable")
         self.bunches = clustered[order]
         self._bunch_tree = tree[order]
-        """Bunches that have clusters, by tree [k]."""
+        """[k] Tree of each of :attr:`bunches` [k], which are the bunches that have clusters, sorted by tree."""
         self.head_mass = model.bunch_head_mass.copy()
         self.head_inertia = model.bunch_head_inertia.copy()
-        """[bunch] kg, [bunch, 3] kg m^2 of the part of a bunch that is no cluster."""
+        """[bunch, 3] kg m^2 (``head_mass``: [bunch] kg) of the head, the part of a bunch that belongs to no cluster."""
         fine = solver.state.tree_fine[self._bunch_tree]
         self.lock(self.bunches[~fine])
         self.unlock(self.bunches[fine])
 
     def clustered_trees(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
-        """Those of some trees that have clusters and are fine or not [k], sorted."""
+        """The trees among ``trees`` that have clusters and whose state is ``fine`` or not, as asked [k], sorted."""
         model = self._solver.model
         trees = np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
         return trees[(self._solver.state.tree_fine[trees] == fine) & (model.tree_core[trees] < model.tree_size[trees])]
 
     def clusters_of(self, trees: np.ndarray) -> np.ndarray:
-        """The clusters of some trees, as bodies [k]."""
+        """Bodies of the clusters of some trees [k]."""
         model = self._solver.model
         core = model.tree_core[trees]
         return spans(model.tree_first[trees] + core, model.tree_size[trees] - core)
@@ -712,8 +732,8 @@ class BerryClusters:
         solver.forward_kinematics(trees)
 
     def _apply_impact(self, trees: np.ndarray, bodies: np.ndarray, impulse: np.ndarray) -> None:
-        """Change joint rates of trees by impulses [k, 6] N s, N m s on bunches [k], about their origins, in their
-        axes."""
+        """Change the joint rates of trees by impulses [k, 6] N s, N m s on the ``bodies`` of bunches [k]. The impulses
+        are given about each body's origin, in its axes."""
         solver = self._solver
         state = self._solver.state
         launches = self._solver.launches
@@ -766,7 +786,7 @@ class BerryClusters:
         """Give one bunch's body the mass of the compound that head and clusters are now, and return the velocity [6]
         m/s, rad/s of its frame, in world axes, with which that compound has the momentum of its parts.
 
-        The state stays as it is: it is for a bunch that leaves its tree, see :meth:`release`. Its poses and
+        The state stays as it is. Call it for a bunch that leaves its tree, see :meth:`release`. The bunch's poses and
         velocities must be current.
         """
         solver = self._solver
@@ -789,7 +809,8 @@ class BerryClusters:
         self.unlock(np.array([bunch] if self._solver.model.bunch_clusters[bunch] else [], np.int64))
 
     def unlock(self, bunches: np.ndarray) -> None:
-        """Leave to each bunch's body its head only."""
+        """Give each bunch's body the mass and inertia of the bunch's head alone, so that the clusters move on their
+        own."""
         solver = self._solver
         model = self._solver.model
         bodies = model.bunch_body[bunches]
@@ -802,7 +823,8 @@ class BerryClusters:
     def lock(self, bunches: np.ndarray) -> np.ndarray:
         """Make each bunch's body a compound of head and clusters as they are.
 
-        Returns the momentum of the clusters' motion against it [bunch, 6]: N s, and N m s about its origin, its axes.
+        Returns the momentum [bunch, 6] of the clusters' motion relative to the body: N s, and N m s about the body's
+        origin, in its axes.
         """
         solver = self._solver
         model = self._solver.model
@@ -877,14 +899,14 @@ def blend_towards(
     turn = frames.log(frames.multiply(frames.conjugate(here), there))
     state.joint_q[bodies] = frames.normalize(frames.multiply(here, frames.exp(blend * turn)))
     state.joint_qd[bodies] = rates
-    state.joint_qd[bodies.start + plants.tree_moving[tree] : bodies.stop] = 0.0  # what rides does not turn
+    state.joint_qd[bodies.start + plants.tree_moving[tree] : bodies.stop] = 0.0  # joints of locked clusters do not turn
 
 
 # Kernels of the articulation solver, each bound once to its arrays, and the transfers of rows around them.
 
 
 STEP_INPUTS = ("body_load", "body_wrench", "joint_x", "joint_xd", "joint_q", "joint_qd")
-"""Rows that are carried to the device before every prediction."""
+"""Per-body arrays that are copied to the device before every prediction."""
 DEVICE_RESULTS = (
     "body_q",
     "body_qd",
@@ -894,7 +916,7 @@ DEVICE_RESULTS = (
     "body_qd_free",
     "body_impulse",
 )
-"""Rows that kernels write, or that are carried over when they are needed."""
+"""Per-body arrays that kernels write, or that are copied only when they are needed."""
 TREE_INPUTS = (
     "stepping",
     "divided",
@@ -917,9 +939,9 @@ TREE_INPUTS = (
     "tie_anchor",
     "tie_anchor_velocity",
 )
-"""Lists and numbers of trees and ties that kernels of a step read."""
+"""Lists, and arrays of trees and ties, that the kernels of a step read."""
 TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
-"""Numbers of trees that they write."""
+"""Arrays of trees that the kernels of a step write."""
 SCRATCH = {
     wp.vec3: ("lever", "tension", "Du"),
     wp.quat: ("axes",),
@@ -935,7 +957,7 @@ SCRATCH = {
         "impact_velocity",
     ),
 }
-"""Rows that only kernels see."""
+"""Per-body arrays that only kernels read and write: element type -> names."""
 
 
 def kernel_parameters(
@@ -954,10 +976,10 @@ def kernel_parameters(
 
 
 BUDGET_PERIOD = 8
-"""Steps in one of which energy is looked at while no tree is watched."""
+"""While no tree is watched closely, energy is checked in one step out of this number of steps."""
 
 MIN_CAPACITY = 16
-"""Bodies that a list holds at least."""
+"""Least number of bodies for which a list of bodies has room."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -965,46 +987,48 @@ class JointWrenches:
     """Wrenches that joints carried in the last step."""
 
     places: np.ndarray
-    """[joint] int32 bodies, where kernels find them: to be written by the caller."""
+    """[joint] int32: place in the kernels' arrays of the body of each joint. The caller writes it."""
     count: np.ndarray
-    """[1] int32 how many joints: to be written by the caller."""
+    """[1] int32: number of joints. The caller writes it."""
     carried: np.ndarray
-    """[joint, 6] N, N m"""
+    """[joint, 6] N, N m: wrench that each joint carried."""
     launch: KernelLaunch
     """Fills :attr:`carried`."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Step:
-    """The kernels of a step on the same arrays."""
+    """The kernels of a step, all on the same arrays."""
 
     predict: KernelGraph
-    """Over groups of trees; on a GPU each tree is a group."""
+    """Predicts the trees, group by group; on a GPU each tree is a group."""
     integrate: dict[tuple[bool, bool], KernelGraph]
-    """Integrates the trees of whole steps: by whether energy budgets are kept and whether there are floating roots."""
+    """Integrates the trees that take whole steps. Key: whether energy budgets are kept, whether there are floating
+    roots."""
     take_substep: dict[tuple[bool, bool], KernelGraph]
-    """Predicts and integrates the trees that take the next substep, likewise."""
+    """Predicts and integrates the trees that take the next substep. Keys as for ``integrate``."""
 
 
 class KernelLaunches:
     """Launches of the articulation kernels on the arrays of one solver.
 
-    Arrays of the model are constants. What has a row for each body a GPU keeps a copy of, see
-    :mod:`vinesim.plants.device_buffers`: :data:`STEP_INPUTS`, :data:`DEVICE_RESULTS`, and all others, which
-    :meth:`upload_changed` carries over when :attr:`changed` says so. Everything else a GPU reads where it is, which in
-    many steps on end would cost more than the steps: those have copies of :data:`TREE_INPUTS` as well, and launches of
-    their own (:attr:`resident`), with :meth:`upload_trees` before and :meth:`download_trees` after.
+    Arrays of the model are constants. A GPU keeps a copy of every array that has a row for each body (see
+    :mod:`vinesim.plants.device_buffers`): :data:`STEP_INPUTS`, :data:`DEVICE_RESULTS`, and all others, which
+    :meth:`upload_changed` copies when :attr:`changed` is set. A GPU reads all other arrays in the host's memory. In a
+    sequence of many steps (:meth:`ArticulationSolver.advance`) that would cost more than the steps themselves. So such
+    a sequence has copies of :data:`TREE_INPUTS` as well, and launches of its own (:attr:`resident`); it begins with
+    :meth:`upload_trees` and ends with :meth:`download_trees`.
     """
 
     def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], max_substeps: int) -> None:
-        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters` but gravity."""
+        """``parameters``: numbers of :class:`vinesim.kernels.plants.structs.SolverParameters`, without gravity."""
         self.buffers = solver.buffers
         self._max_substeps = max_substeps
         self._body_tree = solver.model.body_tree
         self.changed = False
         """Whether model rows (parents, masses, springs) differ from the device's copies."""
         self.substeps_due = False
-        """Whether they have changed since the substeps of trees were counted."""
+        """Whether model rows have changed since the substeps of trees were counted."""
         self._budgeted = np.zeros(0, np.int32)
         self._keeps_budgets = False
         self._watches_closely = False
@@ -1016,11 +1040,11 @@ class KernelLaunches:
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
         self.shared = self._record_step_kernels(self.parameters)
-        """The kernels of a step on what NumPy sees."""
+        """The kernels of a step, on the arrays that NumPy sees."""
         self.resident = self.shared
-        """Those of steps between which nothing comes back to the host."""
+        """The kernels of steps between which nothing comes back to the host; on a GPU they have arrays of their own."""
         self.resident_arrays = self.buffers.arrays
-        """The arrays that these work on."""
+        """The arrays that the kernels of :attr:`resident` read and write."""
         if self.buffers.has_copies:
             self._record_resident(self.parameters)
         self._record_impact(
@@ -1058,7 +1082,8 @@ class KernelLaunches:
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
 
     def _branching(self, parent: np.ndarray) -> np.ndarray:
-        """[place] whether a body is the parent of another than the next one, where kernels look for it."""
+        """[place] Whether the body at this place in the kernels' arrays has a child other than the body that follows
+        it."""
         places = np.zeros(self.buffers.slot_count, np.bool_)
         apart = (parent >= 0) & (parent != np.arange(len(parent)) - 1)
         places[self.buffers.slots[parent[apart]]] = True
@@ -1074,12 +1099,12 @@ class KernelLaunches:
             self.substeps_due = True
 
     def fill(self, struct: Any, **values: Any) -> Any:
-        """A kernel argument struct: each field by its name in ``values`` (arrays by theirs), else the array named
-        so."""
+        """A kernel argument struct. A field that ``values`` names gets that value (a string there names an array); any
+        other field gets the array of its own name."""
         return self._filled(struct, self._arrays, values)
 
     def fill_resident(self, struct: Any, **values: Any) -> Any:
-        """The same with the arrays of :attr:`resident`."""
+        """As :meth:`fill`, with the arrays of :attr:`resident`."""
         return self._filled(struct, self.resident_arrays, values)
 
     def _filled(self, struct: Any, arrays: dict[str, wp.array], values: dict[str, Any]) -> Any:
@@ -1091,27 +1116,27 @@ class KernelLaunches:
         return filled
 
     def launch(self, kernel: Any, *arguments: object, **options: Any) -> KernelLaunch:
-        """A kernel and its arguments; a string among them names an array."""
+        """The launch of a kernel with its arguments; a string among the arguments names an array."""
         return KernelLaunch(kernel, self._named(arguments), **options)
 
     def graph(self, *launches: KernelLaunch) -> KernelGraph:
-        """Launches that follow each other, on the device."""
+        """A graph of launches that follow each other on the device."""
         return KernelGraph(*launches, device=str(self.buffers.device))
 
     def record(self, kernel: Any, *arguments: object, **options: Any) -> BoundLaunch:
-        """A kernel of contacts, for :attr:`ArticulationSolver.launch_pool`."""
+        """The launch of a contact kernel with its arguments, for :attr:`ArticulationSolver.launch_pool`."""
         return bind_launch(kernel, self._named(arguments), [], device=str(self.buffers.device), **options)
 
     def _named(self, arguments: Sequence[object]) -> list[Any]:
         return [self._arrays[value] if isinstance(value, str) else value for value in arguments]
 
     def count(self, place: int) -> wp.array:
-        """One of the counts [1]."""
+        """[1] One entry of the array of counts, by its place there."""
         return self._arrays["counts"][place : place + 1]
 
     @property
     def subset(self) -> tuple[wp.array, wp.array]:
-        """How many trees :meth:`ArticulationSolver.list_subset` has listed [1], and which [tree]."""
+        """Number [1] and list [tree] of the trees that :meth:`ArticulationSolver.list_subset` has listed."""
         return self.count(_SUBSET), self._arrays["subset"]
 
     # ------------------------------------------------------------------ transfers of the listed trees' rows
@@ -1177,10 +1202,10 @@ class KernelLaunches:
             ),
             self.launch(choose_budget, parameters, self._model, *stepping, scratch, "tree_budget"),
         )
-        """Also chooses how energies are watched."""
+        """Counts the substeps of the listed trees, and chooses how closely the energy of each is watched."""
 
     def _record_step_kernels(self, parameters: Any) -> Step:
-        """The kernels of a step on the present arrays."""
+        """The kernels of a step, on the present ``_arrays``."""
         in_groups = not self.buffers.has_copies
         predict = self._predict_groups(parameters) if in_groups else self._predict(parameters, _GROUPS, "stepping")
         begin = self.launch(
@@ -1223,7 +1248,7 @@ class KernelLaunches:
         )
 
     def _predict_groups(self, parameters: Any) -> KernelLaunch:
-        """The prediction of up to eight trees at once."""
+        """The launch that predicts trees in groups of up to eight."""
         size = LANES * RECORD * (self.buffers.max_tree_size + 2)
         return self.launch(
             predict_groups,
@@ -1248,7 +1273,8 @@ class KernelLaunches:
     def _integrate(
         self, parameters: Any, count: int, trees: str, root_count: int, roots: str
     ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
-        """An integration, by whether it has the energy budgets around it, and floating roots behind it."""
+        """Launches of an integration. Key: whether energy budgets are kept around it, whether floating roots follow
+        it."""
         fill = self.fill
         s = structs
         model, forces, joints, prediction = (
@@ -1333,7 +1359,7 @@ class KernelLaunches:
         )
 
     def _record_resident(self, parameters: Any) -> None:
-        """The kernels of a step once more, on copies of what there is of each tree."""
+        """Record the kernels of a step a second time, on copies of the arrays of trees and ties."""
         device = self.buffers.device
         shared = self.buffers.arrays
         names = dict.fromkeys(TREE_INPUTS + TREE_RESULTS)
@@ -1343,27 +1369,28 @@ class KernelLaunches:
         self._arrays = shared
 
     def upload_trees(self) -> None:
-        """Bring the arrays of :attr:`resident` up to those that NumPy sees."""
+        """Copy the arrays that NumPy sees to those of :attr:`resident`."""
         for name in TREE_INPUTS if self.buffers.has_copies else ():
             wp.copy(self.resident_arrays[name], self.buffers.host_array(name))
 
     def download_trees(self) -> None:
-        """The other way round, what kernels write."""
+        """Copy what the kernels of :attr:`resident` wrote to the arrays that NumPy sees."""
         for name in TREE_RESULTS if self.buffers.has_copies else ():
             wp.copy(self.buffers.host_array(name), self.resident_arrays[name])
 
     def list_budgets(self, trees: np.ndarray) -> None:
-        """These trees [k] have energy budgets (:mod:`vinesim.kernels.plants.energy_budget`), no others."""
+        """Keep energy budgets (:mod:`vinesim.kernels.plants.energy_budget`) of these trees [k] and of no others."""
         self._budgeted = trees
         self._budget_phase = -1
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
     def keeps_budgets(self, steps: int = 1) -> bool:
-        """Once before the integrations of a step or of so many: whether they are to keep energy budgets.
+        """Whether the next step, or the next ``steps`` steps, keep energy budgets. Call it once before their
+        integrations.
 
-        Always on a GPU and in many steps. Otherwise in one step of eight, and in the seven that follow if a tree is
-        watched closely after it.
+        They always do on a GPU, and when there are many steps. Otherwise one step of eight does, and also the seven
+        that follow if a tree is watched closely after it.
         """
         self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
         if self._budget_phase == 0 or self.buffers.device.is_cuda:
@@ -1374,7 +1401,8 @@ class KernelLaunches:
         return self._keeps_budgets
 
     def _record_impact(self, parameters: Any) -> None:
-        """An impact within no time: factors of inertia and springs alone, and wrenches that are impulses."""
+        """Record the kernels of a plastic impact that lasts no time: factors of inertia and springs alone, impulses as
+        wrenches."""
         fill = self.fill
         s = structs
         joints = fill(s.JointState)
@@ -1426,7 +1454,8 @@ class KernelLaunches:
         return self._response[:n]
 
     def dense_impulse_response(self, bodies: np.ndarray) -> np.ndarray:
-        """The same [n, 6, n, 6] for bodies in any order, with the zeros between different trees."""
+        """Response [n, 6, n, 6] of bodies in any order to unit impulses on them; zero between bodies of different
+        trees."""
         bodies = np.asarray(bodies)
         order = np.argsort(bodies, kind="stable")
         _, tree_start, tree = np.unique(self._body_tree[bodies[order]], return_index=True, return_inverse=True)
@@ -1482,7 +1511,7 @@ class KernelLaunches:
         self._carry = self.graph(self._joint_wrenches.launch)
 
     def joint_wrenches(self, capacity: int) -> JointWrenches:
-        """What computes the wrenches that up to so many joints carried in the last step."""
+        """The arrays and the launch that compute the wrenches of up to ``capacity`` joints in the last step."""
         buffers = self.buffers
         places = buffers.pinned(np.zeros(capacity, np.int32))
         count = buffers.pinned(np.zeros(1, np.int32))
@@ -1505,36 +1534,37 @@ class KernelLaunches:
 
 # Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.
 #
-# A tree whose first mode is too fast for the step takes substeps instead, of which all others see the sum:
-# :mod:`vinesim.kernels.plants.first_mode` says how many. While contacts act on it, it takes the whole step that
-# they were solved for; and so does always a tree that is tied to wires, which move once a step.
+# A tree whose first mode is too fast for the step takes substeps instead; all other parts see only their sum.
+# :mod:`vinesim.kernels.plants.first_mode` computes the number of substeps. While contacts act on such a tree, it takes
+# the whole step for which they were solved. A tree that is tied to wires always takes whole steps: wires move once a
+# step.
 
 
 Levels = tuple[int, ...]
-"""How many of a list take a first, a second, a third substep."""
+"""Number of entries of a list that take a first, a second, a third substep, and so on."""
 
 
 class StepRunner:
     """Runs predictions and integrations of the listed trees.
 
-    The list that the kernels read has the trees of one step first, then the others, those of most substeps first. On a
-    CPU those of one topology are neighbours within that order and are predicted in groups of up to eight; on a GPU each
-    tree is a group.
+    The list that the kernels read begins with the trees that take one step. The others follow, those with most substeps
+    first. On a CPU trees of one topology are neighbours within that order, and are predicted in groups of up to eight;
+    on a GPU each tree is a group.
 
     Args:
-        buffers: of the solver.
-        launches: of the solver.
-        tree_substeps: [tree] into how many substeps each tree's step is to be divided.
-        tree_steps: [tree] into how many it is divided now, which the kernels read.
-        tree_budget: [tree] how each tree's energy is watched.
+        buffers: the solver's memory.
+        launches: the solver's kernels.
+        tree_substeps: [tree] number of substeps into which each tree's step is to be divided.
+        tree_steps: [tree] number of substeps into which it is divided now; the kernels read it.
+        tree_budget: [tree] how closely each tree's energy is watched.
         whole: [tree] bool, trees on wires, whose steps are never divided.
-        tree_rate: [tree] what the kernels write of each tree's speed.
-        lists: int32, what the kernels read: ``stepping`` [tree], all trees; ``divided`` [tree], those of more substeps
-            than one once more; ``groups`` [tree, 2], first place in the list and number of trees; ``floating``,
-            ``divided_floating`` [body], roots of trees of one step and of more; ``levels`` [substep, 2], how many
-            trees and roots take it.
-        counts: [:data:`_COUNTS`] int32, how many entries of these the kernels take.
-        topologies: of the trees.
+        tree_rate: [tree] each tree's fastest rate, which the kernels write.
+        lists: int32 lists that the kernels read. ``stepping`` [tree] has all trees, ``divided`` [tree] has once more
+            those with more than one substep, and ``groups`` [tree, 2] has first place in the list and number of trees
+            of each group. ``floating`` and ``divided_floating`` [body] have the floating roots of trees with one step,
+            and with more. ``levels`` [substep, 2] has the number of trees and of roots that take each substep.
+        counts: [:data:`_COUNTS`] int32, the number of entries of each list that the kernels take.
+        topologies: topologies of the trees.
     """
 
     def __init__(
@@ -1563,31 +1593,32 @@ class StepRunner:
         self.stepped = np.zeros(0, np.int32)
         """The trees of this step [k], sorted."""
         self.is_stepped = np.zeros(len(tree_rate), np.bool_)
-        """Which these are [tree]."""
+        """[tree] Whether a tree is one of :attr:`stepped`."""
         self.fast = np.zeros(0, np.int32)
-        """Those of them whose step is to be divided [k], sorted."""
+        """The trees of :attr:`stepped` whose step is to be divided into substeps [k], sorted."""
         self._whole = 0
         self._kind = (False, False)
         """Whether the integrations of this step keep energy budgets, and whether there are floating roots."""
         self._room = 0
-        """No list of an integration is longer."""
+        """Length of the longest list of an integration."""
         self._levels: Levels = ()
         self._roots = 0
         self._root_levels: Levels = ()
         self._divided = np.zeros(0, np.int32)
-        """Into how many substeps the steps of ``fast`` were divided when the list was put in order [k]."""
+        """[k] Number of substeps of each tree of ``fast`` when the list was last put in order."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
         self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
-        """Place in the list at which each group begins, and the end of the list."""
+        """Place in the list at which each group begins, and as last entry the end of the list."""
         self._whole_groups = 0
-        """Groups of the trees of whole steps: the first ones."""
+        """Number of groups of trees that take whole steps; these groups come first."""
 
     # ------------------------------------------------------------------ which trees, in which order
 
     def list_trees(self, trees: np.ndarray) -> None:
-        """Step these trees [k] from now on, as the model is now; count their substeps if one of both has changed."""
+        """Step these trees [k] from now on, as the model is now. Counts their substeps if the trees or the model have
+        changed."""
         self._launches.upload_changed()
         if self.stepped is trees and not self._launches.substeps_due:
             return
@@ -1607,7 +1638,7 @@ class StepRunner:
         self._order()
 
     def _order(self) -> None:
-        """List the trees by what ``_steps_of`` says of each."""
+        """List the trees by the number of substeps that ``_steps_of`` gives each."""
         trees = self.stepped
         on_cpu = self._buffers.device.is_cpu
         topologies = self._topologies.of(trees)
@@ -1628,7 +1659,7 @@ class StepRunner:
         self._whole_groups = int(np.searchsorted(self._starts, self._whole))
 
     def _divide(self, touched: np.ndarray) -> None:
-        """Divide the coming step of all fast trees but those ``touched`` [k]."""
+        """Divide the coming step of all fast trees except those that are ``touched`` [k]."""
         if len(self.fast) == 0:
             return
         steps = self._substeps[self.fast]
@@ -1641,7 +1672,7 @@ class StepRunner:
             self._order()
 
     def _list_roots(self, roots: np.ndarray, trees: np.ndarray) -> None:
-        """List floating roots [k] (places of bodies) of trees [k] as their trees are listed."""
+        """List floating roots [k] (places of bodies) in the order of substeps of their trees [k]."""
         if len(roots) == 0:
             self._roots = 0
             self._root_levels = ()
@@ -1652,7 +1683,7 @@ class StepRunner:
         self._lists["divided_floating"][: len(roots) - self._roots] = roots[self._roots :]
 
     def _count(self, steps: int = 1) -> None:
-        """Tell the kernels of integrations how many entries of the lists they are to take."""
+        """Tell the kernels of integrations how many entries of each list to take."""
         counts = self._counts
         self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
         self._room = max(len(self.stepped), self._roots + sum(self._root_levels[:1]))
@@ -1678,9 +1709,9 @@ class StepRunner:
             self._launches.shared.predict(groups)
 
     def integrate(self, touched: np.ndarray, roots: np.ndarray, root_trees: np.ndarray) -> None:
-        """Integrate the listed trees, those that are fast and not ``touched`` [k] in substeps.
+        """Integrate the listed trees. Trees that are fast and not ``touched`` [k] take substeps.
 
-        ``roots`` [j]: places of floating roots, of trees ``root_trees`` [j].
+        ``roots`` [j]: places of the floating roots of the trees ``root_trees`` [j].
         """
         self._divide(touched)
         self._list_roots(roots, root_trees)
@@ -1699,7 +1730,8 @@ class StepRunner:
     def advance(
         self, steps: int, roots: np.ndarray, root_trees: np.ndarray, between: Callable[[], None] | None = None
     ) -> None:
-        """Predict and integrate so many times without coming back in between; ``between`` launches what comes there."""
+        """Predict and integrate ``steps`` times without coming back to the host. ``between`` launches what runs between
+        a prediction and its integration."""
         self._divide(np.zeros(0, np.int32))
         self._list_roots(roots, root_trees)
         if len(self.stepped) == 0:
@@ -1730,12 +1762,13 @@ class StepRunner:
 
 
 def _levels(steps: np.ndarray) -> Levels:
-    """How many of some numbers of substeps [k] are above 0, above 1, and so on."""
+    """How many of the numbers ``steps`` [k] are above 0, how many above 1, and so on."""
     return tuple(int(np.count_nonzero(steps > level)) for level in range(int(steps.max(initial=0))))
 
 
 def _by_substeps(items: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, int, Levels]:
-    """Items [k] of so many substeps each: those of one step first, then by falling number; how many of each."""
+    """Sort items [k] by their numbers of substeps ``steps`` [k]: items of one step first, the others by falling number.
+    Returns them, the count of items of one step, and :data:`Levels` of the others."""
     whole = steps == 1
     rest = items[~whole][np.argsort(-steps[~whole], kind="stable")]
     return np.concatenate([items[whole], rest]), int(np.count_nonzero(whole)), _levels(steps[~whole])
@@ -1745,12 +1778,13 @@ def _by_substeps(items: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, int,
 
 
 class Topologies:
-    """Numbers of topologies, equal for trees whose kernels walk from parent to child alike.
+    """Gives each tree the number of its topology. It is equal for trees whose bodies have the same parents.
 
     Args:
-        model: its trees.
-        body_cut: [body] bool, what has been cut off; such a tree shares its topology with none.
-        tree_moving: [tree] bodies that move: all of a tree's, or all but its berry clusters.
+        model: the model whose trees are numbered.
+        body_cut: [body] bool, whether a body has been cut off; a tree with a cut-off body shares its topology with
+            none.
+        tree_moving: [tree] number of bodies that move: all bodies of a tree, or all except its berry clusters.
     """
 
     def __init__(self, model: Model, body_cut: np.ndarray, tree_moving: np.ndarray) -> None:
@@ -1768,7 +1802,7 @@ class Topologies:
         self._coarse, self._fine = (np.array([*map(number, first, size)], np.int64) for size in sizes)
 
     def of(self, trees: np.ndarray) -> np.ndarray:
-        """Numbers of the topologies of trees [k], as they are now [k]."""
+        """[k] Number of the present topology of each of the ``trees`` [k]."""
         is_fine = self._moving[trees] == self._model.tree_size[trees]
         cut = self._model.body_tree[np.flatnonzero(self._body_cut)]
         alone = -1 - trees.astype(np.int64)
@@ -1776,9 +1810,9 @@ class Topologies:
 
 
 def group_starts(topologies: np.ndarray, whole: int) -> np.ndarray:
-    """Where groups of up to eight trees begin in a list, and its end.
+    """Places in a list at which groups of up to eight trees begin, and the end of the list as last entry.
 
-    Neighbours of one topology [k] go together, but none of the first ``whole`` trees with any of the others.
+    Neighbours of one topology [k] form a group. A group never mixes the first ``whole`` trees with the others.
     """
     place = np.arange(len(topologies))
     differs = np.ones(len(topologies), bool)

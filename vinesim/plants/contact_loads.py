@@ -12,11 +12,11 @@ from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants import contact_loads as kernels
 
 LEAST_ROOM = 64
-"""Bodies for which there is room at least."""
+"""Least number of bodies for which the arrays have room."""
 
 
 class ContactLoads:
-    """Sums the wrenches of a step by body."""
+    """Sums the wrenches that act in a step, body by body."""
 
     def __init__(
         self,
@@ -34,11 +34,11 @@ class ContactLoads:
     ) -> None:
         """Args:
         body_tree, place_in_tree: [body] tree of each, and its number there.
-        is_stepped, tree_moving: [tree] whether it was in the last prediction, and how many of its bodies move.
+        is_stepped, tree_moving: [tree] whether a tree was in the last prediction, and how many of its bodies move.
         body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
-        touched, touched_count: [tree], [1] where the touched trees are listed, and how many they are.
+        touched, touched_count: [tree] list of the touched trees, [1] number of its entries.
         euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
-        then: what follows at once: lets what has been summed act on the touched trees.
+        then: launches that follow at once; they let the summed wrenches act on the touched trees.
         """
         self._then = then
         self._touched_count = touched_count
@@ -63,7 +63,7 @@ class ContactLoads:
             share(last_contact, wp.int64),
             share(euler_steps, wp.int32),
         ]
-        self._loaded = self._body = np.zeros(0, np.int32)  # room is made, and the kernel loaded, by the first contact
+        self._loaded = self._body = np.zeros(0, np.int32)  # the first contact makes room and loads the kernel
 
     def _make_room(self, bodies: int) -> None:
         loaded = self._loaded
@@ -80,15 +80,15 @@ class ContactLoads:
         self._load = KernelGraph(load, *self._then)
 
     def __len__(self) -> int:
-        """How many bodies are loaded, those given several times counted so often."""
+        """Number of loads; a body that was given several times counts several times."""
         return int(self._numbers[kernels.LOADED])
 
     def replace(self, bodies: np.ndarray, wrenches: np.ndarray, tick: int) -> np.ndarray:
-        """Load ``bodies`` [k] with ``wrenches`` [k, 6] in step ``tick`` instead of those of the last call, and let them
+        """Replace the wrenches of the last call by ``wrenches`` [k, 6] on ``bodies`` [k] in step ``tick``, and let them
         act.
 
-        A body may be given several times. Returns the trees touched [j], a view of the list. :class:`ValueError`, and
-        nothing is changed, if a body was not in the last prediction.
+        A body may be given several times. Returns the trees touched [j], a view of the list. If a body was not in
+        the last prediction, raises :class:`ValueError` and changes nothing.
         """
         count = len(bodies)
         if count > len(self._body):

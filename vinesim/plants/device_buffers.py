@@ -1,12 +1,12 @@
 """Device buffers: arrays that NumPy and kernels both use, once on a CPU, twice with a GPU.
 
-A kernel walks a tree from parent to child and back. Were its arrays in the host's memory, every step would wait for the
-bus. So with a GPU the host keeps its arrays in pinned memory that the device can reach, the device has a copy of all
-that has a row for each body, and the rows of the awake trees are carried over and back around the kernels that need
-them. Lists and numbers of trees are read where they are.
+A kernel walks a tree from parent to child and back. If its arrays were in the host's memory, every step would wait for
+the bus. So with a GPU the host keeps its arrays in pinned memory that the device can reach, and the device has a copy
+of every array that has a row for each body. The rows of the awake trees are copied to the device before the kernels
+that need them, and back after. Kernels read lists and arrays of trees directly in the host's memory.
 
-The device's copies lie in another order: 32 trees side by side, first their first bodies, then their second ones, as
-far as the largest of them goes. Its 32 threads in step then read one stretch of memory where they would read 32.
+The device's copies have another order: 32 trees lie side by side, first their first bodies, then their second bodies,
+up to the last body of the largest tree. The 32 threads of a warp then read one stretch of memory instead of 32.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ WARP_SIZE = 32
 
 
 class DeviceUnavailable(ValueError):
-    """The text says which device cannot be had, and what to do."""
+    """There is no such device; the text says which device, and what to do."""
 
     exit_code = 3
 
@@ -53,7 +53,8 @@ def find_device(name: str) -> wp.Device:
 
 
 def device_fault(name: str) -> str | None:
-    """Why a device cannot be used now, in words, or None if a number that was written there can be read."""
+    """Test a device: the reason, in words, why it cannot be used now, or None if a number that was written there can be
+    read back."""
     try:
         find_device(name)
         wp.ones(1, dtype=float, device=name).numpy()
@@ -67,27 +68,27 @@ class DeviceBuffers:
 
     Args:
         device: see :func:`find_device`.
-        interleave: how many trees lie side by side in copies that kernels work on, 0 for no copies. Unless given, 0 on
-        the
-            CPU and :data:`WARP_SIZE` with a GPU.
+        interleave: number of trees that lie side by side in the kernels' copies; 0 for no copies. Unless given, 0 on
+            the CPU and :data:`WARP_SIZE` with a GPU.
     """
 
     def __init__(self, device: str, interleave: int | None = None) -> None:
         self.device = find_device(device)
         interleave = (WARP_SIZE if self.device.is_cuda else 0) if interleave is None else interleave
         self.has_copies = interleave > 0
-        """Whether kernels have copies of their own."""
+        """Whether kernels work on copies of their own."""
         self.pitch = max(interleave, 1)
-        """From one body of a tree to the next, as kernels count."""
+        """Distance from one body of a tree to the next in the kernels' arrays [places]."""
         self.arrays: dict[str, wp.array] = {}
-        """What kernels work on."""
+        """The arrays that kernels work on, by name."""
         self.host: dict[str, np.ndarray] = {}
-        """What NumPy works on."""
+        """The arrays that NumPy works on, by name."""
         self._dtypes: dict[str, type] = {}
         self._points: set[str] = set()
 
     def set_layout(self, first: np.ndarray, size: np.ndarray) -> None:
-        """Give each body its place: ``at`` [body], out of ``places``. ``first``, ``size`` [tree] are the model's."""
+        """Give each body its place in the kernels' arrays. ``first``, ``size`` [tree]: first body and number of
+        bodies."""
         trees = np.arange(len(first))
         there = first
         if self.has_copies:
@@ -97,7 +98,7 @@ class DeviceBuffers:
             there = (np.cumsum(deepest) - deepest)[group] * self.pitch + trees % self.pitch
         tree = np.repeat(trees, size)
         self.slots = (there[tree] + (np.arange(len(tree)) - first[tree]) * self.pitch).astype(np.int32)
-        """Where kernels look for each body [body]."""
+        """[body] Place of each body in the kernels' arrays."""
         self.slot_count = int(deepest.sum()) * self.pitch if self.has_copies else len(tree)
         self._largest = int(size.max(initial=1))
         for name, data in (("tree_first", there), ("host_first", first), ("tree_size", size)):
@@ -105,16 +106,17 @@ class DeviceBuffers:
 
     @property
     def max_tree_size(self) -> int:
-        """Bodies of the largest tree."""
+        """Number of bodies of the largest tree."""
         return self._largest
 
     @property
     def max_tree_extent(self) -> int:
-        """Places from the first body of the largest tree to its last, both included."""
+        """Number of places from the first body of the largest tree to its last, both included."""
         return (self._largest - 1) * self.pitch + 1
 
     def pinned(self, data: np.ndarray) -> np.ndarray:
-        """``data`` itself if the device can reach it, a copy that it can reach otherwise: use that from now on."""
+        """``data`` itself if the device can reach it, else a copy that it can reach. Use the returned array from now
+        on."""
         if self.device.is_cpu or data.size == 0:
             return data
         dtype = wp.dtype_from_numpy(data.dtype)
@@ -123,17 +125,19 @@ class DeviceBuffers:
         return pinned
 
     def add_constant(self, name: str, data: np.ndarray, dtype: type) -> None:
-        """An array that is never written."""
+        """Add an array that is never written."""
         self.arrays[name] = wp.array(data, dtype=dtype, device=self.device)
         self.host[name] = data
 
     def add_shared(self, name: str, data: np.ndarray, dtype: type) -> None:
-        """An array that kernels read and write where it is; with a GPU it must come from :meth:`pinned`."""
+        """Add an array that kernels read and write in the host's memory; with a GPU it must come from
+        :meth:`pinned`."""
         self.arrays[name] = self.reach(data, dtype, name)
         self.host[name] = data
 
     def reach(self, data: np.ndarray, dtype: Any, name: str) -> wp.array:
-        """The same memory for kernels; with a GPU it must come from :meth:`pinned`. ``name``: for messages."""
+        """A Warp array on the memory of ``data``; with a GPU ``data`` must come from :meth:`pinned`. ``name`` is for
+        messages."""
         if self.device.is_cpu:
             shared = wp.array(data, dtype=dtype, device="cpu", copy=False)
             if data.size and shared.ptr != data.ctypes.data:
@@ -143,7 +147,7 @@ class DeviceBuffers:
         return wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
 
     def host_array(self, name: str) -> wp.array:
-        """A shared array as one of the host, to be copied from or to."""
+        """A shared array as a Warp array of the host, to be copied from or to."""
         shared = self.arrays[name]
         data = self.host[name]
         if self.device.is_cpu or data.size == 0:
@@ -151,9 +155,9 @@ class DeviceBuffers:
         return wp.array(ptr=data.ctypes.data, shape=shared.shape, dtype=shared.dtype, device="cpu", pinned=True)
 
     def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, body_indices: bool = False) -> None:
-        """An array with a row of four-byte numbers for each body, written by both sides.
+        """Add an array with a row of four-byte numbers for each body, which host and kernels write.
 
-        See :meth:`row_copier` and :meth:`upload`. ``body_indices``: its numbers are bodies, or negative.
+        See :meth:`row_copier` and :meth:`upload`. ``body_indices``: the numbers are indices of bodies, or negative.
         """
         if not self.has_copies:
             self.add_shared(name, data, dtype)
@@ -165,7 +169,7 @@ class DeviceBuffers:
         self.upload([name])
 
     def add_scratch(self, name: str, dtype: type) -> None:
-        """Rows that only kernels see."""
+        """Add an array with a row for each body that only kernels see."""
         self.arrays[name] = wp.empty(self.slot_count, dtype=dtype, device=self.device)
 
     def upload(self, names: list[str]) -> None:
@@ -179,10 +183,10 @@ class DeviceBuffers:
     def row_copier(
         self, names: tuple[str, ...], trees: str, count: wp.array, *, to_host: bool = False
     ) -> Callable[[int], None]:
-        """What copies rows of the first ``count`` [1] trees of a list to the device, or to the host (``to_host``).
+        """A function that copies the rows of the first ``count`` [1] trees of a list to the device, or to the host
+        (``to_host``).
 
-        It is called with a number that the count does not exceed.
-        Nothing happens where both sides share their memory.
+        Its argument is an upper bound of the count. It does nothing where host and kernels share their memory.
         """
         if not self.has_copies:
             return lambda capacity: None

@@ -1,4 +1,4 @@
-"""Equilibrium of single trees: how far they are from it, and how they are put into it."""
+"""Equilibrium of single trees: measures how far trees are from it, and moves them there."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _INPUTS = ("joint_x", "joint_xd", "joint_q", "joint_qd", "body_load", "body_wren
 
 
 class EquilibriumFinder:
-    """Measures trees between steps; see :mod:`vinesim.kernels.plants.residual_motion`."""
+    """Measures how far trees are from equilibrium, between steps; see :mod:`vinesim.kernels.plants.residual_motion`."""
 
     def __init__(self, plants: ArticulationSolver) -> None:
         self._plants = plants
@@ -43,7 +43,8 @@ class EquilibriumFinder:
         self._record(plants)
 
     def _record(self, plants: ArticulationSolver) -> None:
-        """Bind the kernel; scratch, factors and predicted rates are those of a step, unused between steps."""
+        """Bind the kernel. Its scratch, factors and predicted rates are those of a step, which are unused between
+        steps."""
         launches = plants.launches
         s = structs
         fill = launches.fill
@@ -74,8 +75,9 @@ class EquilibriumFinder:
         self._measure = launches.graph(measure)
 
     def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Speed [k] m/s of the fastest point of some trees [k], distance [k] m of the one that is furthest from where
-        it will rest, and whether :meth:`move_to_rest` knows that place [k] bool. Call it after ``integrate()``."""
+        """Speed [k] m/s of the fastest point of each tree [k], distance [k] m of the point that is furthest from its
+        rest position, and [k] bool whether :meth:`move_to_rest` can move the tree there. Call it after
+        ``integrate()``."""
         plants = self._plants
         plants.list_subset(trees)
         plants.launches.upload_changed()
@@ -85,8 +87,8 @@ class EquilibriumFinder:
         return self._speed[trees], self._distance[trees], self._is_free[trees]
 
     def move_to_rest(self, trees: np.ndarray) -> None:
-        """Turn the joints of trees [k] to equilibrium, by a Newton step: the displacement that
-        :meth:`residual_motion` has just found. Only trees that nothing touches and that stand."""
+        """Turn the joints of trees [k] to equilibrium by one Newton step: by the displacement that
+        :meth:`residual_motion` has just found. Only for trees that nothing touches and that stand."""
         plants = self._plants
         plants.list_subset(trees)
         plants.launches.download_impact_rates(len(trees))

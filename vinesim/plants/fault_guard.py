@@ -1,8 +1,8 @@
 """Faults: a tree whose motion is not finite or too fast is stopped, put to sleep and reported; the others go on.
 
 ``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond
-``ArticulationSolver.fault_rate``: its joints stay
-where they were when the tick began, the last state that was sound. Here such trees are found after the integration.
+``ArticulationSolver.fault_rate``: the tree's joints stay where they were when the tick began, in the last valid state.
+This module finds such trees after the integration.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 log = logging.getLogger(__name__)
 
 MAX_PENDING_FAULTS = 1000
-"""Most faults kept for the log between two reports; the count goes on."""
+"""Most faults that are kept for the log between two reports; :attr:`FaultGuard.count` goes on counting."""
 _NO_TREES = np.zeros(0, np.int32)
 
 
@@ -28,7 +28,7 @@ class Fault:
     tick: int
     tree: int
     rate: float
-    """[rad/s] Fastest joint that the tick would have had; NaN if it was not a number."""
+    """[rad/s] Rate that the fastest joint would have had in that tick; NaN if it was not a number."""
 
 
 class FaultGuard:
@@ -37,13 +37,15 @@ class FaultGuard:
     def __init__(self, plants: ArticulationSolver) -> None:
         self.plants = plants
         self.count = np.zeros(len(plants.model.tree_first), np.int32)
-        """Faults of each tree so far [tree]."""
+        """[tree] Number of faults of each tree so far."""
         self.slowed = 0
-        """How often a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from it."""
+        """Number of times that a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from the
+        tree."""
         self._faults: list[Fault] = []
 
     def stop_faulty_trees(self) -> np.ndarray:
-        """After an integration: the trees stopped in it [k], now asleep. Writes no log: see :meth:`report`."""
+        """Put the trees to sleep that the last integration has stopped, and return them [k]. Writes no log: see
+        :meth:`report`."""
         plants = self.plants
         state = self.plants.state
         awake = plants.awake
@@ -61,7 +63,7 @@ class FaultGuard:
         self._faults += [Fault(plants.tick, *what) for what in zip(stopped.tolist(), rates, strict=True)][:room]
         bodies = plants.bodies_of(stopped)
         length = np.square(state.joint_q[bodies], dtype=float).sum(-1)
-        unsound = bodies[~(abs(length - 1.0) < 0.01)]  # a bad pose was written: no good one is left
+        unsound = bodies[~(abs(length - 1.0) < 0.01)]  # an invalid pose was written from outside: no valid one is left
         state.joint_q[unsound] = plants.model.joint_settled[unsound]
         cut = bodies[state.body_cut[bodies]]
         state.joint_xd[cut] = 0.0
@@ -74,7 +76,7 @@ class FaultGuard:
         return stopped
 
     def report(self) -> list[Fault]:
-        """Log what happened since the last report and return it. Call it outside the tick."""
+        """Log the faults since the last report and return them. Call it outside the tick."""
         faults = self._faults
         self._faults = []
         for fault in faults:

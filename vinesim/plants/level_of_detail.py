@@ -14,7 +14,7 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 
 
 class LevelOfDetail:
-    """Refines the trees that an actor is near to or watches, and coarsens them when that is over."""
+    """Refines the trees that an actor is near to or watches, and coarsens them when no actor is near or watches."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is
@@ -24,7 +24,8 @@ class LevelOfDetail:
         self.rest_rate = p.detail_rate
         self.fine_steps = p.steps(p.detail_duration)
         self.rest_steps = p.steps(p.detail_rest_duration)
-        """Steps that a tree stays fine with no actor near, and that its clusters must be at rest by then."""
+        """Number of successive steps for which the clusters of a tree must have been at rest before it is coarsened.
+        ``fine_steps`` is the number of steps that a tree stays fine with no actor near."""
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)
@@ -38,10 +39,12 @@ class LevelOfDetail:
         self._attached = -1
         self._worth = np.zeros(trees, bool)
         self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
-        """Trees of the last :meth:`_rate`, all their clusters, and where those of each tree begin."""
+        """Trees of the last call of :meth:`_rate`, the clusters of all these trees, and where the clusters of each tree
+        begin."""
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:
-        """Look closely at what hangs within ``radius`` [m] of ``points`` [n, 3], until told otherwise; none: stop."""
+        """Refine what hangs within ``radius`` [m] of ``points`` [n, 3], until the next call. No points: nothing is
+        watched."""
         self._points = np.asarray(points, float).reshape(-1, 3)
         self._radius = float(radius)
 
@@ -51,8 +54,8 @@ class LevelOfDetail:
         return self.plants.state.tree_fine.nonzero()[0]
 
     def update(self, near: np.ndarray) -> np.ndarray:
-        """Before ``predict()``: ``near`` [k] are the awake trees that an actor reaches into; those that were coarsened
-        [k] are returned."""
+        """Refine and coarsen trees; call it before ``predict()``. ``near`` [k] are the awake trees that an actor
+        reaches into. Returns the trees [k] that were coarsened."""
         coarsened = near[:0]
         if len(self._clustered) == 0:
             return coarsened
@@ -91,7 +94,7 @@ class LevelOfDetail:
         return left
 
     def _seen(self) -> np.ndarray:
-        """Awake trees [k] with a bunch near a watched point; poses are those of the last tick's start."""
+        """Awake trees [k] with a bunch near a watched point, by the poses at the start of the last tick."""
         state = self.plants.state
         here = np.flatnonzero(state.tree_awake[self._tree] & state.bunch_attached[self._clustered])
         apart = state.body_q[self._bodies[here], None, :3] - self._points
@@ -99,7 +102,7 @@ class LevelOfDetail:
         return np.unique(self._tree[here[close]])
 
     def _rate(self, trees: np.ndarray) -> np.ndarray:
-        """The fastest cluster of each tree [k] rad/s, against what it hangs on."""
+        """[k] rad/s Rate of the fastest cluster of each tree, relative to the body on which it hangs."""
         if not np.array_equal(trees, self._rated_trees):
             model = self.plants.model
             self._rated_trees = trees

@@ -4,15 +4,17 @@ The kernels are those that :class:`vinesim.plants.articulation_solver.Articulati
 with their adjoints. Each tick has arrays of its own, so that the backward pass finds the values of the forward pass.
 Checkpoints bound the memory: the forward pass keeps only the joints, every ``checkpoint`` ticks; the backward pass
 runs each segment forward once more before its adjoint. You compute the loss, in NumPy, PyTorch or by hand:
-:meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient` takes the loss's derivatives by them.
+:meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient` takes the loss's derivatives with respect
+to them.
 docs/gradients.md shows it at work.
 
-A rollout takes whole steps, where the solver divides those of trees that swing above 5 Hz: give those a shorter ``dt``.
+A rollout always takes whole steps, while the solver divides the steps of trees that swing above 5 Hz: use a shorter
+``dt`` for such trees.
 It keeps no energy budget (:mod:`vinesim.kernels.plants.energy_budget`).
 
-The gradient is of the scheme as it steps, so it is exact where the scheme is smooth. It is not at the tick in which a
-joint passes ``fast_rate`` (phi becomes 1), and damping below ``(2 phi - 1) dt`` times stiffness has none: the scheme
-itself damps that much, and asking for less changes nothing.
+The gradient is that of the numerical scheme, so it is exact where the scheme is smooth. The scheme is not smooth at the
+tick in which a joint passes ``fast_rate`` (phi becomes 1). Damping below ``(2 phi - 1) dt`` times stiffness has no
+gradient: the scheme itself damps that much, and less damping changes nothing.
 """
 
 from __future__ import annotations
@@ -40,59 +42,62 @@ _PREDICT, _INTEGRATE, _FORWARD_KINEMATICS = (
 _STRUCT = type(structs.JointState)
 _DEFAULTS = PhysicsParameters()
 _ZERO_INPUTS = ("body_load", "body_wrench")
-"""Inputs that are zero unless given."""
+"""Input arrays that are zero unless :meth:`Rollout.run` is given them."""
 _COUNTER = "tree_euler_steps"
-"""The state that is no number to differentiate by, and counts on where it stands."""
+"""State array that counts the Euler steps still to be taken. It has no gradient, and each tick continues counting from
+its present value."""
 _PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", "body_product", "body_load")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Where the watched bodies were: at the start, and after each tick."""
+    """Motion of the watched bodies: at the start, and after each tick."""
 
     body_q: np.ndarray
-    """[tick + 1, watched, 7] world poses: m, xyzw."""
+    """[tick + 1, watched, 7] World poses: position [m] and quaternion xyzw."""
     body_qd: np.ndarray
     """[tick + 1, watched, 6] velocity of the origin [m/s] and angular velocity [rad/s], world axes."""
     phi: np.ndarray
-    """[tick, tree] the phi that each tick was stepped with: 1 once a joint has turned faster than ``fast_rate``."""
+    """[tick, tree] phi with which each tick was stepped: 1 once a joint has turned faster than ``fast_rate``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Gradient:
-    """Derivative of a loss by what the rollout began with; units are the loss's over the parameter's."""
+    """Derivative of a loss with respect to the inputs of a rollout. Units: the unit of the loss over that of the
+    input."""
 
     stiffness: np.ndarray
-    """[body, 3] by ``joint_stiffness``."""
+    """[body, 3] With respect to ``joint_stiffness``."""
     damping: np.ndarray
-    """[body, 3] by ``joint_damping``."""
+    """[body, 3] With respect to ``joint_damping``."""
     mass: np.ndarray
-    """[body] by ``body_mass``, the moments of inertia scaling along."""
+    """[body] With respect to ``body_mass``; the moments of inertia scale along with the mass."""
     load: np.ndarray
-    """[body, 6] by ``load``."""
+    """[body, 6] With respect to ``load``."""
     rotation: np.ndarray
-    """[body, 3] by a small rotation vector [rad] put in front of the first ``joint_q``, in joint-frame axes."""
+    """[body, 3] With respect to a small rotation vector [rad] in joint-frame axes that is put in front of the first
+    ``joint_q``."""
     joint_qd: np.ndarray
-    """[body, 3] by the first ``joint_qd``."""
+    """[body, 3] With respect to the first ``joint_qd``."""
 
 
 class RolloutDiverged(ValueError):
-    """The text says which tree left what can be simulated, and when."""
+    """A tree left the range that can be simulated; the text says which tree, and when."""
 
 
 class Rollout:
-    """So many ticks of all trees of a model without contacts, and their adjoint.
+    """A number of ticks of all trees of a model without contacts, and their adjoint.
 
     Args:
-        model: constants; what is not given to :meth:`run` is taken from here. It is not written.
-        ticks: how many.
-        watched: bodies [k] whose motion the loss looks at; all that move unless given.
+        model: constants, and the values of inputs that :meth:`run` is not given. It is not written.
+        ticks: number of ticks.
+        watched: bodies [k] whose motion the loss depends on; all moving bodies unless given.
         fine: let the berry clusters of bunches move.
-        dt: tick [s].
+        dt: duration of a tick [s].
         phi: see :class:`vinesim.plants.articulation_solver.ArticulationSolver`; likewise ``fast_rate``,
         ``max_rate``, ``fault_rate`` and ``geometric_stiffness``.
-        checkpoint: ticks between two states that the first run keeps. Memory is about 1.2 kB for each body and tick of
-            one segment, and 56 B for each body and checkpoint.
+        checkpoint: number of ticks between two states that the forward pass keeps. Memory is about 1.2 kB for each body
+            and tick of one segment, and 56 B for each body and checkpoint.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
     """
 
@@ -123,7 +128,7 @@ class Rollout:
         self.fault_rate = fault_rate
         self.device = find_device(device)
         self.state = State.at_rest(model)
-        plants = ArticulationSolver(model, self.state, buffers=DeviceBuffers("cpu"))  # for the arrays of its kernels
+        plants = ArticulationSolver(model, self.state, buffers=DeviceBuffers("cpu"))  # provides the kernels' arrays
         if fine:
             plants.refine(np.arange(len(model.tree_first)))
         self._host = plants.buffers.host
@@ -144,13 +149,14 @@ class Rollout:
             "tree_awake": wp.array(np.ones(trees), dtype=wp.bool, device=self.device),
         }
         self._stacks: dict[str, wp.array] = {}
-        """What each tick of a segment has for itself [slot, tree or body]; states have one slot more."""
+        """Arrays with one entry for each tick of a segment [slot, tree or body]; arrays of states have one slot
+        more."""
         self._record()
         self._checkpoints: list[dict[str, np.ndarray]] = []
         self._at = -1
-        """The segment that lies in the stacks."""
+        """Number of the segment whose values are in the stacks; -1 for none."""
 
-    # there
+    # forward
 
     def run(
         self,
@@ -162,14 +168,14 @@ class Rollout:
         joint_q: np.ndarray | None = None,
         joint_qd: np.ndarray | None = None,
     ) -> Trajectory:
-        """Roll out and return what was watched.
+        """Roll out and return the motion of the watched bodies.
 
         Args:
-            stiffness: [body, 3] N m/rad, ``joint_stiffness``.
-            damping: [body, 3] N m s/rad, ``joint_damping``.
-            mass: [body] kg; moments of inertia scale along.
+            stiffness: [body, 3] N m/rad, replaces ``joint_stiffness``.
+            damping: [body, 3] N m s/rad, replaces ``joint_damping``.
+            mass: [body] kg, replaces ``body_mass``; moments of inertia scale along.
             load: [body, 6] N, N m: a steady wrench at each body's origin, world axes; none unless given.
-            joint_q: [body, 4] joints at the start; the authored shape unless given.
+            joint_q: [body, 4] joint rotations at the start; the authored shape unless given.
             joint_qd: [body, 3] rad/s joint rates at the start; at rest unless given.
         """
         model = self.model
@@ -205,14 +211,15 @@ class Rollout:
         motions[-1] = self._last[1].numpy()[self.watched]
         return Trajectory(poses, motions, phi)
 
-    # and back
+    # backward
 
     def gradient(self, by_q: np.ndarray | None = None, by_qd: np.ndarray | None = None) -> Gradient:
-        """The gradient of a loss of which these are the derivatives by the last run's track.
+        """The gradient of a loss, from the loss's derivatives with respect to the last run's trajectory.
 
         Args:
-            by_q: [tick + 1, watched, 7] by ``body_q``, the four numbers of a quaternion taken one by one.
-            by_qd: [tick + 1, watched, 6] by ``body_qd``.
+            by_q: [tick + 1, watched, 7] derivative with respect to ``body_q``; the four numbers of a quaternion count
+                as independent.
+            by_qd: [tick + 1, watched, 6] derivative with respect to ``body_qd``.
         """
         if not self._checkpoints:
             raise ValueError("there is no run to differentiate; call run() first")
@@ -255,7 +262,8 @@ class Rollout:
     # memory and launches
 
     def _record(self) -> None:
-        """Arrays for every step of a segment, and the launches that work on them, there and back."""
+        """Allocate arrays for every step of a segment, and record the forward and adjoint launches that work on
+        them."""
         self._states = tuple(structs.fields(structs.JointState))
         for name, field in structs.fields(structs.JointState).items():
             self._stacks[name] = self._zeros(name, field.type.dtype, self._slots + 1)
@@ -265,7 +273,7 @@ class Rollout:
         self._last = (self._arrays["end body_q"], self._arrays["end body_qd"])
 
     def _launch(self, kernel: Any, slot: int, end: bool = False) -> tuple[Any, Any]:
-        """The launch of one kernel in one step, and its adjoint."""
+        """The forward launch of one kernel in one step, and its adjoint launch."""
         types = inspect.get_annotations(kernel.func)
         values = [self._argument(kernel, name, kind, slot, end) for name, kind in types.items()]
         adjoints = [self._adjoint(kind, value) for kind, value in zip(types.values(), values, strict=True)]
@@ -274,7 +282,7 @@ class Rollout:
         return wp.launch(kernel, **common), wp.launch(kernel, adj_inputs=adjoints, adjoint=True, **common)
 
     def _argument(self, kernel: Any, name: str, kind: Any, slot: int, end: bool) -> Any:
-        """What an argument is in one step: a struct filled field by field, an array, or a number."""
+        """The value of a kernel argument in one step: a struct filled field by field, an array, or a number."""
         written = name.endswith("_out")
         if not isinstance(kind, _STRUCT):
             return self._value(kernel, name.removesuffix("_out"), kind, written, slot, end)
@@ -284,13 +292,14 @@ class Rollout:
         return filled
 
     def _adjoint(self, kind: Any, value: Any) -> Any:
-        """Where an argument's derivatives are: a struct's arrays bring their own."""
+        """The array of an argument's derivatives. A struct needs none: its arrays have their own."""
         if isinstance(kind, _STRUCT):
             return kind()
         return value.grad if isinstance(value, wp.array) else None
 
     def _value(self, kernel: Any, name: str, kind: Any, written: bool, slot: int, end: bool) -> Any:
-        """What an argument or field of this name is in one step; what no step changes is among the solver's arrays."""
+        """The value of an argument or field of this name in one step. Values that no step changes come from the
+        solver's arrays."""
         if name in self._given:
             return self._given[name]
         dtype = kind.dtype
@@ -326,7 +335,7 @@ class Rollout:
         return [(i, start, min(self._slots, self.ticks - start)) for i, start in enumerate(starts)]
 
     def _replay(self, segment: int, count: int) -> None:
-        """Run one segment from its checkpoint."""
+        """Run one segment again from its checkpoint."""
         for name, value in self._checkpoints[segment].items():
             _fill(self._stacks[name][0], value)
         counter = self._stacks[_COUNTER]
@@ -338,7 +347,8 @@ class Rollout:
         self._at = segment
 
     def _seed(self, grad: wp.array, rows: np.ndarray) -> None:
-        """Write the loss's derivatives of some ticks by the watched bodies, zero by all others."""
+        """Write the loss's derivatives with respect to the watched bodies in some ticks; they are zero for all other
+        bodies."""
         seed = np.zeros((*grad.shape, rows.shape[-1]), np.float32)
         rows_of: Any = (slice(0, len(rows)), self.watched)
         np.add.at(seed.reshape(-1, *seed.shape[-2:]), rows_of, rows)

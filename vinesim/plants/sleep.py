@@ -1,10 +1,11 @@
-"""Sleep of trees: what is at rest is put to sleep, together with all that it touches.
+"""Sleep of trees: a tree at rest is put to sleep, together with all trees that it touches.
 
-A tree is at rest when no point of it is faster than ``sleep_speed`` nor further than ``sleep_distance`` from where it
-will rest. It is then moved there, so that it sleeps in the pose in which it would have come to rest: less than a camera
-sees, and seconds earlier. What is in contact is not moved, since that would change the forces: it must have come much
-nearer to rest by itself. All this is computed (:mod:`vinesim.plants.equilibrium`) only for trees all of whose
-joints have been slower than ``sleep_rate`` for ``sleep_duration``. Trees in contact sleep together (an *island*), and
+A tree is at rest when no point of it is faster than ``sleep_speed``, or further than ``sleep_distance`` from its rest
+position. The tree is then moved into its rest pose, and so sleeps in the pose in which it would have come to rest. The
+motion is smaller than a camera can see, and the tree sleeps seconds earlier. A tree in contact is not moved, since that
+would change the forces: it must come much nearer to rest by itself. All this is computed
+(:mod:`vinesim.plants.equilibrium`) only for trees all of whose joints have been slower than ``sleep_rate`` for
+``sleep_duration``. Trees in contact sleep together (an *island*), and
 only if nothing keeps one of them awake.
 """
 
@@ -38,30 +39,31 @@ _NO_PAIRS = np.zeros((0, 2), np.int32)
 
 
 class SleepMonitor:
-    """Finds which of the awake trees are at rest, and puts those to sleep that nothing keeps awake."""
+    """Finds the awake trees that are at rest, and puts to sleep those that nothing keeps awake."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``parameters``: those that begin with ``sleep_`` say what is at rest."""
+        """``parameters``: those whose names begin with ``sleep_`` define when a tree is at rest."""
         self.plants = plants
         self.rate = parameters.sleep_rate
         self.speed = parameters.sleep_speed
         self.distance = parameters.sleep_distance
         self._equilibrium = EquilibriumFinder(plants)
         self.patience = parameters.steps(parameters.sleep_duration)
-        """Steps that the joints of a tree must be slow before it is measured."""
+        """Number of steps for which the joints of a tree must have been slow before the tree is measured."""
         self._check_steps = parameters.steps(CHECK_PERIOD)
         trees = len(plants.model.tree_first)
         self.quiet_steps = np.zeros(trees, np.int32)
-        """For how many steps the joints of each awake tree have been slow [tree]."""
+        """[tree] Number of successive steps for which the joints of each awake tree have been slow."""
         self._is_at_rest = np.zeros(trees, bool)
         self._still_steps = parameters.steps(STILL_DURATION)
         self._seen_tick = np.full(trees, -1, np.int64)
-        """Tick of each tree's :attr:`_seen_x` [tree]; -1: it has none."""
+        """[tree] Tick in which the positions of each tree were stored in :attr:`_seen_x`; -1 if none are stored."""
         self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
-        """[body, 3] m where bodies were then."""
+        """[body, 3] m Positions of bodies at that tick."""
         self._limit = np.zeros(1, np.float32)
         self._longest = np.zeros(1, np.int32)
-        """[1] What :attr:`rate` is, and for how many steps the joints of the quietest awake tree have been slower."""
+        """[1] Number of steps for which the joints of the quietest awake tree have been slow. ``_limit`` [1] is
+        :attr:`rate`."""
         self._count_quiet_steps = KernelGraph(
             KernelLaunch(
                 count_quiet_steps,
@@ -89,7 +91,7 @@ class SleepMonitor:
         self._forget(trees)
 
     def wake_unbalanced(self) -> None:
-        """Wake the sleeping trees that would not stay where they are."""
+        """Wake the sleeping trees that would not stay in their present pose."""
         asleep = np.flatnonzero(~self.plants.state.tree_awake).astype(np.int32)
         _, distance, _ = self._equilibrium.residual_motion(asleep)
         self.wake(asleep[distance > CONTACT_SHARE * self.distance])
@@ -100,16 +102,16 @@ class SleepMonitor:
         contact_pairs: np.ndarray = _NO_PAIRS,
         is_coupled: np.ndarray | None = None,
     ) -> np.ndarray:
-        """:meth:`watch`, and :meth:`check` where it is due: the trees that have just been put to sleep [k].
+        """Call :meth:`watch`, and :meth:`check` if it is due. Returns the trees that have been put to sleep [k].
 
-        ``keep_awake`` [tree] bool: what an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees that
-        touch each other. ``is_coupled`` [tree] bool: awake trees that wires join to others. They are not moved to rest:
-        where that is depends on the others.
+        ``keep_awake`` [tree] bool: trees that an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees
+        that touch each other. ``is_coupled`` [tree] bool: awake trees that wires join to others. Coupled trees are not
+        moved to their rest poses, since these depend on the other trees.
         """
         return self.check(keep_awake, contact_pairs, is_coupled) if self.watch() else self.plants.awake[:0]
 
     def watch(self) -> bool:
-        """After an integration: note which trees were slow in it; whether some are due for :meth:`check`."""
+        """Note which trees were slow in the last integration. Returns whether some are due for :meth:`check`."""
         plants = self.plants
         self._limit[0] = self.rate
         self._longest[0] = 0
@@ -127,7 +129,7 @@ class SleepMonitor:
         plants = self.plants
         awake = self.plants.awake
         slow = awake[self.quiet_steps[awake] >= self.patience]
-        if keep_awake is not None:  # what is at rest and stays awake all the same is measured when it has moved
+        if keep_awake is not None:  # a tree at rest that is kept awake is measured again only after it has moved
             slow = slow[~(keep_awake[slow] & self._is_at_rest[slow])]
         if len(slow) == 0:
             return slow
@@ -149,7 +151,7 @@ class SleepMonitor:
         return asleep
 
     def _find_still(self, trees: np.ndarray) -> None:
-        """Of slow trees [k] those that have not moved for :data:`STILL_DURATION` are at rest."""
+        """Mark those of some slow trees [k] as at rest that have not moved for :data:`STILL_DURATION`."""
         plants = self.plants
         now = self.plants.tick
         due = trees[(self._seen_tick[trees] >= 0) & (now - self._seen_tick[trees] >= self._still_steps)]
@@ -165,7 +167,7 @@ class SleepMonitor:
             self._seen_tick[late] = now
 
     def _forget(self, trees: np.ndarray) -> None:
-        """Begin to watch trees anew."""
+        """Begin to watch trees from the start."""
         self.quiet_steps[trees] = 0
         self._is_at_rest[trees] = False
         self._seen_tick[trees] = -1

@@ -1,8 +1,9 @@
-"""Ties: springs and dampers that hold bodies at points of the world, the model's and those of hands; rests of roots.
+"""Ties: springs and dampers that hold bodies at points of the world, both the model's ties and those of hands; and the
+rest poses of roots.
 
-The ties of a body are adjacent in the arrays of the kernels. So behind the model's ties there are equal spans for
-bodies
-that are held: a body gets one, its own ties are copied to the front of it, and its hands take the places behind them.
+The ties of a body are adjacent in the kernels' arrays. So behind the model's ties there are spans of equal length for
+bodies that hands hold. Each held body gets one span: its own ties are copied to the front, and the hands that hold it
+take the places behind them.
 """
 
 from __future__ import annotations
@@ -15,8 +16,8 @@ from vinesim.core import frames
 from vinesim.scene.model import Model
 
 TURNING_TIME = 0.05
-"""[s] A tie grips what hangs from it: it resists that it turns, by so much damping for the stiffness that weight gives
-to its swing. GUESSED: a damping ratio of 0.1 where that swings in 1.5 s."""
+"""[s] A tie grips the wood that it holds: it resists rotation. The damping is this time, multiplied by the stiffness
+that weight gives to the swing. GUESSED: a damping ratio of 0.1 for a swing of 1.5 s."""
 
 
 class TieLimitError(ValueError):
@@ -27,9 +28,9 @@ class TieTable:
     """All ties of a solver.
 
     Args:
-        model: its ties come first, sorted by body.
-        max_bodies: so many bodies can be held at once,
-        max_hands: each in so many places.
+        model: its ties come first in the table, sorted by body.
+        max_bodies: largest number of bodies that can be held at once.
+        max_hands: largest number of places in which one body can be held.
     """
 
     def __init__(self, model: Model, max_bodies: int, max_hands: int) -> None:
@@ -42,26 +43,26 @@ class TieTable:
         self._span_size = self._max_model_ties + max_hands
         room = max_bodies * self._span_size
         self.anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
-        """Where ties are held [tie, 3] m, in the world."""
+        """[tie, 3] m, in the world: the points at which ties are held."""
         self.anchor_velocity = np.zeros_like(self.anchor)
-        """How fast that place moves [tie, 3] m/s."""
+        """[tie, 3] m/s: velocity of the anchor."""
         self.axis = np.zeros_like(self.anchor)
-        """Direction of the wire that a tie is bound to [tie, 3], 0 for none."""
+        """[tie, 3] Direction of the wire that a tie is bound to; 0 for a tie that is not bound to a wire."""
         self.softening = np.zeros(len(self.anchor), np.float32)
-        """How much less stiff than the tie alone tie and wire are across the wire [tie] N/m, when all awake trees of it
-        move as one. Only the sleep of trees asks for it."""
+        """[tie] N/m by which tie and wire in series are less stiff across the wire than the tie alone, when all awake
+        trees of the wire move as one. Only the sleep of trees uses it."""
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
-        """[tie] N/m; a tie of zero does nothing."""
+        """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
-        """[tie] N s/m"""
+        """[tie] N s/m damping."""
         self.point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
-        """[tie, 3] m in the body's frame."""
+        """[tie, 3] m, in the body's frame: the point of the body at which the tie acts."""
         ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
         self.span = np.stack([ends[:-1], ends[1:]], -1)
-        """[body, 2] first tie of a body and the one after its last."""
+        """[body, 2] First tie of a body, and the tie after its last."""
         bound = (model.tie_wire >= 0) & (model.fixed_tension[model.tie_wire] > 0.0) if len(model.fixed_tension) else []
         self.on_wire = np.flatnonzero(bound)
-        """Ties of the model that are bound to wires that give [k], sorted."""
+        """Ties of the model that are bound to wires under tension [k], sorted."""
         self._model_span = self.span.copy()
         self._slot_of: dict[int, int] = {}
 
@@ -76,9 +77,9 @@ class TieTable:
         return np.append(self._model_body, np.array(self.held_bodies, np.int32))
 
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
-        """Tie a body with world pose [7] at a point [3] m of its frame, where that is now; returns the tie.
+        """Tie a body to the place where ``point`` [3] m of its frame is at its world pose [7]. Returns the tie's index.
 
-        :class:`TieLimitError` if too many bodies are held, or this one in too many places.
+        :class:`TieLimitError` if too many bodies are held, or this body in too many places.
         """
         if not (np.isfinite(point).all() and 0.0 < stiffness < math.inf and 0.0 <= damping < math.inf):
             raise ValueError(
@@ -132,34 +133,34 @@ class TieTable:
 
 
 class RootRests:
-    """How arms turn the rests of the springs of roots, on which trees stand; see
+    """Rotations by which the arms of cordons turn the rest poses of the root springs of trees; see
     :mod:`vinesim.wires.elastic_supports`."""
 
     def __init__(self, model: Model) -> None:
         trees = len(model.tree_first)
         self.turn = np.zeros((trees, 3), np.float32)
-        """[tree, 3] rad, joint axes."""
+        """[tree, 3] rad: rotation of each tree's rest pose, in joint axes."""
         self.rate = np.zeros((trees, 3), np.float32)
-        """[tree, 3] rad/s, joint axes."""
+        """[tree, 3] rad/s: rate of this rotation, in joint axes."""
         self.softening = np.zeros((trees, 3), np.float32)
-        """The outer product of this [tree, 3] (N m/rad)^(1/2), joint axes, with itself is by what spring and arm are
-        less stiff than the spring alone, when all awake trees of the arm move as one. Only the sleep of trees asks for
-        it."""
+        """[tree, 3] (N m/rad)^(1/2), in joint axes. The outer product of this vector with itself is the stiffness by
+        which spring and arm in series are less stiff than the spring alone, when all awake trees of the arm move as
+        one. Only the sleep of trees uses it."""
 
 
 def turning_damping(model: Model, bodies: np.ndarray, root: np.ndarray, tied: np.ndarray, gravity: float) -> np.ndarray:
-    """How much ties resist that floating components turn [k] N m s/rad: of each component at its root, 0 elsewhere.
+    """Damping [k] N m s/rad by which ties resist the rotation of floating components: given at each root, 0 elsewhere.
 
-    :data:`TURNING_TIME` times the stiffness that weight gives to its swing if it hangs straight down: masses times
-    lengths along the wood to the nearest tie. It depends on the model, the cuts and the ties alone, so it is the same
-    for a client that joins later.
+    It is :data:`TURNING_TIME` times the stiffness that weight gives to the component's swing if it hangs straight down:
+    the sum of weights times lengths along the wood to the nearest tie. It depends on the model, the cuts and the ties
+    alone, so it is the same for a client that joins later.
 
     Args:
-        model: of the trees.
-        bodies: of some whole trees [k].
-        root: [k] the floating root that each moves with, -1 for none.
-        tied: [k] bool, whether it has ties.
-        gravity: [m/s^2]
+        model: model of the trees.
+        bodies: all bodies of some trees [k].
+        root: [k] the floating root that each body moves with, -1 for none.
+        tied: [k] bool, whether each body has ties.
+        gravity: gravitational acceleration [m/s^2].
     """
     damping = np.zeros(len(bodies), np.float32)
     along = np.zeros(len(bodies))
@@ -168,7 +169,7 @@ def turning_damping(model: Model, bodies: np.ndarray, root: np.ndarray, tied: np
         along += np.where(up >= 0, np.linalg.norm(model.body_offset[up], axis=1), 0.0)
         up = np.where(up >= 0, model.body_parent[up], -1)
     tree = model.body_tree[bodies]
-    core = bodies - model.tree_first[tree] < model.tree_core[tree]  # a bunch's mass has its clusters in it
+    core = bodies - model.tree_first[tree] < model.tree_core[tree]  # the mass of a bunch includes its clusters
     middle = along + model.body_com[bodies, 0]
     for cut in np.unique(root[tied & (root >= 0)]):
         own = (root == cut) & core

@@ -1,4 +1,4 @@
-"""Checks of a model and its state before they are simulated: what is refused, and the remedy."""
+"""Checks of a model and its state before they are simulated: errors, and their remedies."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _log = logging.getLogger(__name__)
 
 
 def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
-    """Numbers of trees [k] as an array; :class:`ValueError` naming the first not from 0 to ``count`` - 1."""
+    """Tree indices [k] as an array; :class:`ValueError` naming the first that is not from 0 to ``count`` - 1."""
     trees = np.atleast_1d(trees)
     if len(trees) and (trees.dtype.kind not in "iu" or trees.min() < 0 or trees.max() >= count):
         for tree in trees.tolist():
@@ -83,7 +83,8 @@ def validate(model: Model, state: State) -> None:
 
 
 def _validate_clusters(model: Model) -> None:
-    """Clusters are all that stands behind a tree's core, each run on one bunch."""
+    """Check that the bodies behind a tree's core are exactly its clusters, and that each run of clusters is on one
+    bunch."""
     core = model.tree_core
     size = model.tree_size
     if (bad := (core < 1) | (core > size)).any():
@@ -129,7 +130,7 @@ def _validate_clusters(model: Model) -> None:
 
 
 def _validate_ties(model: Model) -> None:
-    """Ties are sorted, on bodies that are there and always move, and pull back."""
+    """Check that ties are sorted, are on existing bodies that always move, and pull back."""
     body = model.tie_body
     count = len(model.body_mass)
 

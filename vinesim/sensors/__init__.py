@@ -1,1 +1,1 @@
-"""Cameras, lidars and exact truth."""
+"""Cameras, lidars and exact ground truth."""

@@ -1,8 +1,8 @@
 """Ground truth of pictures: which bunches are seen, how much of each, where, and how every pixel moves.
 
 All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
-Everything is tied to ids that are the same on every client: bunch numbers of the model, and berry numbers as
-:func:`vinesim.scene.berries.lay_out_berries` counts them.
+All ids are the same on every client: bunch numbers are those of the model, and berry numbers those of
+:func:`vinesim.scene.berries.lay_out_berries`.
 """
 
 from __future__ import annotations
@@ -28,20 +28,20 @@ from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Detection:
-    """One bunch in one picture."""
+    """One bunch as seen in one picture."""
 
     bunch: int
-    """Index in the model."""
+    """Index of the bunch in the model."""
     pixels: int
-    """How many pixels show it."""
+    """Number of pixels that show the bunch."""
     box: Box
-    """Of those pixels."""
+    """Bounding box of these pixels."""
     distance: float
     """Median depth [m] of the pixels that measured; NaN if none did."""
 
 
 def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
-    """Every bunch of which at least one pixel is seen, by index."""
+    """A detection for every bunch that at least one pixel shows, by index."""
     rows, columns = np.nonzero(frame.labels // LABEL_STRIDE == int(Organ.BUNCH))
     index = frame.labels[rows, columns] % LABEL_STRIDE
     order = np.argsort(index, kind="stable")
@@ -68,23 +68,24 @@ def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PixelBuffers:
-    """What every pixel of an ideal camera sees at one instant."""
+    """The surfaces that every pixel of an ideal camera sees at one instant."""
 
     info: CameraInfo
     pose: np.ndarray
-    """[7] optical frame in the world."""
+    """[7] Pose of the optical frame in the world."""
     primitive: np.ndarray
-    """[height, width] int32; -1 the sky, -2 the ground."""
+    """[height, width] int32, index of the primitive; -1 for the sky, -2 for the ground."""
     depth: np.ndarray
-    """[height, width] float32 m along the axis, exact to 2 um; +Inf for the sky."""
+    """[height, width] float32 m, depth along the optical axis, exact to 2 um; +Inf for the sky."""
     labels: np.ndarray
-    """[height, width] int32, :func:`vinesim.scene.ids.label`."""
+    """[height, width] int32, labels as of :func:`vinesim.scene.ids.label`."""
     berries: np.ndarray
-    """[height, width] int32, number of the berry in its bunch; -1 where none is seen."""
+    """[height, width] int32, number of the berry in its bunch; -1 where no berry is seen."""
     carrier_poses: np.ndarray
-    """[primitive, 7] poses of what carries the primitives, for :func:`optical_flow`."""
+    """[primitive, 7] Pose of the body that carries each primitive, for :func:`optical_flow`."""
     layout_version: int
-    """:attr:`Primitives.built`: only numbers of the same set of primitives mean the same."""
+    """:attr:`Primitives.layout_version`. Indices of primitives are comparable only between buffers of the same
+    version."""
 
 
 def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -> PixelBuffers:
@@ -105,12 +106,12 @@ def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -
 
 
 def _primitives_shown(primitives: Primitives) -> np.ndarray:
-    """Whether each primitive is there [primitive]."""
+    """[primitive] Whether each primitive is drawn."""
     return np.repeat(primitives.clusters_shown(), primitives.cluster_size)
 
 
 def _berry_numbers(primitives: Primitives) -> np.ndarray:
-    """Number of the berry in its bunch [primitive], -1 for all that is no berry."""
+    """[primitive] Number of the berry in its bunch, -1 for primitives that are not berries."""
     kind = np.repeat(primitives.cluster_kind, primitives.cluster_size)
     fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _primitives_shown(primitives))
     bunch = primitives.label[fruit]
@@ -123,9 +124,10 @@ def _berry_numbers(primitives: Primitives) -> np.ndarray:
 def bunch_truths(
     primitives: Primitives, snapshot: Snapshot, seen: PixelBuffers, caster: RayCaster | None = None
 ) -> tuple[BunchTruth, ...]:
-    """Every bunch of which some pixel would be seen if it were alone, by index.
+    """Every bunch that would cover a pixel if it were the only object in the scene, by index.
 
-    ``primitives`` as posed by ``snapshot`` when ``seen`` was taken; ``caster`` saves building one.
+    ``primitives`` must be posed to the ``snapshot`` at which ``seen`` was rendered. A given ``caster`` for them saves
+    the time to build one.
     """
     info = seen.info
     drawn = lens_map(seen.info).pinhole
@@ -142,10 +144,10 @@ def bunch_truths(
 def visible_bunches(
     primitives: Primitives, snapshot: Snapshot, info: CameraInfo, pose: np.ndarray, drawn: CameraRasterizer
 ) -> tuple[BunchTruth, ...]:
-    """Every bunch of which at least one pixel is seen, by index, at the cost that a live picture may have.
+    """Every bunch that at least one pixel shows, by index, computed fast enough for live pictures.
 
-    ``drawn`` holds what was seen from ``pose`` [7] of ``primitives`` as posed by ``snapshot``; its keys are drawn anew.
-    A cut point counts as seen if the pixel that it is in shows its own peduncle, which takes no rays.
+    ``drawn`` holds the view from ``pose`` [7] of ``primitives``, posed to ``snapshot``; its keys are overwritten. A cut
+    point counts as seen if the pixel in which it lies shows its own peduncle; this test needs no rays.
     """
     view = lens_map(info)
     shape = view.pinhole.height, view.pinhole.width
@@ -160,7 +162,7 @@ def visible_bunches(
 
 @dataclasses.dataclass(frozen=True)
 class _Look:
-    """What one camera sees from where it is; ``rasterizer`` draws bunches alone."""
+    """The view of one camera from its present pose; ``rasterizer`` draws single bunches."""
 
     primitives: Primitives
     snapshot: Snapshot
@@ -171,12 +173,12 @@ class _Look:
     labels: np.ndarray
 
     def pixel(self, point: np.ndarray) -> np.ndarray | None:
-        """Column and row [2] of a point [3] m in the world; None behind the camera."""
+        """Pixel column and row [2] of a point [3] m in the world; None for a point behind the camera."""
         local = frames.rotate(frames.conjugate(self.pose[3:]), point - self.pose[:3])
         return project_points(local, self.info) if local[2] > 0.0 else None
 
     def shows_peduncle(self, bunch: int, point: np.ndarray) -> bool:
-        """Whether the pixel that ``point`` [3] m is in shows the peduncle of a bunch."""
+        """Whether the pixel in which ``point`` [3] m lies shows the peduncle of a bunch."""
         pixel = self.pixel(point)
         if pixel is None or not _inside(pixel, self.info):
             return False
@@ -184,9 +186,9 @@ class _Look:
         return bool(self.labels[row, column] == label(Organ.PEDUNCLE, bunch))
 
     def bunches(self, bunches: np.ndarray, cuts: dict[int, np.ndarray], clear: set[int]) -> Iterator[BunchTruth]:
-        """Those of some bunches [k] of which a pixel would be seen if they were alone.
+        """The truth of those bunches among some bunches [k] that would cover a pixel if they were alone in the scene.
 
-        ``cuts``: points [3] m by bunch; ``clear``: bunches whose cut point nothing hides.
+        ``cuts``: cut points [3] m by bunch. ``clear``: bunches whose cut point nothing hides.
         """
         p = self.primitives
         snapshot = self.snapshot
@@ -235,19 +237,20 @@ class _Look:
 
 
 def _cut_points(model: Model, snapshot: Snapshot, bunches: np.ndarray) -> dict[int, np.ndarray]:
-    """Cut points [3] m of those of some bunches [k] that still hang."""
+    """Cut points [3] m of those bunches among some bunches [k] that still hang."""
     hanging = bunches[snapshot.bunch_attached[bunches]].tolist()
     return {bunch: cut_point(model, snapshot.body_q, bunch) for bunch in hanging}
 
 
 def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
-    """Middle of a hanging bunch's peduncle [3] m, along its axis, for world poses of the bodies [body, 7]."""
+    """Cut point [3] m of a hanging bunch: the middle of its peduncle along the axis. ``body_q`` [body, 7]: world
+    poses."""
     stalk = []
     body = int(model.body_parent[model.bunch_body[bunch]])
     while body >= 0 and model.body_organ[body] == int(Organ.PEDUNCLE):
         stalk.insert(0, body)
         body = int(model.body_parent[body])
-    if not stalk:  # it sits on the cane itself
+    if not stalk:  # the bunch sits on the cane itself
         return np.asarray(body_q[model.bunch_body[bunch], :3], float)
     ends = np.cumsum(model.body_length[stalk], dtype=float)
     half = 0.5 * ends[-1]
@@ -258,11 +261,12 @@ def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
 
 
 def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray, np.ndarray]:
-    """How the surface points of one picture move to another: of the camera, of the plants, or of both.
+    """Optical flow from one picture to another, by motion of the camera, of the plants, or of both.
 
-    Displacement [height, width, 2] of each pixel's point, columns and rows [px], exact for the point that its ray
-    meets and that then moves with what carries it; NaN for the sky and for what has come behind the camera. And
-    whether the second picture shows the same primitive there [height, width].
+    Returns the displacement [height, width, 2] of each pixel's surface point, columns and rows [px]. It is exact for
+    the point that the pixel's ray meets, which moves with the body that carries it. It is NaN for the sky, and for
+    points that are behind the camera in the second picture. Also returns whether the second picture shows the same
+    primitive at the new place [height, width].
     """
     if first.layout_version != second.layout_version:
         raise ValueError("things came or went between the two looks; flow needs the same ones in both")
@@ -278,11 +282,11 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     )
     local = np.stack([across * z, down * z, z], 1)
     point = first.pose[:3] + frames.rotate(first.pose[3:], local)
-    solid = primitive >= 0  # the ground stays
+    solid = primitive >= 0  # the ground does not move
     before, after = (one.carrier_poses[primitive[solid]] for one in (first, second))
     attached = frames.rotate(frames.conjugate(before[:, 3:]), point[solid] - before[:, :3])
     moved = point.copy()
-    # as a difference, so that what did not move does not move by a rounding either
+    # as a difference, so that rounding does not displace points that did not move
     still = frames.rotate(before[:, 3:], attached) + before[:, :3]
     moved[solid] += frames.rotate(after[:, 3:], attached) + after[:, :3] - still
     there = project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
@@ -297,7 +301,7 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
 
 
 def _visible_cut_points(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
-    """Bunches between whose cut point and the eye there is nothing but their own peduncle."""
+    """Bunches whose cut point is visible from the eye: nothing but the bunch's own peduncle lies between."""
     if not points:
         return set()
     bunch = np.array(list(points))
@@ -308,9 +312,10 @@ def _visible_cut_points(caster: RayCaster, eye: np.ndarray, points: dict[int, np
 
 
 def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose [7] and edges [3] m of the tightest box of this orientation around spheroids and cones [k]."""
+    """Pose [7] and edge lengths [3] m of the tightest box around spheroids and cones [k] with the orientation
+    ``turn``."""
     back = frames.conjugate(np.asarray(turn, float))
-    start, end = (frames.rotate(back, v[:, :3].astype(float)) for v in (a, b))  # of a spheroid, end is its axis
+    start, end = (frames.rotate(back, v[:, :3].astype(float)) for v in (a, b))  # for a spheroid, end is its axis
     radius = a[:, 3:].astype(float)
     other = b[:, 3:].astype(float)
     round_one = (kind == SPHEROID)[:, None]
@@ -322,7 +327,8 @@ def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray
 
 
 def _box_of(mask: np.ndarray, window: Box) -> Box | None:
-    """Box in the picture of a mask [rows, columns] of a window of it; None for an empty mask."""
+    """Bounding box, in the picture, of a mask [rows, columns] of a ``window`` of the picture; None for an empty
+    mask."""
     rows = np.flatnonzero(mask.any(1))
     columns = np.flatnonzero(mask.any(0))
     if not len(rows):

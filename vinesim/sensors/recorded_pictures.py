@@ -1,6 +1,6 @@
 """RGB-D pictures that were recorded: from rosbag2's MCAP files, without ROS, or a folder as ``vinesim dataset`` writes.
 
-Of ROS messages (CDR, XCDR1) only sensor_msgs/Image and CameraInfo are read, by their definitions.
+The only ROS messages read (CDR, XCDR1) are sensor_msgs/Image and CameraInfo, by their definitions.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from mcap.reader import make_reader
 from vinesim.scene.values import CameraFrame, CameraInfo
 
 LEVEL_POSE = np.array([0.0, 0.0, 0.0, -np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
-"""[7] Optical frame of a level camera that looks along the world's y: x to the right, z up."""
+"""[7] Pose of the optical frame of a level camera that looks along the world's y axis: x to the right, z up."""
 PAIR_TIME = 0.01
-"""[s] Most between the stamps of a picture's colours and its depth."""
+"""[s] Longest time between the stamps of a colour picture and of its depth picture."""
 IMAGE = "sensor_msgs/msg/Image"
 INFO = "sensor_msgs/msg/CameraInfo"
 _COLOURS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0])}
-"""Channels of an encoding, and which of them are red, green and blue."""
+"""For each encoding: number of channels, and the channels that are red, green and blue."""
 _DEPTHS = {"32FC1": "f4", "16UC1": "u2", "mono16": "u2"}
 _LENSES = ("plumb_bob", "rational_polynomial", "")
 
 
 class RecordedPicturesError(ValueError):
-    """Recorded pictures that cannot be used; one line with file, topic and remedy."""
+    """Recorded pictures cannot be used; the text is one line with file, topic and remedy."""
 
 
 def read_pictures(
@@ -44,17 +44,17 @@ def read_pictures(
     pose: np.ndarray | None = None,
     rate: float | None = None,
 ) -> Iterator[CameraFrame]:
-    """The pictures of an MCAP file, a rosbag2 folder of such, or a data set, in the order of time, one at a time.
+    """Yield the pictures of an MCAP file, of a rosbag2 folder with such files, or of a data set, in the order of time.
 
-    A picture of colours without its depth has depth NaN.
+    A colour picture for which there is no depth has depth NaN.
 
     Args:
         path: file or folder.
-        image: topic of the colours; the only one that is called so (rgb or color) unless given. ``camera_info`` stands
-            beside it.
-        depth: topic of the depth, aligned with the colours; found likewise.
-        pose: [7] of the optical frame in the world; that of the data set, or :data:`LEVEL_POSE`, unless given.
-        rate: pictures a second of a data set whose records have no ``time``.
+        image: topic of the colours; unless given, the only one with rgb or color in its name. ``camera_info`` is read
+            from the same namespace.
+        depth: topic of the depth, aligned with the colours; found in the same way unless given.
+        pose: [7] pose of the optical frame in the world; unless given, that of the data set, or :data:`LEVEL_POSE`.
+        rate: pictures a second [Hz] of a data set whose records have no ``time``.
 
     :class:`RecordedPicturesError` before the first picture if there is none, or for one that cannot be read.
     """
@@ -110,7 +110,7 @@ def _png(file: pathlib.Path, flags: int) -> np.ndarray:
 
 
 def _metres(depth: np.ndarray) -> np.ndarray:
-    """Depth in metres, NaN where there is none, of metres or 16-bit millimetres."""
+    """Depth in metres, NaN where there is none, from an array in metres or 16-bit millimetres."""
     if depth.dtype.kind == "u":
         return np.where(depth > 0, 1e-3 * depth, np.nan).astype(np.float32)
     return np.where(depth > 0.0, depth, np.nan).astype(np.float32)
@@ -148,7 +148,7 @@ def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: 
 
 
 def _topics(files: list[pathlib.Path]) -> dict[str, str]:
-    """Type by topic."""
+    """Message type of each topic, by topic."""
     types: dict[str, str] = {}
     for file in files:
         try:
@@ -163,7 +163,7 @@ def _topics(files: list[pathlib.Path]) -> dict[str, str]:
 
 
 def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[str, ...], option: str) -> str:
-    """A topic of images: the one that was given, or the only one with one of these words."""
+    """Choose a topic of images: the given one, or else the only one whose name contains one of these words."""
     images = sorted(topic for topic, kind in types.items() if kind == IMAGE)
     if given is not None:
         if given not in images:
@@ -202,7 +202,7 @@ def _pair(
     pose: np.ndarray,
     last: bool,
 ) -> Iterator[CameraFrame]:
-    """Pictures of colours that have met their depth, or can no more."""
+    """Colour pictures whose depth picture has been found, or can no longer come."""
     while waiting:
         time, rgb = waiting[0]
         while depths and depths[0][0] < time - PAIR_TIME:
@@ -223,11 +223,11 @@ def _pair(
 
 @dataclasses.dataclass(slots=True)
 class _Cdr:
-    """Reads a serialised message, member by member."""
+    """Reads the members of a serialised CDR message, one after the other."""
 
     data: bytes
     at: int = 4
-    """After the encapsulation, from which alignment counts."""
+    """Position in the message, after the encapsulation header; alignment counts from there."""
 
     def number(self, code: str) -> Any:
         size = struct.calcsize(code)
@@ -247,14 +247,14 @@ class _Cdr:
         return self.block().rstrip(b"\0").decode()
 
     def stamp(self) -> float:
-        """[s] Of a header; its frame is skipped."""
+        """Read a header: its stamp [s]. The frame is skipped."""
         time = self.number("i") + 1e-9 * self.number("I")
         self.text()
         return time
 
 
 def _read_image(data: bytes) -> tuple[float, np.ndarray]:
-    """Stamp [s], and colours uint8 or depth [m]."""
+    """Stamp [s] of an image message, and its colours uint8 or its depth [m]."""
     cdr = _Cdr(data)
     time = cdr.stamp()
     height = cdr.number("I")

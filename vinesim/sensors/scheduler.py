@@ -1,7 +1,8 @@
 """The schedule of a robot's sensors: it renders those that are due and wanted, and counts the frames that are late.
 
-A sensor renders a whole frame at once, from the newest snapshot; so do cameras. A swept sensor takes at every snapshot
-the parts that are due, from where it was at each of them, and delivers a frame after the last: so do lidars.
+Most sensors, such as cameras, render a whole frame at once, from the newest snapshot. A swept sensor, such as a lidar,
+takes at every snapshot the parts of a frame that are due, each from the pose at its own time, and delivers the frame
+after the last part.
 """
 
 from __future__ import annotations
@@ -20,17 +21,18 @@ from vinesim.sensors.sensor import Sensor, SweptSensor
 from vinesim.wind.sway import Sway
 
 LEAST_RATE_MARGIN = 0.9
-"""Live sensors are taken so much more often than their least rate asks, since snapshots come at whole steps."""
+"""Margin on the least rate of live sensors: snapshots come at whole steps, so sensors are taken more often than the
+least rate requires, by the inverse of this factor."""
 COST_GAIN = 0.3
-"""Share of the newest frame in the time that frames take."""
+"""Weight of the newest frame in the smoothed time that frames take."""
 
 DemandQuery = Callable[[], CameraOutput]
-"""The outputs of a sensor that are wanted now: it renders if there is any."""
+"""Gives the outputs of a sensor that are wanted now. The sensor renders if there is any."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ScheduledSensor:
-    """One sensor, the callback for its output, and what is wanted of it."""
+    """One sensor, the callback for its frames, and the outputs that are wanted of it."""
 
     sensor: Sensor
     deliver: Callable[[Any], None]
@@ -39,7 +41,7 @@ class ScheduledSensor:
     rate: float | None = None
     """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
     present_rate: Callable[[], float] | None = None
-    """The same where it may change, asked before every frame."""
+    """Frames a second of simulation time [Hz] where that may change: a function that is called before every frame."""
 
     @property
     def period(self) -> float:
@@ -50,12 +52,12 @@ class ScheduledSensor:
 
     @property
     def name(self) -> str:
-        """The sensor's name, which its pose carries too."""
+        """The sensor's name; its pose has the same name."""
         return self.sensor.name
 
 
 SensorPoses = Mapping[str, np.ndarray]
-"""World pose [7] of each sensor by name; of a camera that of its optical frame."""
+"""World pose [7] of each sensor, by name; for a camera the pose of its optical frame."""
 
 
 class SensorScheduler:
@@ -78,9 +80,9 @@ class SensorScheduler:
         self.sensors = tuple(sensors)
         self.primitives = primitives or Primitives(model)
         self.frames = dict.fromkeys(names, 0)
-        """Frames delivered by each sensor."""
+        """Number of frames that each sensor has delivered, by name."""
         self.dropped = dict.fromkeys(names, 0)
-        """Frames that were due and not rendered in time, by sensor."""
+        """Number of frames of each sensor that were due and were not rendered in time, by name."""
         self._next_time = dict.fromkeys(names, -np.inf)
         self._is_first = dict.fromkeys(names, True)
         """Whether a sensor has delivered at most one frame since it became wanted; the first may take longer."""
@@ -95,12 +97,13 @@ class SensorScheduler:
         """Real time that the present frame of each swept sensor has taken so far [s]."""
         self._sway = Sway(model)
         self._moved = np.zeros(len(model.tree_first), bool)
-        """[tree] whether it moved since the primitives were posed."""
+        """[tree] Whether each tree has moved since the primitives were last posed."""
 
     def warm_up(self, snapshot: Snapshot, poses: SensorPoses) -> Iterator[str]:
-        """Render one frame of every sensor and discard it; yields the name of each before.
+        """Render one frame of every sensor and discard it; yields the name of each sensor before its frame.
 
-        The first of each takes many times as long as the others: buffers, tables and the last kernels are made.
+        The first frame of a sensor takes many times as long as later ones: it makes buffers, tables and the last
+        kernels.
         """
         outputs = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
         self._update_primitives(snapshot, poses)
@@ -111,9 +114,10 @@ class SensorScheduler:
     def advance(
         self, snapshot: Snapshot, poses: SensorPoses, earlier: Sequence[tuple[float, SensorPoses]] = ()
     ) -> None:
-        """Render and deliver what is due in the newest snapshot, its ``moved_trees`` being those since the last call.
+        """Render and deliver the frames that are due, from the newest snapshot.
 
-        ``earlier``: poses of the sensors between the last call and this one, with their times [s].
+        Its ``moved_trees`` must be those that moved since the last call. ``earlier``: poses of the sensors between the
+        last call and this one, with their times [s].
         """
         self._moved[snapshot.moved_trees] = True
         for name, sweep in self._sweeps.items():
@@ -149,15 +153,15 @@ class SensorScheduler:
             self._unfinished[name] = 0.0
 
     def horizon(self) -> float:
-        """Simulated time [s] that the world must not pass before a newer snapshot is taken, or a wanted sensor falls
-        below the rate that its mode promises; infinite if none is wanted."""
+        """Simulated time [s] that the world must not pass before a newer snapshot is taken. Beyond it a wanted sensor
+        would fall below the rate that its mode promises. Infinite if no sensor is wanted."""
         return min(
             (max(self._taken[one.name] + self._gap(one), self._due_time(one)) for one in self._wanted()), default=np.inf
         )
 
     def sustainable_factor(self) -> float:
-        """The largest real-time factor at which the wanted sensors keep the rate that their mode promises, by what
-        their frames took lately; infinite if none is wanted."""
+        """The largest real-time factor at which the wanted sensors keep the rate that their mode promises, from the
+        time that their last frames took. Infinite if no sensor is wanted."""
         load = sum(self._costs.get(one.name, 0.0) / self._gap(one) for one in self._wanted())
         return 1.0 / load if load > 0.0 else np.inf
 
@@ -172,11 +176,11 @@ class SensorScheduler:
         return max(scheduled.period, LEAST_RATE_MARGIN / self._pacing.least_rate) if is_live else scheduled.period
 
     def _due_time(self, scheduled: ScheduledSensor) -> float:
-        """When the next frame that is rendered at once is due [s]: the world must get so far."""
+        """Simulated time [s] at which the next frame is due, of a sensor that renders whole frames."""
         return -np.inf if scheduled.name in self._sweeps else self._next_time[scheduled.name]
 
     def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> Snapshot:
-        """Pose the primitives; the snapshot as it is drawn, good until the next call."""
+        """Pose the primitives. Returns the snapshot as it is drawn, valid until the next call."""
         eye = next((pose[:3] for pose in poses.values()), None)
         seen = self._sway.apply(snapshot, np.flatnonzero(self._moved), eye)
         self.primitives.update(seen, seen.moved_trees)
@@ -184,7 +188,7 @@ class SensorScheduler:
         return seen
 
     def _results(self, scheduled: ScheduledSensor, snapshot: Snapshot, pose: np.ndarray) -> Iterator[SensorFrame]:
-        """Render what a sensor has to deliver of a snapshot that the primitives show."""
+        """Render the frames that a sensor has to deliver from a snapshot, to which the primitives are posed."""
         sweep = self._sweeps.get(scheduled.name)
         if sweep is None:
             yield scheduled.sensor.frame(self.primitives, snapshot, pose, scheduled.wanted())

@@ -1,4 +1,4 @@
-"""What the schedule, the sensor process and the command line know of any sensor that is rendered."""
+"""Interfaces through which the scheduler, the sensor process and the command line use any rendered sensor."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 class Sensor(Protocol):
-    """One sensor. It renders what :class:`Primitives` show, from a pose in the world."""
+    """One sensor. It renders the present state of the :class:`Primitives`, from a pose in the world."""
 
     name: str
 
     @property
     def rate(self) -> float:
-        """Frames a second [Hz]."""
+        """Frame rate [Hz]."""
         ...
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> SensorFrame:
-        """One frame from ``pose`` [7] at the time of ``snapshot``, which the primitives show; ``outputs`` of it are
-        needed."""
+        """One frame from ``pose`` [7] at the time of ``snapshot``, to which the primitives are posed. Only ``outputs``
+        of the frame are needed."""
         ...
 
 
@@ -36,22 +36,22 @@ class Sweep(Protocol):
     """Frames that a sensor takes little by little, each part at its own time and from where the sensor was then."""
 
     dropped: int
-    """Frames that could not be begun in time."""
+    """Number of frames that could not be begun in time."""
 
     def add_pose(self, time: float, pose: np.ndarray) -> None:
-        """The sensor was at ``pose`` [7] at ``time`` [s]."""
+        """Record that the sensor was at ``pose`` [7] at ``time`` [s]."""
         ...
 
     def set_demand(self, period: float, outputs: CameraOutput) -> None:
-        """From the next frame on: the time between two [s], and what is needed of them."""
+        """Set the time between two frames [s] and the outputs that are needed, from the next frame on."""
         ...
 
     def is_due(self, now: float) -> bool:
-        """Whether there is something to take at ``now`` [s]."""
+        """Whether a part of a frame is due at ``now`` [s]."""
         ...
 
     def advance(self, primitives: Primitives, now: float) -> Iterator[SensorFrame]:
-        """Take what is due at ``now`` [s]; yields the frames that this completes."""
+        """Take the parts that are due at ``now`` [s]; yields the frames that this completes."""
         ...
 
     def cancel(self, now: float) -> None:
@@ -61,65 +61,67 @@ class Sweep(Protocol):
 
 @runtime_checkable
 class SweptSensor(Protocol):
-    """A :class:`Sensor` whose frames take time."""
+    """A :class:`Sensor` that takes the parts of a frame at different times."""
 
     def sweep(self, rate: float | None) -> Sweep:
-        """Its frames, ``rate`` a second [Hz], at most its own rate, which counts unless given."""
+        """The sweep of this sensor, with ``rate`` frames a second [Hz]: at most the sensor's own rate, and that rate
+        unless given."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SensorSetting:
-    """What a sensor is made for, beside its mount."""
+    """Settings with which a sensor is made, in addition to its mount."""
 
     sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
-    """Towards the sun, or where it is when."""
+    """Unit vector towards the sun, or a function that gives it for a time."""
     seed: int = 0
-    """With the sensor's name and the number of the frame it decides the noise."""
+    """Seed of the noise. The noise follows from the seed, the sensor's name and the number of the frame."""
     number: int = 0
-    """Of its first frame."""
+    """Number of the sensor's first frame."""
     device: str = "cpu"
     threads: int | None = None
-    """Threads of the CPU that draw; as many as there are cores, up to four, unless given."""
+    """Number of CPU threads that draw; the number of cores, up to four, unless given."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Export:
-    """What a data set keeps of one frame."""
+    """The part of a frame that a data set stores."""
 
     images: dict[str, np.ndarray]
-    """By name: RGB uint8 or grey uint16 [height, width]."""
+    """Images by name: RGB uint8 or grey uint16 [height, width]."""
     record: dict[str, Any]
-    """What the numbers in the images mean, as JSON."""
+    """Meaning of the numbers in the images, as JSON."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SensorMaker:
-    """A kind of sensor, as this package knows it: ``MAKER`` of the module that its
+    """Makes the sensors of one kind. It is ``MAKER`` of the module that the kind's
     :class:`~vinesim.scene.values.SensorKind` names."""
 
     rate: Callable[[str], float]
-    """Rate of the sensor with a data file of this name [Hz]; :class:`~vinesim.sensors.spec_file.SensorError` if the
+    """Frame rate [Hz] of a sensor, by the name of its data file; :class:`~vinesim.sensors.spec_file.SensorError` if the
     file cannot be used."""
     make: Callable[[Any, SensorSetting], Sensor]
-    """The sensor of a mount of this kind."""
+    """Makes the sensor of a mount of this kind."""
     load_kernels: Callable[[], None]
-    """Compiles its kernels for the CPU, or reads them from the cache, before the first frame is due."""
+    """Compiles the CPU kernels of this kind, or reads them from the cache, before the first frame is due."""
     channels: Callable[[str], tuple[str, ...]] = lambda _: ()
-    """Names of the images of a sensor where its data file decides which there are."""
+    """Names of the images of a sensor, by the name of its data file, where the file decides which images there are."""
     export: Callable[[Any], Export] | None = None
-    """What a data set keeps of its frames; None: nothing."""
+    """Converts a frame to what a data set stores; None: a data set stores nothing of this kind."""
 
 
 def maker(kind: str) -> SensorMaker:
-    """What makes sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    """The maker of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     return importlib.import_module(SENSOR_KINDS[kind].maker).MAKER
 
 
 def export_frame(
     mount: RenderedMount, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, setting: SensorSetting
 ) -> Export:
-    """What a data set keeps of one frame of a sensor, made for it, from ``pose`` [7]; its kind must have an export."""
+    """Make a sensor, take one frame from ``pose`` [7], and return what a data set stores of it; its kind must have an
+    export."""
     kind = maker(mount.kind)
     assert kind.export is not None
     whole = SENSOR_KINDS[mount.kind].whole

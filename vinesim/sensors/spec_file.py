@@ -1,4 +1,5 @@
-"""Sensor data files: every number with unit, grade and source; wrong units, absurd values: refused in one line."""
+"""Sensor data files. Every number has unit, grade and source; a wrong unit or an absurd value is refused in one
+line."""
 
 from __future__ import annotations
 
@@ -17,7 +18,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sourced list of numbers."""
+    """A list of numbers with unit, grade and source."""
 
     value: tuple[float, ...]
     unit: str
@@ -26,13 +27,13 @@ class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SensorError(DataError):
-    """A sensor's file that cannot be used. The text is one line."""
+    """A sensor's data file cannot be used. The text is one line."""
 
 
 def load(folder: str, name: str, kind: type[T]) -> T:
-    """The file ``name``, or the one of that name in ``data/<folder>``, as a ``kind``.
+    """Read the file ``name``, or the one of that name in ``data/<folder>``, as a struct of type ``kind``.
 
-    Its fields say what is checked: ``Annotated[Number, unit, (lowest, highest)]``.
+    The fields of ``kind`` declare unit and range: ``Annotated[Number, unit, (lowest, highest)]``.
     """
     path = find_data_file(folder, name, ".toml")
     spec = load_toml(path, kind, SensorError)
@@ -61,5 +62,6 @@ def _check(path: pathlib.Path, spec: msgspec.Struct, place: str = "") -> None:
 
 
 def noise_rng(seed: int, name: str, number: int) -> np.random.Generator:
-    """Random numbers of one image or revolution: the same for the same (seed, sensor, number), on every machine."""
+    """Random generator for one image or revolution. It gives the same numbers for the same (seed, sensor, number), on
+    every machine."""
     return np.random.default_rng([seed & 0xFFFFFFFF, zlib.crc32(name.encode()), number & 0xFFFFFFFF])

@@ -1,15 +1,15 @@
-"""Wires that give to what presses on them: the springs that contacts end at, and where their geoms are.
+"""Wires that give under contacts: the springs behind the contacts, and the positions of the wires' geoms.
 
-A wire has no mass here (see :mod:`vinesim.wires.elastic_supports`). So a contact with it is one with a spring
-of the wire's stiffness across itself, which both solvers treat as implicit, as they do any contact. The wire's geom
-follows what presses on it, so that normals and closest points are those of the deflected wire; the spring is measured
-from where the wire would be without that contact's force.
+A wire has no mass here (see :mod:`vinesim.wires.elastic_supports`). So a contact with a wire is a contact with a spring
+that has the wire's stiffness across the wire. Both solvers treat this spring implicitly, as they do any contact. The
+wire's geom follows the contacts, so that normals and closest points are those of the deflected wire. The deflection of
+the spring is measured from where the wire would be without that contact's force.
 
-Several contacts share a wire. Each ends at a spring as soft as the sum of the deflections there by all that press, over
-that by the contact itself (as of a string without ties); what the others in fact do follows from the forces of the last
-step. With springs as soft as that, these forces converge: the sums of the rows of a matrix of compliances, weighed by
-any positive numbers, bound its eigenvalues. The weights are means of forces over some time: what follows the forces
-themselves feeds swings.
+Several contacts share a wire. The spring of each is softer than the wire alone by a factor: the sum of the deflections
+there by all contacts, over the deflection by the contact itself (as of a string without ties). The actual effect of the
+other contacts follows from the forces of the last step. With springs as soft as that, these forces converge: the row
+sums of a matrix of compliances, weighted by any positive numbers, bound its eigenvalues. The weights are means of
+forces over some time, since weights that follow the forces themselves would feed oscillations.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from vinesim.scene.model import Model
 from vinesim.wires.elastic_supports import LEAST_SHARE, WIRE_DAMPING_TIME, ElasticSupports
 
 MAX_DEFLECTION = 0.25
-"""[m] The geom of a wire follows no further; what presses on still feels its spring. TUNED: far beyond what the law of
-a taut string holds for."""
+"""[m] The geom of a wire follows no further than this; a contact still feels the wire's spring. TUNED: far beyond the
+range in which the law of a taut string holds."""
 LEAST_DEFLECTION = 1e-6
-"""[m] A wire that is nearer to where it was drawn is put there."""
+"""[m] A wire that is nearer than this to its drawn position is put there."""
 LEAST_SPREAD = 0.1
-"""[1] Of a wire's length: contacts that are further apart tilt it; others move it as a whole. TUNED."""
+"""[1] Share of a wire's length. Contacts that are further apart than this tilt the wire; others move it as a whole.
+TUNED."""
 FOLLOWED = 0.7
 """[1] Share of the deflection by other contacts' forces that a contact with the same wire takes over within a step. For
 the rest it takes the mean deflection over :data:`MEMORY`. DERIVED: the largest share for which a mass on two such
@@ -55,25 +56,26 @@ SAME_PLACE = 0.05
 box is long, more than anything slides in a step."""
 ROOM = 32
 MOST_PRESSES = 512
-"""Contacts with wires in one solve for which there is room at first; and those of both solvers that count."""
+"""Most pressing contacts of both solvers that count. ``ROOM``: number of contacts with wires in one solve for which
+there is room at first."""
 NO_TREE = int(np.iinfo(np.int32).min)
-"""Tree of presses that do not outlive a step: whose shape is gone, or that was put elsewhere."""
+"""Tree number of presses that do not outlive a step: their shape is gone, or was put somewhere else."""
 
 
 class DeflectedWires:
-    """The wires of one model, and what presses on them."""
+    """The wires of one model, and the contacts that press on them."""
 
     def __init__(self, model: Model, supports: ElasticSupports, tree_awake: np.ndarray, dt: float) -> None:
-        """``tree_awake``: [tree] what sleeps presses on as it did."""
+        """``tree_awake``: [tree] a tree that sleeps goes on pressing as it did."""
         self._supports = supports
         self.is_compliant = model.fixed_tension > 0.0
-        """[piece] Whether it is a wire under tension."""
+        """[piece] Whether the piece is a wire under tension."""
         self.start = model.fixed_start.astype(float)
         self.end = model.fixed_end.astype(float)
         way = self.end - self.start
         count = len(self.start)
         self.offset = np.zeros((count, 2, 3))
-        """[piece, 2, 3] m by which the start and the end of its geom are away from where they were drawn."""
+        """[piece, 2, 3] m Displacement of the start and the end of the piece's geom from where they were drawn."""
         axis = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
         self._geoms = SharedArrays.zeros(
             kernels.WireGeoms, count, start=self.start, axis=axis, offset=self.offset, count=np.zeros(2, np.int32)
@@ -89,16 +91,16 @@ class DeflectedWires:
 
     @property
     def geoms(self) -> kernels.WireGeoms:
-        """The wires as shapes."""
+        """The wires as shapes for collision detection."""
         return self._geoms.struct
 
     @property
     def deflected(self) -> np.ndarray:
-        """Pieces [k] whose offset is not 0; a view that the next step changes."""
+        """Pieces [k] whose offset is not 0; a view that the next step overwrites."""
         return self._geoms.deflected[: self._geoms.count[0]]
 
     def bind(self, contacts: SharedArrays) -> tuple[KernelGraph, KernelGraph]:
-        """What finds the springs of ``contacts``, and what adds those that press."""
+        """Two kernel graphs: the first finds the springs of ``contacts``, the second adds the contacts that press."""
         wires, nodes, bodies, springs = self._supports.wire_structs
         find = KernelLaunch(
             kernels.find_wire_springs,
@@ -110,9 +112,9 @@ class DeflectedWires:
         return KernelGraph(find), KernelGraph(add)
 
     def end_step(self, rigid_asleep: np.ndarray) -> None:
-        """Move the geoms after what presses on them, let go those that nothing presses on, and load the supports.
+        """Move the geoms of wires with the contacts, release wires that nothing presses on, and load the supports.
 
-        ``rigid_asleep``: [kinematic tree] not negative while it sleeps.
+        ``rigid_asleep``: [kinematic tree] not negative while the kinematic tree sleeps.
         """
         if not (self._found.count[0] or self.presses.count[0] or self._geoms.count[0]):
             return
@@ -121,12 +123,13 @@ class DeflectedWires:
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
     def let_go(self, trees: np.ndarray) -> None:
-        """Trees [k] that slept were put somewhere else: they press on nothing until they wake."""
+        """Remove the presses of sleeping trees [k] that were put somewhere else: they press on nothing until they
+        wake."""
         self.presses.tree[np.isin(self.presses.tree, trees)] = NO_TREE
 
     def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
-        """The rigid world was compiled anew: it has so many kinematic ``trees``. ``numbers``: of a key of rigid bodies
-        the new key, and the new tree; :data:`NO_TREE` if the shape is gone."""
+        """Take over a rigid world that was compiled again, with ``trees`` kinematic trees. ``numbers`` maps the old key
+        of a pair of shapes to the new key and the new tree, which is :data:`NO_TREE` if the shape is gone."""
         presses = self.presses
         for k in np.flatnonzero(presses.tree[: presses.count[0]] < 0).tolist():
             presses.key[k], presses.tree[k] = numbers(int(presses.key[k]))
@@ -156,17 +159,18 @@ class WireContacts:
 
     @property
     def stiffness(self) -> np.ndarray:
-        """[contact] N/m of the springs; of several contacts that press on one wire, what is left for each."""
+        """[contact] N/m Stiffness of each contact's spring; if several contacts press on one wire, the share of
+        each."""
         return self._arrays.stiffness[: len(self)]
 
     @property
     def shift(self) -> np.ndarray:
-        """[contact] m, gap to where the wire would be without the contact's force, less that to its geom."""
+        """[contact] m Gap to where the wire would be without the contact's force, less the gap to the wire's geom."""
         return self._arrays.shift[: len(self)]
 
     @property
     def key(self) -> np.ndarray:
-        """[contact] number of the pair of shapes."""
+        """[contact] Number of the pair of shapes in contact."""
         return self._arrays.key[: len(self)]
 
     def find_springs(
@@ -182,13 +186,13 @@ class WireContacts:
         """Find the springs of contacts with wires; poses of awake trees must be up to date.
 
         Args:
-            piece: [k] which fixed pieces; all must give.
-            point: [k, 3] m.
-            normal: [k, 3] from the wire to the other side.
-            gap: [k] m to the geom of the wire.
-            closing: [k] m/s, how fast the gap would get smaller without the contacts.
+            piece: [k] index of the fixed piece; all must be wires under tension.
+            point: [k, 3] m, contact point.
+            normal: [k, 3] unit vector from the wire to the other shape.
+            gap: [k] m, distance from the other shape to the wire's geom.
+            closing: [k] m/s, rate at which the gap would shrink without the contacts.
             key: [k] number of the pair of shapes, the same in the next step.
-            tree: [k] the tree that presses, or -1 less the kinematic tree of the rigid world.
+            tree: [k] the tree that presses, or -1 minus the number of the kinematic tree of the rigid world.
         """
         count = len(piece)
         if count > len(self._arrays.piece):
@@ -205,11 +209,11 @@ class WireContacts:
         self._find()
 
     def add_presses(self, force: np.ndarray, velocity: np.ndarray) -> None:
-        """Note what the solve has found.
+        """Store the results of the solve.
 
         Args:
-            force: [contact] N with which they press, 0 for those that are near only.
-            velocity: [contact] m/s along the normal, of what presses, at the end of the step.
+            force: [contact] N, normal force; 0 for contacts that are near but do not press.
+            velocity: [contact] m/s along the normal, of the shape that presses, at the end of the step.
         """
         self._arrays.force[: len(self)], self._arrays.velocity[: len(self)] = force, velocity
         self._add()

@@ -1,8 +1,9 @@
-"""Elastic supports: wires that shoots are tied to and arms that they stand on give, so that shoots move each other.
+"""Elastic supports: the wires that shoots are tied to, and the arms that shoots stand on, give. So shoots move each
+other.
 
 See :mod:`vinesim.kernels.wires.elastic_supports`. Only supports of trees that are awake are computed. The
-anchors in the tie table are the wires' places, and the rests of the springs of roots turn with the arms, so that the
-trees, their sleep and joint wrenches need not know of supports.
+anchors in the tie table follow the wires, and the rest poses of root springs turn with the arms. So the code of trees,
+of their sleep and of joint wrenches needs no knowledge of supports.
 """
 
 from __future__ import annotations
@@ -23,19 +24,22 @@ WAKE_SHARE = 0.25
 would move a point of it by as much. TUNED: twenty shoots that sleep on a wire hold it with 2 N until then."""
 
 LEAST_SHARE = 5e-4
-"""[1] Nodes of a support are taken to be by this share of its compliance from each other and from its ends, or more."""
+"""[1] Share of a support's compliance. Nodes are assumed to be at least this far from each other and from the support's
+ends."""
 
 WIRE_DAMPING_TIME = 0.01
-"""[s] Damping of a wire over its stiffness where something presses on it. GUESSED: as ``tie_damping`` of the plants."""
+"""[s] Damping of a wire over its stiffness, where something presses on it. GUESSED: as ``tie_damping`` of the
+plants."""
 
 _NO_TREES = _NO_SUPPORTS = np.zeros(0, np.int32)
 
 
 class ElasticSupports:
-    """The supports of one model: pieces of wire under tension to which a tie is bound, and arms with a shoot."""
+    """The supports of one model: pieces of wire under tension to which a tie is bound, and arms on which a shoot
+    stands."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``parameters``: ``sleep_distance`` says when a tree wakes."""
+        """``parameters``: ``sleep_distance`` decides when a tree wakes."""
         self._plants = plants
         model = plants.model
         wires = _wire_nodes(plants)
@@ -50,13 +54,13 @@ class ElasticSupports:
         trees = len(model.tree_first)
         self._tree_start = np.searchsorted(self._tree[by_tree], np.arange(trees + 1)).astype(np.int32)
         self.deflection = np.zeros((len(self._tree), 3))
-        """[node, 3] of wires m from where they are when nothing has moved, of arms their twist [rad, 0, 0]; wires
-        first, each from start to end."""
+        """[node, 3] Displacement of nodes of wires [m] from where they are when nothing has moved; twist of nodes of
+        arms, [rad, 0, 0]. Wires come first; the nodes of each support go from its start to its end."""
         self.count = len(first)
-        """Supports in all."""
+        """Number of supports."""
         piece = nodes["support"][first]
         self._piece = np.where(piece < len(model.fixed_start), piece, -1)
-        """[support] The piece of wire that it is, -1 for an arm."""
+        """[support] Index of the piece of wire that the support is; -1 for an arm."""
         self._was_active = np.zeros(len(first), np.bool_)
         self._active = np.zeros(len(first), np.int32)
         self._is_moved = np.zeros(trees, np.bool_)
@@ -70,7 +74,7 @@ class ElasticSupports:
         self._is_listed = False
         self._loaded = self._unloaded = _NO_SUPPORTS
         self.load = np.zeros((len(self._tree), 3))
-        """[node, 3] N on wires, but for ties."""
+        """[node, 3] N Forces on nodes of wires, without those of ties."""
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
         self._bind(
@@ -88,7 +92,7 @@ class ElasticSupports:
         )
 
     def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The pieces of wire, for :func:`kernels.wire_spring`; ``nodes``: those of wires."""
+        """Arrays of the pieces of wire for :func:`kernels.wire_spring`; ``nodes`` are the nodes of wires."""
         model = self._plants.model
         tension = model.fixed_tension.astype(float)
         way = (model.fixed_end - model.fixed_start).astype(float)
@@ -156,10 +160,10 @@ class ElasticSupports:
         )
         self._solve = KernelGraph(solve)
         self.wire_structs = SharedArrays(kernels.Wires, **wires).struct, node_struct, body_struct, spring_struct
-        """What :func:`kernels.wire_spring` asks for, but for the loads."""
+        """Arguments of :func:`kernels.wire_spring`, except the loads."""
 
     def set_loaded(self, supports: np.ndarray) -> None:
-        """On which supports [k] there are loads from now on; :attr:`load` is theirs."""
+        """Set the supports [k] that :attr:`load` acts on from now on."""
         if not np.array_equal(supports, self._loaded):
             self._unloaded = self._loaded
             self._loaded = supports.copy()
@@ -171,23 +175,24 @@ class ElasticSupports:
         return self._active[: self._active_count[0]]
 
     def moved_pieces(self) -> np.ndarray:
-        """Pieces of wire [k] that were computed since the last call, or will be next: no other has moved."""
+        """Pieces of wire [k] that may have moved: those computed since the last call, and those that will be computed
+        next."""
         pieces = self._piece[self._was_active]
         self._was_active[:] = False
         self._was_active[self.active] = True
         return pieces[pieces >= 0]
 
     def place(self, trees: np.ndarray) -> None:
-        """Let the next :meth:`update` see that sleeping trees [k] were put somewhere else."""
+        """Tell the next :meth:`update` that sleeping trees [k] were put somewhere else."""
         self._placed = np.union1d(self._placed, trees).astype(np.int32)
 
     def update(self) -> None:
-        """Bring the supports to where the trees hold them, and wake the trees that they move. Poses and velocities
+        """Move the supports to where the trees hold them, and wake the trees that are moved by it. Poses and velocities
         of awake trees must be up to date."""
         plants = self._plants
         awake = self._plants.awake
         if awake is not self._awake:
-            self.place(self._awake)  # what fell asleep was put to its resting place by that
+            self.place(self._awake)  # a tree that fell asleep was moved to its rest pose
             self._awake = awake
             self._is_listed = False
         if not self._is_listed or len(self._placed):
@@ -208,7 +213,8 @@ class ElasticSupports:
             plants.wake(moved)
 
     def _list_supports(self) -> None:
-        """List the supports of the trees that are awake or were put somewhere; note who shares them."""
+        """List the supports of the trees that are awake or were put somewhere else; find the awake trees that share a
+        support."""
         trees = np.concatenate([self._awake, self._placed])
         count = self._tree_start[trees + 1] - self._tree_start[trees]
         support = self._tree_supports[spans(self._tree_start[trees], count)]
@@ -224,7 +230,7 @@ class ElasticSupports:
 
 
 def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Ties that are bound to wires that give, wire by wire, and along each."""
+    """Nodes of wires: the ties that are bound to wires under tension, wire by wire, and along each wire."""
     model = plants.model
     tied = plants.ties.on_wire
     piece = model.tie_wire[tied]
@@ -251,7 +257,7 @@ def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
 
 
 def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Roots of trees that stand on arms that give, arm by arm, and along each."""
+    """Nodes of arms: the roots of trees that stand on elastic arms, arm by arm, and along each arm."""
     model = plants.model
     pieces = np.flatnonzero(model.arm_gives())
     tree = np.flatnonzero(model.is_on_arm())
@@ -298,8 +304,8 @@ def _twist(length: np.ndarray, thick: np.ndarray, thin: np.ndarray, shear_modulu
 
 
 def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """By how much the point that moves most moves when arms turn the rests of trees [k] about axes [k, 3], wires held
-    [k] m/rad."""
+    """[k] m/rad Displacement of the point of each tree that moves most, per rotation of its rest pose by an arm about
+    the axis [k, 3]. Wires are held fixed."""
     if len(tree) == 0:
         return np.zeros(0)
     plants.root_rests.turn[tree] = axis
@@ -311,9 +317,9 @@ def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray
 def _springs_in_series(
     compliance: np.ndarray, whole: np.ndarray, is_free: np.ndarray, first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness [node] of what is before each node of a support, and [support] behind its last one, 0 where its end
-    ``is_free`` [node]. ``compliance`` [node]: up to the node; ``whole`` [node]: of all of its support; ``first``
-    [support]: its first node."""
+    """Stiffness [node] of the part before each node of a support, and [support] of the part behind its last node, which
+    is 0 where the end ``is_free`` [node]. ``compliance`` [node]: from the start to the node; ``whole`` [node]: of the
+    node's whole support; ``first`` [support]: first node of each support."""
     before = np.append(0.0, compliance[:-1])[: len(compliance)]
     before[first] = 0.0
     last = np.append(first[1:], len(compliance))[: len(first)] - 1

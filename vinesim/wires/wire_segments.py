@@ -1,4 +1,4 @@
-"""Wires that give, cut into short straight segments: what moves of them in pictures, scans and pages."""
+"""Wires under tension, cut into short straight segments: the parts of wires that move in pictures, scans and pages."""
 
 from __future__ import annotations
 
@@ -27,19 +27,20 @@ class WireSegments:
     """Segments of the wires of a model, along each wire from its start to its end."""
 
     piece: np.ndarray
-    """[segment] int32, an index of ``Model.fixed_start``."""
+    """[segment] int32, the piece of the segment: an index of ``Model.fixed_start``."""
     start: np.ndarray
-    """[segment] 1, where it begins on its piece, from 0 to 1."""
+    """[segment] 1, place on the piece where the segment begins, from 0 to 1."""
     end: np.ndarray
-    """[segment] 1"""
+    """[segment] 1, place on the piece where the segment ends."""
     rest_q: np.ndarray
-    """[segment, 7] m, 1: its middle as drawn, axes of the world."""
+    """[segment, 7] m, 1: pose of the segment's middle as drawn, axes of the world."""
 
     def __len__(self) -> int:
         return len(self.piece)
 
     def poses(self, which: np.ndarray, away: SegmentPoses) -> np.ndarray:
-        """Poses [k, 7] float32 m, 1 of some segments [k], ascending, of which all but those ``away`` are as drawn."""
+        """Poses [k, 7] float32 m, 1 of some segments [k], in ascending order. All are as drawn, except those in
+        ``away``."""
         q = self.rest_q[which].astype(np.float32)
         _, here, there = np.intersect1d(which, away.segment, assume_unique=True, return_indices=True)
         q[here] = away.q[there]
@@ -58,19 +59,19 @@ def wire_segments(model: Model) -> WireSegments:
 
 
 def cut(length: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lines of ``length`` [k] m in equal parts of at most ``longest`` [m]: the line of each part [part], and where on
-    it the part begins and ends [part], from 0 to 1."""
+    """Cut lines of ``length`` [k] m into equal parts of at most ``longest`` [m]. Returns the line of each part [part],
+    and where on the line the part begins and ends [part], from 0 to 1."""
     parts = np.maximum(np.ceil(length / longest), 1.0).astype(int)
     whole = np.repeat(np.arange(len(parts)), parts)
     number = np.arange(len(whole)) - np.repeat(np.cumsum(parts) - parts, parts)
     return whole, number / parts[whole], (number + 1.0) / parts[whole]
 
 
-# Where the segments of wires are, for snapshots: kept for all pieces, computed for those that may have moved.
+# Poses of the segments of wires, for snapshots: stored for all pieces, computed for pieces that may have moved.
 
 
 class WireShapes:
-    """The shapes of all wires of one model."""
+    """Poses of the segments of all wires of one model."""
 
     def __init__(self, model: Model, supports: ElasticSupports, wires: DeflectedWires) -> None:
         self._supports = supports
@@ -111,7 +112,7 @@ class WireShapes:
         self._pose = KernelGraph(pose)
 
     def poses(self) -> SegmentPoses:
-        """The segments that are away from where they were drawn."""
+        """The segments that are away from where they were drawn, with their poses."""
         marked = self._may_have_moved
         presses = self._wires.presses
         marked[self._supports.moved_pieces()] = True

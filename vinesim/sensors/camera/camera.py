@@ -51,14 +51,14 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Largest depth that is measured."""
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     stereo: StereoSpec | None = None
-    """How depth is measured; exactly unless given."""
+    """How the camera measures depth. Unless given, it measures exactly."""
     distortion: Annotated[spec_file.Numbers | None, "1", (-1000.0, 1000.0)] = None
-    """Coefficients of the lens, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8 (rational_polynomial). A
-    pinhole unless given. Colour, depth and labels show the same at the same pixel."""
+    """Coefficients of the lens distortion, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8
+    (rational_polynomial). A pinhole unless given. Colour, depth and labels are distorted alike."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
-        """The spec in a file, or the one of that name in ``data/cameras``."""
+        """The spec in the file ``name``, or the one of that name in ``data/cameras``."""
         spec = spec_file.load("cameras", name, cls)
         if not 0.0 <= spec.nearest.value < spec.farthest.value:
             raise spec_file.SensorError(
@@ -72,7 +72,7 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return spec
 
     def ideal(self) -> CameraSpec:
-        """The same camera if it measured exactly and from anywhere."""
+        """The same camera with exact depth at any distance."""
         number = msgspec.structs.replace
         near = number(self.nearest, value=0.0)
         far = number(self.farthest, value=1000.0)
@@ -102,19 +102,21 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """How much a picture may cost. Exact depth and labels are the same in all."""
+    """Settings that trade the cost of a picture against its looks. Exact depth and labels are the same in all
+    qualities."""
 
     taps: int
-    """Shadow samples a pixel; 0: a smooth filter of two widths; -1: of one."""
+    """Number of shadow samples for each pixel. 0 stands for a smooth filter of two widths, -1 for a filter of one
+    width."""
     block: int
-    """Pixels, squared, in which one primitive is lit once."""
+    """Side of a block of pixels in which each primitive is lit once."""
     samples: int
-    """Samples, squared, of one pixel's colour."""
+    """Number of colour samples along each side of a pixel."""
     shadow_texel_divisor: int
-    """Divides the texels of the shadow map nearby."""
+    """Divisor of the texel size of the near shadow map."""
     is_live: bool
-    """Whether a CPU lights eight points at once (:mod:`vinesim.sensors.camera.live_light`), and moves the second view
-    of a stereo camera out of the first one instead of rendering it."""
+    """Whether a CPU lights eight points at once (:mod:`vinesim.sensors.camera.live_light`), and computes the second
+    view of a stereo camera from the first one instead of rendering it."""
 
 
 QUALITIES = {
@@ -122,12 +124,12 @@ QUALITIES = {
     "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1, is_live=False),
     "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2, is_live=False),
 }
-"""``fast`` for live robots, ``full`` for spectators, ``still`` for pictures that are not live."""
+"""Qualities by name: ``fast`` for live robots, ``full`` for spectators, ``still`` for pictures that are not live."""
 
 
 @functools.cache
 def load_camera_kernels() -> None:
-    """Compile the CPU kernels of cameras, or read them from the cache: threads must not do so at the same time."""
+    """Compile the CPU kernels of cameras, or read them from the cache. Threads must not call it at the same time."""
     for module in (
         camera_raster,
         camera_raster_plants,
@@ -149,20 +151,21 @@ class Camera:
     info: CameraInfo
     name: str = "camera"
     sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
-    """Towards the sun, or where it is when."""
+    """Unit vector towards the sun, or a function that gives it for a time [s]."""
     quality: str = "full"
-    """One of :data:`QUALITIES`."""
+    """Name of one of :data:`QUALITIES`."""
     shadow_period: float | None = None
-    """Moving things get new shadows this often [s]; 0 for every frame; 0.2 unless given, 0 for stills."""
+    """Period at which shadows of moving things are redrawn [s]; 0 for every frame. Unless given, 0.2, and 0 for
+    stills."""
     exposure: float | None = None
-    """Fixed; automatic unless given. 0.75 suits a sunny noon."""
+    """Fixed exposure; automatic unless given. 0.75 suits a sunny noon."""
     device: str = "cpu"
     threads: int | None = None
-    """Threads of the CPU that draw: the cores that this process may use, up to four, unless given. Every number of
-    them gives the same bits."""
+    """Number of CPU threads that draw. Unless given, the number of cores that this process may use, up to four. The
+    result is the same to the bit for every number."""
     seed: int = 0
     image_index: int = 0
-    """Number of the next image. What the sensor measures follows from (seed, name, this)."""
+    """Number of the next image. The noise of the measurement follows from (seed, name, this number)."""
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
@@ -205,11 +208,12 @@ class Camera:
 
     @property
     def rate(self) -> float:
-        """Frames a second [Hz]."""
+        """Frame rate [Hz]."""
         return self.spec.rate.value
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> CameraFrame:
-        """See :class:`vinesim.sensors.sensor.Sensor`; with the truth of the bunches if that is needed."""
+        """See :class:`vinesim.sensors.sensor.Sensor`. The frame has the ground truth of the bunches if ``outputs`` ask
+        for it."""
         frame = self.render(primitives, pose, snapshot.time, outputs=outputs)
         if CameraOutput.BUNCHES in outputs:
             bunches = visible_bunches(primitives, snapshot, self.info, frame.pose, self.rasterizer)
@@ -221,7 +225,7 @@ class Camera:
     ) -> CameraFrame:
         """The frame seen from ``pose`` [7], the optical frame in the world.
 
-        Only ``outputs`` are made; the other arrays of the frame have the size 0.
+        Only ``outputs`` are rendered; the other arrays of the frame have the size 0.
         """
         pose = np.array(pose, float)
         shape = (self._drawn.height, self._drawn.width)
@@ -268,7 +272,8 @@ class Camera:
         )
 
     def _download(self, *arrays: wp.array | None) -> list[np.ndarray]:
-        """Copies for the host, empty for None: from a GPU through memory that it can write to, all at once."""
+        """Copies of arrays for the host; an empty array for None. From a GPU all are copied at once, through pinned
+        memory."""
         if self.device == "cpu":
             return [np.zeros(0, np.float32) if a is None else a.numpy().copy() for a in arrays]
         copies = []
@@ -293,10 +298,10 @@ class Camera:
         is_lit: bool = True,
         measures: bool = False,
     ) -> wp.array | None:
-        """The colours [pixel, 3] without distortion, where they were made: on a GPU, nothing is waited for.
+        """The colours [pixel, 3] without distortion, on the device. With a GPU the call does not wait for them.
 
-        None, and depth and labels alone, unless ``is_lit``. ``measures``: the noise of a stereo measurement is drawn
-        meanwhile.
+        Unless ``is_lit``, it renders depth and labels alone and returns None. ``measures``: the noise of a stereo
+        measurement is drawn at the same time.
         """
         if self.device == "cpu":
             load_camera_kernels()
@@ -328,7 +333,8 @@ class Camera:
     def update_shadows(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0
     ) -> tuple[ShadowMap, ShadowMap]:
-        """The near and the far shadow map, drawn anew where they no longer hold at ``time`` [s] for ``pose`` [7]."""
+        """The near and the far shadow map. A map that is no longer valid at ``time`` [s] for ``pose`` [7] is drawn
+        again."""
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         return self._sunlight.update(primitives, pose[:3], forward, time)
 
@@ -337,7 +343,7 @@ class Camera:
         seen = self._supersampled
         block = self._quality.block
         across, down = (-(-n // block) for n in (seen.width, lens.end_row - lens.first_row))
-        run = across if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        run = across if self.device == "cpu" else 1  # a thread takes a row: structs are passed once a thread
         wp.launch(
             deferred.shade_pixels,
             across * down // run,

@@ -16,26 +16,27 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 NOON_EXPOSURE = 0.75
 """Exposure that suits a sunny noon."""
 KEY_VALUE = 0.13
-"""Exposed light of the usual picture's geometric mean; white is 1."""
+"""Geometric mean of the exposed light in a usual picture; white is 1."""
 ADAPTED_SHARE = 0.5
-"""Share of the stops that would bring any picture to the key value: dark scenes stay darker than bright ones."""
+"""Share of the difference to the key value, in stops, that automatic exposure makes up: dark scenes stay darker than
+bright ones."""
 LOW_SUN_SHARE = 0.7
-"""Share of the stops by which a low sun gives less light that exposure makes up beforehand."""
+"""Share of the loss of light under a low sun, in stops, that the usual exposure makes up in advance."""
 MIN_EXPOSURE = 0.25
 MAX_EXPOSURE = 8.0
-"""Exposure stays within these."""
+"""Largest exposure; ``MIN_EXPOSURE`` is the smallest."""
 ADAPTATION_TIME = 0.25
 """Time constant with which exposure, in stops, follows its target [s]."""
 _METERING_STRIDE = 8
-"""One of so many pixels, squared, is metered."""
+"""Metering uses one pixel out of a square of this side [px]."""
 _GLARE = ((2.0, 0.5), (9.0, 0.12))
-"""Widths [share of a hundredth of the picture's height] and strengths of the light that a lens scatters."""
+"""Widths [1/100 of the picture's height] and strengths of the light that a lens scatters."""
 _GLARE_REACH = 4.0
-"""It reaches so many widths."""
+"""Reach of the scattered light, in multiples of its width."""
 
 
 def usual_exposure(brightness: float) -> float:
-    """Exposure that suits daylight of this brightness beside that of a sunny noon."""
+    """Exposure that suits daylight of this ``brightness``, relative to that of a sunny noon."""
     return NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE
 
 
@@ -51,7 +52,7 @@ class Exposure:
         device: str = "cpu",
         workers: ThreadPool | None = None,
     ) -> None:
-        """``width`` and ``height`` of the picture [px], each pixel of ``samples`` squared samples."""
+        """``width`` and ``height`` of the picture [px]; ``samples``: number of samples along each side of a pixel."""
         self.width = width
         self.height = height
         self.samples = samples
@@ -60,7 +61,7 @@ class Exposure:
         self._workers = workers or ThreadPool(1)
         self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
         self._numbers = self.radiance.view(float) if device == "cpu" else None
-        """The same light as plain numbers [sample, 3]."""
+        """The memory of ``radiance`` as plain numbers [sample, 3]; None on a GPU."""
         self._rgb = wp.empty((width * height, 3), dtype=wp.uint8, device=device)
         self._sum = wp.zeros(2, dtype=wp.int64, device=device)
         self._exposure = wp.array([fixed or 0.0], dtype=float, device=device)
@@ -68,9 +69,9 @@ class Exposure:
         self._time: float | None = None
 
     def tone_map(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> wp.array:
-        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]: it stays on the device.
+        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]. It stays on the device.
 
-        ``balance`` are factors [3] on linear light; ``brightness`` is that of the daylight beside a sunny noon.
+        ``balance``: factors [3] on linear light. ``brightness``: of the daylight, relative to a sunny noon.
         """
         if self.fixed is None:
             since = np.inf if self._time is None else time - self._time
@@ -130,7 +131,8 @@ class Exposure:
         )
 
     def add_glare(self, primitives: Primitives, seen: wp.array) -> None:
-        """Spread some light of the lamps among the seen primitives [sample] around them, as a lens does."""
+        """Spread some light of the lamps in the picture over their surroundings, as a lens does. ``seen`` [sample]:
+        primitives."""
         lamps = primitives.lamp_primitives
         if not len(lamps):
             return
@@ -148,8 +150,8 @@ class Exposure:
 def glare(picture: np.ndarray, lit: np.ndarray) -> None:
     """Spread the light of the pixels that are ``lit`` [height, width] over ``picture`` [height, width, 3], in place.
 
-    Lamps are few pixels: the products of matrices here have their rows and columns only, and cost 2 ms where a blur
-    of the whole picture takes 150.
+    Lamps cover few pixels. The matrix products here contain only the rows and columns of lamps: they cost 2 ms, while a
+    blur of the whole picture takes 150 ms.
     """
     rows = np.flatnonzero(lit.any(1))
     columns = np.flatnonzero(lit.any(0))
@@ -163,7 +165,8 @@ def glare(picture: np.ndarray, lit: np.ndarray) -> None:
 
 
 def _gaussian(sources: np.ndarray, size: int, sigma: float) -> tuple[np.ndarray, slice]:
-    """Weights [place, source] with which ``sources`` [px] spread over the places that they reach, and these places."""
+    """Weights [place, source] with which light from ``sources`` [px] spreads to the places that it reaches, and these
+    places."""
     reach = int(_GLARE_REACH * sigma) + 1
     places = slice(max(int(sources[0]) - reach, 0), min(int(sources[-1]) + reach + 1, size))
     away = (np.arange(places.start, places.stop)[:, None] - sources) / sigma

@@ -1,4 +1,5 @@
-"""Light of live pictures on a CPU: points sorted by what they lie on, each kind lit by a kernel of its own."""
+"""Light of live pictures on a CPU: points are sorted by the kind of surface that they lie on, and each kind has its own
+kernel."""
 
 from __future__ import annotations
 
@@ -17,11 +18,12 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import BANDS_PER_THREAD, CameraRasterizer
 
 _ROWS = 4
-"""Rows of blocks of 2 x 2 pixels whose points make one list: long enough to fill batches, short enough for caches."""
+"""Number of rows of blocks of 2 x 2 pixels whose points form one list: long enough to fill batches, short enough for
+caches."""
 
 
 class LiveLight:
-    """Lights the points that one rasteriser sees; its buffers."""
+    """Lights the points that one rasteriser sees, and holds the buffers for it."""
 
     def __init__(self, seen: CameraRasterizer) -> None:
         self._seen = seen
@@ -36,7 +38,7 @@ class LiveLight:
         points.count = wp.empty((self.list_count, light_points.CLASS_COUNT), dtype=wp.int32, device="cpu")
         self._tables = light_points.FloatTables()
         self._sources: list[wp.array] = []
-        """Arrays that the tables are views of."""
+        """Arrays that the memory of the tables belongs to."""
 
     def shade(
         self,
@@ -83,7 +85,7 @@ class LiveLight:
         launch(light_points.light_others, [primitives.shapes, materials, *solid], [radiance])
 
     def _update_tables(self, primitives: Primitives, light: Light) -> None:
-        """Views of the primitives' arrays as they are now: they are made anew with the list of bodies."""
+        """Make views of the primitives' present arrays. The arrays are replaced whenever the list of bodies changes."""
         shapes = primitives.shapes
         materials = primitives.materials
         sources = [shapes.a, shapes.b, shapes.c, shapes.d, materials.tint]
@@ -108,6 +110,6 @@ def shadow_maps(near: ShadowMap, far: ShadowMap, depth: wp.array) -> light_point
 
 
 def _numbers(vectors: wp.array) -> wp.array:
-    """The same memory as plain numbers [vector, component]."""
+    """The memory of an array of vectors as plain numbers [vector, component]."""
     shape = int(np.prod(vectors.shape)), int(vectors.dtype._length_)
     return wp.array(ptr=vectors.ptr, dtype=float, shape=shape, device="cpu", copy=False)

@@ -1,8 +1,9 @@
-"""Multispectral cameras: what is seen, how much light falls on it, and what it reflects in each band.
+"""Multispectral cameras: the surface that each pixel sees, the light that falls on it, and its reflectance in each
+band.
 
 A pixel's value is reflectance x illumination. Illumination is that of the RGB picture (sun, shadow maps, sky through
-the canopy, light from the ground, light through leaves), its colours averaged: the same share of the light of every
-band falls on a pixel, so that a ratio of bands such as the NDVI is the same in the sun and in the shade. Reflectances
+the canopy, light from the ground, light through leaves), averaged over its colours. The same share of the light falls
+on a pixel in every band, so a ratio of bands such as the NDVI is the same in the sun and in the shade. Reflectances
 follow from the surface alone. Not modelled: the bluer light of shadows, light that leaves pass on to leaves,
 highlights, haze, and the distances between the lenses.
 """
@@ -32,14 +33,14 @@ from vinesim.sensors.raster.primitive_arrays import LEAF
 from vinesim.sensors.sensor import Export, SensorMaker, SensorSetting
 
 FULL_SCALE = 32768
-"""A reflectance of 1 in 16-bit images, as in MicaSense's own."""
+"""Value of a reflectance of 1 in 16-bit images, as in MicaSense's own images."""
 SHADOW_PERIOD = 0.2
-"""Moving things get new shadows this often [s]."""
+"""Period at which shadows of moving things are redrawn [s]."""
 DARK_BERRY = 0.55
-"""Green over red of the picture's berries, up to which they count as dark; from 1 on they are green. GUESSED."""
+"""Ratio of green to red in the picture's berries: up to this value they count as dark, from 1 on as green. GUESSED."""
 GREEN_AGE = 0.42
 DRY_AGE = 1.0
-"""Age of leaves up to which they are green, and from which on they are dry, as in the picture."""
+"""Age of leaves from which on they are dry; up to ``GREEN_AGE`` they are green. As in the picture."""
 SURFACES = (
     "leaf",
     "leaf_dry",
@@ -81,19 +82,20 @@ _OF_MATERIAL = {
 }
 _SURFACE_OF_MATERIAL = np.array([SURFACES.index(_OF_MATERIAL[kind]) for kind in sorted(_OF_MATERIAL)])
 _SECOND = {"leaf": "leaf_dry", "berry_green": "berry_dark", "soil": "grass"}
-"""What a surface turns into, by a share from 0 to 1 of each primitive or pixel."""
+"""The surface that a surface changes into. The share of the change, from 0 to 1, is given for each primitive or
+pixel."""
 _SECOND_OF_SURFACE = np.array([SURFACES.index(_SECOND.get(name, name)) for name in SURFACES])
 
 
 class BandSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One band, a Gaussian."""
+    """One band, with a Gaussian response."""
 
     name: str
     centre: Annotated[Number, "nm", (300.0, 1100.0)]
     width: Annotated[Number, "nm", (1.0, 500.0)]
-    """Between the wavelengths at which the response is half of its greatest."""
+    """Distance between the two wavelengths at which the response is half of its maximum."""
     irradiance: Annotated[Number, "W/(m^2 nm)", (0.0, 3.0)]
-    """Of a level surface in the open, sun and sky."""
+    """Irradiance of a level surface in the open, by sun and sky."""
 
 
 class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -106,23 +108,23 @@ class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     fy: Annotated[Number, "px", (1.0, 1e6)]
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     bits: Annotated[Number, "1", (1, 16)]
-    """Of the converter."""
+    """Resolution of the converter in bits."""
     brightest: Annotated[Number, "1", (0.1, 10.0)]
-    """Reflectance at full scale; what is brighter counts as this."""
+    """Reflectance at full scale; a brighter surface gives this value."""
     full_well: Annotated[Number, "1", (10.0, 1e9)]
-    """Electrons of a pixel at full scale, whose number varies by its square root."""
+    """Number of electrons of a pixel at full scale. A number of electrons has its square root as standard deviation."""
     read_noise: Annotated[Number, "1", (0.0, 1e4)]
     """Standard deviation of a dark pixel [electron]."""
     transmission: Annotated[Number, "1", (0.0, 2.0)]
-    """Light that a leaf lets through over what it reflects, in all bands."""
+    """Light that a leaf transmits, relative to the light that it reflects, in all bands."""
     bands: tuple[BandSpec, ...]
-    """By wavelength; one is ``red``, one ``nir``."""
+    """Bands in the order of wavelength; one is named ``red``, one ``nir``."""
     reflectance: dict[str, Annotated[spec_file.Numbers, "1", (0.0, 1.0)]]
-    """Diffuse, of each of :data:`SURFACES`, a number for each band."""
+    """Diffuse reflectance: for each of :data:`SURFACES` one number for each band."""
 
     @classmethod
     def load(cls, name: str) -> MultispectralSpec:
-        """The spec in a file, or the one of that name in ``data/multispectral``."""
+        """The spec in the file ``name``, or the one of that name in ``data/multispectral``."""
         spec = spec_file.load("multispectral", name, cls)
         names = [band.name for band in spec.bands]
         if not {"red", "nir"} <= set(names) or len(set(names)) < len(names):
@@ -142,7 +144,8 @@ class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         return spec
 
     def info(self, frame_id: str, size: tuple[int, int] | None = None) -> CameraInfo:
-        """Intrinsics with the principal point in the middle; ``size`` [px] with the same horizontal angle."""
+        """Intrinsics with the principal point in the middle. ``size`` [px] sets another size with the same horizontal
+        angle."""
         width, height = size or (round(self.width.value), round(self.height.value))
         scale = width / self.width.value
         middle = 0.5 * (width - 1), 0.5 * (height - 1)
@@ -162,14 +165,14 @@ class MultispectralCamera:
         is_exact: bool = False,
         shadow_period: float = SHADOW_PERIOD,
     ) -> None:
-        """``is_exact``: without noise, steps and a full scale; ``shadow_period``: moving things get new shadows this
-        often [s]."""
+        """``is_exact``: measure without noise, quantisation and saturation. ``shadow_period``: period at which shadows
+        of moving things are redrawn [s]."""
         self.spec = spec
         self.info = info
         self.name = name
         self.is_exact = is_exact
         self.image_index = setting.number
-        """Number of the next image. Noise follows from (seed, name, this)."""
+        """Number of the next image. The noise follows from (seed, name, this number)."""
         self._seed = setting.seed
         self._device = device = setting.device
         threads = min(usable_cores(), MAX_THREADS) if setting.threads is None else setting.threads
@@ -179,23 +182,24 @@ class MultispectralCamera:
         self._light = wp.empty(info.width * info.height, dtype=float, device=device)
         self._sod = wp.empty(info.width * info.height, dtype=float, device=device)
         self._reflectance = np.array([spec.reflectance[name].value for name in SURFACES], np.float32)
-        """[surface, band]"""
+        """[surface, band] Reflectances."""
         self.bands = tuple(Band(b.name, b.centre.value, b.width.value, b.irradiance.value) for b in spec.bands)
         self._layout: tuple[Primitives, int] | None = None
         self._surface = np.zeros(0, int)
-        """[primitive + 2] index of its surface; the last two are the ground and the sky, -2 and -1."""
+        """[primitive + 2] Index of each primitive's surface. The last two entries are the ground (primitive -2) and the
+        sky (-1)."""
         self._turned = np.zeros(0, np.float32)
-        """[primitive + 2] share of the surface that it turns into."""
+        """[primitive + 2] Share by which each primitive has changed into the second surface of :data:`_SECOND`."""
 
     @property
     def rate(self) -> float:
-        """Frames a second [Hz]."""
+        """Frame rate [Hz]."""
         return self.spec.rate.value
 
     def frame(
         self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput
     ) -> MultispectralFrame:
-        """See :class:`vinesim.sensors.sensor.Sensor`: all bands, whatever is needed of them."""
+        """See :class:`vinesim.sensors.sensor.Sensor`. The frame has all bands, whichever ``outputs`` are needed."""
         return self.render(primitives, pose, snapshot.time)
 
     def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> MultispectralFrame:
@@ -231,9 +235,9 @@ class MultispectralCamera:
         return frame
 
     def _illuminate(self, primitives: Primitives, near: ShadowMap, far: ShadowMap, lens: Pinhole) -> None:
-        """Find the light on the rows that ``lens`` draws."""
+        """Compute the light that falls on the rows of ``lens``."""
         seen = self._seen
-        run = seen.width if self._device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        run = seen.width if self._device == "cpu" else 1  # a thread takes a row: structs are passed once a thread
         wp.launch(
             illumination.illuminate_pixels,
             seen.width * (lens.end_row - lens.first_row) // run,
@@ -254,7 +258,7 @@ class MultispectralCamera:
         )
 
     def _update_surfaces(self, primitives: Primitives) -> None:
-        """Look up the surface of each primitive again if there are others."""
+        """Look up the surface of each primitive again if the set of primitives has changed."""
         if self._layout == (primitives, primitives.layout_version):
             return
         self._layout = primitives, primitives.layout_version
@@ -271,7 +275,7 @@ class MultispectralCamera:
         self._turned = np.append(turned, [0.0, 0.0]).astype(np.float32)
 
     def _measure(self, exact: np.ndarray) -> np.ndarray:
-        """What the receiver makes of reflectances [band, height, width]: noise, steps, a full scale."""
+        """Measured reflectances from exact ones [band, height, width]: with noise, quantisation and saturation."""
         spec = self.spec
         rng = spec_file.noise_rng(self._seed, self.name, self.image_index)
         scale = np.float32(spec.full_well.value / spec.brightest.value)
@@ -291,7 +295,7 @@ def ndvi_colours(ndvi: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def load_kernels() -> None:
-    """Compile the CPU kernels, or read them from the cache: threads must not do so at the same time."""
+    """Compile the CPU kernels, or read them from the cache. Threads must not call it at the same time."""
     load_camera_kernels()
     wp.load_module(illumination, device="cpu")
 
@@ -302,7 +306,7 @@ def _make(mount: MultispectralMount, setting: SensorSetting) -> MultispectralCam
 
 
 def _export(frame: MultispectralFrame) -> Export:
-    """One image a band, 16 bits, and the NDVI in colours."""
+    """One 16-bit image for each band, and the NDVI in colours."""
     scaled = np.clip(np.rint(frame.reflectance * FULL_SCALE), 0, 65535).astype(np.uint16)
     images: dict[str, np.ndarray] = {band.name: scaled[k] for k, band in enumerate(frame.bands)}
     bands: list[dict[str, Any]] = [

@@ -1,9 +1,9 @@
 """Depth as a stereo camera measures it: RealSense D400 and its kind.
 
-Noise follows sigma_z = z^2 sigma_d / (f B), where sigma_d is the error of disparity. The first imager is taken to sit
-where the picture is taken, the second a baseline to its right: what that one cannot see (to the left of near things)
-has no depth. A window of the matcher sees one surface: it smooths what is uneven, loses what is thin, and lets near
-edges grow.
+Noise follows sigma_z = z^2 sigma_d / (f B), where sigma_d is the error of disparity. The first imager is assumed to be
+at the camera's place, the second to its right by the baseline. Points that the second imager cannot see (to the left of
+near things) have no depth. A window of the matcher sees one surface: it smooths uneven surfaces, loses thin ones, and
+lets near edges grow.
 """
 
 from __future__ import annotations
@@ -30,35 +30,36 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """How a stereo camera measures (table ``[stereo]`` in ``data/cameras``); pixels are those of its imagers."""
 
     baseline: Annotated[Number, "m", (0.001, 2.0)]
-    """Between both imagers."""
+    """Distance between both imagers."""
     focal: Annotated[Number, "px", (10.0, 10000.0)]
-    """Of the imagers, at the resolution at which they are matched."""
+    """Focal length of the imagers, at the resolution at which their pictures are matched."""
     field: Annotated[Number, "deg", (10.0, 170.0)]
-    """What the imagers see horizontally."""
+    """Horizontal field of view of the imagers."""
     noise: Annotated[Number, "px", (0.0, 10.0)]
     """Standard deviation of disparity on a well-textured plane."""
     step: Annotated[Number, "px", (0.0, 10.0)]
-    """Resolution of disparity; 0 for none."""
+    """Resolution of disparity; 0 for no quantisation."""
     window: Annotated[Number, "px", (1.0, 63.0)]
-    """Side of the matching window: noise is alike within it, and it sees one surface."""
+    """Side of the matching window. Noise is the same within a window, and a window sees one surface."""
     fattening: Annotated[Number, "1", (0.1, 10.0)]
-    """How much more the nearest surface in a window weighs than others: above 1 near edges grow."""
+    """Weight of the nearest surface in a window, relative to the others. Above 1 near edges grow."""
     support: Annotated[Number, "1", (0.0, 1.0)]
-    """Share of a window that must show one surface."""
+    """Share of a window that must show the same surface."""
     slant_kept: Annotated[Number, "deg", (0.0, 90.0)]
-    """Up to this angle between ray and normal every surface is measured."""
+    """Every surface is measured up to this angle between ray and normal."""
     slant_lost: Annotated[Number, "deg", (0.0, 90.0)]
-    """From this angle on none is."""
+    """No surface is measured from this angle on."""
     contrast: Annotated[Number, "1", (0.0, 255.0)]
-    """Grey levels within a window below which there is no texture but the projector's."""
+    """Grey levels within a window below which the scene has no texture; only the projector's texture is matched
+    then."""
     projector: Annotated[Number, "m", (0.0, 100.0)]
-    """How far the projector's texture is seen; nothing of it from twice as far on."""
+    """Distance up to which the projector's texture is seen; from twice this distance on, none of it is seen."""
     saturation: Annotated[Number, "1", (0.0, 256.0)]
     """Grey level from which on a window is overexposed."""
 
 
 class Stereo:
-    """The depth sensor of one camera: its second imager, matching and noise."""
+    """The depth sensor of one camera: second imager, matching and noise."""
 
     def __init__(
         self,
@@ -72,8 +73,8 @@ class Stereo:
     ) -> None:
         """``reach``: nearest and farthest depth [m].
 
-        ``second_from_first``: what the second imager sees is not drawn but taken from the depth of the first one (on a
-        CPU). ``workers`` share the rows; every number of them gives the same bits.
+        ``second_from_first``: the view of the second imager is not drawn but computed from the depth of the first one
+        (on a CPU). ``workers`` share the rows; the result is the same to the bit for every number of workers.
         """
         self.info = info
         self.device = device
@@ -131,7 +132,7 @@ class Stereo:
     ) -> np.ndarray:
         """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``.
 
-        ``rng`` None: with the noise of the last :meth:`draw_noise`.
+        If ``rng`` is None, the noise of the last :meth:`draw_noise` is used.
         """
         if rng is not None:
             self.draw_noise(rng)
@@ -143,9 +144,9 @@ class Stereo:
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
 
     def measure_on_device(self, primitives: PosedPrimitives, lens: Pinhole, depth: wp.array, rgb: wp.array) -> wp.array:
-        """The same on a GPU, from and to arrays [pixel] there, with the noise of the last :meth:`draw_noise`.
+        """As :meth:`measure` on a GPU: from and to arrays [pixel] there, with the noise of the last :meth:`draw_noise`.
 
-        Nothing is waited for.
+        The call does not wait for the result.
         """
         second = self._second_pinhole(lens)
         self._second.draw(primitives, second)
@@ -176,13 +177,14 @@ class Stereo:
         return self._depth
 
     def _set_picture(self, depth: np.ndarray, rgb: np.ndarray) -> None:
-        """Disparity and grey levels of a picture for the kernels of a CPU."""
+        """Compute disparity and grey levels of a picture for the kernels of a CPU."""
         disparity = self._disparity.numpy().reshape(depth.shape)
         np.divide(np.float32(self._parameters.focal_baseline), depth, out=disparity)
         cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY, dst=self._grey.numpy().reshape(depth.shape))
 
     def draw_noise(self, rng: np.random.Generator) -> None:
-        """Draw the noise of the next measurement; it does not depend on the picture. Other bits on a GPU."""
+        """Draw the noise of the next measurement. It does not depend on the picture. A GPU draws other numbers than a
+        CPU."""
         if self.device == "cpu":
             self._noise.numpy()[:] = self._correlated_noise(rng)
             return
@@ -225,7 +227,7 @@ class Stereo:
         self._workers.share([functools.partial(measure, *ends) for ends in itertools.pairwise(bounds)])
 
     def _second_pinhole(self, lens: Pinhole) -> Pinhole:
-        """The second imager: parallel to the first, a baseline to its right."""
+        """The second imager: parallel to the first, and to its right by the baseline."""
         other = Pinhole()
         turn = np.array(lens.rotation).reshape(3, 3)
         other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._parameters.baseline * turn[0]))
@@ -243,7 +245,7 @@ class Stereo:
         return other
 
     def _correlated_noise(self, rng: np.random.Generator) -> np.ndarray:
-        """Two fields [2, row, column] of normal numbers with variance 1, alike within a window."""
+        """Two fields [2, row, column] of normal numbers with variance 1, correlated within a window."""
         _, rows, columns = self._noise.shape
         wide = self._window - 1
         raw = rng.standard_normal((2, rows + wide, columns + wide), np.float32)
@@ -255,7 +257,8 @@ class Stereo:
 
 
 def _imager_pixels(cells: tuple[int, int], scale: float, info: CameraInfo) -> stereo_rows.ImagerPixels:
-    """Where the ``cells`` (rows, columns) of an imager lie in the picture, of which ``scale`` cells make one pixel."""
+    """The pixels of a picture in which the ``cells`` (rows, columns) of an imager lie; one pixel is ``scale`` cells
+    wide."""
     o = stereo_rows.ImagerPixels()
     for name, count, size in (("row", cells[0], info.height), ("column", cells[1], info.width)):
         ends = np.ceil(np.arange(count + 1, dtype=np.float32) / np.float32(scale)).astype(np.int32)

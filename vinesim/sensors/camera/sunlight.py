@@ -1,7 +1,7 @@
 """Sun, sky and the cached shadow maps of one camera.
 
 Two maps follow the camera: a fine one around what it looks at, a coarse one of the plants far around. A map is drawn
-anew only when the camera has left its middle, or when something inside it has moved, and then at a bounded rate.
+again only when the camera has left its middle, or when something inside it has moved, and then at a bounded rate.
 """
 
 from __future__ import annotations
@@ -19,17 +19,18 @@ from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives
 
 DEFAULT_SUN = (-0.41, -0.52, 0.75)
-"""Towards the sun: south-west, half-way up."""
+"""Direction towards the sun: south-west, half-way up."""
 
 
 Window = tuple[int, int, int, int]
-"""First and last + 1 column, first and last + 1 row of a shadow map."""
+"""A part of a shadow map: first column, last column + 1, first row, last row + 1."""
 _TILES = 8
-"""A map is drawn anew in tiles, this many across and down."""
+"""A map is redrawn in tiles; this is the number of tiles across and down."""
 _NOTHING = 1.0e9
-"""Depth where nothing casts a shadow [m]."""
+"""Depth of texels where nothing casts a shadow [m]."""
 _GPU_THREADS = (8, 16)
-"""Threads that share the primitives of a cluster, and the rows of each of them, on a GPU."""
+"""On a GPU: number of threads that share the primitives of a cluster, and of threads that share the rows of a
+primitive."""
 
 
 def _vector(v: np.ndarray) -> wp.vec3:
@@ -41,7 +42,7 @@ def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
 
 
 class ShadowSquare:
-    """One square of depths seen from the sun, around a focus that moves in steps."""
+    """One square shadow map: depths seen from the sun, around a focus that moves in steps."""
 
     def __init__(
         self,
@@ -68,10 +69,10 @@ class ShadowSquare:
         self.struct.side = side
         self.half = 0.5 * texel * side
         self._drawn_balls = np.zeros((0, 4), np.float32)
-        """Bounding spheres of all clusters when the map was drawn last; a GPU draws the whole map and keeps none."""
+        """Bounding spheres of all clusters when the map was last drawn. A GPU draws the whole map and keeps none."""
 
     def set_sun(self, sun: np.ndarray) -> None:
-        """Turn to the sun, a unit vector towards it; nothing that was drawn holds any more."""
+        """Turn to the sun, a unit vector towards it. Everything drawn so far becomes invalid."""
         self.right = np.cross(sun, [0.0, 0.0, 1.0]) if abs(sun[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
         self.right /= np.linalg.norm(self.right)
         self.up = np.cross(self.right, sun)
@@ -82,7 +83,7 @@ class ShadowSquare:
         self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
 
     def follow(self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float, period: float) -> None:
-        """Draw the map anew, or the part of it that changed, if it no longer holds for this camera at ``time``."""
+        """Draw the map again, or the part of it that changed, if it is no longer valid for this camera at ``time``."""
         wanted = eye + self.ahead * forward
         strayed = not np.linalg.norm(wanted - self.focus) <= self.slack
         other = self.built != primitives.layout_version
@@ -109,14 +110,15 @@ class ShadowSquare:
         return [(0, side, side * i // count, side * (i + 1) // count) for i in range(count)]
 
     def _texels(self, ball: np.ndarray) -> np.ndarray:
-        """Least and largest column and row [ball, 4] that the shadows of some spheres [ball, 4] may touch."""
+        """[ball, 4] Least and largest column and row that the shadows of some spheres [ball, 4] may touch."""
         apart = ball[:, :3] - self.focus
         middle = np.stack([apart @ self.right, apart @ self.up], 1) / self.struct.texel + 0.5 * self.struct.side
         reach = ball[:, 3:] / self.struct.texel + float(shadow_maps.SHADOW_MARGIN) + 1.0
         return np.stack([middle - reach, middle + reach], 2).reshape(-1, 4)
 
     def _changed_windows(self, primitives: Primitives) -> list[Window]:
-        """Windows that hold all shadows that moved since the map was drawn, as they were and as they are."""
+        """Windows that contain all shadows that moved since the map was drawn, both at their old and at their new
+        places."""
         moved = primitives.cluster_version > self.version
         balls = primitives.ball.numpy()[moved]
         if self.device == "cpu":
@@ -147,7 +149,7 @@ class ShadowSquare:
         return np.flatnonzero(inside)
 
     def _casters(self, primitives: Primitives) -> wp.array:
-        """Clusters that this map shows, wherever they are."""
+        """All clusters that this map shows, wherever they are."""
         if self._known != primitives.layout_version:
             every = np.arange(len(primitives.cluster_first), dtype=np.int32)
             mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
@@ -169,7 +171,7 @@ class ShadowSquare:
             slices = 1
             square = self.struct.depth.numpy().reshape(self.struct.side, self.struct.side)
             square[window[2] : window[3], window[0] : window[1]] = _NOTHING
-        else:  # a GPU culls faster than it can be told what to draw, and wants a thread for every row
+        else:  # a GPU culls faster than it receives a list, and needs a thread for every row
             which = self._casters(primitives)
             (lanes, slices) = _GPU_THREADS
             self.struct.depth.fill_(_NOTHING)
@@ -187,28 +189,31 @@ class ShadowSquare:
 SunPath = Callable[[float], tuple[float, float, float]]
 """Unit vector towards the sun at a simulated time [s]."""
 _MIN_COS_CHANGE = np.cos(np.radians(0.25))
-"""The light is made anew when the sun has moved by a quarter of a degree: once a minute."""
+"""The light is computed again when the sun has moved by a quarter of a degree: once a minute."""
 _NOON_SUN = np.array([3.3, 2.95, 2.35])
-"""Light of a sun with :data:`_NOON_SINE` for the sine of its elevation; white is 1 for a sheet in full light."""
+"""Light of the sun when the sine of its elevation is :data:`_NOON_SINE`; a white sheet in full light has the value
+1."""
 _NOON_SINE = 0.75
 _OPTICAL_DEPTH = np.array([0.10, 0.15, 0.27])
-"""Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh's and some haze."""
+"""Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh scattering and some haze."""
 _SKY_COLOUR = np.array([0.52, 0.70, 1.0])
 _HAZE_COLOUR = np.array([0.50, 0.60, 0.72])
 _GROUND_COLOUR = np.array([0.26, 0.21, 0.13])
 _CANOPY_COLOUR = np.array([0.14, 0.19, 0.075])
 _WHITE_BALANCE_SHARE = 0.6
-"""Share of the colour of the light that a camera's white balance takes out."""
+"""Share of the light's colour that a camera's white balance removes."""
 
 
 def air_mass(height: float) -> float:
-    """Air on the way of sunlight, 1 from the zenith, by the sine of the sun's elevation (Kasten and Young 1989)."""
+    """Air mass on the path of sunlight, 1 from the zenith. ``height`` is the sine of the sun's elevation (Kasten and
+    Young 1989)."""
     degrees = np.degrees(np.arcsin(np.clip(height, 0.0, 1.0)))
     return float(1.0 / (max(height, 0.0) + 0.50572 * (degrees + 6.07995) ** -1.6364))
 
 
 def daylight(height: float) -> tuple[np.ndarray, float]:
-    """Colour [3] of direct sunlight, and how bright the sky is beside its usual self, by the sine of the elevation."""
+    """Colour [3] of direct sunlight, and brightness of the sky relative to noon. ``height`` is the sine of the
+    elevation."""
     sun = (
         _NOON_SUN
         * np.exp(-_OPTICAL_DEPTH * (air_mass(height) - air_mass(_NOON_SINE)))
@@ -219,25 +224,25 @@ def daylight(height: float) -> tuple[np.ndarray, float]:
 
 @dataclasses.dataclass(frozen=True)
 class OutdoorLight:
-    """Light by day, of one elevation of the sun: linear RGB [3] each."""
+    """Daylight at one elevation of the sun. Colours are linear RGB [3]."""
 
     sun: np.ndarray
     sky: np.ndarray
     haze: np.ndarray
     ground: np.ndarray
-    """From the ground."""
+    """Light from the ground."""
     canopy: np.ndarray
-    """Through the canopy."""
+    """Light through the canopy."""
     dim: float
-    """How bright the sky is beside its usual self."""
+    """Brightness of the sky, relative to noon."""
     brightness: float
-    """Light that falls on the ground, beside that of a high sun."""
+    """Light that falls on the ground, relative to that at noon."""
     balance: np.ndarray
     """White balance of a camera: factors on linear light."""
 
     @classmethod
     def of(cls, height: float) -> OutdoorLight:
-        """The light by the sine of the sun's elevation."""
+        """The light when ``height`` is the sine of the sun's elevation."""
         sun, dim = daylight(height)
         falls = sun * max(height, 0.05) + _SKY_COLOUR * dim
         usual = _NOON_SUN * _NOON_SINE + _SKY_COLOUR
@@ -255,7 +260,7 @@ class OutdoorLight:
 
 
 class Sunlight:
-    """Light of one camera's surroundings."""
+    """Sun, sky and shadow maps for one camera."""
 
     def __init__(
         self,
@@ -267,10 +272,10 @@ class Sunlight:
         device: str = "cpu",
         workers: ThreadPool | None = None,
     ) -> None:
-        """``sun`` points towards the sun, or says where it is when.
+        """``sun``: vector towards the sun, or a function that gives it for a time [s].
 
         ``taps`` are as in :class:`vinesim.kernels.shading.deferred.Light`; ``period`` [s] as in :class:`Camera`;
-        ``fine`` divides the texels of the shadow map nearby.
+        ``fine``: divisor of the texel size of the near shadow map.
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
         self.period = period
@@ -279,7 +284,7 @@ class Sunlight:
         self.balance = np.ones(3)
         """White balance: factors [3] on linear light."""
         self.brightness = 1.0
-        """Light that falls on the ground, beside that of a high sun."""
+        """Light that falls on the ground, relative to that at noon."""
         light = deferred.Light()
         light.shadow_taps = taps
         k = np.arange(max(taps, 1))
@@ -299,7 +304,7 @@ class Sunlight:
         self._far = ShadowSquare(0.035, 1024, 12.0, 4.0, False, far, device, workers)
 
     def _update_light(self, time: float) -> None:
-        """Take the light from where the sun is now, if it has moved."""
+        """Compute the light again if the sun has moved."""
         direction = np.asarray(self._path(time), float)
         direction = direction / np.linalg.norm(direction)
         if direction @ self._direction > _MIN_COS_CHANGE:

@@ -1,4 +1,5 @@
-"""Truth as files: JSON records, COCO with run-length masks, YOLO boxes, images of ids, and an overlay for people."""
+"""Ground truth as files: JSON records, COCO with run-length masks, YOLO boxes, images of ids, and an overlay for
+people."""
 
 from __future__ import annotations
 
@@ -16,12 +17,12 @@ from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
 from vinesim.sensors.ground_truth import PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
-"""Fields of a bunch in annotations beside those of COCO."""
+"""Fields of a bunch in annotations, in addition to those of COCO."""
 MIN_ANNOTATED_PIXELS = 16
-"""A bunch is annotated (COCO, YOLO) if at least so many pixels show it; records name all."""
+"""Least number of pixels that must show a bunch for it to be annotated (COCO, YOLO); records name all bunches."""
 
 CATEGORIES = [{"id": int(Organ.BUNCH), "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
-"""The categories of COCO: numbers of :class:`Organ`."""
+"""The categories of COCO; their ids are numbers of :class:`Organ`."""
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:
@@ -53,7 +54,7 @@ def bunch_records(
 ) -> list[dict[str, Any]]:
     """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px.
 
-    ``ripeness`` [bunch], 0 green to 1 ripe; all are ripe unless given.
+    ``ripeness`` [bunch]: from 0, green, to 1, ripe; all are ripe unless given.
     """
     return [
         {
@@ -87,7 +88,8 @@ def bunch_records(
 
 
 def actor_records(actors: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
-    """What else was set down in a picture of these ``labels`` [height, width]: with its pixels and its visible box."""
+    """Records of the actors and boxes in a picture with these ``labels`` [height, width], with their pixels and visible
+    boxes."""
     found = []
     for one in actors:
         rows, columns = np.nonzero(labels == one["label"])
@@ -97,7 +99,7 @@ def actor_records(actors: list[dict[str, Any]], labels: np.ndarray) -> list[dict
 
 
 def _xywh(box: Box | None) -> list[int] | None:
-    """COCO's way to write a box."""
+    """A box in COCO's format: column, row, width, height [px]."""
     return None if box is None else [box[0], box[1], box[2] - box[0] + 1, box[3] - box[1] + 1]
 
 
@@ -112,14 +114,15 @@ def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int) -> str:
 
 
 def annotated_bunches(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those of a record that are large enough to be annotated."""
+    """The bunches of a record that are large enough to be annotated."""
     return [one for one in bunches if one["pixels"] >= MIN_ANNOTATED_PIXELS]
 
 
 def coco_json(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
     """The text of a COCO instances (and keypoints) file, piece by piece, from the records of its images.
 
-    ``read`` gives the records of all images, in order; it is called twice, so that never more than one is in memory.
+    ``read`` yields the records of all images, in order. It is called twice, so that only one record at a time is in
+    memory.
     """
     info = {"description": "vinesim", "berry_pixels": MIN_BERRY_PIXELS, "least_pixels": MIN_ANNOTATED_PIXELS}
     yield f'{{"info": {json.dumps(info)}, "licenses": [], "categories": {json.dumps(CATEGORIES)},\n"images": ['
@@ -163,18 +166,18 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
 
 
 def encode_labels(labels: np.ndarray) -> np.ndarray:
-    """Labels [height, width] as RGB, ``id = R + 256 G + 65536 B``, which is how COCO's panoptic images write ids."""
+    """Labels [height, width] as RGB, with ``id = R + 256 G + 65536 B``, as in COCO's panoptic images."""
     return np.stack([labels & 255, labels >> 8 & 255, labels >> 16 & 255], -1).astype(np.uint8)
 
 
 def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:
-    """Number of the berry in its bunch plus one [height, width] uint16; 0 where none is seen."""
+    """[height, width] uint16: number of the berry in its bunch, plus one; 0 where no berry is seen."""
     return (seen.berries + 1).astype(np.uint16)
 
 
 def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
-    """A picture with its ground truth: visible boxes green, amodal boxes where they differ white, cut points yellow
-    discs (rings where hidden), and of each bunch its number, berries seen and share that is hidden.
+    """A picture with its ground truth drawn in: visible boxes in green, amodal boxes where they differ in white, cut
+    points as yellow discs (rings where hidden). Each bunch has its number, the berries seen and the hidden share.
     """
     scale = max(1, round(1280 / rgb.shape[1]))
     image = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
@@ -183,7 +186,7 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
     def corner(column: float, row: float) -> tuple[int, int]:
         return round((column + 0.5) * scale), round((row + 0.5) * scale)
 
-    for one in sorted(truths, key=lambda t: t.pixels):  # what is large comes last, on top
+    for one in sorted(truths, key=lambda t: t.pixels):  # large bunches come last, on top
         if one.amodal_box != one.visible_box:
             cv2.rectangle(image, corner(*one.amodal_box[:2]), corner(*one.amodal_box[2:]), (255, 255, 255), 1)
         assert one.visible_box is not None
@@ -191,7 +194,7 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
         cv2.rectangle(image, (left, top), corner(*one.visible_box[2:]), (60, 255, 60), 1)
         if one.cut_pixel is not None and np.abs(one.cut_pixel).max() < 20000:
             cv2.circle(image, corner(*one.cut_pixel), 5, (255, 230, 0), -1 if one.cut_seen else 1)
-        if one.amodal_pixels * scale * scale > 1500:  # a smaller one would vanish under its words
+        if one.amodal_pixels * scale * scale > 1500:  # the text would cover a smaller bunch
             words = f"{one.bunch}: {one.berries_seen}/{one.berries}, {100.0 * one.occlusion:.0f}% hidden"
             for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
                 cv2.putText(image, words, (left, max(top - 4, 12)), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick)

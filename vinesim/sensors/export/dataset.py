@@ -1,9 +1,9 @@
 """Data sets: random pictures of random vineyards with their ground truth, in files that a killed run leaves whole.
 
-What an image shows follows from (plan, its number) alone: any process may draw it, in any order, and gets the same
-bits. An image is done when its record is there, which is written last, and its files have the sizes that the record
-names: what was deleted, truncated or half copied since then is drawn again. Checksums would find changed bytes too, but
-would read the whole data set at every start; sizes need one system call a file.
+The content of an image follows from the plan and the image's number alone: any process may draw it, in any order, and
+gets the same bits. An image is complete when its record exists, which is written last, and its files have the sizes
+that the record names. So files that were deleted, truncated or half copied since then are drawn again. Checksums would
+also find changed bytes, but would read the whole data set at every start; sizes need one system call for each file.
 """
 
 from __future__ import annotations
@@ -39,27 +39,27 @@ from vinesim.sensors.sensor import SensorSetting, export_frame
 from vinesim.sensors.spec_file import SensorError
 
 IMAGES_PER_VINEYARD = 5
-"""Images of one vineyard before the next one is generated."""
+"""Number of images of one vineyard before the next one is generated."""
 MIN_IMAGE_SIZE = 16
 MAX_IMAGE_SIZE = 4096
-"""Width and height of pictures [px]."""
+"""Largest width and height of pictures [px]; ``MIN_IMAGE_SIZE`` is the smallest."""
 CAMERA_HEIGHT = (0.7, 1.7)
 """Height of the camera above the ground [m]: robots' arms and heads."""
 BUNCH_DISTANCE = (0.35, 1.8)
 """Distance from the camera to the bunch it looks at [m]."""
 MAX_ACTOR_DISTANCE = 2.5
-"""Horizontal distance [m] from the centre of the activity to the bunch in view, at most."""
+"""Largest horizontal distance [m] from the centre of the activity to the bunch in view."""
 MIN_CLEARANCE = 0.15
 """A picture is rejected if more than a fiftieth of it is nearer than this [m]."""
 LATITUDE = np.radians(41.6)
-"""Of the vineyards near Aprilia, Italy, where CANOPIES picks [rad]: it sets the sun's path."""
+"""Latitude [rad] of the vineyards near Aprilia, Italy, where CANOPIES picks; it determines the sun's path."""
 MIN_ACTOR_SHARE = 0.01
-"""Least share of the pixels that show actors or boxes, where there are any."""
+"""Least share of the pixels that show actors or boxes, in pictures of scenes that have some."""
 _MAX_TRIES = 60
 _TRIES_WITH_ACTORS = 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 _SUFFIXES = {"labels": ".txt", "records": ".json"}
-"""Of files in folders that hold no PNGs."""
+"""Suffixes of the files in folders that hold no PNGs."""
 SPLITS = ("train", "val", "test")
 _VAL_VINEYARD = 1
 _TEST_VINEYARD = 2
@@ -68,7 +68,7 @@ _SPLIT_PERIOD = 10
 
 
 class DatasetError(SensorError):
-    """A data set that cannot be made or gone on with. The text is one line."""
+    """A data set cannot be made or continued. The text is one line."""
 
 
 def split_of(image: int) -> str:
@@ -78,7 +78,7 @@ def split_of(image: int) -> str:
 
 
 def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
-    """Intrinsics of a camera at another size [px]: the same horizontal field of view, square pixels kept so."""
+    """Intrinsics of a camera at another size [px]: with the same horizontal field of view, and square pixels."""
     width, height = size or (int(spec.width.value), int(spec.height.value))
     if not (MIN_IMAGE_SIZE <= width <= MAX_IMAGE_SIZE and MIN_IMAGE_SIZE <= height <= MAX_IMAGE_SIZE):
         raise SensorError(
@@ -89,16 +89,17 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
 
 
 class SnapshotSource(Protocol):
-    """Random scenes with actors and wind; sensors draw the snapshots and do not know how they are made."""
+    """Random scenes with actors and wind. Sensors draw the snapshots and do not depend on how they are made."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides the scenes, as JSON."""
+        """All settings that decide the scenes, as JSON."""
         ...
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """Snapshot, point [2] m of the ground to look at, and a record of it; None for the vineyard at rest.
+        """A snapshot, the point [2] m of the ground to look at, and a record of the scene; None for the vineyard at
+        rest.
 
-        It follows from the model and the random numbers alone. ``actors`` of the record are what
+        The result follows from the model and the random numbers alone. ``actors`` of the record have the form that
         :func:`formats.actors` takes.
         """
         ...
@@ -106,7 +107,7 @@ class SnapshotSource(Protocol):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class DatasetPlan:
-    """What a data set is made from; image ``n`` of equal plans is the same image."""
+    """The settings of a data set. Image ``n`` of equal plans is the same image."""
 
     scene: Scene
     seed: int
@@ -118,10 +119,10 @@ class DatasetPlan:
     renderer: str = "warp"
     device: str = "cpu"
     sensors: tuple[RenderedMount, ...] = ()
-    """Which look as well, from the camera's place."""
+    """Further sensors that look from the camera's place."""
 
     def settings(self) -> dict[str, Any]:
-        """All that decides what the images show, as JSON."""
+        """All settings that decide the images, as JSON."""
         info = resized_intrinsics(CameraSpec.load(self.camera), self.size)
         return {
             "vinesim": __version__,
@@ -136,7 +137,8 @@ class DatasetPlan:
         }
 
     def vineyard(self, number: int) -> Scene:
-        """The scene with another seed, leaves and varieties: one row each of all that there are, in any order."""
+        """The scene with another seed, other leaves and varieties: one row of each variety that there is, in any
+        order."""
         rng = np.random.default_rng([self.seed, 1, number])
         names = [VARIETIES[k].name for k in rng.permutation(len(VARIETIES))]
         season = Season(leafiness=round(rng.uniform(0.5, 1.0), 3), yellow=round(rng.uniform(0.0, 0.5), 3))
@@ -145,7 +147,7 @@ class DatasetPlan:
 
 
 class VineyardRenderer:
-    """One vineyard of a plan, ready to be looked at."""
+    """One vineyard of a plan, ready to be rendered."""
 
     def __init__(self, plan: DatasetPlan, number: int) -> None:
         self.plan = plan
@@ -162,7 +164,7 @@ class VineyardRenderer:
         self.info = resized_intrinsics(self.spec, plan.size)
 
     def write_image(self, image: int, folder: pathlib.Path) -> None:
-        """Write everything about one image; its record last."""
+        """Write all files of one image, its record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
         snapshot, near, activity = self._pose_scene(image)
@@ -220,7 +222,8 @@ class VineyardRenderer:
         write_files({folder / name: [data] for name, data in files.items()})
 
     def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
-        """Pose the primitives for one image, whatever the image before showed: snapshot, place [2] m, record of it."""
+        """Pose the primitives for one image, independently of the image before. Returns snapshot, place [2] m, and
+        record."""
         all_trees = np.arange(len(self.model.tree_first))
         self.primitives.update(self.rest, all_trees)
         source = self.plan.snapshot_source
@@ -233,10 +236,10 @@ class VineyardRenderer:
     def _choose_view(
         self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> ground_truth.PixelBuffers:
-        """From somewhere near a hanging bunch, in the open, with that bunch in sight.
+        """A view from a free place near a hanging bunch, with that bunch in sight.
 
-        If there are actors, the bunch hangs ``near`` them, and one of the ``actors`` [m] is seen too, if a
-        place for that is soon found.
+        If there are actors, the bunch hangs ``near`` them, and one of the ``actors`` [m] is in sight too, provided
+        that such a place is soon found.
         """
         model = self.model
         hanging = np.flatnonzero(snapshot.bunch_attached)
@@ -278,7 +281,8 @@ class VineyardRenderer:
 
 
 def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
-    """An hour of solar time [h] on a day from August to October, and where the sun stands: 6 degrees up or more."""
+    """A random hour of solar time [h] on a day from August to October, and the direction towards the sun, 6 degrees up
+    or more."""
     declination = np.radians(rng.uniform(-8.0, 16.0))
     lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
     half_day = float(np.degrees(np.arccos(lowest / (np.cos(LATITUDE) * np.cos(declination))))) / 15.0
@@ -290,21 +294,21 @@ def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, fl
 
 
 class _RecordedFiles(msgspec.Struct):
-    """What a record says of the files of its image."""
+    """The part of a record that lists the files of its image."""
 
     files: dict[str, int]
-    """Size of each file [B]."""
+    """Size of each file [B], by name."""
 
 
 def _file_of(kind: str, image: int) -> str:
-    """A file of an image, relative to the data set's folder."""
+    """Path of a file of an image, relative to the data set's folder."""
     return f"{kind}/{image:06d}{_SUFFIXES.get(kind, '.png')}"
 
 
 def prepare_folder(plan: DatasetPlan, folder: pathlib.Path, images: int) -> None:
-    """Make the folder for so many images, or go on with it if it was begun with the same plan and has no more.
+    """Make the folder for a number of images, or continue one that was begun with the same plan and has no more images.
 
-    :class:`DatasetError` otherwise.
+    :class:`DatasetError` if neither is possible.
     """
     file = folder / "dataset.json"
     settings = plan.settings()
@@ -341,7 +345,8 @@ def _check_same_settings(file: pathlib.Path, wanted: dict[str, Any]) -> None:
 
 
 def _check_no_more_images(folder: pathlib.Path, images: int) -> None:
-    """Lists of fewer images than the folders hold would let readers of lists and of folders see two data sets."""
+    """Refuse fewer images than the folder holds: readers of its lists and readers of its folders would see different
+    data sets."""
     records = (path.stem for path in (folder / "records").glob("*.json"))
     there = 1 + max((int(stem) for stem in records if stem.isdigit()), default=-1)
     if images < there:
@@ -352,7 +357,7 @@ def _check_no_more_images(folder: pathlib.Path, images: int) -> None:
 
 
 def missing_images(folder: pathlib.Path, images: int) -> list[int]:
-    """Which of the first images are not there yet, or not there any more as they were written."""
+    """Numbers of the first ``images`` images that are missing, or whose files are no longer as they were written."""
     return [n for n in range(images) if not _is_whole(folder, n)]
 
 
@@ -369,7 +374,8 @@ def _is_whole(folder: pathlib.Path, image: int) -> bool:
 
 
 def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
-    """Draw images, in order; yields the number of each when it is done. :class:`WriteError` if one is not written."""
+    """Render images, in order; yields the number of each image when it is done. :class:`WriteError` if one cannot be
+    written."""
     number = -1
     vineyard = None
     for image in images:
@@ -384,9 +390,10 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
 
 
 def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
-    """Gather the records of the first images into ``annotations.json`` (COCO); write ``data.yaml`` (YOLO), its lists.
+    """Write ``annotations.json`` (COCO) from the records of the first ``images`` images; ``data.yaml`` (YOLO); its
+    lists.
 
-    Returns the path of the annotations; :class:`WriteError` if one of these files is not written, then none is.
+    Returns the path of the annotations. :class:`WriteError` if one of these files cannot be written; then none is.
     """
 
     def read() -> Iterator[dict[str, Any]]:
@@ -394,7 +401,7 @@ def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
             yield json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
 
     target = folder / "annotations.json"
-    # Without `path`, Ultralytics takes the folder of data.yaml; any relative `path` would be one from where it runs.
+    # Without `path`, Ultralytics takes the folder of data.yaml. It resolves a relative `path` from where it runs.
     yaml = "".join(f"{split}: {split}.txt\n" for split in SPLITS) + "names:\n  0: bunch\n"
     files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, formats.coco_json(read))}
     for split in SPLITS:  # `./` is relative to the list

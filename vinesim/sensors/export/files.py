@@ -1,4 +1,4 @@
-"""Files that are never seen half-written: under other names until all are complete, then renamed into place."""
+"""Files that are never seen half-written: they are written under other names, and renamed when all are complete."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 
 
 def write_files(files: Mapping[pathlib.Path, Iterable[bytes]]) -> None:
-    """Write files from their pieces; they appear in the order given, when all are complete.
+    """Write files from their pieces; they appear in the given order, when all are complete.
 
-    :class:`OSError` if one cannot be written; then those that were there before stay as they were.
+    :class:`OSError` if one cannot be written; then files that were there before stay as they were.
     """
     parts = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in files}
     try:
@@ -27,11 +27,11 @@ def write_files(files: Mapping[pathlib.Path, Iterable[bytes]]) -> None:
 
 
 def remove_partial_files(folder: pathlib.Path) -> None:
-    """Remove what killed processes left of files that they were writing anywhere in a folder, as far as that goes."""
+    """Remove the half-written files that killed processes have left anywhere in a folder, as far as possible."""
     for part in folder.glob("**/.*.part"):
         _remove(part)
 
 
 def _remove(part: pathlib.Path) -> None:
-    with contextlib.suppress(OSError):  # a disk that became read-only: readers do not look at parts
+    with contextlib.suppress(OSError):  # the disk may have become read-only; readers ignore partial files
         part.unlink(missing_ok=True)

@@ -1,4 +1,5 @@
-"""Pictures as files: colour, depth (colours, and raw millimetres), label colours; and portraits of a scene."""
+"""Pictures as files: colour, depth (as colours, and as raw millimetres) and label colours; and overview pictures of a
+scene."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 def look_at(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Pose [7] of an optical frame at ``eye`` that looks ``at`` a point, level."""
+    """Pose [7] of an optical frame at ``eye`` that looks ``at`` a point, with a level horizon."""
     eye = np.asarray(eye, float)
     at = np.asarray(at, float)
     forward = frames.normalize(at - eye)
@@ -58,7 +59,8 @@ _ORGAN_COLOUR = {
 
 
 def label_colours(labels: np.ndarray) -> np.ndarray:
-    """Labels [height, width] as RGB: one colour for each organ, its brightness (hue for bunches) by instance."""
+    """Labels [height, width] as RGB: one colour for each organ. The instance changes its brightness, or for bunches its
+    hue."""
     organ = labels // LABEL_STRIDE
     index = labels % LABEL_STRIDE
     table = np.array([_ORGAN_COLOUR[o] for o in Organ], np.float32)
@@ -108,7 +110,7 @@ def save_frame(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "fram
 
 
 def overview_pose(model: Model) -> np.ndarray:
-    """Pose [7] of an optical frame from which a scene shows itself: in the alley, at eye height, along the rows."""
+    """Pose [7] of an optical frame that gives an overview of a scene: in the alley, at eye height, along the rows."""
     spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2], np.zeros((1, 2))])
     low = spots.min(0)
     high = spots.max(0)

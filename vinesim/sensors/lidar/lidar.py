@@ -1,10 +1,11 @@
 """Spinning lidars: firing times and angles from a table, beams with a width, echoes, and what is reported.
 
-Each shot is a handful of rays over the beam's footprint. What they meet closer together along the beam than the pulse
-is long comes back as one echo, whose range lies in between: mixed returns at the edges of leaves. Points are raw, as
-drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
+Each shot is a handful of rays over the beam's footprint. Surfaces that are closer to each other along the beam than the
+pulse is long give one echo, whose range lies in between: these are the mixed returns at the edges of leaves. Points are
+raw, as drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
 
-Two halves, so that either can be exchanged: a :class:`RayGrid` tells what rays meet, a :class:`Lidar` what is reported.
+The code has two exchangeable halves: a :class:`RayGrid` finds the surfaces that rays meet, a :class:`Lidar` computes
+the returns.
 """
 
 from __future__ import annotations
@@ -32,19 +33,21 @@ from vinesim.sensors.sensor import SensorMaker, SensorSetting
 from vinesim.sensors.spec_file import Numbers
 
 MAX_RAYS = 8
-"""Of one shot."""
+"""Most rays of one shot."""
 FOOTPRINT_RANGE = 3.0
-"""All rays leave from one point; beams have their real width at this range [m], less nearer, more beyond."""
+"""Range at which beams have their real width [m]. All rays leave from one point, so beams are narrower at less range,
+and wider at more."""
 MAX_SHARED_TRANSLATION = 4e-3
 MAX_SHARED_ROTATION = 3.5e-3
-"""Firings within which the lidar moves by less [m] and turns by less [rad] are taken from one place, their middle one.
+"""[rad] Successive firings share one pose, that of the middle firing, if the lidar turns by less than this between them
+and moves by less than ``MAX_SHARED_TRANSLATION`` [m].
 
-That is at most half a step of the head aside, and saves the finding of what is near for every few firings.
+The error is at most half a step of the head, and the clusters nearby need not be searched for every firing.
 """
 _BANDS_PER_THREAD = 2
-"""Bands of firings that one thread takes on average: what meets more gets more time from whichever is free."""
+"""Average number of bands of firings for each thread. A thread that has finished a band takes the next one."""
 _MIN_BAND = 32
-"""Firings of a band, at least: each band looks through all that is near."""
+"""Least number of firings in a band. Every band searches all clusters nearby, so small bands waste time."""
 _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
@@ -53,45 +56,47 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     model: str
     elevation: Annotated[Numbers, "deg", (-90.0, 90.0)]
-    """By laser, in the order of firing."""
+    """Elevation of each laser, in the order of firing."""
     azimuth: Annotated[Numbers, "deg", (-180.0, 180.0)] | None = None
-    """By laser: how far it looks counter-clockwise of the head."""
+    """Azimuth of each laser, counter-clockwise from the direction of the head."""
     laser_period: Annotated[Number, "s", (0.0, 0.01)]
-    """Between two lasers."""
+    """Time between the shots of two lasers."""
     firing_period: Annotated[Number, "s", (1e-6, 0.1)]
-    """Between two firings of all lasers."""
+    """Time between two firings; a firing is one shot of every laser."""
     rate: Annotated[Number, "Hz", (0.1, 200.0)]
-    """Revolutions a second."""
+    """Revolutions per second."""
     nearest: Annotated[Number, "m", (0.0, 100.0)]
     farthest: Annotated[Number, "m", (0.1, 500.0)]
     rays: Annotated[Number, "1", (1, MAX_RAYS)]
-    """Of one shot."""
+    """Number of rays of one shot."""
     aperture: Annotated[Numbers, "m", (0.0, 0.1)]
-    """Width and height of the beam where it leaves."""
+    """Width and height of the beam where it leaves the lidar."""
     divergence: Annotated[Numbers, "mrad", (0.0, 50.0)]
-    """How fast they grow: full angles, to 1/e^2 of the middle's power."""
+    """Growth of width and height with range: full angles, to 1/e^2 of the power on the axis."""
     merge: Annotated[Number, "m", (0.0, 10.0)]
-    """Surfaces closer than this along the beam come back as one echo."""
+    """Surfaces that are closer to each other than this along the beam give one echo."""
     separation: Annotated[Number, "m", (0.0, 10.0)]
-    """Two returns of one shot lie at least so far apart."""
+    """Least distance along the beam between two returns of one shot."""
     returns: Literal["strongest", "last", "dual"] = "strongest"
     """Which echoes of a shot are reported; ``dual``: the strongest and the last, or the two strongest."""
     noise: Annotated[Number, "m", (0.0, 1.0)]
     """Standard deviation of the range of a strong echo."""
     weak_noise: Annotated[Number, "m", (0.0, 1.0)]
-    """The same of the weakest echo; between them it falls with the root of the signal."""
+    """Standard deviation of the range of the weakest echo. Between the strongest and the weakest echo it falls with the
+    root of the signal."""
     step: Annotated[Number, "m", (0.0, 1.0)]
     """Resolution of the range."""
     weakest: Annotated[Number, "1/m^2", (0.0, 1.0)]
-    """Signal from which on an echo is noticed: reflectance, times the cosine, over the square of the range."""
+    """Signal from which on an echo is detected: reflectance, times the cosine of the incidence angle, over the square
+    of the range."""
     flicker: Annotated[Number, "1", (0.0, 2.0)]
-    """Standard deviation of the signal's logarithm from shot to shot."""
+    """Standard deviation of the logarithm of the signal, from shot to shot."""
     reflectance: dict[str, Annotated[Number, "1"]]
-    """Diffuse, by organ in lower case."""
+    """Diffuse reflectance of each organ, by its name in lower case."""
 
     @classmethod
     def load(cls, name: str) -> LidarSpec:
-        """The spec in a file, or the one of that name in ``data/lidars``."""
+        """The spec in the file ``name``, or the one of that name in ``data/lidars``."""
         spec = spec_file.load("lidars", name, cls)
         organs = {o.name.lower() for o in Organ if o != Organ.NOTHING}
         if set(spec.reflectance) != organs:
@@ -119,7 +124,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return spec
 
     def ideal(self) -> LidarSpec:
-        """The same table of firings with thin beams that measure exactly, however weak the echo."""
+        """The same table of firings, with thin beams that measure exactly and detect every echo."""
 
         def but(number: Number, value: float) -> Number:
             return msgspec.structs.replace(number, value=value)
@@ -132,26 +137,26 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class RayGrid(Protocol):
-    """What the rays of a turning head meet; :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless
-    another one is given."""
+    """Finds the surfaces that the rays of a turning head meet.
+    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless another one is given."""
 
     direction: wp.array
-    """[column * row] unit vectors in the head's frame."""
+    """[column * row] Unit vectors of the rays, in the head's frame."""
     distance: wp.array
-    """[column * row] m"""
+    """[column * row] m Distance to the nearest hit of each ray."""
     primitive: wp.array
-    """[column * row], -2 the ground, -1 nothing."""
+    """[column * row] Index of the primitive that each ray meets; -2 for the ground, -1 for nothing."""
 
     def cast(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
         """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7].
 
-        Threads call it for different columns at the same time.
+        Several threads may call it at the same time for different columns.
         """
         ...
 
 
 class Lidar:
-    """One lidar: a table of firings, and the returns of one revolution."""
+    """One lidar: a table of firings, and the returns of the present revolution."""
 
     def __init__(
         self,
@@ -166,9 +171,9 @@ class Lidar:
     ) -> None:
         """Noise follows from (``seed``, ``name``, number of the revolution).
 
-        ``threads`` of the CPU share the shots: the cores that this process may use, up to four, unless given. Every
-        number of them gives the same bits. ``grid(elevation, azimuth, step, columns, device)`` makes what finds hits:
-        see :class:`LidarRasterizer`.
+        ``threads``: number of CPU threads that share the shots; unless given, the number of cores that this process may
+        use, up to four. The result is the same to the bit for every number.
+        ``grid(elevation, azimuth, step, columns, device)`` makes the :class:`RayGrid`: see :class:`LidarRasterizer`.
         """
         self.spec = spec
         self.name = name
@@ -176,22 +181,22 @@ class Lidar:
         self.device = device
         self.seed = seed
         self.is_exact = False
-        """Whether revolutions that begin from now on measure what the middle of each beam meets, exactly."""
+        """Whether later revolutions measure exactly what the middle of each beam meets."""
         self.revolution = 0
-        """Of the present revolution."""
+        """Number of the present revolution."""
         self.lasers = len(spec.elevation.value)
         self.firing_period = spec.firing_period.value
-        """Between two firings [s]."""
+        """Time between two firings [s]."""
         self.firings = round(1.0 / (spec.rate.value * spec.firing_period.value))
-        """Of one revolution."""
+        """Number of firings of one revolution."""
         within = np.arange(self.lasers) * spec.laser_period.value
         offset = np.arange(self.firings)[:, None] * spec.firing_period.value + within
         self.offset = offset.ravel().astype(np.float32)
-        """Time of each shot after the first [shot] s."""
+        """[shot] s Time of each shot after the first."""
         elevation = np.radians(spec.elevation.value)
         order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
         self.ring = np.tile(order, self.firings).astype(np.uint16)
-        """[shot], 0 for the lowest laser."""
+        """[shot] Ring of each shot; 0 for the lowest laser."""
         # the head turns clockwise seen from above; the first shot looks forward
         beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
         azimuth = beside - 2.0 * np.pi * spec.rate.value * within
@@ -214,12 +219,12 @@ class Lidar:
             self.firings,
             device,
         )
-        """Finds what rays meet: a column for each firing, in it the rays of each laser's shot."""
+        """Finds what the rays meet. It has a column for each firing; a column has the rays of each laser's shot."""
         self._workers = ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1)
         wp.load_module(lidar_echoes, device=device)  # threads must not do so at the same time
         self._measuring, self._exact = self._receiver_parameters(spec), self._receiver_parameters(spec.ideal())
         self._receiver = self._measuring
-        """Of the present revolution."""
+        """Receiver of the present revolution."""
         kept = 2 if spec.returns == "dual" else 1
         self._noise = wp.zeros((len(self.offset), 3), dtype=float, device=device)
         self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
@@ -229,7 +234,7 @@ class Lidar:
     def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
         """Offset of each ray of a shot in its beam, across and up [ray] rad: one in the middle, the others on a ring.
 
-        Each stands for an equal share of a Gaussian beam's energy.
+        Each ray has an equal share of the energy of a Gaussian beam.
         """
         count = round(self.spec.rays.value)
         ring = np.sqrt(-0.5 * np.log(0.5 * (1.0 - 1.0 / count))) if count > 1 else 0.0
@@ -239,7 +244,8 @@ class Lidar:
         return np.append(0.0, ring * wide * np.cos(turn)), np.append(0.0, ring * high * np.sin(turn))
 
     def _receiver_parameters(self, spec: LidarSpec) -> lidar_echoes.Receiver:
-        """What this lidar makes of its shots with the numbers of ``spec``: of as many rays of each as that has."""
+        """Parameters of the receiver for the numbers of ``spec``. It evaluates as many rays of each shot as ``spec``
+        has."""
         receiver = lidar_echoes.Receiver()
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
@@ -254,18 +260,18 @@ class Lidar:
 
     @property
     def rate(self) -> float:
-        """Revolutions a second [Hz]."""
+        """Revolutions per second [Hz]."""
         return self.spec.rate.value
 
     def scan(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> LidarScan:
-        """One revolution from ``pose`` [7], the lidar in the world (x forward, z up), while nothing moves."""
+        """One revolution from ``pose`` [7] of the lidar in the world (x forward, z up), with everything at rest."""
         pose = np.array(pose, float)
         self.begin_revolution()
         self.fire(primitives, 0, np.broadcast_to(pose, (self.firings, 7)))
         return self.finish_revolution(pose, time)
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> LidarScan:
-        """See :class:`vinesim.sensors.sensor.Sensor`: a revolution while nothing moves."""
+        """See :class:`vinesim.sensors.sensor.Sensor`. The frame is a revolution with everything at rest."""
         return self.scan(primitives, pose, snapshot.time)
 
     def sweep(self, rate: float | None) -> SpinningScan:
@@ -273,7 +279,7 @@ class Lidar:
         return SpinningScan(self, rate)
 
     def begin_revolution(self) -> None:
-        """A new revolution, exact or as the lidar measures: :attr:`is_exact`."""
+        """Begin a new revolution. It measures exactly if :attr:`is_exact`, else with the errors of the lidar."""
         self._receiver = self._exact if self.is_exact else self._measuring
         noise = spec_file.noise_rng(self.seed, self.name, self.revolution).standard_normal(
             (len(self.offset), 3), np.float32
@@ -281,7 +287,7 @@ class Lidar:
         self._noise.assign(noise)
 
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
-        """Firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
+        """Fire the firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
         poses = np.array(poses, float)
         if not np.isfinite(poses).all():
             wrong = poses[~np.isfinite(poses).all(1)][0]
@@ -293,7 +299,7 @@ class Lidar:
             self._fire(primitives, first + start, len(part), part[len(part) // 2])
 
     def _firings_per_pose(self, poses: np.ndarray) -> int:
-        """How many firings may be taken from one place, so slowly does the lidar move."""
+        """Number of successive firings that may be taken from one place; it follows from the speed of the lidar."""
         if len(poses) < 2:
             return 1
         way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / MAX_SHARED_TRANSLATION
@@ -301,7 +307,7 @@ class Lidar:
         return max(int(1.0 / max(way, turn, 1e-6)), 1)
 
     def _fire(self, primitives: Primitives, first: int, count: int, pose: np.ndarray) -> None:
-        """Firings from one ``pose`` [7], in bands that threads take one after the other."""
+        """Fire ``count`` firings from one ``pose`` [7], in bands that threads take one after the other."""
         size = self._workers.size
         bands = max(min(_BANDS_PER_THREAD * size, count // _MIN_BAND), 1) if size > 1 else 1
         ends = [first + count * i // bands for i in range(bands + 1)]
@@ -309,7 +315,7 @@ class Lidar:
         self._workers.share([functools.partial(fire_band, i, j - i) for i, j in itertools.pairwise(ends)])
 
     def _fire_band(self, primitives: Primitives, pose: np.ndarray, first: int, count: int) -> None:
-        """``count`` firings from ``first`` on."""
+        """Fire ``count`` firings from ``first`` on."""
         grid = self.ray_grid
         grid.cast(primitives, pose, first, count, self.spec.farthest.value)
         wp.launch(
@@ -334,7 +340,7 @@ class Lidar:
         )
 
     def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
-        """What was reported since :meth:`begin`; ``pose`` [7] and ``time`` [s] of the first firing."""
+        """The returns since :meth:`begin_revolution`. ``pose`` [7] and ``time`` [s] are those of the first firing."""
         labels = self._label.numpy()
         shot, which = np.nonzero(labels >= 0)
         self.revolution += 1

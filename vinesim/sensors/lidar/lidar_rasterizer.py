@@ -1,7 +1,7 @@
 """A spinning head's rays, rasterised: the nearest primitive along each ray of a grid of azimuths and elevations.
 
-Rows are rays of one elevation, columns follow each other in even steps of azimuth; each row has an azimuth of its own
-to start from, as lasers that fire in turn have, or the sub-rays of one beam. The oracle is
+A row has the rays of one elevation; columns follow each other in even steps of azimuth. Each row has its own first
+azimuth, as have lasers that fire in turn, and the sub-rays of one beam. The test oracle is
 :class:`~vinesim.sensors.primitives.ray_caster.RayCaster`.
 """
 
@@ -20,12 +20,12 @@ from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 
 
 def _as_floats(vectors: wp.array) -> wp.array:
-    """The same memory [n, 3] as numbers."""
+    """The memory of an array of vectors as plain numbers [n, 3]."""
     return wp.array(ptr=vectors.ptr, shape=(len(vectors), 3), dtype=float, device=vectors.device, copy=False)
 
 
 class LidarRasterizer:
-    """The rays of one revolution, and their latest hits."""
+    """The rays of one revolution, and the latest hit of each."""
 
     def __init__(
         self, elevation: np.ndarray, azimuth: np.ndarray, step: float, columns: int, device: str = "cpu"
@@ -44,11 +44,11 @@ class LidarRasterizer:
         a = (azimuth + step * np.arange(columns)[:, None]).ravel()
         rays = np.stack([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)], 1).astype(np.float32)
         self.direction = wp.array(rays, dtype=wp.vec3, device=device)
-        """Unit vectors in the head's frame [column * row]: column by column, as shots are fired."""
+        """[column * row] Unit vectors of the rays in the head's frame: column by column, in the order of firing."""
         self.distance = wp.zeros(columns * self.rows, dtype=float, device=device)
-        """To the nearest hit [column * row] m; 1e30 where nothing is met."""
+        """[column * row] m Distance to the nearest hit; 1e30 where nothing is hit."""
         self.primitive = wp.full(columns * self.rows, -1, dtype=wp.int32, device=device)
-        """What was met [column * row]: -2 the ground, -1 nothing."""
+        """[column * row] Index of the primitive that was hit; -2 for the ground, -1 for nothing."""
         self._keys = wp.empty(columns * self.rows, dtype=wp.int64, device=device)
         order = np.argsort(elevation, kind="stable")
         tangent = np.clip(np.tan(elevation[order]), -1.0e6, 1.0e6).astype(np.float32)
@@ -58,7 +58,7 @@ class LidarRasterizer:
             wp.array(v.astype(np.float32), dtype=float, device=device) for v in (tangent, azimuth[order])
         )
         head.row_index = wp.array(order.astype(np.int32), device=device)
-        # one slot early: the division above may round otherwise than a kernel's
+        # one slot early: the division above may round differently than in a kernel
         slots = np.searchsorted(slot, np.arange(ELEVATION_SLOTS + 3) - 1).astype(np.int32)
         head.row_slots = wp.array(slots, device=device)
         head.direction = _as_floats(self.direction)
@@ -74,10 +74,11 @@ class LidarRasterizer:
         count: int | None = None,
         reach: float = MAX_DEPTH,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Fire ``count`` columns from ``first`` on (all that follow), with the head at ``pose`` [7] in the world.
+        """Fire ``count`` columns from ``first`` on (all of them unless given), with the head at ``pose`` [7] in the
+        world.
 
-        Fills that part of :attr:`distance` and :attr:`primitive`, and returns it [count, row]. Threads may do so for
-        different columns at the same time.
+        Fills these columns of :attr:`distance` and :attr:`primitive`, and returns them [count, row]. Several threads
+        may call it at the same time for different columns.
         """
         count = self.columns - first if count is None else count
         head = self._head_at(pose, reach, first, first + count)
@@ -94,7 +95,7 @@ class LidarRasterizer:
         distance = bound.numpy()
         seen = np.flatnonzero(distance < float(shapes.FAR))
         seen = seen[np.argsort(distance[seen], kind="stable")].astype(np.int32)
-        lanes, slices = (1, 1) if self.device == "cpu" else (24, min(self.rows, 16))  # what is near meets every row
+        lanes, slices = (1, 1) if self.device == "cpu" else (24, min(self.rows, 16))  # near clusters cover every row
         wp.launch(
             lidar_raster.raster_clusters,
             (len(seen), lanes, slices),
@@ -123,7 +124,7 @@ class LidarRasterizer:
         return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)
 
     def _head_at(self, pose: np.ndarray, reach: float, first: int, end: int) -> LidarHead:
-        """The head at ``pose`` [7], firing the columns from ``first`` to before ``end``."""
+        """Kernel struct of the head at ``pose`` [7] that fires the columns from ``first`` to before ``end``."""
         head = LidarHead()
         for name in LidarHead.vars:
             setattr(head, name, getattr(self._head, name))

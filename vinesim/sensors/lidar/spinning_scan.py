@@ -17,29 +17,29 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 class SpinningHead(Protocol):
-    """What fires: :class:`vinesim.sensors.lidar.lidar.Lidar`."""
+    """The lidar that is fired: :class:`vinesim.sensors.lidar.lidar.Lidar`."""
 
     is_exact: bool
     revolution: int
     firings: int
     firing_period: float
-    """Between two firings [s]."""
+    """Time between two firings [s]."""
 
     @property
     def rate(self) -> float:
-        """Revolutions a second [Hz]."""
+        """Revolutions per second [Hz]."""
         ...
 
     def begin_revolution(self) -> None:
-        """Begin one."""
+        """Begin a revolution."""
         ...
 
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
-        """Firings from ``first`` on, one for each pose [firing, 7]."""
+        """Fire the firings from ``first`` on, one for each pose [firing, 7]."""
         ...
 
     def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
-        """What was reported; ``pose`` [7] and ``time`` [s] of the first firing."""
+        """The returns of the revolution. ``pose`` [7] and ``time`` [s] are those of the first firing."""
         ...
 
 
@@ -51,7 +51,8 @@ class PoseHistory:
         self._poses: list[np.ndarray] = []
 
     def add(self, time: float, pose: np.ndarray) -> None:
-        """Add ``pose`` [7] at ``time`` [s]; poses of later times are removed, as when time was set back."""
+        """Add ``pose`` [7] at ``time`` [s]. Poses of later times are removed: there are some after time was set
+        back."""
         kept = int(np.searchsorted(self._times, time))
         del self._times[kept:], self._poses[kept:]
         self._times.append(time)
@@ -83,26 +84,28 @@ class SpinningScan:
     """Revolutions of one lidar, fired sector by sector."""
 
     def __init__(self, lidar: SpinningHead, rate: float | None = None) -> None:
-        """``rate``: revolutions per second to deliver [Hz]; the rate of the lidar unless given, never more."""
+        """``rate``: number of revolutions to deliver per second [Hz], at most that of the lidar, and that unless
+        given."""
         self.lidar = lidar
         self.pose_history = PoseHistory()
         self.dropped = 0
-        """Revolutions that ended before their first firing could be computed."""
+        """Number of revolutions that ended before their first firing could be computed."""
         self._set_period(1.0 / rate if rate else 0.0)
         self._start: float | None = None
         self._next_column = 0
 
     def add_pose(self, time: float, pose: np.ndarray) -> None:
-        """The lidar was at ``pose`` [7] at ``time`` [s]."""
+        """Record that the lidar was at ``pose`` [7] at ``time`` [s]."""
         self.pose_history.add(time, pose)
 
     def set_demand(self, period: float, outputs: CameraOutput) -> None:
-        """Time from one revolution to the next [s], and whether exact depth alone is needed of it."""
+        """Set the time from one revolution to the next [s], and whether exact depth is the only output that is
+        needed."""
         self._set_period(period)
         self.lidar.is_exact = outputs == CameraOutput.EXACT_DEPTH
 
     def _set_period(self, period: float) -> None:
-        """Never less than the lidar takes for one."""
+        """Set the time from one revolution to the next; never less than the lidar takes for one."""
         self._period = max(1.0 / self.lidar.rate, period)
 
     def cancel(self, now: float) -> None:

@@ -17,39 +17,39 @@ from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stac
 from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 
 _BATCH_SIZE = 256
-"""Bunches that are laid out together: numpy then works on rows, and temporary arrays stay small."""
+"""Number of bunches that are laid out together: numpy then works on rows, and temporary arrays stay small."""
 _RACHIS_RADIUS = (0.0028, 0.0013)
-"""At the peduncle and at the tip [m]: GUESSED."""
+"""Radius of the rachis at the peduncle and at its tip [m]: GUESSED."""
 _MIN_PEDICEL = 0.002
 """A pedicel shorter than this [m] is not drawn."""
 _GREEN = np.array([0.085, 0.150, 0.022])
 """Colour of a hard green berry, linear RGB reflectance: GUESSED by eye."""
 _SHOT_BERRY_SIZE = 0.45
-"""Size of a berry without seeds beside a ripe one [1]: GUESSED."""
+"""Size of a berry without seeds, relative to a ripe berry [1]: GUESSED."""
 _RIPENESS_SPREAD = 0.10
 """Standard deviation of ripeness within a bunch: berries soften and colour one by one. GUESSED."""
 _SHOT_BERRY_SHARE = 0.06
-"""Share of the berries of a quite unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
+"""Share of the berries of a completely unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ripeness:
-    """How ripe fruit is: 0 green and hard, 1 as the variety is harvested."""
+    """Ripeness of fruit: 0 is green and hard, 1 is as the variety is harvested."""
 
     bunch: np.ndarray
-    """[bunch] mean of its berries."""
+    """[bunch] Mean ripeness of the berries of each bunch."""
     seed: int = 0
-    """Of the differences between berries."""
+    """Seed of the differences between berries."""
 
     @classmethod
     def random(cls, count: int, seed: int) -> Ripeness:
-        """Of a vineyard before harvest: most bunches ripe, some turning, few green."""
+        """Ripeness in a vineyard before harvest: most bunches are ripe, some are turning, few are green."""
         rng = np.random.default_rng([seed, 3])
         return cls(np.round(rng.beta(2.2, 0.7, count), 3), seed)
 
 
 def bunch_bodies(model: Model, bunch: int) -> np.ndarray:
-    """Bodies that carry one bunch's berries [piece]: its own, then its clusters."""
+    """Bodies that carry one bunch's berries [piece]: the bunch's own body, then its clusters."""
     first = int(model.bunch_cluster[bunch])
     count = int(model.bunch_clusters[bunch])
     return np.append(model.bunch_body[bunch], np.arange(first, first + count))
@@ -68,10 +68,10 @@ def bunch_batches(
     Args:
         model: constants of the vineyard.
         which: numbers of the bunches [k].
-        poses: [k][segment, 7] of the segments on what carries them; their carriers' own frames unless given.
-        carrier: [k][segment] rows of the poses that move the segments. A bunch without clusters has one segment.
-        group: [k] groups that must not mix in a cluster of primitives.
-        ripeness: of the fruit; all is ripe unless given.
+        poses: [k][segment, 7] pose of each segment in the frame of its carrier; identity unless given.
+        carrier: [k][segment] row of the pose that moves each segment. A bunch without clusters has one segment.
+        group: [k] group of each bunch; groups do not mix in a cluster of primitives.
+        ripeness: ripeness of the fruit; all of it is ripe unless given.
     """
     found: list[Batch] = []
     for first in range(0, len(which), _BATCH_SIZE):
@@ -84,7 +84,8 @@ def bunch_batches(
 
 
 class _Bunches:
-    """Some bunches [k], and where the points of each lie on its segments. Segments of all bunches are in one list."""
+    """Some bunches [k], and the segment that carries each point of them. The segments of all bunches are in one
+    list."""
 
     def __init__(
         self,
@@ -113,11 +114,12 @@ class _Bunches:
         self._length = model.bunch_length[which].astype(float)
 
     def segment_at(self, position: np.ndarray, bunch: np.ndarray) -> np.ndarray:
-        """Segments [n] that carry points ``position`` [n, 3] m of the bunches ``bunch`` [n] (of these k)."""
+        """[n] Segment that carries each of the points ``position`` [n, 3] m of the bunches ``bunch`` [n] (indices into
+        these k)."""
         return self._first_segment[bunch] + segment_of(position, self._length[bunch], self._segments[bunch])
 
     def placed(self, points: np.ndarray, segment: np.ndarray, bunch: np.ndarray) -> np.ndarray:
-        """Points [n, 3] m of the bunches' frames, in the frames of their carriers."""
+        """Points [n, 3] m, given in the frames of bunches, in the frames of their carriers."""
         along = (self._length / self._segments)[bunch] * (segment - self._first_segment[bunch])
         own = points - along[:, None] * np.array([1.0, 0.0, 0.0])
         if self._poses is None:
@@ -125,11 +127,11 @@ class _Bunches:
         return self._poses[segment, :3] + frames.rotate(self._poses[segment, 3:], own)
 
     def rotated(self, vectors: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Vectors [n, 3] of the bunches' frames, in the frames of their carriers."""
+        """Vectors [n, 3], given in the frames of bunches, in the frames of their carriers."""
         return vectors if self._poses is None else frames.rotate(self._poses[segment, 3:], vectors)
 
     def common(self, segment: np.ndarray, bunch: np.ndarray) -> dict[str, Any]:
-        """What primitives [n] of any kind get from their segment and bunch."""
+        """Columns that primitives [n] of every kind get from their segment and bunch."""
         which = self.which[bunch]
         return {
             "organ": int(Organ.BUNCH),
@@ -140,7 +142,7 @@ class _Bunches:
         }
 
     def rachis(self) -> Batch:
-        """The axes on which the pedicels sit."""
+        """Round cones of the rachises, the axes on which the pedicels sit."""
         lines = [one.rachis for one in self.layouts]
         start, end = (np.concatenate([r[:, k : k - 1 or None].reshape(-1, 3) for r in lines]) for k in (0, 1))
         radius = np.concatenate([np.tile(np.linspace(*_RACHIS_RADIUS, r.shape[1] - 1), len(r)) for r in lines])
@@ -158,30 +160,30 @@ class _Bunches:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Berries:
-    """All berries [n] of some bunches."""
+    """All berries [n] of some bunches [k]."""
 
     bunch: np.ndarray
-    """[n], of these bunches"""
+    """[n] Bunch of each berry, an index into these k."""
     segment: np.ndarray
-    """[n]"""
+    """[n] Segment that carries each berry."""
     position: np.ndarray
-    """[n, 3] m, in the bunch's frame"""
+    """[n, 3] m Centre, in the bunch's frame."""
     radius: np.ndarray
-    """[n] m"""
+    """[n] m Radius."""
     axis: np.ndarray
-    """[n, 3] unit vectors"""
+    """[n, 3] Axis of the spheroid, a unit vector."""
     foot: np.ndarray
-    """[n, 3] m, where the pedicel sits on the rachis"""
+    """[n, 3] m Place on the rachis where the pedicel begins."""
     elongation: np.ndarray
-    """[n] length over width"""
+    """[n] Length over width."""
     colour: np.ndarray
-    """[n, 3] linear RGB reflectance"""
+    """[n, 3] Colour, linear RGB reflectance."""
     seed: np.ndarray
-    """[n] of the pattern of the skin, 0 to 1"""
+    """[n] Seed of the pattern of the skin, 0 to 1."""
     depth: np.ndarray
-    """[n] how far out in the bunch, 0 to 1"""
+    """[n] How far out in the bunch the berry sits, 0 to 1."""
     occlusion: np.ndarray
-    """[n, 4] see :func:`_neighbour_occlusion`"""
+    """[n, 4] Occlusion by other berries, see :func:`_neighbour_occlusion`."""
 
     @classmethod
     def of(cls, model: Model, bunches: _Bunches, ripeness: Ripeness | None) -> _Berries:
@@ -230,7 +232,7 @@ class _Berries:
         )
 
     def pedicels(self, bunches: _Bunches) -> Batch:
-        """From the rachis to the berries that do not touch it."""
+        """Round cones from the rachis to those berries that do not touch it."""
         end = self.position - self.axis * (self.radius * self.elongation * 0.95)[:, None]
         free = np.linalg.norm(end - self.foot, axis=1) > _MIN_PEDICEL
         segment = self.segment[free]
@@ -246,7 +248,8 @@ class _Berries:
 
 
 def _ripe_colours(variety: np.ndarray, rngs: list[np.random.Generator], count: np.ndarray) -> np.ndarray:
-    """Colours [n, 3] of ripe berries about those of their ``variety`` [n, 3]; ``count`` [k] berries of each bunch."""
+    """Colours [n, 3] of ripe berries, scattered around the colours of their ``variety`` [n, 3]; ``count`` [k]: number
+    of berries of each bunch."""
     tone, blush = (np.concatenate([rng.normal(size=n) for rng, n in zip(rngs, count, strict=True)]) for _ in (0, 1))
     colour = variety * (1.0 + 0.10 * tone[:, None])
     reddish = (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(0.5 * blush[:, None], 0.0, 1.0)
@@ -256,7 +259,8 @@ def _ripe_colours(variety: np.ndarray, rngs: list[np.random.Generator], count: n
 def _apply_ripeness(
     colour: np.ndarray, radius: np.ndarray, ripeness: Ripeness, which: np.ndarray, count: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and radii of berries that are not all ripe: each on its way from green, and some that never set out."""
+    """Colours and radii of berries that are not all ripe. Each berry is part of the way from green to ripe; some
+    berries stay green."""
     owner = np.repeat(np.arange(len(which)), count)
     draws = zip(which, count, strict=True)
     draw = np.concatenate([np.random.default_rng([ripeness.seed, 4, int(b)]).uniform(size=(n, 2)) for b, n in draws])
@@ -270,7 +274,7 @@ def _apply_ripeness(
 
 
 def _quantile_80(away: np.ndarray) -> float:
-    """The 80 % quantile, without the ceremony of np.quantile."""
+    """The 80 % quantile, computed faster than by np.quantile."""
     at = 0.8 * (len(away) - 1)
     low = int(at)
     ends = np.partition(away, [low, min(low + 1, len(away) - 1)])
@@ -278,13 +282,13 @@ def _quantile_80(away: np.ndarray) -> float:
 
 
 def _padded_neighbours(neighbours: np.ndarray) -> np.ndarray:
-    """Eight neighbours of each berry [n, 8], -1 where there are fewer."""
+    """Eight neighbours of each berry [n, 8]; -1 fills rows that have fewer."""
     missing = 8 - neighbours.shape[1]
     return np.pad(neighbours, ((0, 0), (0, missing)), constant_values=-1) if missing else neighbours
 
 
 def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Light that the nearest neighbours take from each berry: share(n) = w + v . n as (v, w) [n, 4].
+    """Share of the light that the nearest neighbours take from each berry, as (v, w) [n, 4]: share(n) = w + v . n.
 
     A touching sphere of equal size takes (1/4 + 0.85 cos) r^2 / l^2 as seen from the berry's surface.
     """

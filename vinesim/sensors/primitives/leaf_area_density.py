@@ -17,7 +17,8 @@ class LeafDensity:
     """Leaf area per volume [1/m] in the cells of a grid that covers a vineyard."""
 
     def __init__(self, blades: np.ndarray, low: np.ndarray, high: np.ndarray, device: str = "cpu") -> None:
-        """``blades`` [leaf, 4]: position [m] and length [m]; ``low`` and ``high`` [2] m: the ground that is covered."""
+        """``blades`` [leaf, 4]: position [m] and length [m] of each blade. ``low`` and ``high`` [2] m: corners of the
+        ground that the grid covers."""
         self._device = device
         cell = max(0.15, float((high - low).max()) / 600.0)
         size = np.maximum(((high - low) / cell).astype(int) + 1, 1)

@@ -1,4 +1,4 @@
-"""Rows of primitives before they are laid out in clusters: one kind a batch, in the frames of what carries them."""
+"""Primitives before they are laid out in clusters: batches of one kind, in the frames of their carriers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from vinesim.sensors.raster.primitive_arrays import CONE
 
 @dataclasses.dataclass
 class Batch:
-    """Primitives of one kind in the frames of their carriers; neither groups nor bunches ever mix in one cluster."""
+    """Primitives of one kind, in the frames of their carriers. Primitives of different groups or bunches never share a
+    cluster."""
 
     kind: int
-    """A number of :data:`vinesim.sensors.raster.primitive_arrays.KINDS`."""
+    """Kind of the primitives, a number of :data:`vinesim.sensors.raster.primitive_arrays.KINDS`."""
     a: np.ndarray
-    """[n, 4] float32; ``a`` to ``d`` as in :mod:`vinesim.kernels.raster.primitives`."""
+    """[n, 4] float32; ``a`` to ``d`` have the meaning given in :mod:`vinesim.kernels.raster.primitives`."""
     b: np.ndarray
     c: np.ndarray
     d: np.ndarray
@@ -27,15 +28,15 @@ class Batch:
     tint: np.ndarray
     """[n, 3] linear RGB reflectance, 0.004 to 1."""
     organ: np.ndarray
-    """[n] int32, :class:`vinesim.scene.ids.Organ`."""
+    """[n] int32, a number of :class:`vinesim.scene.ids.Organ`."""
     label: np.ndarray
-    """[n] int32, :func:`vinesim.scene.ids.label`."""
+    """[n] int32, as of :func:`vinesim.scene.ids.label`."""
     carrier: np.ndarray
-    """[n] int32, row of the pose that moves it."""
+    """[n] int32, row of the pose that moves the primitive."""
     group: np.ndarray
-    """[n] int32, primitives of two groups never share a cluster."""
+    """[n] int32. Primitives of different groups never share a cluster."""
     bunch: np.ndarray
-    """[n] int32, bunch it belongs to while that hangs; -1 for none."""
+    """[n] int32, bunch that the primitive belongs to while the bunch hangs; -1 for none."""
 
     def __len__(self) -> int:
         return len(self.a)
@@ -83,14 +84,14 @@ def make_batch(
 
 
 def stack_columns(*parts: ArrayLike) -> np.ndarray:
-    """Vectors [n, k] and scalars, one or [n], side by side."""
+    """Vectors [n, k] and scalars, one or [n], as columns of one array, side by side."""
     columns = [np.asarray(p, float).reshape(-1, 1) if np.ndim(p) < 2 else np.asarray(p, float) for p in parts]
     n = max(len(c) for c in columns)
     return np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in columns], 1)
 
 
 def placeholder_batch(static_carrier: int) -> Batch:
-    """A stand-in for a world without plants, far below the ground: no array is ever empty."""
+    """A primitive far below the ground that stands in for a world without plants, so that no array is ever empty."""
     return make_batch(
         CONE,
         [[0.0, 0.0, float(primitives.HIDDEN_HEIGHT), 1e-6]],

@@ -10,7 +10,7 @@ import numpy as np
 from vinesim.sensors.primitives.primitive_batches import Batch
 
 MAX_CLUSTER = 24
-"""Most primitives of one cluster."""
+"""Largest number of primitives in one cluster."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class ClusterLayout:
     """All primitives in the order of their clusters, in the frames of their carriers."""
 
     a: np.ndarray
-    """[primitive, 4] float32; ``a`` to ``d`` as in :mod:`vinesim.kernels.raster.primitives`."""
+    """[primitive, 4] float32; ``a`` to ``d`` have the meaning given in :mod:`vinesim.kernels.raster.primitives`."""
     b: np.ndarray
     c: np.ndarray
     d: np.ndarray
@@ -27,29 +27,29 @@ class ClusterLayout:
     tint: np.ndarray
     """[primitive, 3] linear RGB reflectance."""
     organ: np.ndarray
-    """[primitive] int32"""
+    """[primitive] int32, a number of :class:`vinesim.scene.ids.Organ`."""
     label: np.ndarray
-    """[primitive] int32"""
+    """[primitive] int32, as of :func:`vinesim.scene.ids.label`."""
     carrier: np.ndarray
-    """[primitive] int32, row of the pose that moves it."""
+    """[primitive] int32, row of the pose that moves the primitive."""
     first: np.ndarray
-    """[cluster] int32, index of its first primitive."""
+    """[cluster] int32, index of the cluster's first primitive."""
     size: np.ndarray
-    """[cluster] int32, number of its primitives."""
+    """[cluster] int32, number of the cluster's primitives."""
     kind: np.ndarray
-    """[cluster] int32"""
+    """[cluster] int32, kind of the cluster's primitives."""
     owner: np.ndarray
-    """[cluster] int32, tree that moves it; -1 for what no tree moves."""
+    """[cluster] int32, tree that moves the cluster; -1 for clusters that no tree moves."""
     bunch: np.ndarray
-    """[cluster] int32, bunch it shows while that hangs; -1 for none."""
+    """[cluster] int32, bunch that the cluster belongs to while the bunch hangs; -1 for none."""
     is_rigid: np.ndarray
-    """[cluster] bool, whether it is part of a rigid body."""
+    """[cluster] bool, whether the cluster is part of a rigid body."""
 
 
 def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int) -> ClusterLayout:
     """Clusters of the plants and the static scene (``fixed``), then of rigid bodies (``moving``).
 
-    Neither groups nor bunches mix in a cluster. ``static_carrier`` is the carrier of what never moves.
+    Neither groups nor bunches mix in a cluster. ``static_carrier`` is the carrier of primitives that never move.
     """
     whole: dict[str, list[np.ndarray]] = {
         name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
@@ -81,7 +81,7 @@ def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int
 
 
 def join_rigid(layouts: Sequence[ClusterLayout], carriers: Sequence[int], first_row: int) -> ClusterLayout:
-    """Layouts of rigid bodies, one after the other from the primitive ``first_row`` on, each on its own carrier."""
+    """Join layouts of rigid bodies, each on its own carrier. The first primitive has the index ``first_row``."""
     joined = {
         field.name: np.concatenate([getattr(one, field.name) for one in layouts])
         for field in dataclasses.fields(ClusterLayout)
@@ -94,7 +94,8 @@ def join_rigid(layouts: Sequence[ClusterLayout], carriers: Sequence[int], first_
 
 
 def _runs(group: np.ndarray, bunch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First index and size [cluster] of runs of equal group and bunch, cut after :data:`MAX_CLUSTER` primitives."""
+    """First index and size [cluster] of runs of primitives of equal group and bunch, cut after :data:`MAX_CLUSTER`
+    primitives."""
     starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
     lengths = np.diff(np.r_[starts, len(group)])
     parts = (lengths + MAX_CLUSTER - 1) // MAX_CLUSTER

@@ -14,7 +14,7 @@ from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSO
 
 
 def enclosing_primitive(primitives: Primitives, point: np.ndarray) -> int:
-    """A solid primitive that holds a point [3] m, -1 if none does. Leaves and meshes hold nothing."""
+    """Index of a solid primitive that contains a point [3] m, -1 if none does. Leaves and meshes contain no points."""
     point = np.asarray(point, float)
     reach = primitives.ball.numpy()
     near = np.flatnonzero(np.linalg.norm(reach[:, :3] - point, axis=1) <= reach[:, 3])
@@ -33,7 +33,8 @@ def enclosing_primitive(primitives: Primitives, point: np.ndarray) -> int:
 
 
 def _contains(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Whether primitives [k] of one kind hold a point (vectors as in :mod:`vinesim.kernels.raster.primitives`)."""
+    """[k] Whether each of some primitives [k] of one kind contains a point (vectors as in
+    :mod:`vinesim.kernels.raster.primitives`)."""
     away = point - a[:, :3]
     if kind == SPHEROID:
         along = (away * b[:, :3]).sum(1)
@@ -52,7 +53,7 @@ def _contains(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.
 
 
 class RayCaster:
-    """Exact nearest hits of any rays."""
+    """Finds the exact nearest hit of any ray."""
 
     def __init__(self, primitives: Primitives) -> None:
         self.primitives = primitives
@@ -61,7 +62,7 @@ class RayCaster:
         self._refit()
 
     def hierarchies(self) -> ray_cast.Hierarchies:
-        """The hierarchies around the present poses."""
+        """The hierarchies, refitted to the present poses."""
         if self._pose_version != self.primitives.pose_version or self._layout_version != self.primitives.layout_version:
             self._refit()
         return self._struct
@@ -87,7 +88,8 @@ class RayCaster:
     def cast(
         self, origin: np.ndarray, direction: np.ndarray, reach: float = MAX_DEPTH
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Distances [ray], in lengths of ``direction`` (inf: nothing is met), and primitives (-2 ground, -1 none)."""
+        """Nearest hits of rays: distance [ray] in lengths of ``direction`` (inf: nothing is hit), and index of the
+        primitive [ray] (-2 the ground, -1 none)."""
         p = self.primitives
         direction = np.ascontiguousarray(direction, np.float32).reshape(-1, 3)
         origin = np.ascontiguousarray(np.broadcast_to(np.asarray(origin, np.float32), direction.shape))
@@ -105,7 +107,8 @@ class RayCaster:
         return np.where(found == -1, np.inf, distance.numpy()), found
 
     def cast_camera(self, lens: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-        """Depth [height, width] m (inf: nothing) and primitives [height, width] of a camera; as :meth:`cast`."""
+        """Depth [height, width] m (inf: nothing is hit) and index of the primitive [height, width] in a camera's
+        picture; as :meth:`cast`."""
         p = self.primitives
         count = lens.width * lens.height
         depth = wp.empty(count, dtype=float, device=p.device)

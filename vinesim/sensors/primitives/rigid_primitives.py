@@ -18,7 +18,7 @@ from vinesim.sensors.primitives.primitive_batches import Batch, make_batch
 from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE
 
 _DEFAULT_SURFACE = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
-"""Surfaces of bodies that name none; robots are painted."""
+"""Surface of bodies that name none, by organ; robots are painted."""
 _MATERIALS = {
     "paint": int(materials.PAINT),
     "plastic": int(materials.PLASTIC),
@@ -32,7 +32,7 @@ _MATERIALS = {
     "lamp": int(materials.LAMP),
 }
 _NORMAL_LEVELS = 2047
-"""Levels of either coordinate of a packed normal."""
+"""Number of levels of each coordinate of a packed normal."""
 
 
 def rigid_batches(
@@ -43,9 +43,9 @@ def rigid_batches(
     shape: dict[int, np.ndarray],
     ripeness: Ripeness | None = None,
 ) -> list[Batch]:
-    """Shapes of all rigid bodies; carriers and groups count on from the given numbers.
+    """Shapes of all rigid bodies. Their carriers and groups are numbered from the given numbers on.
 
-    ``shape`` has the poses [piece, 7] of each picked bunch's pieces in its frame.
+    ``shape`` has for each picked bunch the poses [piece, 7] of its pieces, in the bunch's frame.
     """
     batches: list[Batch] = []
     for k, visual in enumerate(visuals):
@@ -72,7 +72,7 @@ def rigid_batches(
 
 
 def _rigid_shape(shape: Shape, common: dict) -> Batch:
-    """One primitive, or the triangles of a mesh, in the frame of its body."""
+    """One primitive, or the triangles of a mesh, in the frame of the body."""
     size = shape.size
     pose = np.asarray(shape.pose, float)
     centre = pose[:3]
@@ -99,9 +99,10 @@ def _rigid_shape(shape: Shape, common: dict) -> Batch:
 
 
 def pack_normals(normals: np.ndarray) -> np.ndarray:
-    """Unit vectors [..., 3] each in one float, as :func:`vinesim.kernels.shading.materials.unpack_normal` reads them.
+    """Unit vectors [..., 3], each packed in one float, as :func:`vinesim.kernels.shading.materials.unpack_normal` reads
+    them.
 
-    Octahedral (Meyer et al. 2010), two times eleven bits: exact to 0.001 rad.
+    The mapping is octahedral (Meyer et al. 2010), with eleven bits for each coordinate: exact to 0.001 rad.
     """
     flat = normals / np.maximum(np.abs(normals).sum(-1, keepdims=True), 1e-12)
     side = np.where(flat[..., :2] >= 0.0, 1.0, -1.0)

@@ -2,8 +2,8 @@
 
 :class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model` and follows the world through
 :meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing
-else. Plants come from :mod:`vinesim.core.disk_cache` where they were laid out before; another list of rigid bodies lays
-out those, and no plant.
+else. Plants come from :mod:`vinesim.core.disk_cache` if they were laid out before. When the list of rigid bodies
+changes, only rigid bodies are laid out again.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.wires.wire_segments import wire_segments
 
 _SKY_OF_RIGID = 0.7
-"""Share of the sky that robots, people and boxes see: GUESSED, nothing is baked for them."""
+"""Share of the sky's light that reaches robots, people and boxes: GUESSED, since none is computed for them."""
 _RIGID_ROOM = 2048
-"""Rigid primitives for which there is room from the start."""
+"""Number of rigid primitives for which there is room from the start."""
 _PRIMITIVE_COLUMNS = {
     **{f"local_{name}": wp.vec4 for name in "abcd"},
     **dict.fromkeys("abcd", wp.vec4),
@@ -53,11 +53,12 @@ _PRIMITIVE_COLUMNS = {
     "sky": wp.float32,
     **dict.fromkeys(("kind", "carrier", "label", "organ", "material"), wp.int32),
 }
-"""Values of each primitive: ``local_`` in the frame of its carrier, the others in the world."""
+"""Columns of the table of primitives: name -> type. Names with ``local_`` are in the frame of the carrier, others in
+the world."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
-"""Fields of :class:`ClusterLayout` with a value for each primitive."""
+"""Fields of :class:`ClusterLayout` that have a value for each primitive."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
-"""Values of each cluster."""
+"""Columns of the table of clusters: name -> type."""
 _TEXTURES = (
     "leaf_texture",
     "noise_texture",
@@ -84,38 +85,40 @@ class Primitives:
         ripeness: Ripeness | None = None,
         renderer: str = "warp",
     ) -> None:
-        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness`` of
-        the fruit: all of it is ripe unless given; ``renderer``: see :mod:`~vinesim.sensors.raster.renderer_selection`.
+        """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness``:
+        that of the fruit, all of it ripe unless given; ``renderer``: see
+        :mod:`~vinesim.sensors.raster.renderer_selection`.
         """
         self.model = model
         self.device = device
         self._ripeness = ripeness
         self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
-        """Fills the pixels of cameras; None where :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
-        does so itself."""
+        """Fills the pixels of cameras; None if :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
+        fills them itself."""
         self._bodies = len(model.body_mass)
         self._wires = wire_segments(model)
         self._static_carrier = self._bodies + len(self._wires)
-        """Carrier of the static scene; before it are those of plants' bodies and of segments of wires, behind it those
-        of rigid bodies."""
+        """Carrier of the static scene. Carriers before it are bodies of plants, then segments of wires; those behind it
+        are rigid bodies."""
         self._wires_away = np.zeros(0, int)
-        """Segments [k] that were away from where they were drawn."""
+        """Segments of wires [k] that were away from where they were drawn."""
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
-        """Shapes and clusters of the rigid bodies by organ, index and identity of the shapes."""
+        """Shapes and clusters of each rigid body. Key: organ, index, identity of the shapes."""
         self._moved = np.zeros(0, np.int64)
         outline, hull = textures.leaf_outlines()
         self._outline = wp.array(outline, device=device)
         self._hull = wp.array(hull, dtype=wp.vec2, device=device)
         self._body_q = State.at_rest(model).body_q
         self.pose_version = 0
-        """Counts changes of any pose."""
+        """Number of changes of any pose."""
         self.layout_version = 0
-        """Counts changes of the set of primitives."""
+        """Number of changes of the set of primitives."""
         self._columns: dict[str, wp.array] = {}
-        """All values of primitives and clusters by name, with room for more rigid bodies than there are now."""
+        """Columns of the tables of primitives and clusters, by name, with room for more rigid bodies than there are
+        now."""
         self._poses = np.zeros((0, 7), np.float32)
         self._textures = materials.Materials()
         self._textures.rows = wp.vec2(*row_layout(model))
@@ -134,16 +137,16 @@ class Primitives:
 
     @property
     def count(self) -> int:
-        """How many primitives there are."""
+        """Number of primitives."""
         return len(self.label)
 
     def counts_by_kind(self) -> dict[str, int]:
-        """How many there are of each kind."""
+        """Number of primitives of each kind."""
         kinds = self.shapes.kind.numpy()
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
     def clusters_shown(self) -> np.ndarray:
-        """Whether each cluster is drawn [cluster]; those of picked bunches are not."""
+        """[cluster] Whether each cluster is drawn; clusters of picked bunches are not."""
         return self.ball.numpy()[:, 3] > 0.0
 
     def local_columns(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
@@ -155,15 +158,16 @@ class Primitives:
         return {name: self._columns[column].numpy()[rows] for name, column in names.items()}
 
     def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
-        """Poses [..., 7] m, 1 of the carriers of some primitives [...]: a body of a plant, a segment of wire, a rigid
-        body, or the world."""
+        """Poses [..., 7] m, 1 of the carriers of some primitives [...]. A carrier is a body of a plant, a segment of
+        wire, a rigid body, or the world."""
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
 
     # -- building
 
     def _bake(self, grass: float) -> disk_cache.Arrays:
-        """Plants and the static scene laid out in clusters, and the share of the sky that each primitive, the far end
-        of each piece of wood, and the ground see through the leaves, in the shape at rest."""
+        """Lay out plants and the static scene in clusters, and compute the share of the sky that is visible through the
+        leaves. It is computed in the shape at rest: for each primitive, for the far end of each piece of wood, and for
+        the ground."""
         low, high = _ground_extent(self.model)
         layout = lay_out(self._plant_batches(grass, low, high), [], self._static_carrier)
         baked = {field.name: getattr(layout, field.name) for field in dataclasses.fields(layout)}
@@ -178,7 +182,7 @@ class Primitives:
         kind = self.shapes.kind.numpy()
         blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
         canopy = LeafDensity(blades, low, high, self.device)
-        # light runs on from one piece of wood to the next: cones know the sky at their far end too
+        # light is continuous from one piece of wood to the next: cones store the sky at their far end too
         wood = np.flatnonzero(kind == CONE)
         far = canopy.visible_sky(self.shapes.b.numpy()[wood, :3])
         baked["c"][wood, 2:] = np.stack([far, np.ones(len(wood))], 1)
@@ -205,7 +209,7 @@ class Primitives:
         return [b for b in batches if len(b)] or [placeholder_batch(static)]
 
     def _open(self, baked: disk_cache.Arrays) -> None:
-        """Take over what :meth:`_bake` made; poses are not yet applied."""
+        """Take over the result of :meth:`_bake`. Poses are not yet applied."""
         low, high = _ground_extent(self.model)
         low = low - 3.0
         high = high + 3.0
@@ -214,14 +218,14 @@ class Primitives:
         self._textures.ground_y = float(low[1])
         self._textures.ground_cell = float(_ground_step(low, high))
         self.plant_count = len(baked["label"])
-        """How many primitives are plants or the static scene; those of rigid bodies follow them."""
+        """Number of primitives of plants and of the static scene; those of rigid bodies follow them."""
         names = [field.name for field in dataclasses.fields(ClusterLayout)]
         plants = ClusterLayout(**{name: baked[name] for name in names})
         self._columns = {}
         self._reserve(plants, 0)
         self._write(plants, baked["sky"], 0, 0)
         self._plant_lamps = np.flatnonzero(plants.material == int(materials.LAMP))
-        nothing = np.zeros(0, np.float32)  # the columns hold these: hundreds of megabytes in a large vineyard
+        nothing = np.zeros(0, np.float32)  # the columns hold the values: hundreds of megabytes in a large vineyard
         self._plants = dataclasses.replace(plants, **dict.fromkeys(_ONLY_IN_COLUMNS, nothing))
         owners = len(self.model.tree_first) + len(self.model.fixed_start)  # trees, then pieces of wire
         self._by_owner = np.argsort(self._plants.owner, kind="stable")
@@ -260,7 +264,7 @@ class Primitives:
         if self.layout_version:
             version[:clusters] = self.cluster_version[:clusters]
         self.cluster_version = version
-        """:attr:`pose_version` at which each cluster moved last."""
+        """[cluster] :attr:`pose_version` at the last motion of each cluster."""
         lamps = self._plant_lamps
         if not empty:
             lamps = np.concatenate([lamps, np.flatnonzero(rigid.material == int(materials.LAMP)) + rows])
@@ -275,12 +279,13 @@ class Primitives:
             poses[: self._bodies], poses[self._bodies : self._static_carrier] = self._body_q, self._wires.rest_q
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
-        """[carrier, 7]; on a CPU the kernels read this very memory."""
+        """[carrier, 7] Pose of each carrier. On a CPU the kernels read the same memory."""
         self._visuals = visuals
         self.layout_version += 1
 
     def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
-        """Carrier and clusters of each rigid body that has a shape; one that was there before is not laid out anew."""
+        """Carrier and clusters of each rigid body that has a shape. A body that was there before is not laid out
+        again."""
         picked = self._picked_bunch_shapes(visuals)
         known = {}
         found = []
@@ -297,7 +302,8 @@ class Primitives:
         return found
 
     def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
-        """Device memory for the plants and twice as many rigid primitives as given; that of the plants is kept."""
+        """Allocate device memory for the plants and for twice the number ``rigid`` of primitives; values of plants are
+        kept."""
         kept = self._columns
         room = max(2 * rigid, _RIGID_ROOM)
         for names, count in ((_PRIMITIVE_COLUMNS, self.plant_count), (_CLUSTER_COLUMNS, len(plants.first))):
@@ -308,7 +314,7 @@ class Primitives:
                 self._columns = self._columns | {name: column}
 
     def _write(self, layout: ClusterLayout, sky: np.ndarray, row: int, cluster: int) -> None:
-        """Write primitives and clusters to the device, from a ``row`` and a ``cluster`` on."""
+        """Write primitives and clusters of a layout to the device, from the ``row`` and the ``cluster`` on."""
         values = {name: getattr(layout, name) for name in ("material", "tint", "organ", "label", "carrier")}
         values |= {f"local_{name}": getattr(layout, name) for name in "abcd"}
         values |= {"kind": np.repeat(layout.kind, layout.size), "sky": sky}
@@ -321,7 +327,7 @@ class Primitives:
             self._columns[name][cluster:end].assign(np.ascontiguousarray(column.astype(np.int32)))
 
     def _bind(self) -> None:
-        """Structs of the primitives and clusters that there are now, in the memory of the columns."""
+        """Make the structs of the present primitives and clusters, in the memory of the columns."""
         column = {name: self._columns[name][: len(self.label)] for name in _PRIMITIVE_COLUMNS}
         column |= {name: self._columns[name][: len(self.cluster_first)] for name in _CLUSTER_COLUMNS}
         self._local = primitives.Shapes()
@@ -352,7 +358,8 @@ class Primitives:
             setattr(self.materials, name, getattr(self._textures, name))
 
     def _picked_bunch_shapes(self, visuals: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
-        """Poses [piece, 7] of the pieces of picked bunches in their frames: as they were when first seen loose."""
+        """Poses [piece, 7] of the pieces of each picked bunch, in the bunch's frame, as they were when it was first
+        seen detached."""
         picked = {}
         for bunch in (visual.index for visual in visuals if visual.organ == Organ.BUNCH):
             q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
@@ -365,8 +372,8 @@ class Primitives:
     def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
         """Take over the poses of ``snapshot``; returns the clusters [k] that moved.
 
-        ``moved`` are the trees that may have moved since the last call (default: those of this snapshot and
-        the one before). A caller that skips snapshots must gather them from all of these.
+        ``moved`` are the trees that may have moved since the last call (default: the moved trees of this snapshot and
+        of the one before). A caller that skips snapshots must collect the moved trees of all skipped ones.
         """
         body_q = snapshot.body_q
         visual_q = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
@@ -376,7 +383,7 @@ class Primitives:
         if new_visuals:
             self._body_q = body_q
             self._build(snapshot.visuals)
-            # a world that is new, or was set back, need not say what moved
+            # a new world, or one that was set back, need not list the trees that moved
             differs = (np.asarray(body_q, np.float32) != self._poses[: self._bodies]).any(1)
             trees = np.union1d(trees, self.model.body_tree[differs])
         attached = np.asarray(snapshot.bunch_attached, bool)
@@ -401,7 +408,7 @@ class Primitives:
         return dirty
 
     def _clusters_of(self, owners: np.ndarray) -> np.ndarray:
-        """Clusters that the given trees, and pieces of wire, which are numbered behind all trees, [k] move."""
+        """Clusters [k] that the given owners move. Owners are trees, and behind all trees the pieces of wire."""
         start = self._owner_start[owners]
         size = self._owner_start[owners + 1] - self._owner_start[owners]
         inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
@@ -428,8 +435,8 @@ class Primitives:
 
 
 def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
-    """Whether each cluster is to be drawn [cluster] int32, by the bunch that it belongs to (-1 for none) [cluster]: not
-    those of bunches that no longer hang."""
+    """[cluster] int32 Whether each cluster is to be drawn. It is not if the bunch [cluster] that it belongs to (-1 for
+    none) no longer hangs."""
     if not len(attached):
         return np.ones(len(bunch), np.int32)
     return ((bunch < 0) | attached[bunch]).astype(np.int32)
@@ -442,12 +449,13 @@ def _ground_extent(model: Model) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _ground_step(low: np.ndarray, high: np.ndarray) -> float:
-    """Spacing of the table of the sky that the ground sees [m]."""
+    """Spacing [m] of the table of the share of the sky that is visible from the ground."""
     return max(0.2, float((high - low).max()) / 500.0)
 
 
 def _digest(model: Model, grass: float, device: str) -> str:
-    """Of all that the plants' primitives follow from; a GPU rounds their light in its own way."""
+    """Digest of everything that the primitives of plants depend on. A GPU rounds their light differently, so the device
+    counts."""
     package = pathlib.Path(__file__).parents[2]
     folders = ("scene", "sensors/primitives", "sensors/raster", "kernels/raster")
     code = [package / part for part in (*folders, "core/frames.py", "wires/wire_segments.py")]

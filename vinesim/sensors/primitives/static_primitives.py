@@ -1,4 +1,4 @@
-"""Posts, wires, trunks and arms as primitives; grass and herbs. Of these only wires under tension move."""
+"""Posts, wires, trunks and arms as primitives; grass and herbs. Only wires under tension move."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
 
 _CELL_SIZE = 2.5
-"""Side of the squares in which things that never move are clustered [m]."""
+"""Side of the squares by which primitives that never move are clustered [m]."""
 _MAX_SEGMENT = 0.5
-"""Longest piece of what never moves [m]."""
+"""Longest piece into which primitives that never move are cut [m]."""
 _TRELLIS = {
     Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
     Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
@@ -26,18 +26,18 @@ _TRELLIS = {
 
 
 def _ground_cells(position: np.ndarray, first: int) -> np.ndarray:
-    """A group number for each square of the ground [n]."""
+    """[n] Group number of each position: one number for each square of the ground."""
     cell = np.floor(position[:, :2] / _CELL_SIZE).astype(np.int64)
     cell -= cell.min(0, initial=0)
     return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
 
 
 def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
-    """All that stands, but for :func:`wire_batch`."""
+    """All trellis and wood that never moves; for wires under tension see :func:`wire_batch`."""
     still = np.flatnonzero(model.fixed_tension <= 0.0)
     if not len(still):
         return []
-    # long ones in pieces: a box around a whole one holds half of the vineyard
+    # long pieces are cut: a box around a whole one would contain half of the vineyard
     length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)[still]
     whole, begin, stop = cut(length, _MAX_SEGMENT)
     values = _cones(model, still[whole], begin, stop)
@@ -46,7 +46,7 @@ def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
 
 
 def wire_batch(model: Model, segments: WireSegments, first_carrier: int, first_group: int) -> Batch | None:
-    """The segments of wires that give, each on a carrier of its own, in a group for each piece of wire."""
+    """The segments of wires under tension. Each has its own carrier; the segments of a piece of wire form a group."""
     if not len(segments):
         return None
     values = _cones(model, segments.piece, segments.start, segments.end)
@@ -57,7 +57,7 @@ def wire_batch(model: Model, segments: WireSegments, first_carrier: int, first_g
 
 
 def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray) -> dict[str, np.ndarray]:
-    """Values of the parts of fixed pieces [part] between two shares of their length [part], as drawn."""
+    """Columns of parts of fixed pieces [part], as drawn. A part lies between two shares of its piece's length."""
     way = model.fixed_end - model.fixed_start
     length = np.linalg.norm(way, axis=1)[piece]
     start, end = (model.fixed_start[piece] + share[:, None] * way[piece] for share in (begin, stop))
@@ -69,7 +69,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
     rng = np.random.default_rng(3)
     seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[index] * 7.0
-    # bark runs through from piece to piece: distances count from the foot of a post, along a wire
+    # bark is continuous from piece to piece: distances count from the foot of a post, and along a wire
     upright = np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1)
     return {
         "a": stack_columns(start, thick),
@@ -91,7 +91,8 @@ def row_layout(model: Model) -> tuple[float, float]:
 
 
 def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
-    """As :func:`vinesim.kernels.shading.materials.row_greenness`, which colours the ground."""
+    """Greenness of the ground, as :func:`vinesim.kernels.shading.materials.row_greenness` computes it to colour the
+    ground."""
     lane = (y - rows[0]) / rows[1]
     away = np.abs(lane - np.round(lane)) * rows[1]
     track = np.abs(away - 0.5 * rows[1] + 0.7)
@@ -144,7 +145,7 @@ def grass_batch(
     rng = np.random.default_rng(23)
     position = low + (high - low) * rng.uniform(size=(count, 2))
     noise = textures.sample_noise(position[:, 0] * 0.21, position[:, 1] * 0.21)
-    # as the ground is coloured
+    # greenness as in the colour of the ground
     green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _row_greenness(rows, position[:, 1])
     position = position[green > 0.40 + 0.24 * rng.uniform(size=count)]
     n = len(position)

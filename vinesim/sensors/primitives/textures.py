@@ -30,18 +30,18 @@ _SUPERSAMPLING = 4
 
 @functools.cache
 def _digest() -> str:
-    """Of the code that makes the tables."""
+    """Digest of the code that makes the tables."""
     return disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(leaves.__file__), cv2.__version__)
 
 
 def _on_disk(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
-    """``make``, which computes tables, with what it returns kept on disk."""
+    """A function that returns the tables computed by ``make``, which are kept on disk."""
     name = make.__name__.strip("_").replace("_", "-")
     return lambda: disk_cache.load_or_make(name, _digest(), make)
 
 
 def _cached(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
-    """The same, kept in this process, too."""
+    """As :func:`_on_disk`; the tables are kept in this process, too."""
     return functools.cache(_on_disk(make))
 
 
@@ -217,10 +217,11 @@ def _soil_texture() -> disk_cache.Arrays:
     return {"table": np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)}
 
 
-@_on_disk  # 13 MB, for a moment whenever the sun is elsewhere
+@_on_disk  # 13 MB, needed only for a moment when the sun has moved
 def _sky_layers() -> disk_cache.Arrays:
-    """What of the sky no sun changes: ``cloud``, its share; and of ``ridges`` and ``trees`` in front of it, which reach
-    up to some row, the shares and the colour of the trees. float64, as they are mixed."""
+    """Parts of the sky that do not depend on the sun: ``cloud``, the share of clouds; ``ridges``, ``trees`` and
+    ``tree_share`` in front of the sky, which reach up to some row: the shares, and the colour of the trees. float64, in
+    which they are mixed."""
     height, azimuth = (np.ascontiguousarray(part) for part in np.broadcast_arrays(*_sky_directions()))
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
@@ -251,7 +252,8 @@ _RIDGE_ROWS = 180
 _RIDGE_TONES = np.array([0.36, 0.47, 0.62]), np.array([0.22, 0.32, 0.36])
 """Linear RGB of the far and the near ridge."""
 _SKY_BAND = 12
-"""Rows of the sky's table that are computed at once, so few that they stay in a core's cache; divides the ridge's."""
+"""Number of rows of the sky's table that are computed at once: few enough to stay in a core's cache. It divides
+:data:`_RIDGE_ROWS`."""
 
 
 def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
@@ -260,7 +262,7 @@ def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _clear_sky() -> np.ndarray:
-    """The blue of a sky without clouds [row, 1, 3]: it is the same all around."""
+    """Blue of a sky without clouds [row, 1, 3]: it is the same in all directions."""
     height, _ = _sky_directions()
     horizon = np.exp(-5.5 * height)[..., None]
     return (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
@@ -301,7 +303,7 @@ def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of
 
 
 def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
-    """Noise at positions of period 1, bilinear [..., 4], or some octaves of it."""
+    """Noise of period 1 at some positions, with bilinear interpolation [..., 4]; or some of its octaves."""
     table = np.ascontiguousarray(noise_texture()[..., octaves]).reshape(TEXTURE_SIZE**2, -1)
     fx = (x % 1.0) * TEXTURE_SIZE
     fy = (y % 1.0) * TEXTURE_SIZE

@@ -32,22 +32,22 @@ from vinesim.sensors.raster.primitive_arrays import (
 MAX_DEPTH = 500.0
 """Nothing is drawn beyond this depth [m]."""
 BANDS_PER_THREAD = 2
-"""Bands of a picture that one thread draws on average: a thread that has finished its band takes the next."""
+"""Average number of bands of a picture for each thread. A thread that has finished its band takes the next one."""
 _KERNELS = (
     (camera_raster_plants.raster_cones, (CONE,)),
     (camera_raster_plants.raster_spheroids, (SPHEROID,)),
     (camera_raster.raster_triangles, (TRIANGLE,)),
     (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
-    (camera_raster_plants.raster_leaves, (LEAF,)),  # last: the dearest test, so most of it is hidden by then
+    (camera_raster_plants.raster_leaves, (LEAF,)),  # last, since this test costs most: most leaves are hidden by then
 )
 _KERNEL_OF_KIND = np.array(
     [next(i for i, (_, kinds) in enumerate(_KERNELS) if kind in kinds) for kind in range(TRIANGLE + 1)]
 )
-"""Which of these draws a kind."""
+"""[kind] Index of the entry of ``_KERNELS`` that draws each kind."""
 
 
 def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
-    """Intrinsics and pose [7] of the optical frame as kernels need them."""
+    """Kernel struct of a camera with intrinsics ``info`` whose optical frame has the ``pose`` [7]."""
     if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
         raise ValueError(
             f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
@@ -76,7 +76,7 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
 
 
 def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
-    """``count`` lenses or fewer that draw the rows of one picture between them, an even number of rows each."""
+    """Up to ``count`` lenses that together draw the rows of one picture; each draws an even number of rows."""
     rows = [2 * round(0.5 * lens.height * i / count) for i in range(count)] + [lens.height]
     bands = []
     for first, end in itertools.pairwise(rows):
@@ -91,7 +91,7 @@ def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
 
 
 def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
-    """Intrinsics of the same view with ``samples`` squared pixels for each one."""
+    """Intrinsics of the same view with ``samples`` times as many pixels along each side."""
     return dataclasses.replace(
         info,
         width=info.width * samples,
@@ -104,10 +104,11 @@ def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
 
 
 class CameraRasterizer:
-    """Nearest primitive of every pixel; the buffers of one camera."""
+    """Finds the nearest primitive of every pixel, and holds the buffers of one camera."""
 
     def __init__(self, width: int, height: int, device: str = "cpu", workers: ThreadPool | None = None) -> None:
-        """``workers`` draw bands of rows at once; every number of them gives the same bits."""
+        """``workers`` draw bands of rows at the same time. The result is the same to the bit for every number of
+        workers."""
         count = width * height
         self.workers = workers or ThreadPool(1)
         self.width = width
@@ -129,7 +130,7 @@ class CameraRasterizer:
     ) -> None:
         """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels.
 
-        ``beside`` is other work for the same threads, done when this returns.
+        ``beside`` is other work for the same threads; it is done when this returns.
         """
         if primitives.rasterizer is not None:
             primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
@@ -150,8 +151,8 @@ class CameraRasterizer:
         return row_bands(lens, BANDS_PER_THREAD * self.workers.size if self.workers.size > 1 else 1)
 
     def _resolve(self, primitives: PosedPrimitives, lens: Pinhole, nearest: float, farthest: float) -> None:
-        """Read the keys of the rows that ``lens`` draws into primitive numbers, depth and labels."""
-        run = self.width if self.device == "cpu" else 1  # structs are handed to a thread, not to a pixel
+        """Convert the keys of the rows of ``lens`` to primitive numbers, depth and labels."""
+        run = self.width if self.device == "cpu" else 1  # a thread takes a row: structs are passed once a thread
         wp.launch(
             camera_raster.resolve_keys,
             self.width * (lens.end_row - lens.first_row) // run,
@@ -171,7 +172,7 @@ class CameraRasterizer:
         )
 
     def cluster_distances(self, primitives: PosedPrimitives, lens: Pinhole) -> np.ndarray:
-        """How near each cluster may come to the eye [cluster] m; :data:`shapes.FAR` if no pixel can see it."""
+        """[cluster] m Least distance of each cluster from the eye; :data:`shapes.FAR` if no pixel can see it."""
         distance = wp.empty(len(primitives.cluster_first), dtype=float, device=self.device)
         wp.launch(
             camera_raster.cull_clusters,
@@ -183,7 +184,7 @@ class CameraRasterizer:
         return distance.numpy()
 
     def coverage(self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray) -> np.ndarray:
-        """Pixels [height, width] that would see these clusters [k] if there were nothing else. Only keys are drawn."""
+        """Pixels [height, width] that would see some clusters [k] if the scene had no others. Only keys are drawn."""
         if primitives.rasterizer is None:
             self._rasterize(primitives, lens, clusters)
         else:
@@ -191,12 +192,11 @@ class CameraRasterizer:
         return self.keys.numpy().reshape(self.height, self.width) < int(EMPTY_KEY)
 
     def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
-        """Fill the keys of the rows that ``lens`` draws with the nearest of some clusters [k]; fastest if they come
-        from near to far.
-        """
+        """Fill the keys of the rows of ``lens`` with the nearest primitive of some clusters [k]. Fastest if the
+        clusters are sorted from near to far."""
         assert self._keys is not None, "these kernels draw on a CPU only"
         rows = slice(lens.first_row * self.width, lens.end_row * self.width)
-        self._keys[rows].fill(int(EMPTY_KEY))  # numpy's fill of the same memory: five times as fast
+        self._keys[rows].fill(int(EMPTY_KEY))  # numpy fills this memory five times as fast as Warp
         seen = np.asarray(seen, np.int32)
         kind = primitives.cluster_kind[seen]
         stage = _KERNEL_OF_KIND[kind]

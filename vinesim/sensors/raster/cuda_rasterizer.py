@@ -1,4 +1,4 @@
-"""The rasteriser on a GPU: where its lists of pieces live, and how many threads draw them."""
+"""The rasteriser on a GPU: the memory of its lists of pieces, and the number of threads that draw them."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ _LISTS = int(cuda_raster.TILE_LISTS)
 
 
 class CudaRasterizer:
-    """Fills the keys of pictures of any size; no host waits for a GPU.
+    """Fills the keys of pictures of any size. The host does not wait for the GPU.
 
     Args:
-        groups: how many pieces are drawn at once, of each list.
-        lanes: threads that draw one piece together.
-        listers: threads that list the pieces of one cluster.
-        block: CUDA threads a block that draw pieces.
-        room: pieces for which each list has room. What finds none is drawn too, only slowly.
+        groups: number of pieces of each list that are drawn at the same time.
+        lanes: number of threads that draw one piece together.
+        listers: number of threads that list the pieces of one cluster.
+        block: number of threads in a CUDA block that draws pieces.
+        room: number of pieces for which each list has room. Further pieces are drawn too, but slowly.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class CudaRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """The nearest primitive of every pixel, of all clusters or of some [k]."""
+        """Find the nearest primitive of every pixel among all clusters, or among some [k]."""
         if len(self._all) != len(primitives.cluster_first):
             self._all = wp.array(np.arange(len(primitives.cluster_first), dtype=np.int32), device=self.device)
         which = self._all if clusters is None else wp.array(np.asarray(clusters, np.int32), device=self.device)

@@ -1,4 +1,4 @@
-"""Pictures through a lens with distortion: taken by a pinhole that sees at least as much, and moved to their pixels."""
+"""Pictures through a lens with distortion: drawn by a pinhole camera that sees at least as much, then resampled."""
 
 from __future__ import annotations
 
@@ -12,23 +12,24 @@ from vinesim.scene.camera_geometry import pixel_rays
 from vinesim.scene.values import CameraInfo
 
 MAX_GROWTH = 4.0
-"""Pixels of the pinhole for each one of the picture, at most."""
+"""Largest number of pixels of the pinhole picture for each pixel of the distorted picture."""
 
 
 class LensError(ValueError):
-    """Coefficients of distortion that no picture can be drawn with. The text is one line."""
+    """No picture can be drawn with these coefficients of distortion. The text is one line."""
 
 
 class LensMap:
-    """What is drawn for a camera, and how its pictures follow from that: unchanged if it has no distortion."""
+    """The pinhole that is drawn for a camera, and the map from its pictures to the camera's. Pictures of a camera
+    without distortion are not changed."""
 
     def __init__(self, info: CameraInfo) -> None:
         self.pinhole = info
-        """Intrinsics of what is drawn."""
+        """Intrinsics of the pinhole that is drawn."""
         self._columns = self._rows = np.zeros((0, 0), np.float32)
-        """Where in it each pixel is taken from [height, width]."""
+        """[height, width] Place in the pinhole's picture from which each pixel is taken."""
         self._nearest = np.zeros((0, 0), np.intp)
-        """The pixel there, counted row by row."""
+        """[height, width] Pixel of the pinhole's picture that is nearest to this place, counted row by row."""
         if not info.distortion:
             return
         if len(info.distortion) not in camera_geometry.MODELS:
@@ -58,19 +59,19 @@ class LensMap:
         self._nearest = np.rint(self._rows).astype(np.intp) * width + np.rint(self._columns).astype(np.intp)
 
     def nearest(self, drawn: np.ndarray) -> np.ndarray:
-        """What was drawn, [height, width] of the pinhole, as the picture shows it: the nearest value of each pixel."""
+        """The camera's picture from the pinhole's ``drawn`` [height, width]: each pixel takes the nearest value."""
         return drawn if not self._nearest.size else drawn.reshape(-1)[self._nearest]
 
     def smooth(self, drawn: np.ndarray) -> np.ndarray:
-        """The same for colours [height, width, 3] uint8, between pixels linearly."""
+        """As :meth:`nearest` for colours [height, width, 3] uint8, with linear interpolation between pixels."""
         if not self._nearest.size:
             return drawn
-        import cv2  # here, as most cameras do without
+        import cv2  # imported here, since most cameras do not need it
 
         return cv2.remap(drawn, self._columns, self._rows, cv2.INTER_LINEAR)
 
 
 @functools.lru_cache(maxsize=16)
 def lens_map(info: CameraInfo) -> LensMap:
-    """The map of a camera, made once. :class:`LensError` if there is none."""
+    """The map of a camera, made once. :class:`LensError` if its distortion cannot be drawn."""
     return LensMap(info)

@@ -41,21 +41,22 @@ class PosedPrimitives(Protocol):
     shapes: primitives.Shapes
     clusters: primitives.Clusters
     ball: wp.array
-    """[cluster] vec4: centre and radius of a bounding sphere [m]; the radius is negative where a cluster is hidden."""
+    """[cluster] vec4, bounding sphere: centre and radius [m]. The radius is negative if the cluster is hidden."""
     labels: wp.array
-    """[primitive] int32, :func:`vinesim.scene.ids.label`."""
+    """[primitive] int32, as of :func:`vinesim.scene.ids.label`."""
     cluster_first: np.ndarray
-    """[cluster] int32, index of the first primitive."""
+    """[cluster] int32, index of the cluster's first primitive."""
     cluster_size: np.ndarray
-    """[cluster] int32, number of primitives."""
+    """[cluster] int32, number of the cluster's primitives."""
     cluster_kind: np.ndarray
     """[cluster] int32, one of :data:`KINDS`."""
     pose_version: int
-    """Changes when any pose changes."""
+    """Number that changes when any pose changes."""
 
     @property
     def rasterizer(self) -> PrimitiveRasterizer | None:
-        """What fills the keys of cameras; None: the kernels of :mod:`vinesim.kernels.raster.camera_raster`."""
+        """The rasteriser that fills the keys of cameras; None for the kernels of
+        :mod:`vinesim.kernels.raster.camera_raster`."""
         ...
 
 

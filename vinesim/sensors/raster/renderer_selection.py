@@ -7,7 +7,7 @@ import importlib.util
 from vinesim.sensors.raster.primitive_arrays import PrimitiveRasterizer
 
 RENDERERS = ("warp", "taichi", "taichi-gpu")
-"""By name, the default first (docs/decisions/renderers.md)."""
+"""Names of the renderers, the default first (docs/decisions/renderers.md)."""
 
 
 class RendererUnavailable(ValueError):
@@ -17,7 +17,8 @@ class RendererUnavailable(ValueError):
 
 
 def check_renderer(renderer: str, device: str = "cpu") -> str:
-    """Its name, if it is known, installed and draws on ``device``; :class:`RendererUnavailable` in words if not."""
+    """Return the name of a renderer that is known, installed and draws on ``device``; :class:`RendererUnavailable` in
+    words if not."""
     if renderer not in RENDERERS:
         raise RendererUnavailable(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
     if renderer != "warp" and importlib.util.find_spec("taichi") is None:
@@ -32,7 +33,7 @@ def check_renderer(renderer: str, device: str = "cpu") -> str:
 
 
 def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
-    """The rasteriser of that name for primitives on ``device``; None for Warp's own on a CPU."""
+    """The rasteriser of a renderer, by name, for primitives on ``device``; None for Warp's own on a CPU."""
     if check_renderer(renderer, device) != "warp":
         from vinesim.sensors.raster.taichi_rasterizer import TaichiRasterizer
 

@@ -1,6 +1,6 @@
 """Primitives in Taichi: for each kind, functions that place it in the optical frame, bound it, and meet it with a ray.
 
-``place`` carries a primitive into the optical frame, ``outline`` bounds its picture by a box and two strips
+``place`` transforms a primitive into the optical frame, ``outline`` bounds its picture by a box and two strips
 ``low <= x - slope y <= high``, ``hit`` meets it with the ray of a pixel. The arrays are those of
 :mod:`vinesim.kernels.raster.primitives`. No postponed annotations: Taichi needs real ones.
 """
@@ -23,12 +23,14 @@ TEXELS = float(leaf_surface.OUTLINE_TEXELS)
 
 mat3 = ti.types.matrix(3, 3, ti.f32)
 Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
-"""A primitive in the optical frame; boxes and ellipsoids keep two axes in b and c, with a half size beside each."""
+"""A primitive in the optical frame. Boxes and ellipsoids keep two axes in b and c, each with a half size as fourth
+component."""
 Lens = ti.types.struct(
     eye=vec3, rotation=mat3, focal=vec2, centre=vec2, size=vec2, max_depth=ti.f32, near_radius=ti.f32
 )
 Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
-"""Box: lowest and highest x, lowest and highest y [pixel]; strips: slope, low, high; no point of it is nearer [m]."""
+"""Bounds of a primitive in the picture. ``box``: lowest and highest x, lowest and highest y [pixel]. ``rising``,
+``falling``: strips (slope, low, high). ``depth``: no point of the primitive is nearer [m]."""
 EMPTY_BOUNDS = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
 UNBOUNDED_STRIP = vec3(0.0, -UNBOUND, UNBOUND)
 
@@ -38,7 +40,8 @@ UNBOUNDED_STRIP = vec3(0.0, -UNBOUND, UNBOUND)
 
 @ti.func
 def tangents(x, z, r):
-    """Both tangents (x / z) from the origin to a circle; unbound, with the right sign, beyond +-90 degrees."""
+    """Both tangents (x / z) from the origin to a circle. Beyond +-90 degrees they are unbounded, with the right
+    sign."""
     out = vec2(-UNBOUND, UNBOUND)
     free = x * x + z * z - r * r
     if free > 0.0:
@@ -190,7 +193,7 @@ def triangle_outline(s, hull: ti.template(), lens):
 
 @ti.func
 def hit_ball(centre, r, d):
-    """First hit of a ray from the origin with a sphere that does not hold the origin."""
+    """First hit of a ray from the origin with a sphere that does not contain the origin."""
     dd = dot(d, d)
     along = dot(d, centre) / dd
     miss = centre - d * along
@@ -236,7 +239,7 @@ def hit_box(s, outlines: ti.template(), d, smooth):
 
 @ti.func
 def hit_cone(s, outlines: ti.template(), d, smooth):
-    """The hull of two spheres, measured from the foot of the perpendicular onto the axis' middle."""
+    """Hit with the hull of two spheres, measured from the foot of the perpendicular onto the axis' middle."""
     a = s.a.xyz
     b = s.b.xyz
     ra = s.a[3]
@@ -347,7 +350,7 @@ def on_blade(outlines: ti.template(), number, u, v, smooth):
 
 @ti.func
 def hit_leaf(s, outlines: ti.template(), ray, smooth):
-    """Two half surfaces w = a u^2 + b v^2 + c |u| in the leaf's own frame and unit, hinged at u = 0."""
+    """Hit with two half surfaces w = a u^2 + b v^2 + c |u| in the leaf's own frame and unit, hinged at u = 0."""
     rib = s.b.xyz
     up = s.c.xyz
     bend = s.d
@@ -393,7 +396,7 @@ def arrow(lens, v):
 
 @ti.func
 def place_blade(lens, a, b, c, d):
-    """Leaves and spheroids: a point and directions."""
+    """Place leaves and spheroids, which have one point; the other vectors are directions."""
     return Placed(a=point(lens, a), b=arrow(lens, b), c=arrow(lens, c), d=d)
 
 
@@ -420,5 +423,5 @@ KERNEL_FUNCTIONS = {
     BOX: (place_box, box_outline, hit_box),
     ELLIPSOID: (place_box, ellipsoid_outline, hit_ellipsoid),
     CYLINDER: (place_points, cylinder_outline, hit_cylinder),
-    LEAF: (place_blade, leaf_outline, hit_leaf),  # last: the dearest test, so most of it is hidden by then
+    LEAF: (place_blade, leaf_outline, hit_leaf),  # last, since this test costs most: most leaves are hidden by then
 }

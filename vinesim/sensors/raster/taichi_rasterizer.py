@@ -1,7 +1,8 @@
 """The camera rasteriser in Taichi: for all cores of a CPU, and for GPUs that Warp cannot use (Vulkan, Metal).
 
 It reads the arrays of :mod:`vinesim.kernels.raster.primitives` and finds the same primitive in every pixel. A GPU here
-may have no 64-bit atomics; there depth and number are found one after the other, in two passes.
+may have no 64-bit atomics; there depth and number of the nearest primitive are found one after the other, in two
+passes.
 
 Only this module and :mod:`vinesim.sensors.raster.taichi_primitives` know Taichi. No postponed annotations: Taichi needs
 real ones.
@@ -26,20 +27,22 @@ EMPTY_KEY = int(pinhole.EMPTY_KEY)
 SMOOTH_SIZE = float(pinhole.SMOOTH_SIZE)
 _NO_PRIMITIVE = 2**31 - 1
 _INEXACT = 2**30
-"""Added to numbers found a micrometre too deep: one pass may be compiled, and round, otherwise than the other."""
+"""Added to primitive numbers that were found a micrometre too deep: the compiler may round differently in the two
+passes."""
 _CORES = (64, 1)
 _GPU = (24, 32)
-"""How many share the primitives of a cluster, and the rows of each of them. Taichi hands 512 iterations at once to a
-core of a CPU, idle ones counted: so 8 clusters, few enough that no core is left with all that is near."""
+"""On a GPU: number of threads that share the primitives of a cluster, and of threads that share the rows of a
+primitive. On a CPU (``_CORES``) Taichi gives 512 iterations at once to a core, idle ones included. So a core gets 8
+clusters, few enough that no core gets all near ones."""
 KEY, DEPTH, NUMBER = range(3)
-"""What a pass draws: depth and number in one; depth alone; the number of what lies at that depth."""
+"""What a pass draws: depth and number at once; depth alone; the number of the primitive at that depth."""
 
 Table = ti.types.ndarray(dtype=vec4, ndim=1)
 
 
 @ti.func
 def lens_of(view: ti.template()):
-    """The camera out of one array: a struct of vectors costs Taichi a millisecond a launch."""
+    """Unpack the camera from one array: passing a struct of vectors costs Taichi a millisecond in every launch."""
     return Lens(
         eye=vec3(view[0], view[1], view[2]),
         rotation=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
@@ -124,7 +127,8 @@ class TaichiRasterizer:
     """Fills the keys of pictures as Warp's rasteriser does: on all cores of the CPU, or on a Vulkan or Metal GPU."""
 
     def __init__(self, gpu: bool = False) -> None:
-        """Raises RuntimeError where there is no such GPU. A process has one kind of twin."""
+        """Raises RuntimeError if there is no such GPU. A process has Taichi rasterisers of one kind only, CPU or
+        GPU."""
         _start(gpu)
         self._gpu = gpu
         self._of: tuple[object, int] = (None, -1)
@@ -135,7 +139,7 @@ class TaichiRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """The nearest primitive of every pixel, of all clusters or of some [k]."""
+        """Find the nearest primitive of every pixel among all clusters, or among some [k]."""
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
         mine = {number: which[kind == number] for number in KERNEL_FUNCTIONS}
@@ -155,7 +159,7 @@ class TaichiRasterizer:
     def _rasterize_on_gpu(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
-        """On a GPU: depths, then numbers; what has not moved stays there."""
+        """Draw on a GPU: first depths, then numbers. Arrays of primitives are copied there again only after motion."""
         if self._of != (primitives, primitives.pose_version):
             s = primitives.shapes
             self._of = (primitives, primitives.pose_version)
@@ -181,7 +185,7 @@ class TaichiRasterizer:
 
 @functools.cache
 def _start(gpu: bool) -> None:
-    """Taichi, once a process; its greeting is kept from standard output, which belongs to the command."""
+    """Start Taichi, once in a process. Its greeting is kept from standard output, which belongs to the command."""
     with contextlib.redirect_stdout(io.StringIO()), _floating_point_kept():
         if gpu:
             ti.init(arch=[ti.metal, ti.vulkan], enable_fallback=False, log_level=ti.ERROR)
@@ -194,8 +198,8 @@ def _start(gpu: bool) -> None:
 def _floating_point_kept() -> Iterator[None]:
     """Leave the floating-point environment of this thread as it was.
 
-    Taichi switches denormal numbers off for whatever this thread computes from then on: physics in the same process
-    would have other bits than without a camera.
+    Taichi switches denormal numbers off for all later computations of this thread. Physics in the same process would
+    then differ in some bits from physics without a camera.
     """
     # fenv_t: 32 bytes on x86-64, 8 on AArch64
     libm = ctypes.CDLL(None)
@@ -208,13 +212,13 @@ def _floating_point_kept() -> Iterator[None]:
 
 
 def _pinhole_values(lens: pinhole.Pinhole) -> np.ndarray:
-    """What :func:`lens_of` reads."""
+    """The array that :func:`lens_of` unpacks."""
     others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.max_depth, lens.near_radius
     return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
 
 
 def _visible_clusters(primitives: PosedPrimitives, lens: pinhole.Pinhole) -> np.ndarray:
-    """Clusters of which a pixel may see something, near ones first [k]."""
+    """Clusters that a pixel may see, near ones first [k]."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]
     p = (ball[:, :3] - np.array(lens.eye)) @ np.array(lens.rotation).reshape(3, 3).T
