@@ -163,7 +163,8 @@ class Client:
         """Called at the end of a tick. They wake the processes that take its results. They come last because a process
         that is woken may get this core at once."""
         self.script = ""
-        """Command line options that let the robots act by themselves. Services do not reset a client that has any."""
+        """Command line option that lets the robots act by themselves, or "". Services do not reset a client that has
+        one."""
         self.after_reset: list[Callable[[], None]] = []
         """Called after :meth:`reset`, so that parts that hold references to the physics or a robot take the new
         objects."""
