@@ -31,7 +31,7 @@ class GripperController(abc.ABC):
 
     @abc.abstractmethod
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """Take a goal at ``time`` [s]. ``effort`` None: no limit but the drive's. Raises :class:`CommandError` if the
+        """Take a goal at ``time`` [s]. ``effort`` None: the gripper's own limit. Raises :class:`CommandError` if the
         goal is unfit."""
 
     @abc.abstractmethod

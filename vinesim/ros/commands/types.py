@@ -97,7 +97,7 @@ class GripperGoal:
     goal: bytes
     position: float
     max_effort: float | None
-    """Largest effort; None: the limit of the drive."""
+    """Largest effort; None: the own limit of the gripper."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
