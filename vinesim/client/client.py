@@ -60,26 +60,26 @@ log = logging.getLogger(__name__)
 
 
 def label_index(name: str) -> int:
-    """Index of an actor's label in images: the same on every client, from the name alone.
+    """Index of an actor's label in images. It follows from the name alone, so it is the same on every client.
 
-    With 64 actors the chance that two have the same is 0.2 %.
+    With 64 actors the chance that two of them have the same index is 0.2 %.
     """
     return zlib.crc32(name.encode()) % LABEL_STRIDE
 
 
 CLOCK_POLL_PERIOD = 0.005
-"""Time between two looks for the server's first reply [s]."""
+"""Time between two checks for the server's first reply [s]."""
 
 
 class Exchange(NamedTuple):
-    """What a client does with one kind of the messages that actors send each other directly."""
+    """Functions of a client that make and apply one kind of the messages that actors send each other directly."""
 
     say: Callable[[str], Any]
-    """What a local actor tells others in this step: the value for
+    """Returns the message of the named local actor to others in this step: the value for
     :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`."""
     apply: Callable[[Mapping[str, Any]], None]
-    """Applies, before a step, what holds now of what others told each local actor:
-    :meth:`vinesim.net.replication.direct_messages.MessageSync.current`, by its name."""
+    """Applies, before a step, the messages from other actors that are valid now: for each local actor, by name, the
+    value of :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
 
 
 class Client:
@@ -88,7 +88,7 @@ class Client:
     picking = True
     """Whether bunches and branches detach in this client's physics when they are pulled too hard."""
     slows_the_world = True
-    """Whether the clock of its world waits for this client where its machine is slow."""
+    """Whether the clock of the world slows down if this client's machine cannot follow it."""
 
     def __init__(
         self,
@@ -109,12 +109,13 @@ class Client:
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
     ) -> None:
-        """A robot of this ``description`` at ``pose`` [7] m, 1; None: a human of ``height`` [m] in an
-        ``outfit`` (:func:`vinesim.scene.appearance.outfit_names`; empty: what follows from its name).
+        """The client's own actor is a robot of this ``description`` at ``pose`` [7] m, 1. If ``description`` is None,
+        it is a human of ``height`` [m] in an ``outfit`` (:func:`vinesim.scene.appearance.outfit_names`; if empty, the
+        outfit follows from the human's name).
 
         ``source(time)`` gives the human's pose; without one it stands still. ``interest_radius`` [m]: actors nearer
         than this to an object receive its motion. ``jitter_buffer`` [s]: delay of remote actors. ``executor`` compiles
-        actors that join; without one that is done in the loop.
+        the bodies of actors that join; without an executor the loop compiles them.
         """
         self.name = name
         self.model = model
@@ -129,9 +130,9 @@ class Client:
         self.humans: dict[str, LocalHuman] = {}
         """Humans that this client simulates, by name."""
         self.meshes = MeshExchange()
-        """Meshes of local robots for other clients, and of remote ones for this client."""
+        """Sends the meshes of local robots to other clients, and receives the meshes of remote robots."""
         self.step_time: Callable[[], float] | None = None
-        """Of a client whose steps follow the clock of its server: the world's time at the present step [s]."""
+        """Returns the world's time at the present step [s]. None if the steps do not follow the server's clock."""
         self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
@@ -140,7 +141,7 @@ class Client:
             WRENCHES: Exchange(self._say_wrenches, self._apply_wrenches),
             COUPLINGS: Exchange(self._say_couplings, self._apply_couplings),
         }
-        """What the actors of this client and of others tell each other, by kind of message."""
+        """Functions that make and apply the direct messages between actors, by kind of message."""
         self._description = description
         self._executor = executor
         self._outfit = outfit
@@ -151,35 +152,39 @@ class Client:
         self.meshes.bus = bus
         self.remote_actors: dict[str, RemoteRobot | RemoteHuman] = {}
         self.steps_before_pause: int | None = None
-        """Steps that are still simulated before the simulation pauses; None: it runs."""
+        """Number of steps that are still simulated before the simulation pauses. None: it runs without a pause."""
         self.between_steps: list[Callable[[], None]] = []
         """Called at the start of every tick, also while the simulation pauses."""
         self.pre_step: list[Callable[[float], None]] = []
         """Called before every step with the simulation time [s]: tasks and commands of robots."""
         self.post_step: list[Callable[[Client], None]] = []
-        """Called after every step: sensors, ROS, recorders."""
+        """Called after every step, with this client: sensors, ROS, recorders."""
         self.wake_readers: list[Callable[[], None]] = []
-        """Called last in a tick: they wake the processes that take its results, which may get this core at once."""
+        """Called at the end of a tick. They wake the processes that take its results. They come last because a process
+        that is woken may get this core at once."""
         self.script = ""
-        """Options by which its robots act by themselves; such a client is not reset by services."""
+        """Command line option that lets the robots act by themselves, or "". Services do not reset a client that has
+        one."""
         self.after_reset: list[Callable[[], None]] = []
-        """Called after :meth:`reset`: parts that keep the physics or a robot take the new ones."""
+        """Called after :meth:`reset`, so that parts that hold references to the physics or a robot take the new
+        objects."""
         self.earlier_faults: collections.Counter[str] = collections.Counter()
-        """Faults of the physics and of couplings before the last reset."""
-        self.other_faults: list[Callable[[], dict[str, int]]] = []  # counts of parts that serve it: of its page
+        """Number of faults of the physics and of couplings before the last reset, by kind of fault."""
+        # Each returns the fault counts of a part that serves this client, such as its page.
+        self.other_faults: list[Callable[[], dict[str, int]]] = []
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
-        """How much there is to see now; the picture with the highest score is kept."""
+        """Returns a score of how much there is to see now. The picture with the highest score is kept."""
         self.trace: Trace | None = None
-        """If set, force on and displacement of one bunch are recorded in it."""
+        """Record of the force on one bunch and of its displacement. None: nothing is recorded."""
         self.interest_audit = InterestAudit()
         self.world_time = WorldTime(self.physics.dt)
         """Time of the world, in which ROS messages are stamped."""
         self.pace_text: Callable[[], str] = lambda: ""
-        """How fast time passes and what limits it, for people: see :func:`vinesim.net.pace.describe`."""
+        """Returns a text for people: how fast time passes and what limits it (:func:`vinesim.net.pace.describe`)."""
         self.holds: list[Callable[[], str]] = []
-        """Each says why the next step has to wait, such as "sensors"; empty if it may begin."""
+        """Each returns the reason why the next step has to wait, such as "sensors", or "" if the step may begin."""
         self.pace_limits: list[Callable[[], Limit]] = []
-        """Each says how fast a part that serves this client can follow."""
+        """Each returns the largest real-time factor that a part that serves this client can follow."""
         self.clock = clock
         self.sound = SoundExchange(self)
         self.tree_copies = TreeCopies(self.physics, self.objects)
@@ -187,14 +192,15 @@ class Client:
 
     @property
     def is_alone(self) -> bool:
-        """Whether this world is this client's alone: it follows no server, and no other client is in it."""
+        """Whether this client is alone in its world: it follows no server, and no other client is present."""
         return not (self.world_time.is_shared or self.remote_actors)
 
     def reset(self) -> None:
-        """Begin the scene anew as it was generated, between steps: plants, boxes, robots where they started, at rest.
+        """Restore the scene as it was generated: plants, boxes and robots are where they started, at rest.
 
-        People who are here stay. Simulated time goes on, and so do all counts of the network. Takes as long as a start
-        of the physics. :class:`ValueError` unless the client :attr:`is_alone`.
+        Call it between steps. Human actors who are present stay. Simulated time continues, and so do all counters of
+        the network. It takes as long as the start of the physics. Raises :class:`ValueError` unless the client
+        :attr:`is_alone`.
         """
         if not self.is_alone:
             raise ValueError("a world that other clients share cannot be reset by one of them")
@@ -279,7 +285,7 @@ class Client:
         return human
 
     def remove_human(self, name: str) -> None:
-        """Remove a local human who is not this client's own actor, between steps; the bus is the caller's to close."""
+        """Remove a local human who is not this client's own actor. Call it between steps, and close its bus after."""
         self.physics.remove_human(name)
         del self.humans[name], self.replicators[name]
         self._share_client()
@@ -296,8 +302,8 @@ class Client:
         )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
-        """Stamp, send and show all of a step for the world's time of that step, ``step_time()`` [s]; None: for the
-        moment at which it is made."""
+        """Set the time with which the results of a step are stamped, sent and shown: ``step_time()`` [s], the world's
+        time of that step. None: the moment at which the step is made."""
         self.step_time = step_time
         for replicator in self.replicators.values():
             replicator.step_time = step_time
@@ -336,7 +342,7 @@ class Client:
             callback()
 
     def held(self) -> str:
-        """Why the next step has to wait; empty if it may begin."""
+        """Returns the reason why the next step has to wait, or "" if it may begin."""
         return next((cause for hold in self.holds if (cause := hold())), "")
 
     def wait_for_clock(self, timeout: float) -> None:
@@ -408,7 +414,7 @@ class Client:
             callback(self)
 
     def send(self, now: float) -> None:
-        """Publish poses of local actors, and to actors nearby the states of what they touch."""
+        """Publish the poses of local actors, and send the states of the objects that they touch to actors nearby."""
         objects = self.objects
         objects.collect()
         moving = objects.moving
@@ -437,14 +443,17 @@ class Client:
                 carried_on=carried_on,
             )
             for update in settled:
-                # the last message is what all copies hold: hold the same, quantised state
+                # All copies hold the quantised state of the last message, so this client takes it, too.
                 objects.blend_tree(update, 1.0)
             for number in mine.union(carried_on) - replicator.owned:
                 objects.mark_resting(replicator.record(number))
         self.interest_audit.update(self, touching)
 
     def leave(self) -> None:
-        """Before the buses close: publish objects at rest on local robots in the world frame, as their parent goes."""
+        """Publish the objects that rest on local robots with poses in the world frame, as the robots disappear.
+
+        Call it before the buses close.
+        """
         self.meshes.close()
         now = self.clock()
         for name, robot in self.robots.items():
@@ -468,7 +477,8 @@ class Client:
     # ------------------------------------------------------------------ remote actors
 
     def _receive_all(self, now: float) -> Inbox:
-        """Merge the inboxes of all local actors; of each remote actor the update of its nearest one counts."""
+        """Merge the inboxes of all local actors. If several received an update of the same remote actor, the update
+        that the nearest of them received counts."""
         inboxes = {name: replicator.receive(now) for name, replicator in self.replicators.items()}
         for kind, exchange in self.exchanges.items():
             exchange.apply({name: one.messages[kind] for name, one in inboxes.items()})
@@ -506,7 +516,7 @@ class Client:
         return bool(owners) and not owners & self.replicators.keys()
 
     def _link_centre(self, name: str, link: str) -> np.ndarray | None:
-        """Centre of mass [3] m of a link of a local robot; None if it is no robot or has no such link."""
+        """Centre of mass [3] m of a link of a local robot. None if ``name`` is no robot or it has no such link."""
         try:
             return self.physics.rigid.link_centre(name, link) if name in self.robots else None
         except ValueError:
@@ -525,7 +535,7 @@ class Client:
                 log.debug("a wrench on an unknown link: %s", error)
 
     def _say_couplings(self, name: str) -> list[Coupling]:
-        """Couplings of a local actor's contacts with trees that others move or touch, too."""
+        """Couplings for the contacts of a local actor with trees that other clients also move or touch."""
         return self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees)
 
     def _apply_couplings(self, received: Mapping[str, dict[str, tuple[Coupling, ...]]]) -> None:
@@ -538,20 +548,21 @@ class Client:
 
 
 class InterestAudit:
-    """Counts bytes of touched plants that leave while no remote actor is near; they must be zero."""
+    """Counts the bytes with states of touched plants that are sent while no remote actor is near. It must stay 0."""
 
     MARGIN = 3.0
-    """A tree is not a point: actors count as far beyond the interest radius and this [m]."""
+    """An actor counts as far if its distance exceeds the interest radius by this much [m], as a tree is not a point."""
 
     def __init__(self) -> None:
         self.bytes = 0
-        """Environment bytes that left in ticks with no remote actor near."""
+        """Bytes with states of the environment that were sent in ticks in which no remote actor was near."""
         self.ticks_touching = 0
-        """Ticks in which this client touched plants with no remote actor near."""
+        """Number of ticks in which this client touched plants and no remote actor was near."""
         self._seen = 0
 
     def update(self, client: Client, touching: bool) -> None:
-        """Count one tick, by where the remote actors say that they are: copies appear later, spectators have none."""
+        """Count one tick. Remote actors are where their messages say: copies appear later, and spectators have no
+        copy."""
         replicators = client.replicators.values()
         sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
         if touching or sent != self._seen:

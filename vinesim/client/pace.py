@@ -10,13 +10,13 @@ from vinesim.net.pace import PaceReport, WorldClock
 from vinesim.net.replication.replicator import Replicator
 
 HEADROOM = 0.9
-"""Share of a core's time that steps may take: the rest is for what comes seldom."""
+"""Share of a core's time that steps may take. The rest is for work that occurs seldom."""
 WINDOW = 0.5
 """Real time over which work is measured [s]; the last two such spans count."""
 HELD_SHARE = 0.1
-"""A client whose steps are held for more than this share of the time can follow only as fast as it does now."""
+"""If steps are held for more than this share of the time, the client reports its present speed as its limit."""
 REPORT_PERIOD = 0.05
-"""Real time between two reports to a clock of its own [s]."""
+"""Real time between two reports to the clock of a client without a server, :class:`OwnPace` [s]."""
 
 
 class StepClock(Protocol):
@@ -24,24 +24,24 @@ class StepClock(Protocol):
 
     @property
     def factor(self) -> float:
-        """How many times as fast as real time its time passes now."""
+        """Returns the present real-time factor: seconds of this clock in a second of real time."""
         ...
 
     @property
     def cause(self) -> str:
-        """What limits the factor; empty if nothing does."""
+        """Returns the name of the part that limits the factor, or "" if nothing limits it."""
         ...
 
     def time(self, now: float) -> float:
-        """Its time at ``now`` [s]."""
+        """Time of this clock at ``now`` [s]."""
         ...
 
     def is_current(self, now: float) -> bool:
-        """Whether its time at ``now`` [s] is known, not extrapolated from long ago."""
+        """Whether the time at ``now`` [s] is known, rather than extrapolated from an old value."""
         ...
 
     def keep(self, now: float) -> None:
-        """Called several times a second, also while no step is made."""
+        """Keep the clock up to date. Called several times a second, also while no step is made."""
 
 
 class RealTime:
@@ -63,7 +63,7 @@ class RealTime:
 
 
 class OwnPace:
-    """The clock of a client without a server: it passes as fast as this client can follow."""
+    """The clock of a client without a server. Its time passes as fast as this client can follow."""
 
     def __init__(self, name: str, now: float, report: Callable[[], PaceReport]) -> None:
         self._name = name
@@ -124,7 +124,7 @@ class Limit(NamedTuple):
 
 
 class _Span:
-    """What a loop did in a span of real time."""
+    """How a loop spent a span of real time."""
 
     def __init__(self, begun: float) -> None:
         self.begun = begun
@@ -137,11 +137,14 @@ class _Span:
 
 
 class PaceMeter:
-    """Measures how fast a loop could make steps of ``dt`` [s], by its idle time. Work that waits for a core counts."""
+    """Measures from a loop's idle time how fast it could make steps of ``dt`` [s].
+
+    Time in which work waits for a core counts as work.
+    """
 
     def __init__(self, dt: float) -> None:
         self.limits: list[Callable[[], Limit]] = []
-        """Other parts of the client, which know what they can follow."""
+        """Each returns the limit of another part of the client."""
         self._dt = dt
         self._spans: deque[_Span] = deque(maxlen=2)
         self._span: _Span | None = None
@@ -152,17 +155,18 @@ class PaceMeter:
         self._span = _Span(now)
 
     def idle(self, seconds: float) -> None:
-        """The loop slept for so long, be it longer than it wanted: a loop that is late sleeps less the next time."""
+        """Count ``seconds`` [s] for which the loop slept. A sleep that took longer than requested counts in full,
+        because a loop that is late sleeps less the next time."""
         if self._span is not None:
             self._span.idle += seconds
 
     def hold(self, cause: str, seconds: float) -> None:
-        """A step that was due waited for so long, because of ``cause``."""
+        """Count ``seconds`` [s] for which a step that was due waited because of ``cause``."""
         if self._span is not None:
             self._span.held[cause] = self._span.held.get(cause, 0.0) + seconds
 
     def step(self, now: float) -> None:
-        """A step ended at ``now`` [s]."""
+        """Count a step that ended at ``now`` [s]."""
         if (span := self._span) is None:
             return
         span.steps += 1
@@ -186,5 +190,5 @@ class PaceMeter:
             self._measured = min(self._measured, Limit(simulated / elapsed, longest))
 
     def limit(self) -> Limit:
-        """The largest real-time factor that the client can follow, and what limits it."""
+        """Returns the largest real-time factor that the client can follow, and the part that limits it."""
         return min([self._measured, *(limit() for limit in self.limits)])

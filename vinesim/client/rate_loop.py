@@ -1,4 +1,4 @@
-"""A loop whose steps follow a clock: each begins when it is due, with a record of how well that was kept."""
+"""A loop whose steps follow a clock: each step begins when it is due. The loop records begin and work of the steps."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 WAITING_MAX_LAG = 1.0
-"""Lag behind a clock that waits for slow clients, beyond which steps are skipped after all [s]."""
+"""Largest lag behind a clock that waits for slow clients [s]. A loop that is further behind skips steps."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -28,18 +28,18 @@ class TickLog:
     """A record of steps, for statistics of any part of a run."""
 
     begins: np.ndarray
-    """[step] when each began, by ``time.monotonic`` of this machine [s]."""
+    """[step] Time at which each step began, by ``time.monotonic`` of this machine [s]."""
     work: np.ndarray
-    """[step] how long it took [s]."""
+    """[step] Duration of the work of each step [s]."""
     dt: float
     """Simulated time of a step [s]."""
     periods: np.ndarray
-    """[step] from one deadline to the next [s]: longer than ``dt`` where the world is slower than real time."""
+    """[step] Real time from one deadline to the next [s]: longer than ``dt`` if the world is slower than real time."""
 
     def between(self, since: float, until: float) -> dict[str, float]:
         """Rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of time [s].
 
-        :class:`ValueError` if there are fewer than two.
+        Raises :class:`ValueError` if fewer than two steps began in it.
         """
         part = slice(*np.searchsorted(self.begins, (since, until)))
         begins = self.begins[part]
@@ -58,12 +58,12 @@ class TickLog:
         }
 
     def save(self, path: pathlib.Path) -> None:
-        """Write it as a NumPy archive."""
+        """Write the record as a NumPy archive."""
         np.savez(path, begins=self.begins, work=self.work, dt=self.dt, periods=self.periods)
 
     @classmethod
     def load(cls, path: pathlib.Path) -> TickLog:
-        """Read what :meth:`save` wrote."""
+        """Read a record that :meth:`save` wrote."""
         with np.load(path) as archive:
             return cls(archive["begins"], archive["work"], float(archive["dt"]), archive["periods"])
 
@@ -81,18 +81,21 @@ class RateLoop:
     LEAST_SPACING = 0.5
     """Real time between the begins of two steps, as a share of ``dt``."""
     MAX_LEAD = 5.0
-    """A clock that is further behind than this is another one, whose time is taken at once [s]."""
+    """If the clock is further behind the loop than this [s], it is a different clock, and the loop takes its time at
+    once."""
     MAX_SKIP = 3600.0
-    """The same of a clock that is further ahead [s]: so is the first that a server tells."""
+    """If the clock is further ahead of the loop than this [s], the loop also takes its time at once. The first time
+    that a server reports is that far ahead."""
     FREE_LEAD = 0.015
-    """A clock that is further behind than this was set back: steps go on at :data:`LEAD_RATE` until it has come [s]."""
+    """If the clock is further behind the loop than this [s], it was set back. Steps continue at :data:`LEAD_RATE` until
+    the clock has caught up."""
     LEAD_RATE = 0.9
     LONGEST_SLEEP = 0.05
-    """The clock is looked after between two sleeps [s]."""
+    """Longest single sleep [s]. The loop keeps the clock up to date between two sleeps."""
     SHORTEST_SLEEP = 1e-6
-    """A step that is due so soon begins now [s]."""
+    """A step that is due within this time begins now [s]."""
     HOLD_POLL = 0.001
-    """Time between two looks whether a step is still held [s]."""
+    """Time between two checks whether a step is still held [s]."""
     CLOCK_PATIENCE = 3.0
     """Longest wait for a clock that has to be asked, before steps are skipped [s]."""
 
@@ -106,16 +109,16 @@ class RateLoop:
         self.next_time = 0.0
         """Time of the clock at which the next step is due [s]; from :meth:`begin` to :meth:`end`, the present step."""
         self.hold: Callable[[], str] = lambda: ""
-        """Why the step that is due has to wait: "sensors"; empty if it may begin."""
+        """Returns the reason why the step that is due has to wait, such as "sensors", or "" if it may begin."""
         self.is_stopping: Callable[[], bool] = lambda: False
-        """Whether not to wait any longer."""
+        """Returns whether the loop should stop waiting, because the run ends."""
         self.meter = PaceMeter(dt)
         self.ticks = 0
         self.overruns = 0
-        """Steps whose work took longer than the period."""
+        """Number of steps whose work took longer than the period."""
         self.dropped = 0
-        """Steps that were skipped after a stall."""
-        # filled, not np.zeros: their pages are there from the start, and the memory of a run does not grow
+        """Number of steps that were skipped after a stall."""
+        # np.full touches all pages now, unlike np.zeros, so the memory of a run does not grow later.
         self._work = np.full(capacity, 0.0, np.float32)
         self._begins = np.full(capacity, 0.0)
         self._periods = np.full(capacity, dt, np.float32)
@@ -123,7 +126,7 @@ class RateLoop:
 
     @property
     def target_factor(self) -> float:
-        """How many times as fast as real time the steps should follow each other now."""
+        """Real-time factor at which the steps should follow each other now."""
         return self.clock.factor
 
     @property
@@ -132,7 +135,7 @@ class RateLoop:
         return self.dt / self.clock.factor
 
     def report(self) -> PaceReport:
-        """The time that the steps have reached, and how fast they could go on."""
+        """Returns the time that the steps have reached, and the rate at which they could continue."""
         return PaceReport(self.next_time, *self.meter.limit())
 
     def begin(self) -> None:
@@ -177,9 +180,9 @@ class RateLoop:
         return max(wait, self.LEAST_SPACING * self.dt - since)
 
     def _wait_for_clock(self, now: float) -> float:
-        """Wait until the clock knows its time again, if steps are to be skipped by it; the real time then [s].
+        """If steps are to be skipped, wait until the clock knows its time again. Returns the real time after that [s].
 
-        A client that was stopped knows only what the world's time was before, and would skip too many steps.
+        A client that was stopped knows only the world's time from before the stop, and would skip too many steps.
         """
         until = now + self.CLOCK_PATIENCE
         while (
@@ -234,7 +237,7 @@ class RateLoop:
         return self.ticks * self.dt / span if span > 0.0 else 0.0
 
     def log(self) -> TickLog:
-        """When the last steps began and how long they took, as many as there was room for."""
+        """The begin and the duration of the last steps; at most ``capacity`` of them."""
         order = np.arange(max(self.ticks - len(self._work), 0), self.ticks) % len(self._work)
         return TickLog(
             self._begins[order], self._work[order].astype(float), self.dt, self._periods[order].astype(float)
@@ -247,8 +250,9 @@ class RateLoop:
 
 
 def paced_loop(client: Client, *, is_shared: bool, factor: float | None = None) -> RateLoop:
-    """A loop for the steps of a client: by the clock of its server if its world ``is_shared``, else by a clock of its
-    own, which runs at a fixed real-time ``factor`` or, without one, as fast as this client can follow."""
+    """A loop for the steps of a client. It follows the clock of the server if the world ``is_shared``. Otherwise it
+    follows a clock of its own, which runs at a fixed real-time ``factor`` or, if that is None, as fast as this client
+    can follow."""
     if is_shared:
         loop = RateLoop(client.physics.dt, WorldPace(client.replicator), max_lag=WAITING_MAX_LAG)
         client.follow_steps(lambda: loop.next_time)

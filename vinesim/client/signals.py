@@ -1,5 +1,5 @@
-"""Signals by the time of the world: indicator lights of robots, alike on all clients; what people intend, and what
-their hands show."""
+"""Signals of robots and people: indicator lights, which flash by the time of the world and so are equal on all
+clients, intentions of people, and gestures of their hands."""
 
 from __future__ import annotations
 
@@ -13,27 +13,27 @@ from vinesim.scene.values import HandGestures, HumanPose, Intention
 
 
 def show_lights(actors: Iterable[RobotInstance | RemoteHuman], time: float) -> None:
-    """Let the indicator lights of all robots flash as at a ``time`` of the world [s]; once a step."""
+    """Let the indicator lights of all robots show their state at ``time`` of the world [s]. Call it once a step."""
     for actor in actors:
         if isinstance(actor, RobotInstance):
             actor.show_lights(time)
 
 
 class IntentionLog:
-    """What each person indicated last, since when, and until when."""
+    """The last intention that each person indicated, with its begin and end."""
 
     def __init__(self) -> None:
         self._known: dict[str, Intention] = {}
 
     @property
     def intentions(self) -> tuple[Intention, ...]:
-        """The last one of each person, sorted by name."""
+        """The last intention of each person, sorted by the person's name."""
         return tuple(self._known[name] for name in sorted(self._known))
 
     def update(self, present: Mapping[str, str], time: float) -> bool:
-        """Take what all people indicate at a ``time`` of the world [s], by name; whether that has changed.
+        """Take the intentions of all ``present`` people, by name, at ``time`` of the world [s].
 
-        An intention whose person leaves has ended.
+        Returns whether any has changed. If a person leaves, the person's intention ends.
         """
         has_changed = False
         for name in self._known.keys() | present.keys():
@@ -50,16 +50,16 @@ class IntentionLog:
 
 
 class GestureLog:
-    """What the hands of all people show: the six gestures, by name."""
+    """The gestures that the hands of all people show, of six kinds, by name."""
 
     def __init__(self) -> None:
         self._known = Gestures()
         self._fingers: list[tuple[str, tuple[float, ...], tuple[float, ...]]] = []
         self.gestures: tuple[HandGestures, ...] = ()
-        """Sorted by the person's name."""
+        """Gestures of the hands of each person, sorted by the person's name."""
 
     def update(self, people: Mapping[str, HumanPose]) -> bool:
-        """Take the poses of all people by name; whether what any hand shows has changed."""
+        """Take the poses of all people, by name. Returns whether the gesture of any hand has changed."""
         fingers = [(name, people[name].left_fingers, people[name].right_fingers) for name in sorted(people)]
         if fingers == self._fingers:
             return False

@@ -29,7 +29,7 @@ FOLLOW_DISTANCE = 2.6
 """Horizontal distance of the eyes from a robot that they follow [m]."""
 
 FOLLOW_YAW = 0.7
-"""Angle of the eyes beside the line straight behind that robot [rad]."""
+"""Angle between the line straight behind a followed robot and the line from the robot to the eyes [rad]."""
 
 
 def standing_view(x: float, y: float, heading: float) -> np.ndarray:
@@ -46,7 +46,7 @@ def follow_view(base: np.ndarray) -> np.ndarray:
 
 
 class Spectator(Client):
-    """A client that only watches. :attr:`pose` [7] is that of its eyes: x forward, z up; assign it to move."""
+    """A client that only watches. :attr:`pose` [7] is the pose of its eyes: x forward, z up. Assign it to move them."""
 
     picking = False  # the owners of plants report what detaches
     slows_the_world = False
@@ -86,10 +86,10 @@ class Spectator(Client):
 
 
 class PictureWriter:
-    """Writes what a spectator sees to files ``view_SECONDS.png``; the last one also with depth and labels.
+    """Writes a spectator's view to files ``view_SECONDS.png``, and the last one also with depth and labels.
 
-    Rendered in the loop, so each shows exactly the state of its time, and a replay renders the same pictures every
-    time; a spectator has no robot that would suffer from late steps.
+    The pictures are rendered in the loop, so each shows exactly the state of its time, and a replay renders the same
+    pictures every time. Late steps do no harm, because a spectator has no robot.
     """
 
     WIDTH = 960
@@ -144,7 +144,7 @@ class PictureWriter:
             images.write_png(self.folder / f"view_{view.time:08.2f}.png", self.last.rgb)
 
     def save(self, spectator: Spectator) -> None:
-        """Render what is seen now: ``rgb``, ``depth``, ``depth_mm`` and ``labels`` PNGs."""
+        """Render the present view into the PNG files ``rgb``, ``depth``, ``depth_mm`` and ``labels``."""
         self._draw(spectator)
         assert self.last is not None
         with writing(self.folder):

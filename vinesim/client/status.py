@@ -25,11 +25,11 @@ _WITHOUT_SENSORS = {
     "sensor_restart_s": 0.0,
     "processes": {},
 }
-"""Status of sensors of a client that has none."""
+"""Sensor part of the status of a client without sensors."""
 
 
 class Status:
-    """Measurements of a running client; reads only, and may be used from another thread than the loop's."""
+    """Measurements of a running client. It only reads the client, and may be used from another thread."""
 
     def __init__(
         self,
@@ -39,8 +39,8 @@ class Status:
         task: Task | None = None,
         sensors: Callable[[], dict[str, Any]] = dict,
     ) -> None:
-        """``sent`` gives the number of ROS messages sent so far by topic; ``task``: what the robot does, if
-        anything; ``sensors`` gives the status of sensors."""
+        """``sent()`` returns the number of ROS messages sent so far, by topic. ``task``: the robot's task, or None.
+        ``sensors()`` returns the status of the sensors."""
         self.client = client
         self.rate_loop = rate_loop
         self._task = task
@@ -52,7 +52,7 @@ class Status:
         self._before_ticks = 0
 
     def current(self) -> dict[str, Any]:
-        """The present values, for JSON; rates of topics and recent values are since the last call.
+        """The present values, for JSON. Rates of topics and recent values cover the time since the last call.
 
         Recent faults are the kinds that occurred within the last minute.
         """
@@ -124,11 +124,11 @@ class Status:
 
 
 def network_trouble(client: Client) -> str:
-    """Why the first of the client's actors that is cut off has no network now; empty if all have it."""
+    """Returns why an actor of the client has no network now (the first such actor), or "" if all have it."""
     return next((text for one in client.replicators.values() if (text := one.bus.status_message)), "")
 
 
-# Faults of a client so far: what was stopped, left out or refused, so that nothing goes wrong in silence.
+# Faults of a client are counted whenever something was stopped, left out or refused, so that none stays unnoticed.
 
 
 log = logging.getLogger(__name__)
@@ -152,11 +152,11 @@ DESCRIPTIONS = {
     "page_messages_refused": "messages of pages were refused, as they were malformed or cannot be true",
     "steps_skipped": "steps were skipped after the process had stood still",
 }
-"""What each fault is, for a person."""
+"""Description of each kind of fault, for people."""
 
 
 def count_faults(client: Client, steps_skipped: int = 0) -> dict[str, int]:
-    """How often each fault of :data:`DESCRIPTIONS` occurred; faults that did not are left out."""
+    """How often each fault of :data:`DESCRIPTIONS` occurred. Faults that did not occur are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
     physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
     counts = client.earlier_faults + collections.Counter(physics)
@@ -182,29 +182,33 @@ RECENT_TIME = 60.0
 
 
 class RecentCounts:
-    """Which of several counts rose lately."""
+    """Tells which of several counters rose within the last :data:`RECENT_TIME`."""
 
     def __init__(self) -> None:
         self.counts: dict[str, int] = {}
-        """The newest."""
+        """The newest value of each counter, by name."""
         self._risen: dict[str, float] = {}
-        """Time at which each was last seen to have risen [s]."""
+        """Time at which the last rise of each counter was noticed [s]."""
 
     def update(self, counts: Mapping[str, int], time: float) -> list[str]:
-        """Take the ``counts`` at ``time`` [s]; the names of those that rose within the last :data:`RECENT_TIME`."""
+        """Take the ``counts`` at ``time`` [s]. Returns the names of the counters that rose within the last
+        :data:`RECENT_TIME`."""
         self._risen |= {name: time for name, count in counts.items() if count > self.counts.get(name, 0)}
         self.counts = dict(counts)
         return [name for name, risen in self._risen.items() if time - risen < RECENT_TIME]
 
 
 class FaultLog:
-    """Logs the first fault of each kind, later ones are only counted; knows which kinds occurred lately."""
+    """Logs the first fault of each kind, only counts later ones, and knows which kinds occurred recently."""
 
     def __init__(self) -> None:
         self._recent = RecentCounts()
 
     def update(self, counts: Mapping[str, int], time: float) -> list[str]:
-        """Log what is new in ``counts`` at ``time`` [s]; the kinds that are recent. Call it outside the step."""
+        """Log the kinds of faults that are new in ``counts`` at ``time`` [s]. Returns the kinds that occurred recently.
+
+        Call it outside the step.
+        """
         for name, count in counts.items():
             if name not in self._recent.counts:
                 log.warning("%d %s (further ones are only counted: %s)", count, DESCRIPTIONS[name], name)

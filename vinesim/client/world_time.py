@@ -1,8 +1,8 @@
-"""Time of the world: the server's clock as one client sees it at its steps, for the stamps of all that leaves a client.
+"""Time of the world: the server's clock as one client sees it at its steps. It stamps all messages of the client.
 
-Simulated time counts a client's own steps from 0. Clients start at different moments, and one that is slow or stood
-still falls behind, so stamps are simulated time plus an offset that follows the server's clock. Without a server the
-offset is 0.
+Simulated time counts a client's own steps from 0. Clients start at different moments, and a client that is slow or was
+stopped falls behind. Stamps are therefore simulated time plus an offset that follows the server's clock. Without a
+server the offset is 0.
 """
 
 from __future__ import annotations
@@ -15,20 +15,22 @@ import numpy as np
 log = logging.getLogger(__name__)
 
 GAIN = 0.01
-"""Share of its error by which the offset follows in one step: jitter of single steps is smoothed over a second."""
+"""Share of the offset's error that one step corrects. It smooths jitter of single steps over a second."""
 MAX_RATE = 0.1
 """[s/s] Largest rate at which the offset follows: a step of 10 ms is stamped as 9 to 11 ms."""
 MAX_LAG = 0.05
-"""[s] Stamps are never further behind the server's clock: a client that is slow skips ahead. Where they are further
-ahead of it, steps that follow each other faster than ``dt`` (a loop catches up) are stamped no faster than it runs."""
+"""[s] Stamps are never further behind the server's clock than this: the stamps of a slow client skip ahead. If stamps
+are further ahead than this while steps follow each other faster than ``dt`` (a loop catches up), the stamps advance no
+faster than the server's clock."""
 MIN_RATE = 0.1
-"""[s/s] Stamps rise in every step, by this share of ``dt`` at least."""
+"""[s/s] Stamps rise in every step, by at least this share of ``dt``."""
 MAX_LEAD = 5.0
-"""[s] A server's clock that is further behind belongs to another run of the world, and is taken at once."""
+"""[s] A server's clock that is further behind than this belongs to another run of the world. The offset takes its time
+at once."""
 
 
 class WorldTime:
-    """Offset of the world's time against the simulated time of one client."""
+    """Offset between the world's time and the simulated time of one client."""
 
     def __init__(self, dt: float) -> None:
         """``dt``: duration of a step [s]."""
@@ -58,13 +60,14 @@ class WorldTime:
             self.offset = max(self.offset, clock - simulated - MAX_LAG)
 
     def take(self, offset: float) -> None:
-        """Stamp steps with this ``offset`` [s], which a loop that follows the server's clock says."""
+        """Stamp steps with this ``offset`` [s], given by a loop that follows the server's clock."""
         self.is_shared = True
         self.offset = offset
 
 
 class OffsetHistory:
-    """Offsets of the world's time at recent simulated times, for the stamps of what is ready later than it happened."""
+    """Offsets of the world's time at recent simulated times, for stamps of data that become ready later than their
+    time, such as pictures."""
 
     def __init__(self, length: int) -> None:
         """Keeps the last ``length`` offsets."""
@@ -72,7 +75,8 @@ class OffsetHistory:
         self._offsets: deque[float] = deque(maxlen=length)
 
     def add(self, simulated: float, offset: float) -> None:
-        """Add the ``offset`` [s] at ``simulated`` time [s]; those of later times are removed, as time was set back."""
+        """Add the ``offset`` [s] at ``simulated`` time [s]. Offsets of later times are removed, because time was set
+        back."""
         while self._times and self._times[-1] >= simulated:
             self._times.pop()
             self._offsets.pop()
@@ -80,9 +84,9 @@ class OffsetHistory:
         self._offsets.append(offset)
 
     def world_time(self, simulated: float) -> float:
-        """World's time [s] at ``simulated`` time [s]; beyond the known offsets the nearest of them holds.
+        """World's time [s] at ``simulated`` time [s]. Outside the known range the nearest known offset holds.
 
-        Rises with ``simulated`` if the stamps of the steps rise, however late it is asked for. :class:`ValueError`
-        before the first offset.
+        The result rises with ``simulated`` if the stamps of the steps rise, however late it is asked for. Raises
+        :class:`ValueError` before the first offset.
         """
         return simulated + float(np.interp(simulated, self._times, self._offsets))

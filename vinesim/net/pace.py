@@ -2,8 +2,8 @@
 
 Clients report the time that their steps have reached, and the largest real-time factor that they could follow. The
 factor of the world falls at once to the smallest of these, and rises slowly. A client that falls behind nevertheless
-brakes the clock within half a second of simulated time, so that it has to skip no step. One that reports nothing for
-:data:`SILENCE` is left behind: it slows the others no longer, until it has caught up.
+slows the clock within half a second of simulated time, so that it need not skip steps. A client that reports nothing
+for :data:`SILENCE` is left behind: it does not slow the others any more, until it has caught up.
 """
 
 from __future__ import annotations
@@ -20,44 +20,45 @@ MIN_FACTOR = 0.01
 FALL_TIME = 0.3
 """Time constant with which the factor falls to what the slowest client can follow [s]."""
 RISE_TIME = 4.0
-"""Time constant with which it rises [s]; so that a client that can only just follow does not make it swing."""
+"""Time constant with which the factor rises [s]. It is long so that the factor does not oscillate with a client that
+can only just follow."""
 LEAST_RISE = 0.04
-"""The factor rises at least by this much a second."""
+"""Lowest rate at which the factor rises [1/s]."""
 FREE_LAG = 0.15
-"""A client that is less than this behind brakes nothing [s of the world]: messages take some time."""
+"""A client that is less than this behind does not slow the clock [s of the world]: messages take some time."""
 STOP_LAG = 0.5
-"""The clock stands, at :data:`MIN_FACTOR`, for a client that is this far behind [s of the world]."""
+"""The factor is :data:`MIN_FACTOR`, so that the clock almost stops, if a client is this far behind [s of the world]."""
 OVERDUE = 0.6
 """A client that has reported nothing for this long is taken to have stopped [s]; it reports five times a second."""
 SILENCE = 3.0
 """A client that has reported nothing for this long is left behind [s]."""
 STEP = 0.05
-"""Longest real time for which the clock runs at one factor [s]."""
+"""Longest real time for which the clock runs at a constant factor [s]."""
 
 
 SHOWN_FACTOR = 0.995
-"""A real-time factor from here on is shown as real time."""
+"""A real-time factor of at least this is shown as real time."""
 
 
 def describe(factor: float, cause: str) -> str:
-    """A real-time factor and what limits it, for a status line: "0.43 of real time (picker: sensors)"; empty for real
-    time."""
+    """Text for a status line with a real-time factor and what limits it: "0.43 of real time (picker: sensors)". It is
+    "" for real time."""
     if factor >= SHOWN_FACTOR:
         return ""
     return f"{factor:.2f} of real time" + (f" ({cause})" if cause else "")
 
 
 MAX_STEP = 4.0 * STEP
-"""Most by which the silence of clients grows between two calls of :meth:`WorldClock.advance` [s]."""
+"""Longest time that two successive calls of :meth:`WorldClock.advance` add to the silence of clients [s]."""
 
 
 class PaceReport(NamedTuple):
-    """What one client tells the clock of its world."""
+    """Report of one client to the clock of its world."""
 
     time: float
     """Time of the world that its steps have reached [s]."""
     factor: float
-    """Largest real-time factor that it can follow; may be above 1."""
+    """Largest real-time factor that the client can follow; may be above 1."""
     cause: str = ""
     """What limits this factor: "steps", "sensors", "ROS messages"."""
 
@@ -70,7 +71,7 @@ class _Client:
     lag: float
     """How far it is behind [s of the world]."""
     silence: float = 0.0
-    """How long it has reported nothing, as far as this clock itself got a processor meanwhile [s]."""
+    """Time since its last report [s]. Time in which this clock itself got no processor does not count."""
     is_left_behind: bool = False
 
 
@@ -81,13 +82,13 @@ class WorldClock:
         """The world begins at ``time`` [s]. ``factor``: a fixed real-time factor; None: as the clients can follow."""
         self.is_fixed = factor is not None
         self.factor = 1.0 if factor is None else factor
-        """How many times as fast as real time the world's time passes now."""
+        """Present real-time factor of the world: seconds of its time in a second of real time."""
         self.cause = ""
-        """Which client limits the factor, and by what: "picker: sensors"; empty while nothing does."""
+        """Client that limits the factor, and the cause: "picker: sensors". Empty while nothing limits it."""
         self._time = time
         self._now = now
         self._pace = self.factor
-        """The factor before the brake for those who are behind."""
+        """The factor before it is reduced for clients that are behind."""
         self._clients: dict[str, _Client] = {}
 
     @property
@@ -110,11 +111,11 @@ class WorldClock:
         self._clients[name] = _Client(report, now, lag, is_left_behind=stays_behind)
 
     def forget(self, name: str) -> None:
-        """A client has left."""
+        """Remove a client that has left."""
         self._clients.pop(name, None)
 
     def advance(self, now: float) -> None:
-        """Go on to real time ``now`` [s]; call it several times a second."""
+        """Advance to real time ``now`` [s]. Call it several times a second."""
         for client in self._clients.values():  # a machine that starves the server starves its clients, too
             client.silence += min(now - self._now, MAX_STEP)
         while self._now < now:
@@ -127,7 +128,7 @@ class WorldClock:
                 self._adapt(step)
 
     def _watch(self, name: str, client: _Client, step: float) -> None:
-        """Note how far a client without a report is behind now, and leave it behind in the end."""
+        """Update the lag of a client without a new report, and leave it behind after :data:`SILENCE`."""
         if self._now - client.arrived > OVERDUE:
             client.lag += self.factor * step
         if client.silence > SILENCE and not client.is_left_behind:

@@ -1,9 +1,9 @@
-"""Removes shared memory of Fast DDS whose process was killed: else 24 MiB a sensor process stay until the next boot.
+"""Removes shared memory of Fast DDS whose process was killed. Otherwise 24 MiB of each sensor process stay until boot.
 
 Fast DDS keeps a lock (flock) on ``NAME_el`` while the owner of segment ``NAME`` lives; its own ``fastdds shm clean``
 goes by the same lock. Readers that still have a removed segment mapped keep it until they unmap it.
 
-Its files of ports are left: they take 52 KB each and are used again by the next node with that number.
+The port files of Fast DDS are left: they take 52 KB each, and the next node with that number uses them again.
 """
 
 from __future__ import annotations
@@ -19,13 +19,14 @@ log = logging.getLogger(__name__)
 
 FOLDER = pathlib.Path("/dev/shm")
 SMALLEST = 4 << 20
-"""The smallest segment of vinesim's profiles [B]; Fast DDS itself makes such of 0.5 MiB, which are left to it."""
+"""The smallest segment of vinesim's profiles [B]. Smaller ones, such as the 0.5 MiB of Fast DDS itself, are left."""
 YOUNGEST = 60.0
 """A segment younger than this may belong to a process that is about to lock it [s]."""
 
 
 def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
-    """Large segments of this user whose owner is dead, each with its lock file, which is locked for so long."""
+    """Large segments of this user whose owner is dead, each with its lock file. The file stays locked until the next
+    segment is taken."""
     try:
         import fcntl
     except ImportError:
@@ -43,7 +44,8 @@ def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path,
 
 
 def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
-    """Remove large segments of this user whose owner is dead; how many. The log has their number and size."""
+    """Remove large segments of this user whose owner is dead. Returns their number. The log has their number and
+    size."""
     removed = size = 0
     for path, lock in dead_segments(folder):
         with contextlib.suppress(OSError):  # another process removes them as well

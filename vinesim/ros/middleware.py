@@ -20,7 +20,7 @@ FOLDER = pathlib.Path(__file__).resolve().parent
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
 LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"
-"""The older name of LOCALHOST as the range; it comes first where it is 1."""
+"""Older variable that means LOCALHOST as the discovery range. If it is 1, it takes precedence."""
 WHEEL_MIDDLEWARE = "rmw_fastrtps_cpp"
 """The only middleware among the wheels."""
 
@@ -30,7 +30,7 @@ class RosUnavailableError(RuntimeError):
 
 
 def unavailable_reason() -> str | None:
-    """None if ROS 2 can be used here, else one line that says why not and names the remedy."""
+    """Returns None if ROS 2 can be used in this process, else one line with the reason and the remedy."""
     wheels = importlib.util.find_spec("ros_wheels_bootstrapper") is not None
     sourced = os.environ.get("AMENT_PREFIX_PATH", "")
     if wheels and sourced:
@@ -67,14 +67,14 @@ OWN_PROFILES = {
     for large in (False, True)
     for local in (False, True)
 }
-"""What each is for."""
+"""vinesim's own Fast DDS profiles: path -> (large messages, peers on this machine only)."""
 
 
 def configure(*, large_messages: bool | None = None) -> None:
-    """Set the environment for the first ROS context; :class:`RosUnavailableError` if ROS cannot be used.
+    """Set the environment for the first ROS context. Raises :class:`RosUnavailableError` if ROS cannot be used.
 
     Shared memory that killed processes left is removed.
-    ``large_messages``: whether the process sends pictures or clouds; unless given as in the call before, at first True.
+    ``large_messages``: whether the process sends pictures or clouds. None: as in the call before, at first True.
     A profile that the user has chosen stays.
     """
     reason = unavailable_reason()
@@ -97,14 +97,14 @@ def configure(*, large_messages: bool | None = None) -> None:
 
 
 def asks_for_acknowledgements() -> bool:
-    """Whether publishers ask their subscribers many times a second what has come, as vinesim's profile without large
-    messages makes them; else Fast DDS asks every three seconds."""
+    """Whether publishers request acknowledgements from their subscribers many times a second, which vinesim's profile
+    without large messages sets. Otherwise Fast DDS requests them every three seconds."""
     large, _ = OWN_PROFILES.get(os.environ.get(PROFILE_VARIABLE, ""), (True, False))
     return uses_fast_dds() and not large
 
 
 def uses_fast_dds() -> bool:
-    """Whether Fast DDS is the middleware here."""
+    """Whether this process uses Fast DDS as its middleware."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     return get_rmw_implementation_identifier().startswith("rmw_fastrtps")

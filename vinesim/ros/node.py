@@ -1,7 +1,7 @@
-"""What every ROS 2 node of vinesim has: topics with counts, a thread that receives, and an orderly end.
+"""Base class of all ROS 2 nodes of vinesim: topics with counts, a thread that receives, and an orderly end.
 
-Messages without subscribers are not built; :meth:`Node.has_subscribers` lets the simulation skip what would go into
-them as well.
+Messages without subscribers are not built. With :meth:`Node.has_subscribers` the simulation can also skip the
+computation of their content.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from vinesim.ros.topic import EVERY_STEP, RELIABLE, Topic
 log = logging.getLogger(__name__)
 
 SUBSCRIPTION_COUNT_PERIOD = 0.1
-"""Wall time between two counts of subscribers [s]: a new one waits at most that long for its first message."""
+"""Wall time between two counts of subscribers [s]. A new subscriber waits at most this long for its first message."""
 
 
 class Node:
@@ -104,7 +104,7 @@ class Node:
         """Create publishers and subscriptions."""
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
-        """Threads beside the receiving one; they end once ``_closing`` is set and :meth:`_wake` was called."""
+        """Threads in addition to the receiving one. They end after ``_closing`` is set and :meth:`_wake` was called."""
         return []
 
     def _wake(self) -> None:
@@ -116,7 +116,7 @@ class Node:
     def has_subscribers(self, family: str) -> bool:
         """Whether a topic, or one below it, has subscribers: ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
 
-        As counted at most :data:`SUBSCRIPTION_COUNT_PERIOD` ago; :class:`ValueError` if there is no such topic.
+        The count is at most :data:`SUBSCRIPTION_COUNT_PERIOD` old. Raises :class:`ValueError` for an unknown topic.
         """
         below = family.rstrip("/") + "/"
         topics = [topic for name, topic in self._topics.items() if (name + "/").startswith(below)]
@@ -126,7 +126,7 @@ class Node:
 
     @property
     def set_parameters(self) -> dict[str, Any]:
-        """Values of the parameters that were ever set, by name; another object after each change."""
+        """Values of the parameters that were ever set, by name. It is a new object after each change."""
         return self._parameters.set_by_user
 
     @property
@@ -136,11 +136,11 @@ class Node:
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Messages with subscribers that were replaced by newer ones or could not be built, by topic."""
+        """Number of messages with subscribers that were replaced by newer ones or could not be built, by topic."""
         return {name: topic.dropped for name, topic in self._topics.items()}
 
     def close(self) -> None:
-        """Leave the ROS graph; returns when the threads have ended. A second call does nothing."""
+        """Leave the ROS graph, and wait until the threads have ended. A second call does nothing."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -171,7 +171,7 @@ class Node:
         return topic
 
     def _withdraw(self, topic: Topic) -> None:
-        """Take a topic's publisher out of the ROS graph; what was counted of it stays."""
+        """Remove a topic's publisher from the ROS graph. Its counts stay."""
         topic.close()
         self._node.destroy_publisher(topic.publisher)
 

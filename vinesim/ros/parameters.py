@@ -13,17 +13,17 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.parameter import Parameter
 
 _FRAME = re.compile(r"[^/\s]\S*")
-"""Names of frames."""
+"""Pattern of valid names of frames."""
 
 
 class Parameters:
     """The parameters of one node. The receiving thread changes them; every thread may read them."""
 
     def __init__(self, node: rclpy.node.Node, values: Mapping[str, Any] | None = None) -> None:
-        """``values``: of parameters that were set before, in an earlier run of the node."""
+        """``values``: values of the parameters that were set in an earlier run of the node, by name."""
         self._node = node
         self.set_by_user = dict(values or {})
-        """Values of the parameters that were ever set, by name; replaced, never changed."""
+        """Values of the parameters that were ever set, by name. A change replaces the object."""
         self._values: dict[str, Any] = {}
         self._defaults: dict[str, Any] = {}
         self._changed: dict[str, Callable[[], None]] = {}
@@ -40,7 +40,8 @@ class Parameters:
     ) -> None:
         """Declare a parameter of the type of its ``default``: bool, int, float, or str for the name of a frame.
 
-        A value that was set before counts, else that of the node's parameter file; :class:`ValueError` if that is none.
+        Its value is the one that was set before, else the one of the node's parameter file, else the default. Raises
+        :class:`ValueError` if the value of the file is invalid.
 
         ``between``: the least and the greatest value of a number. ``changed`` is called after it was set.
         """
@@ -64,7 +65,7 @@ class Parameters:
             self._changed[name] = changed
 
     def apply(self) -> None:
-        """Call the change handlers of parameters that differ from their defaults; after all have been declared."""
+        """Call the change handlers of parameters that differ from their defaults. Call it after all declarations."""
         for name, changed in self._changed.items():
             if self._values[name] != self._defaults[name]:
                 changed()
@@ -73,7 +74,7 @@ class Parameters:
         return self._values[name]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse what rclpy lets through: it compares with ranges, and NaN is neither below nor above."""
+        """Refuse invalid values that rclpy accepts. It compares with ranges, and NaN is neither below nor above one."""
         for one in parameters:
             if isinstance(one.value, float) and not math.isfinite(one.value):
                 reason = f"parameter {one.name} is {one.value}; give a finite number"

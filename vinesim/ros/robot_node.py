@@ -1,4 +1,4 @@
-"""The ROS 2 node of a robot: state, transforms, ground truth, diagnostics and commands; everything but its pictures.
+"""The ROS 2 node of a robot: state, transforms, ground truth, diagnostics, commands; not its cameras and lidars.
 
 Every message is built and sent by the thread that passes its values, in order.
 """
@@ -41,7 +41,7 @@ from vinesim.scene.values.signals import Color
 log = logging.getLogger(__name__)
 
 FEEDBACK_PERIOD = 5
-"""Steps between two messages of feedback of an action: 20 Hz, as joint_trajectory_controller has it."""
+"""Number of steps between two feedback messages of an action: 20 Hz, as in joint_trajectory_controller."""
 MAP_TO_ODOM = "publish_map_to_odom"
 TRUTH = "publish_truth"
 ENVIRONMENT_RATE = "environment_rate"
@@ -49,16 +49,16 @@ EXACT_ODOMETRY = "exact_odometry"
 ODOM_FRAME_ID = "odom_frame_id"
 """Names of parameters."""
 LOOK_PERIOD = 1.0
-"""Wall time between two looks for another robot under the same names, and for commands of another type [s]."""
+"""Wall time between two checks for another robot under the same names, and for commands of another type [s]."""
 STAMPED_REMEDY = " (teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)"
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
-"""The name of a node, to rmw, that has not introduced itself yet."""
+"""Name that rmw reports for a node that has not introduced itself yet."""
 OWN_MESSAGES = ("tf2_msgs", "control_msgs", "audio_common_msgs")
 """Message packages that no wheel has."""
 
 
 class RobotNode(Node):
-    """One robot's topics but those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
+    """The topics of one robot, except those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
 
     ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
     sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none, ``interest_radius`` [m]
@@ -167,7 +167,7 @@ class RobotNode(Node):
 
     @property
     def environment_rate(self) -> float:
-        """Messages of true poses a second [Hz] that are asked for."""
+        """Rate at which messages with true poses are to be published [Hz]."""
         return self._parameters[ENVIRONMENT_RATE]
 
     def has_subscribers(self, family: str) -> bool:
@@ -189,7 +189,7 @@ class RobotNode(Node):
             self._warn_of_types()
 
     def _locate_subscribers(self) -> None:
-        """Note whether the subscribers of what every step publishes are all on this machine.
+        """Note whether all subscribers of the topics that every step publishes are on this machine.
 
         Identifiers of Fast DDS begin with the maker and the machine, two bytes each.
         """
@@ -239,8 +239,8 @@ class RobotNode(Node):
                 )
 
     def must_wait(self, now: float) -> bool:
-        """Whether no step shall be published at ``now`` [s], as subscribers do not keep up; see :class:`FlowControl`.
-        False where nothing is known of them."""
+        """Whether no step shall be published at ``now`` [s], because subscribers do not keep up; see
+        :class:`FlowControl`. False if nothing is known about the subscribers."""
         return self._flow_control is not None and self._flow_control.must_wait(self._topics_of_every_step(), now)
 
     def publish_clock(self, time: float) -> None:
@@ -259,35 +259,35 @@ class RobotNode(Node):
             self._actions.publish_feedback(sample)
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish true poses [name, 7] m, 1 in the map of what moves, at :attr:`environment_rate`.
+        """Publish the true poses [name, 7] m, 1 of moving objects in the map, at :attr:`environment_rate`.
 
         Pass the same tuple object as long as the names stay: the serialised message is then patched, not built.
         """
         self._send(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish true poses [name, 7] m, 1 in the map of poles, once; late subscribers receive them, too."""
+        """Publish the true poses [name, 7] m, 1 of poles in the map, once. Late subscribers receive them, too."""
         self._send(self._ground_truth.pending_static(names, poses), always=True)
 
     def publish_intentions(self, intentions: Sequence[Intention]) -> None:
-        """Publish what people indicate, when it changes; late subscribers receive the last message, too."""
+        """Publish the intentions of people when they change. Late subscribers receive the last message, too."""
         self._send([(self._intentions, lambda: convert.intentions(intentions))], always=True)
 
     def publish_gestures(self, time: float, gestures: Sequence[HandGestures]) -> None:
-        """Publish what the hands of people show since a ``time`` of the world [s]; late subscribers receive the last
-        message, too."""
+        """Publish the gestures that the hands of people show since ``time`` of the world [s]. Late subscribers receive
+        the last message, too."""
         self._send([(self._gestures, lambda: convert.gestures(time, gestures))], always=True)
 
     def publish_lights(self, color: Color | None) -> None:
-        """Publish what the indicator lights show, when it changes: UNLIT between flashes, None when they are off."""
+        """Publish the colour of the indicator lights when it changes: UNLIT between flashes, None when they are off."""
         self._send(self._lights.pending(color), always=True)
 
     def publish_sound(self, time: float, pcm: bytes) -> None:
-        """Publish what the microphone recorded from ``time`` [s] of the world on: PCM16 of 16 kHz, mono."""
+        """Publish the sound that the microphone recorded from ``time`` [s] of the world on: PCM16 of 16 kHz, mono."""
         self._send(self._sound.pending(time, pcm))
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
-        """Publish the states of parts of the client; the node adds its own. 1 Hz will do."""
+        """Publish the states of parts of the client. The node adds its own state. A rate of 1 Hz is enough."""
         own = {"refused_commands": self.refused_commands}
         prefix = self._node.get_fully_qualified_name()
         trouble = [f"{topic} is published as {', '.join(types)}" for topic, types in self._foreign_types.items()]
@@ -301,7 +301,7 @@ class RobotNode(Node):
 
     @property
     def refused_commands(self) -> int:
-        """Messages and goals so far that contradicted themselves, or that left a full queue unread."""
+        """Number of messages and goals that contradicted themselves, or were dropped from a full queue unread."""
         return self._commands.rejected
 
     @property

@@ -1,7 +1,7 @@
-"""The ROS 2 node of a robot's sensors, as their drivers are on a real robot.
+"""The ROS 2 node of a robot's sensors, which replaces their drivers on a real robot.
 
-Frames are passed by the thread that renders them; a thread of the node builds and sends the messages. Of each topic
-only the newest frame waits: an older one that was not sent is replaced and counted as dropped.
+The thread that renders frames passes them to the node. A thread of the node builds and sends the messages. Only the
+newest frame of each topic waits: it replaces an older one that was not sent, which is counted as dropped.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class SensorPublisher(Protocol):
         ...
 
     def wanted(self) -> CameraOutput:
-        """What the present subscribers need."""
+        """The outputs that the present subscribers need."""
         ...
 
     def pending(self, frame: Any) -> Iterator[PendingMessage]:
@@ -49,7 +49,7 @@ class SensorPublisher(Protocol):
 
 
 def publisher(kind: str) -> type[SensorPublisher]:
-    """What publishes sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    """Class that publishes the sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     return importlib.import_module(SENSOR_KINDS[kind].publisher).PUBLISHER
 
 
@@ -77,7 +77,7 @@ class SensorNode(Node):
             message_packages.ensure_importable(needed)
         self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}
-        """The newest message of each topic; the one that waits longest is the first."""
+        """The function that builds the newest message of each topic. The topic that waits longest is the first."""
         self._changed = threading.Condition()
         self._sending = False
         super().__init__(name, namespace, tuple(sensors), params_file, parameters)
@@ -103,7 +103,7 @@ class SensorNode(Node):
                 topic.mute(not self._parameters[TRUTH])
 
     def rate(self, sensor: str) -> float:
-        """Rate [Hz] that is asked for of a sensor of ``rates``."""
+        """Requested rate of a sensor of ``rates`` [Hz]."""
         return self._parameters[f"{sensor}.rate"]
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
@@ -118,7 +118,7 @@ class SensorNode(Node):
         self._enqueue(self._publisher(frame.name).pending(frame))
 
     def outputs_wanted(self, sensor: str) -> CameraOutput:
-        """What subscribers need of the frames of one of ``sensors``; :class:`ValueError` if there is no such sensor."""
+        """Outputs of one of ``sensors`` that subscribers need. Raises :class:`ValueError` for an unknown sensor."""
         return self._publisher(sensor).wanted()
 
     @property
@@ -142,7 +142,7 @@ class SensorNode(Node):
             self._changed.notify()
 
     def _send(self) -> None:
-        """The sending thread: of the topics with a message the one that waits longest comes first."""
+        """The sending thread. Among the topics with a message, the one that waits longest comes first."""
         while True:
             with self._changed:
                 self._sending = False

@@ -1,7 +1,7 @@
 """simulation_interfaces: how test programs pause, step and reset a simulation, and change what is in it.
 
-Services wait for an answer of the simulation, which is given between two steps; so this node has a thread of its own.
-What is not supported says so: result 0, with a text.
+Services wait for an answer of the simulation, which comes between two steps, so this node has a thread of its own.
+Services that are not supported answer with result 0 and a text.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from vinesim.ros.node import Node
 from vinesim.ros.publishers.robot import MAP_FRAME
 
 REPLY_TIMEOUT = 10.0
-"""[s] A simulation that has not answered by then stands still."""
+"""[s] A simulation that has not answered a request within this time is taken to be stopped."""
 RESET_TIMEOUT = 120.0
-"""[s] The same of a reset, which takes as long as a start of the physics."""
+"""[s] Longest time for the answer to a reset, which takes as long as a start of the physics."""
 STEP_TIMEOUT = 1.0
-"""[s] More for each step that was asked for: the slowest simulation that is waited for."""
+"""[s] Additional time for the answer for each requested step. A slower simulation is taken to be stopped."""
 UNSUPPORTED = (
     "SpawnEntities",
     "SetEntityInfo",
@@ -67,7 +67,7 @@ INVALID_POSE = 101
 
 
 class SimulationNode(Node):
-    """The services and the action, beside a robot's node.
+    """The services and the action, in addition to a robot's node.
 
     ``ask`` sends a request to the simulation; :meth:`answer` takes replies.
     """

@@ -14,17 +14,17 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 log = logging.getLogger(__name__)
 
 RELIABLE = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
-"""A hundred messages wait for a subscriber that has no processor."""
+"""Default QoS: reliable. Up to a hundred messages wait for a subscriber that gets no processor."""
 HISTORY = 1000
-"""Messages that wait of the topics of every step, ten seconds of them; see :mod:`vinesim.ros.topic`."""
+"""History depth of the topics that every step publishes: ten seconds of messages."""
 EVERY_STEP = QoSProfile(depth=HISTORY, reliability=ReliabilityPolicy.RELIABLE)
-"""Of these topics; tf2 listeners expect reliable of /tf."""
+"""QoS of the topics that every step publishes. tf2 listeners expect /tf to be reliable."""
 TRANSIENT_LOCAL = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
-"""A late subscriber receives the last message, too."""
+"""QoS of latched topics: a late subscriber receives the last message, too."""
 SENSOR_DATA = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE)
-"""Pictures and clouds: reliable, so that reliable and best-effort subscribers both receive them (REP-2003)."""
+"""QoS of pictures and clouds: reliable, so that reliable and best-effort subscribers both receive them (REP-2003)."""
 
 _AT_ONCE = Duration()
 
@@ -37,7 +37,7 @@ class Topic:
 
     def __init__(self, name: str, publisher: Publisher, *, is_of_every_step: bool = False) -> None:
         self.name = name
-        """Relative to the node's namespace unless it begins with a slash."""
+        """Name of the topic, relative to the node's namespace unless it begins with a slash."""
         self.is_of_every_step = is_of_every_step
         """Whether every step publishes it, or every other one."""
         self.subscription_count = 0
@@ -45,9 +45,9 @@ class Topic:
         self.is_local = True
         """Whether all subscribers run on this machine."""
         self.sent = 0
-        """Messages."""
+        """Number of messages that were sent."""
         self.dropped = 0
-        """Messages that were replaced by newer ones before their turn, or that could not be built or sent."""
+        """Number of messages that newer ones replaced before their turn, or that could not be built or sent."""
         self.publisher = publisher
         self._is_muted = False
         self._lock = threading.Lock()
@@ -64,13 +64,13 @@ class Topic:
             return self._is_closed or self.publisher.wait_for_all_acked(_AT_ONCE)
 
     def mute(self, is_muted: bool) -> None:
-        """Whether nothing is sent, as if there were no subscribers; for the thread that counts them."""
+        """Set whether the topic sends nothing, as if it had no subscribers. For the thread that counts subscribers."""
         self._is_muted = is_muted
         self.subscription_count = 0
         self.update_subscription_count()
 
     def close(self) -> None:
-        """Send nothing any more; returns when nothing is being sent."""
+        """Stop sending, and wait until a message that is being sent is complete."""
         with self._lock:
             self._is_closed = True
             self.subscription_count = 0
@@ -113,13 +113,15 @@ PendingMessage = tuple[Topic, Build]
 
 
 SUBSCRIBER_TIMEOUT = 3.0
-"""Subscribers that have not acknowledged all for so long are waited for no longer, until they do [s]."""
+"""If subscribers have not acknowledged all messages for this long, publishing no longer waits for them until they do
+[s]."""
 WINDOW = 5
 """Messages of a topic that may be on their way to subscribers on this machine."""
 WIDE_WINDOW = HISTORY // 2
-"""The same if one is on another machine: a network may take long to acknowledge, and the world should not slow down."""
+"""Messages of a topic that may be on their way if a subscriber is on another machine: a network may take long to
+acknowledge, and the world should not slow down."""
 FIRST_LOOK = 3
-"""Messages after which acknowledgements are looked at."""
+"""Number of messages after which acknowledgements are checked."""
 
 
 class FlowControl:
@@ -127,11 +129,11 @@ class FlowControl:
 
     def __init__(self) -> None:
         self._acknowledged: dict[Topic, int] = {}
-        """Messages sent when all were acknowledged last."""
+        """Number of messages that had been sent when all were last acknowledged, by topic."""
         self._waits_since: float | None = None
-        """Since when subscribers are waited for [s]; None: they are not."""
+        """Time since which publishing waits for subscribers [s]. None: it does not wait."""
         self._given_up: set[Topic] = set()
-        """Topics with a subscriber that is waited for no longer."""
+        """Topics with a subscriber for which publishing no longer waits."""
 
     def must_wait(self, topics: Sequence[Topic], now: float) -> bool:
         """Whether nothing more shall be sent on ``topics`` at ``now`` [s]; to be called before every step, and many

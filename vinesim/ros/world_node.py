@@ -1,4 +1,4 @@
-"""The ROS 2 node that shows a whole world and takes no commands: the clock, every robot, true poses of all else."""
+"""The ROS 2 node that shows a whole world and takes no commands: clock, robots, true poses of all other objects."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class WorldNode(Node):
     def publish_robot(
         self, name: str, urdf: str, base: str, static: Sequence[tuple[str, str, np.ndarray]], sample: RobotSample
     ) -> None:
-        """Publish a robot's joints and frames; what never changes, at its first sample.
+        """Publish a robot's joints and frames. Data that never change are published at its first sample.
 
         ``static``: (parent, child, pose [7]) of every fixed joint; ``base``: the root link, whose parent is the map.
         """
@@ -54,11 +54,11 @@ class WorldNode(Node):
         self._send(self._robots[name].pending(sample))
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish true poses [name, 7] m, 1 in the map of what moves."""
+        """Publish the true poses [name, 7] m, 1 of moving objects in the map."""
         self._send(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish true poses [name, 7] m, 1 in the map of what never moves, once; late subscribers get them, too."""
+        """Publish the true poses [name, 7] m, 1 of static objects in the map, once. Late subscribers get them, too."""
         for topic, build in self._ground_truth.pending_static(names, poses):
             topic.build_and_send(build)
 

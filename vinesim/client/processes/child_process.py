@@ -1,4 +1,4 @@
-"""Child processes that run Python modules: started, read, and ended together."""
+"""Child processes that run Python modules, in groups whose processes end together."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ START_TIMEOUT = 300.0
 REPORT_TIMEOUT = 180.0
 """Longest time in which a process writes its report and ends [s]; a client waits up to 60 s for its last picture."""
 STDERR_LINES = 40
-"""Lines of standard error that are kept."""
+"""Number of the last lines of standard error that are kept."""
 
 
 class ProcessFailed(RuntimeError):
@@ -37,9 +37,9 @@ class Process:
     name: str
     child: subprocess.Popen[str]
     started: float
-    """Wall time [s since the epoch]."""
+    """Wall time at which the process was started [s since the epoch]."""
     stdout_lines: queue.Queue[str]
-    """An empty string marks the end."""
+    """Lines of output that were not read yet. An empty string marks the end of the output."""
     stderr_tail: list[str]
 
     @classmethod
@@ -72,7 +72,8 @@ class Process:
             self.stderr_tail = [*self.stderr_tail[-STDERR_LINES:], line.rstrip("\n")]
 
     def next_line(self, timeout: float) -> str:
-        """The next line of output; :class:`ProcessFailed` if it ended or printed nothing for ``timeout`` [s]."""
+        """The next line of output. Raises :class:`ProcessFailed` if the process ended, or printed nothing for
+        ``timeout`` [s]."""
         try:
             line = self.stdout_lines.get(timeout=timeout)
         except queue.Empty:
@@ -82,7 +83,7 @@ class Process:
         return line
 
     def new_lines(self) -> list[str]:
-        """The lines of output that have come since the last call; :class:`ProcessFailed` if it has ended."""
+        """The lines of output since the last call. Raises :class:`ProcessFailed` if the process has ended."""
         lines = []
         with contextlib.suppress(queue.Empty):
             while line := self.stdout_lines.get_nowait():
@@ -153,8 +154,10 @@ class ProcessGroup:
         return self.processes[-1]
 
     def start_server(self, real_time_factor: float | None = None) -> tuple[Process, str]:
-        """Start a server on a free port of this machine; the process and its endpoint. ``real_time_factor``: of its
-        world; None: as its clients can follow."""
+        """Start a server on a free port of this machine. Returns the process and the server's endpoint.
+
+        ``real_time_factor``: rate of the server's world; None: as fast as its clients can follow.
+        """
         factor = "auto" if real_time_factor is None else f"{real_time_factor:g}"
         server = self.start(
             "server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--real-time-factor", factor
@@ -171,9 +174,9 @@ def free_port() -> int:
 
 @contextlib.contextmanager
 def process_group(exit_timeout: float = EXIT_TIMEOUT, **environ: str) -> Iterator[ProcessGroup]:
-    """Processes that end with the block, all within ``exit_timeout`` [s], however it is left.
+    """A group of processes that end with the ``with`` block, all within ``exit_timeout`` [s], also after an exception.
 
-    ``environ`` is added to the environment of each.
+    ``environ`` is added to the environment of each process.
     """
     group = ProcessGroup(environ)
     try:

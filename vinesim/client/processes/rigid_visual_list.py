@@ -1,7 +1,7 @@
-"""The list of rigid bodies that sensors show, with a version, as it goes from the client to the sensor process.
+"""The list of rigid bodies that sensors show, with a version, as the client sends it to the sensor process.
 
-The list is compared by content: a list that was only made anew keeps its version. A message has the shapes of those
-bodies only that the process does not have yet.
+The list is compared by content: a new list with the same content keeps its version. A message has the shapes only of
+the bodies that the process does not have yet.
 """
 
 from __future__ import annotations
@@ -12,23 +12,23 @@ from vinesim.client.processes.shared_arrays import SharedArrays
 from vinesim.scene.values import RigidVisual, Shape
 
 _FIRST_CAPACITY = 256
-"""Bodies for whose poses there is room at first; doubled when they are more."""
+"""Number of bodies for whose poses there is room at first. It is doubled whenever there are more bodies."""
 
 _Key = tuple[str, int, int, int]
-"""Name, organ, index and identity of the shapes."""
+"""Key of a body: its name, organ and index, and the identity of its shapes."""
 
 
 @dataclasses.dataclass(frozen=True)
 class VisualListMessage:
-    """One version of the list."""
+    """Message with one version of the list."""
 
     version: int
     numbers: tuple[int, ...]
-    """Number of each body; equal numbers are equal bodies in all versions."""
+    """Number of each body. Equal numbers mean the same body in all versions."""
     new: dict[int, RigidVisual]
-    """Bodies that no version before had, by number."""
+    """Bodies that no earlier version had, by number."""
     visual_q: SharedArrays | None
-    """Memory for their poses, if it is not that of the version before."""
+    """Memory for the poses of the bodies, or None if it is the memory of the version before."""
 
 
 class VisualListSender:
@@ -39,13 +39,13 @@ class VisualListSender:
         self._visuals: tuple[RigidVisual, ...] | None = None
         self._numbers: tuple[int, ...] = ()
         self._known: dict[_Key, tuple[int, tuple[Shape, ...]]] = {}
-        """Number of each body in the list; the shapes are kept, so that their identity stays theirs."""
+        """Number of each body in the list. The shapes are kept alive, so that no other object gets their identity."""
         self._next_number = 0
         self.capacity = 0
         self._memory: SharedArrays | None = None
 
     def update(self, visuals: tuple[RigidVisual, ...]) -> VisualListMessage | None:
-        """The message to send before poses of this list are written; None if it is the list of the last call."""
+        """The message to send before poses of this list are written. None if the list equals that of the last call."""
         if visuals is self._visuals:
             return None
         self._visuals = visuals
@@ -90,7 +90,7 @@ class VisualListReceiver:
     def __init__(self) -> None:
         self.version = 0
         self.visuals: tuple[RigidVisual, ...] = ()
-        """The same object as long as the version is the same."""
+        """The bodies of the list. It is the same object as long as the version is the same."""
         self.memory: SharedArrays | None = None
         self._by_number: dict[int, RigidVisual] = {}
 

@@ -24,7 +24,7 @@ from vinesim.scene.values import ComponentStatus, SensorPacing
 log = logging.getLogger(__name__)
 
 BEHIND = 0.95
-"""A loop that has done a smaller share than this of the steps that were due since the last status is behind."""
+"""Share of the steps that were due since the last status. A loop that has done less than this share is behind."""
 _LOOP_VALUES = (
     "tick_hz",
     "tick_p99_ms",
@@ -39,11 +39,11 @@ _LOOP_VALUES = (
 )
 """Values of a client's status that /diagnostics shows with the loop."""
 _NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
-"""The same with the network."""
+"""Values of a client's status that /diagnostics shows with the network."""
 
 
 class RobotProcesses:
-    """Starts the processes of one robot; a context: they end with it."""
+    """Starts the processes of one robot. It is a context manager: the processes end with the context."""
 
     def __init__(
         self,
@@ -64,8 +64,9 @@ class RobotProcesses:
         pacing: SensorPacing | None = None,
         standby: bool = False,
     ) -> None:
-        """``clock``: may publish /clock, as one node of a ROS domain does; ``params_file``: ROS parameters of the
-        nodes; ``interest_radius``: see :class:`RosProcess`. For the others see :class:`SensorProcess`."""
+        """``clock``: whether the ROS node may publish /clock; only one node of a ROS domain does. ``params_file``: ROS
+        parameters of the nodes. ``interest_radius``: see :class:`RosProcess`. For the other arguments see
+        :class:`SensorProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
@@ -103,9 +104,9 @@ class RobotProcesses:
         self._restarts = RecentCounts()
 
     def attach(self, client: Client, robot: Robot | None = None, *, wait_for_sensors: bool = True) -> None:
-        """Connect the processes with a robot of the client, its first unless given.
+        """Connect the processes with a robot of the client: its first robot unless ``robot`` is given.
 
-        Waits until the ROS node is ready, and unless otherwise asked the sensors; see :meth:`SensorProcess.attach`.
+        Waits until the ROS node is ready and, if ``wait_for_sensors``, the sensors; see :meth:`SensorProcess.attach`.
         """
         self.sensors.attach(client, robot, wait=wait_for_sensors)
         if self.ros is not None:
@@ -116,19 +117,20 @@ class RobotProcesses:
         return self.sensors.sent_messages() | ({} if self.ros is None else self.ros.sent_messages())
 
     def dropped_messages(self) -> dict[str, int]:
-        """ROS messages that had subscribers and were not sent, by topic; topics that lost none are left out."""
+        """Number of ROS messages that had subscribers and were not sent, by topic. Topics that lost none are left
+        out."""
         dropped = collections.Counter(self.sensors.dropped_messages())
         if self.ros is not None:
             dropped.update(self.ros.dropped_messages())
         return {topic: count for topic, count in sorted(dropped.items()) if count}
 
     def awaited(self) -> list[str]:
-        """What has to be done before pictures and messages are sent."""
+        """Names of the steps of preparation that are still needed before pictures and messages are sent."""
         ros = [] if self.ros is None or self.ros.worker.is_ready else [f"{self.sensors.name}: ROS node"]
         return self.sensors.awaited() + ros
 
     def status(self) -> dict[str, Any]:
-        """Whether the sensors are ready, what was lost so far, and process ids; for the status of a client."""
+        """Whether the sensors are ready, counts of losses so far, and process ids; for the status of a client."""
         report = self.sensors.report()
         awaited = self.awaited()
         pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
@@ -149,12 +151,12 @@ class RobotProcesses:
         }
 
     def report(self) -> dict[str, Any]:
-        """Everything that was counted, by sensor and topic."""
+        """All counts, by sensor and topic."""
         restarts = 0 if self.ros is None else self.ros.worker.restarts
         return self.sensors.report() | {"ros_dropped": self.dropped_messages(), "ros_restarts": restarts}
 
     def publish_diagnostics(self, status: dict[str, Any]) -> None:
-        """Publish a client's status on /diagnostics, with that of the sensors."""
+        """Publish the status of a client and of the sensors on /diagnostics."""
         if self.ros is None:
             return
         report = self.report() | {"sound_lost": self.ros.sound_lost}
@@ -187,7 +189,8 @@ class RobotProcesses:
 
 
 def loop_status(status: dict[str, Any]) -> ComponentStatus:
-    """A client's loop for /diagnostics: a warning while it is behind and after recent faults, the counts of all."""
+    """State of a client's loop for /diagnostics: a warning while the loop is behind and after recent faults. The values
+    include the counts of all faults."""
     trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND * status["target_real_time_factor"])
     trouble += [name.replace("_", " ") for name in status["recent_faults"]]
     values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
@@ -197,15 +200,15 @@ def loop_status(status: dict[str, Any]) -> ComponentStatus:
 
 
 def network_status(status: dict[str, Any]) -> ComponentStatus:
-    """A client's network for /diagnostics: a warning while its server is gone or rejects it."""
+    """State of a client's network for /diagnostics: a warning while its server is gone or rejects the client."""
     trouble = status["network"]
     values = {key: status[key] for key in _NETWORK_VALUES}
     return ComponentStatus("network", "warning" if trouble else "ok", trouble or "well", values)
 
 
 def sensors_status(awaited: Sequence[str], restarted: Sequence[str], report: dict[str, Any]) -> ComponentStatus:
-    """A robot's sensors for /diagnostics, with all that was counted: an error while any is ``awaited``; a warning after
-    a process was started again, for that can take less than the time between two messages."""
+    """State of a robot's sensors for /diagnostics, with all counts. It is an error while any is ``awaited``, and a
+    warning after a process was started again, because a restart can be shorter than the time between two messages."""
     if awaited:
         return ComponentStatus("sensors", "error", f"not ready: {awaited[0]}", report)
     trouble = [f"{process} restarted" for process in restarted]

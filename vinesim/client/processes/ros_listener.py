@@ -1,4 +1,5 @@
-"""A stock ROS node in a process of its own that receives the topics of clients: when the first came, and how many."""
+"""A stock ROS node in a process of its own. It receives the topics of clients, and records the time of their first
+message and the number of messages."""
 
 from __future__ import annotations
 
@@ -24,8 +25,8 @@ class RosListener:
         events: Sequence[str] = (),
         arrivals: pathlib.Path | None = None,
     ) -> None:
-        """``once``: topics that it leaves after their first message; ``events``: topics that may stay silent;
-        ``arrivals``: file for the times of every message, see :attr:`TopicStats.arrivals`."""
+        """``once``: topics from which it unsubscribes after their first message. ``events``: topics that may stay
+        silent. ``arrivals``: file for the times of every message, see :attr:`TopicStats.arrivals`."""
         self.topics = (*topics, *once)
         words = [word for topic in (*topics, *events) for word in ("--topic", topic)]
         words += [word for topic in once for word in ("--once", topic)]
@@ -49,12 +50,12 @@ class RosListener:
         return self._process.started
 
     def wait_until_listening(self) -> None:
-        """Return when it subscribes to whatever appears."""
+        """Wait until the node subscribes to topics that appear."""
         while self.listens_since is None:
             self._read(json.loads(self._process.next_line(START_TIMEOUT)))
 
     def missing(self) -> list[str]:
-        """Topics without any message yet, in the order in which they were named; those of events are left out."""
+        """Topics without any message yet, in the order in which they were named. Topics of events are left out."""
         for line in self._process.new_lines():
             self._read(json.loads(line))
         return [topic for topic in self.topics if topic not in self.first]
@@ -66,7 +67,7 @@ class RosListener:
             self.first[announcement["topic"]] = announcement["first"]
 
     def restart(self) -> None:
-        """Begin all counts anew: rates and losses are from now on."""
+        """Reset all counts: rates and losses are counted from now on."""
         self._process.write_line("restart")
 
     def stop(self) -> None:
@@ -74,6 +75,6 @@ class RosListener:
         self._process.write_line("stop")
 
     def report(self) -> TopicReport:
-        """Its statistics, of all that came until :meth:`stop` or now."""
+        """Statistics of all messages that came until :meth:`stop` or, if it was not called, until now."""
         *_, report = self._process.remaining_output(REPORT_TIMEOUT).splitlines()
         return json.loads(report)

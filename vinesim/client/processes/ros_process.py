@@ -1,4 +1,5 @@
-"""The client's side of a robot's ROS process: it passes the robot's state of every step, and takes commands."""
+"""The client's side of a robot's ROS process: it passes the robot's state after every step to the process, and takes
+commands from it."""
 
 from __future__ import annotations
 
@@ -43,11 +44,11 @@ log = logging.getLogger(__name__)
 START_TIMEOUT = 120.0
 """How long the process may take to start; a first run builds message packages [s]."""
 FREE_BACKLOG = 0.2
-"""Share of the room for steps that may be taken before the world slows down."""
+"""Share of the queue of steps that may be occupied before the world slows down."""
 RATE_PERIOD = 0.5
-"""Time over which the rate is measured at which the process takes steps [s]."""
+"""Time over which the rate at which the process takes steps is measured [s]."""
 TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
-"""Rigid bodies whose true poses are published; robots have their own transforms."""
+"""Organs of the rigid bodies whose true poses are published. Robots publish their own transforms."""
 
 
 class RosProcess:
@@ -64,19 +65,21 @@ class RosProcess:
         clock: bool = True,
         interest_radius: float | None = None,
     ) -> None:
-        """Starts the process; :meth:`attach` connects it with a client. ``clock``: may publish /clock, and
-        serves simulation_interfaces. ``params_file``: ROS parameters of its node. ``interest_radius`` [m]: of the
-        client, to be shown; None without a server."""
+        """Starts the process; :meth:`attach` connects it with a client.
+
+        ``clock``: whether its node may publish /clock and serves simulation_interfaces. ``params_file``: ROS parameters
+        of its node. ``interest_radius`` [m]: interest radius of the client, to be shown; None without a server.
+        """
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
         self._sent: dict[str, int] = {}
         self._dropped: dict[str, int] = {}
         self._sent_before: collections.Counter[str] = collections.Counter()
         self._dropped_before: collections.Counter[str] = collections.Counter()
-        """Counts of the runs of the process before this one."""
+        """Dropped messages of the earlier runs of the process, by topic."""
         self._losses: collections.Counter[str] = collections.Counter()
         self._losses_before: collections.Counter[str] = collections.Counter()
-        """Frames of sound and commands that were lost or refused in this run of the process, and in those before."""
+        """Lost frames of sound and refused commands, in the earlier runs of the process."""
         self._contacts_left_out = 0
         self._is_restarted = False
         self._leads = clock
@@ -87,9 +90,9 @@ class RosProcess:
         self._had_people = False
         """Whether there were people after the last step."""
         self._told_run: Run[RosChannel] | None = None
-        """The run of the process that knows :attr:`_intentions` and :attr:`_gestures`."""
+        """The run of the process that received the present :attr:`_intentions` and :attr:`_gestures`."""
         self._told_lights: tuple[Run[RosChannel], Color | None] | None = None
-        """The run of the process that knows what the indicator lights show, and that."""
+        """The run of the process that received the state of the indicator lights, and the colour that was sent."""
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
         self._records = StepRecords(name, description, series_stiffness(description.drives))
@@ -111,7 +114,7 @@ class RosProcess:
             params_file,
         )
         self._visuals: tuple[RigidVisual, ...] | None = None
-        """All rigid bodies when the list of those in the truth was made."""
+        """All rigid bodies at the time when the list of bodies in the ground truth was made."""
         self._truth_rows = np.zeros(0, np.intp)
         self._truth_visuals: tuple[RigidVisual, ...] = ()
         self._truth_list = VisualListSender()
@@ -119,14 +122,14 @@ class RosProcess:
         """The run of the process that :attr:`_truth_list` belongs to."""
         self._step_topics = config.step_topics
         self._lost = np.zeros(len(self._step_topics), np.int64)
-        """[topic] messages of steps that found no room on the way to the process."""
+        """[topic] Number of messages of steps that were lost because the queue to the process was full."""
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
         self._parameters = config.parameters
         self._hold: Hold | None = None
         self._taken = 0.0, 0, np.inf
-        """When the process's rate was last measured [s], how many steps it had taken then, and its rate as a factor of
-        real time."""
+        """Time of the last measurement of the process's rate [s], number of steps that the process had taken then, and
+        the rate as a factor of real time."""
         self.worker = WorkerProcess(
             f"the ROS process of {name}",
             ROS_MODULES,
@@ -137,9 +140,10 @@ class RosProcess:
         )
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:
-        """Publish a robot of the client from now on, the first unless ``robot`` is given, and obey its commands.
+        """Publish a robot of the client from now on, and execute the commands that it receives.
 
-        Waits until the process is ready; :class:`WorkerError` if it fails.
+        ``robot``: the client's first robot unless given. Waits until the process is ready. Raises :class:`WorkerError`
+        if the process fails.
         """
         self.client = client
         self.robot = robot or client.robot
@@ -166,12 +170,12 @@ class RosProcess:
     # ------------------------------------------------------------------ in the loop
 
     def held(self) -> str:
-        """Why the next step must wait, in two words: no more "ROS messages" fit on the way to the process, or it waits
-        for "ROS subscribers", which are behind. Empty when it may run.
+        """Returns why the next step must wait: "ROS messages" if the queue to the process is full, "ROS subscribers" if
+        the process waits for subscribers that are behind, "" if the step may run.
 
-        A loop that calls it before each step, until it is empty, loses no message of a step on the way. A process that
-        is not ready, or has done nothing for :data:`HOLD_TIMEOUT`, does not hold the loop; what finds no room is lost
-        then, and counted.
+        A loop that calls this method before each step, until it returns "", loses no message of a step on the way. A
+        process that is not ready, or has done nothing for :data:`HOLD_TIMEOUT`, does not hold the loop. Messages that
+        find no room are lost then, and counted.
         """
         run = self.worker.current()
         cause = _cause_to_wait(run.shared) if self.worker.is_ready else ""
@@ -189,7 +193,7 @@ class RosProcess:
 
     @property
     def backlog(self) -> float:
-        """Share of the room for steps on the way to the process that is taken, 0 to 1."""
+        """Share of the queue of steps to the process that is occupied, 0 to 1."""
         steps = self.worker.current().shared.steps
         return steps.waiting_count / steps.capacity
 
@@ -205,7 +209,7 @@ class RosProcess:
         return Limit(factor if self.backlog > FREE_BACKLOG else np.inf, "ROS messages")
 
     def _control(self, time: float) -> None:
-        """Apply commands; goals of a process that is gone end."""
+        """Apply the received commands. Goals of a process that has ended end, too."""
         if self._is_restarted:
             self._is_restarted = False
             self.handler.cancel_all(time)
@@ -214,18 +218,18 @@ class RosProcess:
         self.handler(time)
 
     def _finish(self, result: GoalResult) -> None:
-        """Tell the process how a goal ended; its client hears of it after the steps that led there."""
+        """Tell the process the result of a goal. The action client receives it after the steps that led to it."""
         run = self.worker.current()
         run.send("finish", (run.shared.steps.put_count, result))
 
     def _begin_anew(self) -> None:
-        """After a reset: obey no earlier command, and publish the new robot."""
+        """After a reset: drop earlier commands, and publish the new robot."""
         self._take_commands()
         self.robot = self.client.robots[self.robot.name]
         self.handler.begin_anew(self.robot)
 
     def _after_step(self, client: Client) -> None:
-        """Pass the state to the process, as far as its topics have subscribers."""
+        """Pass the parts of the robot's state whose topics have subscribers to the process."""
         physics = client.physics
         channel = self.worker.current().shared
         wanted = channel.wanted["steps"]
@@ -269,14 +273,14 @@ class RosProcess:
             run.send("gestures", (now, self._gestures.gestures))
 
     def _tell_lights(self) -> None:
-        """Pass what the indicator lights show to the process when it changes, and to a new run."""
+        """Pass the colour of the indicator lights to the process when it changes, and to a new run."""
         told = self.worker.current(), self.robot.shown_lights
         if told != self._told_lights:
             self._told_lights = told
             told[0].send("lights", told[1])
 
     def _write_truth(self, client: Client) -> None:
-        """Pass true poses to the process: of bunches, boxes and people."""
+        """Pass the true poses of bunches, boxes and people to the process."""
         physics = client.physics
         run = self.worker.current()
         if run is not self._run:  # a new run knows nothing yet
@@ -303,7 +307,7 @@ class RosProcess:
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 
     def hear(self, step: SoundStep) -> None:
-        """Pass what is heard at the robot to the process."""
+        """Pass the sound at the robot's microphone in this step to the process."""
         self.worker.send("sound", at_place(step, self.client.sound.place_of(self.robot.name)))
 
     def _wake(self) -> None:
@@ -351,12 +355,12 @@ class RosProcess:
 
     @property
     def sound_lost(self) -> int:
-        """Frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
+        """Number of frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
         return self._losses_before["sound_lost"] + self._losses["sound_lost"]
 
     @property
     def commands_refused(self) -> int:
-        """Commands that contradicted themselves, or what the robot has."""
+        """Number of commands that were refused, because they contradict themselves or do not fit the robot."""
         kind = "commands_refused"
         return self._losses_before[kind] + self._losses[kind] + self.handler.rejected_count
 
@@ -365,7 +369,7 @@ class RosProcess:
         self.worker.send("diagnose", (time, list(components)))
 
     def close(self) -> None:
-        """End the process; its counts are complete then. A second call does nothing."""
+        """End the process. Its counts are complete after that. A second call does nothing."""
         self.worker.close()
         self._truth_list.close()
 
@@ -383,7 +387,7 @@ def _cause_to_wait(channel: RosChannel) -> str:
 
 
 class _Microphone:
-    """Listens for a robot while its topics of sound have subscribers."""
+    """Microphone of a robot, which listens while the robot's topics of sound have subscribers."""
 
     decodes_opus = opus.is_available()
 

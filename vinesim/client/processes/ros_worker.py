@@ -1,7 +1,7 @@
 """The ROS process of one robot: publishes its state, the ground truth and diagnostics, and takes commands.
 
-It renders nothing and imports neither Warp nor the renderer, so that it starts at once, needs little memory, and keeps
-the rate of the topics of every step whatever the sensors do.
+It renders nothing and imports neither Warp nor the renderer. So it starts at once, needs little memory, and keeps the
+rate of the topics that are published every step, whatever the sensors do.
 """
 
 from __future__ import annotations
@@ -33,64 +33,67 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
 
 STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
-"""Topics that need a robot's state after a step, whatever robot it is."""
+"""Topics of every robot that need its state after a step."""
 TRUTH_TOPIC = "tf_environment"
 SOUND_TOPICS = ("audio", "audio_stamped")
 NICENESS = 5
-"""Behind the client's loop, before the renderer."""
+"""Niceness of the process: it yields to the client's loop, and takes precedence over the renderer."""
 QUEUE_CAPACITY = 100
-"""Steps that may wait for the process, a second of them; the loop waits then (:meth:`RosProcess.held`)."""
+"""Number of steps that may wait for the process (1 s of them). When the queue is full, the loop waits
+(:meth:`RosProcess.held`)."""
 WAIT_PERIOD = 0.004
-"""Time between two looks whether subscribers are behind [s]."""
+"""Time between two checks whether subscribers are behind [s]."""
 STATISTICS_PERIOD = 0.2
 """Wall time between two reports to the client [s]."""
 COUNT_PERIOD = 0.05
-"""Wall time between two looks at what has subscribers [s]; the node counts them half as often."""
+"""Wall time between two checks which topics have subscribers [s]. The node counts subscribers half as often."""
 SWITCH_INTERVAL = 5e-4
-"""[s] The thread that receives gives way to the one that publishes after so long; Python's default is half a step."""
+"""[s] Python's switch interval: after this time the receiving thread yields to the publishing thread. Python's default
+is half a step."""
 POLL_PERIOD = 0.02
-"""Longest time without a look at commands and requests [s]."""
+"""Longest time between two checks for commands and requests [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RosConfig:
-    """What the process needs to start: plain values only, so that it imports nothing large."""
+    """Data that the process needs to start. They are plain values only, so that it imports nothing large."""
 
     name: str
-    """The robot's."""
+    """The robot's name."""
     urdf: str
     base: str
     namespace: str
-    """Prefix of its topics."""
+    """Prefix of the robot's topics."""
     clock: bool
-    """Whether the node may publish /clock; one of a ROS domain does."""
+    """Whether the node may publish /clock. Only one node of a ROS domain does."""
     static_transforms: tuple[tuple[str, str, np.ndarray], ...]
     poles: np.ndarray
-    """Poses [pole, 7] m, 1."""
+    """Poses of the poles [pole, 7] m, 1."""
     records: StepRecords
     bunch_count: int
     bunch_of_body: np.ndarray
-    """[body] -1 for wood."""
+    """[body] Index of the bunch that a body belongs to; -1 for wood."""
     controllers: tuple[ControllerSpec, ...]
     imus: tuple[str, ...]
     wrenches: tuple[str, ...]
     interest_radius: float | None = None
-    """[m] Of the area around the robot within which the network sends it what others move; None without a server."""
+    """[m] Radius of the area around the robot within which the network sends it the motion of objects that others move.
+    None without a server."""
     params_file: pathlib.Path | None = None
     """ROS parameters of the node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
+    """Values of the node's parameters that were set. The client updates them, and each run starts with them."""
 
     @property
     def step_topics(self) -> tuple[str, ...]:
-        """Topics that need the record of a step, or names above several such topics; /clock comes first."""
+        """Topics that need the record of a step, or prefixes of several such topics. /clock is the first."""
         states = [one.name for one in self.controllers if one.kind is ControllerKind.JOINT_TRAJECTORY]
         elastic = [one.name for one in self.controllers if one.kind is ControllerKind.SERIES_ELASTIC]
         return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic)
 
 
 class RosChannel:
-    """What the client and the process share."""
+    """Shared memory of the client and the process."""
 
     def __init__(self, config: RosConfig, context: BaseContext) -> None:
         self.steps = SharedQueue(config.records.dtype, QUEUE_CAPACITY, context)
@@ -113,9 +116,9 @@ class RosChannel:
                 "turns": ((1,), "i8"),
             }
         )
-        """Whether topics have subscribers, and actions goals, and how often true poses are wanted [s], 0 for never;
-        whether the process waits for subscribers; how often the process has looked at all this, so that the client
-        sees that it lives. Written by the process."""
+        """Demands of the process, written by it: whether topics have subscribers; whether actions have goals; the
+        period at which true poses are wanted [s], 0 for never; whether the process waits for subscribers; the number of
+        times that the process has updated these values, by which the client sees that it is alive."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -124,7 +127,7 @@ class RosChannel:
 
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
-    """Entry of the process: publish until told to stop."""
+    """Main function of the process: publish until told to stop."""
     sys.setswitchinterval(SWITCH_INTERVAL)
     serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
 
@@ -167,9 +170,10 @@ class RosWorker:
         self._rigid = VisualListReceiver()
         self._truth_names: tuple[str, ...] = ()
         self._named: tuple[int, bytes] = 0, b""
-        """Version of the list of rigid bodies, and attached bunches, that :attr:`_truth_names` belong to."""
+        """Version of the list of rigid bodies, and array of the attached bunches as bytes, for which
+        :attr:`_truth_names` was made."""
         self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
-        """Goals that have ended, each after how many records of steps."""
+        """Goals that have ended, each with the number of step records after which its result is sent."""
         self._microphone = Microphone()
         self._next_count = self._next_statistics = 0.0
         self._pace = Pace()
@@ -194,7 +198,7 @@ class RosWorker:
                 if commands := self.node.commands():
                     self.pipe.send(("commands", commands))
                 self._report()
-        self._send_statistics()  # what was sent last is counted, too
+        self._send_statistics()  # so that the last messages are counted, too
 
     def _next_record(self) -> Any | None:
         """The next step to publish; None if none comes for a while, or subscribers are behind."""
@@ -237,7 +241,7 @@ class RosWorker:
         return True
 
     def _record(self, step: MicrophoneStep) -> None:
-        """Mix what the robot hears, and publish what is complete."""
+        """Mix the sound at the robot's microphone, and publish the frames that are complete."""
         for frame in step.frames:
             self._microphone.hear(frame)
         for source, frequency, level in step.tones:
@@ -246,7 +250,7 @@ class RosWorker:
             self.node.publish_sound(block.time + step.to_world, to_pcm(block.samples))
 
     def _publish_truth(self) -> None:
-        """True poses of rigid bodies, and of the bunches that hang on their plants."""
+        """Publish the true poses of rigid bodies, and of the bunches that hang on their plants."""
         with self.channel.truth.reading() as truth:
             version = int(truth["version"][0])
             memory = self._rigid.memory
@@ -263,7 +267,7 @@ class RosWorker:
         self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
-        """Tell the client what is subscribed to, and now and then what was sent."""
+        """Tell the client which topics have subscribers, and every :data:`STATISTICS_PERIOD` what was sent."""
         wanted = self.channel.wanted
         now = time.monotonic()
         wanted["turns"][0] += 1
@@ -291,20 +295,20 @@ class RosWorker:
 
 
 class Pace:
-    """How fast steps are published that have waited: little faster than the world makes them, few at once.
+    """Limits the rate at which delayed steps are published: little faster than the world makes them, few at once.
 
-    Stock subscribers keep ten messages of a topic, and overwrite them when more come before they are taken. What takes
-    them may wait for a processor, and does not say so.
+    Stock subscribers keep ten messages of a topic, and overwrite them if more arrive before the messages are taken. A
+    subscriber may wait for a processor, and does not tell the publisher.
     """
 
     BURST = 5
-    """Steps that are published at once."""
+    """Number of steps that may be published at once."""
     SPEED = 1.5
-    """Rate beyond, as a multiple of the world's."""
+    """Rate at which further steps are published, as a multiple of the world's rate."""
     LEAST = 50.0
-    """The same at least [Hz]: the world may have paused."""
+    """Lowest rate at which further steps are published [Hz]: the world may have paused."""
     PERIOD = 0.5
-    """Of measurements of the world's rate [s]."""
+    """Time between two measurements of the world's rate [s]."""
 
     def __init__(self) -> None:
         self._interval = 0.01
@@ -312,7 +316,8 @@ class Pace:
         self._count = 0
 
     def delay(self, put_count: int) -> float:
-        """Time until the next step may be published [s], after the world has put so many."""
+        """Time until the next step may be published [s]. ``put_count``: number of steps that the world has put so
+        far."""
         now = time.monotonic()
         if (passed := now - self._since) > self.PERIOD:
             rate = self.SPEED * (put_count - self._count) / passed
@@ -322,7 +327,7 @@ class Pace:
         return max(self._due - now, 0.0)
 
     def add(self) -> None:
-        """A step is published now."""
+        """Count a step that is published now."""
         earliest = time.monotonic() - (self.BURST - 1) * self._interval
         self._due = max(self._due, earliest) + self._interval
 

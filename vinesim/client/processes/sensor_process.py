@@ -37,12 +37,12 @@ SNAPSHOT_PERIOD = 2
 START_TIMEOUT = 300.0
 """How long the process may take to start; a first run compiles kernels [s]."""
 COUNT_TIMEOUT = 20.0
-"""How long the process may take to say what it has rendered [s]: it ends its present picture before."""
+"""How long the process may take to report its counts [s]: it completes its present picture first."""
 SAVE_TIMEOUT = 60.0
 """How long the process may take to write its pictures [s]; on a busy machine it renders first."""
 
 Counts = dict[str, dict[str, int]]
-"""Counts by sensor or topic, by what is counted."""
+"""Counts: kind of count -> sensor or topic -> number."""
 
 
 def time_of_snapshot(time: float, dt: float) -> float:
@@ -52,7 +52,7 @@ def time_of_snapshot(time: float, dt: float) -> float:
 
 
 class SensorProcess:
-    """Cameras and lidars of one robot of the client. A context: the process ends with it."""
+    """Cameras and lidars of one robot of the client. It is a context manager: the process ends with the context."""
 
     def __init__(
         self,
@@ -75,22 +75,22 @@ class SensorProcess:
 
         ``keep_pictures`` keeps the picture of the first camera with the highest ``Client.frame_score`` for
         :meth:`save_picture`, and renders it even without subscribers. ``sensor_hz`` replaces the sensors' own rates.
-        ``pacing``: whether simulated time waits for sensors; as the ``description`` says unless given.
-        ``standby``: another process stands by and takes its place if it fails, see :class:`WorkerProcess`.
+        ``pacing``: whether simulated time waits for sensors; by default as in the ``description``.
+        ``standby``: whether another process stands by and replaces this one if it fails, see :class:`WorkerProcess`.
         """
         self.name = name
         self.missed_snapshots = 0
-        """Snapshots that were written one step later, as the process was just reading."""
+        """Number of snapshots that were written one step later, because the process was reading."""
         self._awaited: tuple[str, ...] = ("process",)
         self._device = device
         self._counts: Counts = {}
         self._counts_before: dict[str, collections.Counter[str]] = {}
-        """Counts of the runs of the process before this one."""
+        """Counts of the earlier runs of the process: kind of count -> sensor or topic -> number."""
         self._saved = threading.Event()
         self._save_failure = ""
         """Why the last picture could not be written."""
         self._moved_trees = np.zeros(len(model.tree_first), bool)
-        """[tree] whether it moved since the last snapshot that was written."""
+        """[tree] Whether the tree moved since the last snapshot that was written."""
         self._is_overdue = False
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
@@ -124,15 +124,15 @@ class SensorProcess:
             rehearsal=SENSOR_REHEARSAL if standby else "",
         )
         self._run: Run[SensorChannel] | None = None
-        """The run of the process that snapshots were last written for."""
+        """The run of the process for which the last snapshot was written."""
         self._visuals = VisualListSender()
         self._snapshot_count = self._pose_count = 0
 
     def attach(self, client: Client, robot: Robot | None = None, *, wait: bool = True) -> None:
-        """Show the process the client's world from now on, as seen by its first robot unless ``robot`` is given.
+        """Show the client's world to the process from now on, as ``robot`` sees it (the first robot unless given).
 
-        Waits until the process has rendered a first picture of every sensor; :class:`WorkerError` if it fails. Without
-        ``wait`` the client may step meanwhile, and the error comes from the step after the failure.
+        Waits until the process has rendered a first picture of every sensor. Raises :class:`WorkerError` if the process
+        fails. Without ``wait`` the client may step meanwhile, and the step after the failure raises the error.
         """
         self.client = client
         self.robot = robot or client.robot
@@ -149,8 +149,8 @@ class SensorProcess:
     # ------------------------------------------------------------------ in the loop
 
     def held(self) -> str:
-        """Why the next step must wait: "sensors", which have not taken or, in lockstep, not sent what their mode
-        promises; empty when it may run.
+        """Returns why the next step must wait: "sensors" if they have not taken (in lockstep: not sent) the frames that
+        their mode promises, "" if the step may run.
 
         A process that is not ready, or has done nothing for three seconds, holds only the steps of lockstep.
         """
@@ -184,7 +184,7 @@ class SensorProcess:
         return self._pacing.mode is SensorMode.LOCKSTEP
 
     def limit(self) -> Limit:
-        """The largest real-time factor at which the sensors keep what their mode promises."""
+        """The largest real-time factor at which the sensors deliver the frames that their mode promises."""
         run = self.worker.current()
         return Limit(float(run.shared.wanted["factor"][0]) if self.worker.is_ready else np.inf, "sensors")
 
@@ -280,7 +280,7 @@ class SensorProcess:
         return {name: count + before[name] for name, count in self._counts.get(what, {}).items()}
 
     def awaited(self) -> list[str]:
-        """What has to be done before all sensors are ready; empty when they are."""
+        """Names of the steps of preparation before all sensors are ready. Empty when they are ready."""
         if self.worker.is_ready:
             return []
         return [f"{self.name}: {part}" for part in self._awaited or ("process",)]
@@ -290,12 +290,12 @@ class SensorProcess:
         return self._total("sent")
 
     def dropped_messages(self) -> dict[str, int]:
-        """ROS messages that newer ones replaced before they were sent, by topic."""
+        """Number of ROS messages that newer ones replaced before they were sent, by topic."""
         return self._total("ros_dropped")
 
     def report(self) -> dict[str, Any]:
-        """Frames delivered and dropped by sensor, snapshots that could not be shown or were late, restarts, device;
-        in lockstep a digest of all frames of each sensor."""
+        """Counts of frames delivered and dropped, by sensor; of snapshots that could not be shown or were late; of
+        restarts. Also the device and, in lockstep, a digest of all frames of each sensor."""
         digests = {"frame_digests": self._digests} if self.is_lockstep else {}
         return digests | {
             "frames": self._total("frames"),
@@ -316,8 +316,8 @@ class SensorProcess:
     def save_picture(self, folder: pathlib.Path) -> None:
         """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs.
 
-        A process that is not ready, or fails now, costs the picture and is logged. :class:`WriteError` if the folder
-        cannot be written.
+        If the process is not ready, or fails now, the picture is lost and a message is logged. Raises
+        :class:`WriteError` if the folder cannot be written.
         """
         self._saved.clear()
         if self.worker.is_ready:

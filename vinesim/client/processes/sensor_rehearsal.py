@@ -1,4 +1,5 @@
-"""A first picture and a first revolution of a sensor process that stands by: what they load and make is there then."""
+"""A first camera picture and a first lidar revolution of a sensor process that stands by. Kernels and modules that they
+need are loaded after that."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ SCENE = "demo"
 CAMERA = "d435"
 LIDAR = "vlp16"
 SIZE = (64, 48)
-"""Of the picture: it is the first call of each kernel that takes its time."""
+"""Size of the picture [px]. It may be small, because it is the first call of each kernel that takes long."""
 
 
 def rehearse() -> None:

@@ -1,4 +1,4 @@
-"""The sensor process of one robot: renders what is subscribed to, and publishes it as the drivers of sensors do."""
+"""The sensor process of one robot. It renders the sensors that have subscribers, and publishes like their drivers."""
 
 from __future__ import annotations
 
@@ -56,18 +56,18 @@ log = logging.getLogger(__name__)
 STATISTICS_PERIOD = 0.2
 """Wall time between two reports to the client [s]."""
 SEND_POLL = 5e-4
-"""Time between two looks whether all messages were sent [s]."""
+"""Time between two checks whether all messages were sent [s]."""
 POLL_PERIOD = 0.02
-"""Longest time without a look at requests and subscribers [s]."""
+"""Longest time between two checks for requests and subscribers [s]."""
 SWITCH_INTERVAL = 5e-4
 """How long one thread here may hold the interpreter lock when another wants it [s]."""
 NICENESS = 10
-"""The client's loop and its ROS process come first, but a renderer that is much nicer starves beside other programs
-(docs/decisions/sensor-process.md)."""
+"""Niceness of the process. The client's loop and its ROS process take precedence, but a much higher niceness would let
+other programs starve the renderer (docs/decisions/sensor-process.md)."""
 POSE_HISTORY = 128
-"""Poses of the sensors that are kept for swept ones: of 2.5 s."""
+"""Number of poses of each sensor that are kept for sensors that sweep, such as lidars: 2.5 s."""
 OFFSET_HISTORY = 512
-"""Offsets of the world's time that are kept for the stamps of scans: of 10 s."""
+"""Number of offsets of the world's time that are kept for the stamps of scans: 10 s."""
 
 
 LIVE = SensorPacing()
@@ -75,40 +75,40 @@ LIVE = SensorPacing()
 
 @dataclasses.dataclass(frozen=True)
 class SensorConfig:
-    """What the process needs to start."""
+    """Data that the process needs to start."""
 
     name: str
-    """The robot's."""
+    """The robot's name."""
     model: Model
     description: RobotDescription
     sun: SunPath
     namespace: str
-    """Prefix of its topics."""
+    """Prefix of the robot's topics."""
     ros: bool
     """Whether it runs a ROS node."""
     keep_pictures: bool
-    """Whether the best picture of the first camera is kept, which renders it even without subscribers."""
+    """Whether the best picture of the first camera is kept. If so, it is rendered even without subscribers."""
     sensor_hz: float | None
     """Rate of all sensors [Hz]; None: each sensor's own."""
     renderer: str = "warp"
     device: str = "cpu"
-    """Where they compute; the CPU from the next start on if a GPU fails."""
+    """Device on which the sensors compute. If a GPU fails, it is the CPU from the next start on."""
     pacing: SensorPacing = LIVE
     wind: Wind | None = None
-    """That of the scene."""
+    """Wind of the scene."""
     params_file: pathlib.Path | None = None
     """ROS parameters of its node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Values of the node's parameters that were set; the client changes it, and each run starts with it."""
+    """Values of the node's parameters that were set. The client updates them, and each run starts with them."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
-        """Link that carries each sensor, by name; the order of poses in snapshots."""
+        """Link that carries each sensor, by the sensor's name. Poses in snapshots have the same order."""
         return {mount.name: mount.frame for mount in self.description.sensors}
 
 
 class SensorChannel:
-    """What the client and the process share: the newest snapshot of the world, and what is wanted."""
+    """Shared memory of the client and the process: the newest snapshot of the world, and the process's demands."""
 
     def __init__(self, config: SensorConfig, context: BaseContext) -> None:
         model = config.model
@@ -145,9 +145,10 @@ class SensorChannel:
         self.wanted = SharedArrays(
             {"world": ((1,), "?"), "horizon": ((1,), "f8"), "factor": ((1,), "f8"), "shown": ((1,), "i8")}
         )
-        """Whether snapshots of the world are wanted; which simulated time the world must not pass before another is
-        taken [s]; the largest real-time factor that the sensors can follow; number of the newest snapshot of which all
-        is rendered and sent. Written by the process."""
+        """Demands of the process, written by it. ``world``: whether snapshots of the world are wanted. ``horizon``:
+        simulated time that the world must not pass before another snapshot is taken [s]. ``factor``: the largest
+        real-time factor that the sensors can follow. ``shown``: number of the newest snapshot whose frames are all
+        rendered and sent."""
         self.wanted["horizon"][0] = self.wanted["factor"][0] = np.inf
 
     def close(self) -> None:
@@ -157,7 +158,7 @@ class SensorChannel:
 
 
 def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
-    """Entry of the process: render and publish until told to stop."""
+    """Main function of the process: render and publish until told to stop."""
     sys.setswitchinterval(SWITCH_INTERVAL)
 
     def work() -> None:
@@ -178,11 +179,11 @@ class SensorWorker:
         self.channel = channel
         self.pipe = pipe
         self.frames_skipped = 0
-        """Snapshots that could not be shown as their list of bodies had not arrived."""
+        """Number of snapshots that could not be shown because their list of bodies had not arrived."""
         self._state = State.at_rest(config.model)
         self._visuals = VisualListReceiver()
         self._missing_version: int | None = None
-        """Version of the list of bodies that the newest snapshot belongs to, if that has not arrived."""
+        """Version of the list of bodies of the newest snapshot, if this list has not arrived. Otherwise None."""
         self._offsets = OffsetHistory(OFFSET_HISTORY)
         self._last_number = 0
         self._pose_count = 0
@@ -190,7 +191,7 @@ class SensorWorker:
         self._kept_camera = next((mount.name for mount in config.description.sensors_of(CameraMount.kind)), "")
         self._is_lockstep = config.pacing.mode is SensorMode.LOCKSTEP
         self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
-        """Of all that each sensor has delivered, in lockstep."""
+        """Digest of all frames that each sensor has delivered in lockstep, by the sensor's name."""
         self._time = self._frame_score = 0.0  # of the newest snapshot
         self._next_statistics = 0.0
         self._awaits("kernels and scene")
@@ -203,7 +204,7 @@ class SensorWorker:
 
     @contextlib.contextmanager
     def _awaiting_progress(self) -> Iterator[None]:
-        """Tell the client how far this process is with what takes long, which also shows that it does not hang."""
+        """Tell the client the progress of work that takes long. This also shows that the process does not hang."""
         handler = logging.Handler()
         handler.emit = lambda record: self._awaits(record.getMessage()) if record.getMessage() else None
         progress.log.setLevel(logging.INFO)
@@ -240,7 +241,7 @@ class SensorWorker:
         return {m.name: given or m.rate or maker(m.kind).rate(m.type) for m in self.config.description.sensors}
 
     def _present_rate(self, name: str) -> Callable[[], float] | None:
-        """The rate of a sensor that its parameter says."""
+        """Function that returns the rate of a sensor from its ROS parameter [Hz]; None without such a parameter."""
         return None if self.node is None else partial(self.node.rate, name)
 
     def _open_sensors(self) -> SensorScheduler:
@@ -273,7 +274,8 @@ class SensorWorker:
         )
 
     def _working_device(self) -> str:
-        """The device of the configuration, or the CPU if it cannot be used any more, which is logged and reported."""
+        """The device of the configuration, or the CPU if that device can no longer be used. A change is logged and
+        reported."""
         device = self.config.device
         if device != "cpu" and (fault := device_fault(device)) is not None:
             log.error("the sensors of %s compute on the CPU: %s", self.config.name, fault)
@@ -282,7 +284,8 @@ class SensorWorker:
         return device
 
     def _demand(self, mount: RenderedMount) -> Callable[[], CameraOutput]:
-        """The outputs of a sensor that its subscribers need now, and those for which its pictures are kept."""
+        """Function that returns the outputs of a sensor that are needed now: by its subscribers, or for the kept
+        picture."""
         name = mount.name
         whole = SENSOR_KINDS[mount.kind].whole
         keeper = self._keeper if name == self._kept_camera else None
@@ -316,7 +319,7 @@ class SensorWorker:
                     is_ready = True
                     self._awaits()
                     report_ready(self.pipe, NICENESS)
-                    allocator.release_free_memory()  # takes 0.1 s, which nothing has to wait for
+                    allocator.release_free_memory()  # takes 0.1 s; nothing waits for it here
                 self.channel.wanted["shown"][0] = self._last_number
             is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
             self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
@@ -327,13 +330,13 @@ class SensorWorker:
                 self.pipe.send(("statistics", self._statistics()))
 
     def _publish_pace(self) -> None:
-        """Tell the client how far the world may go on, and how fast."""
+        """Tell the client up to which time the world may continue, and how fast."""
         wanted = self.channel.wanted
         wanted["horizon"][0] = self.scheduler.horizon()
         wanted["factor"][0] = self.scheduler.sustainable_factor()
 
     def _wait_until_sent(self) -> None:
-        """Return when all messages of the frames that were delivered have been sent."""
+        """Wait until all messages of the delivered frames have been sent."""
         while self.node is not None and self.node.has_pending:
             time.sleep(SEND_POLL)
 
@@ -344,7 +347,8 @@ class SensorWorker:
             self.pipe.send(("parameters", parameters))
 
     def _wait_for_snapshot(self) -> bool:
-        """Whether there is a snapshot to read: a new one, or one that was skipped and whose list arrived since."""
+        """Wait for a snapshot. Returns whether there is one to read: a new one, or one that was skipped and whose list
+        of bodies has arrived since."""
         return self.channel.snapshot.wait(POLL_PERIOD) or self._visuals.version == self._missing_version
 
     def _take_requests(self) -> bool:
@@ -364,10 +368,11 @@ class SensorWorker:
         return True
 
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
-        """The newest snapshot, and sensor poses with their times [s] since the last one; the last are of its time.
+        """The newest snapshot, and the sensor poses since the snapshot before, with their times [s]. The last poses
+        belong to the time of the snapshot.
 
-        None if it was read before: it was written between the signal for the last one and its reading. None, and
-        counted, if the list of bodies that it belongs to has not arrived.
+        None if the snapshot was read before: it was written between the signal for the snapshot before and its reading.
+        None also if its list of bodies has not arrived; this is counted.
         """
         with self.channel.snapshot.reading() as shared:
             if shared["number"][0] == self._last_number:
@@ -423,7 +428,7 @@ class SensorWorker:
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 
     def _statistics(self) -> dict[str, Any]:
-        """What was rendered, sent and dropped."""
+        """Counts of frames and messages that were rendered, sent and dropped."""
         statistics: dict[str, Any] = {
             "frames": dict(self.scheduler.frames),
             "frames_dropped": dict(self.scheduler.dropped),

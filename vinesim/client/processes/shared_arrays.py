@@ -1,4 +1,4 @@
-"""Numpy arrays in memory that two processes share, and a snapshot of such arrays of which only the newest is kept."""
+"""NumPy arrays in memory that two processes share, and a snapshot of such arrays, which a newer one overwrites."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Layout = Mapping[str, tuple[tuple[int, ...], Any]]
 """Shape and type of each array, by name."""
 
 _ALIGNMENT = 64
-"""Of the first byte of each array [bytes]: a line of the cache."""
+"""Alignment of the first byte of each array [bytes]: a cache line."""
 
 
 class SharedArrays:
@@ -36,7 +36,7 @@ class SharedArrays:
         return self._arrays[name]
 
     def _offsets(self) -> dict[str, int]:
-        """First byte of each array, and of what would follow the last under the empty name."""
+        """Offset of the first byte of each array, by name, and the end of the last array under the empty name."""
         offsets = {}
         end = 0
         for name, (shape, dtype) in self.layout.items():
@@ -55,7 +55,7 @@ class SharedArrays:
         }
 
     def close(self) -> None:
-        """Release the memory; arrays taken from here must not be used any more. A second call does nothing."""
+        """Release the memory. Arrays taken from here must not be used after that. A second call does nothing."""
         if self._arrays:
             self._arrays = {}
             with contextlib.suppress(BufferError):  # a view still exists, and the memory lives as long as that
@@ -74,18 +74,19 @@ class SharedArrays:
 
 
 class SharedSnapshot:
-    """Arrays that one process writes and another reads as a whole. The writer never waits; the reader has the newest.
+    """Arrays that one process writes and another reads as a whole. The writer never waits. The reader has the newest.
 
-    Both hold a lock while they copy. A writer that finds it taken leaves the snapshot as it is and counts that; it
-    should write the next time, with all that has changed since. The reader is woken by :meth:`wake`, not by writing.
+    Both hold a lock while they copy. A writer that finds the lock taken leaves the snapshot as it is and counts a
+    missed write. It should write the next time, with all changes since. Writing does not wake the reader; :meth:`wake`
+    does.
     """
 
     def __init__(self, layout: Layout, context: BaseContext) -> None:
         self.arrays = SharedArrays(layout)
         self.missed_writes = 0
-        """Snapshots that were not written because the reader was just reading."""
+        """Number of snapshots that were not written because the reader was reading."""
         self._is_new = False
-        """Whether something was written since the reader was woken last."""
+        """Whether a snapshot was written since the reader was last woken."""
         self._lock = context.Lock()
         self._written = context.Semaphore(0)
 
@@ -103,13 +104,14 @@ class SharedSnapshot:
             self._is_new = True
 
     def wake(self) -> None:
-        """Let the reader know of what was written."""
+        """Wake the reader if a snapshot was written since it was last woken."""
         if self._is_new:
             self._is_new = False
             self._written.release()
 
     def wait(self, timeout: float) -> bool:
-        """Wait up to ``timeout`` [s] until the writer has woken it since the last call; whether it has."""
+        """Wait up to ``timeout`` [s] for the writer's :meth:`wake`. Returns whether it was called since the last
+        call of this method."""
         if not self._written.acquire(timeout=timeout):
             return False
         while self._written.acquire(block=False):

@@ -1,7 +1,7 @@
-"""A queue of records in shared memory, from one process to another: none is replaced, each lost one is counted.
+"""A queue of records in shared memory, from one process to another. No record is overwritten; lost ones are counted.
 
-Putting a record does not wake the reader, :meth:`SharedQueue.wake` does: where all cores are busy the kernel often runs
-the process that was woken at once and on the same core, in the middle of the writer's work.
+Putting a record does not wake the reader; :meth:`SharedQueue.wake` does. If all cores are busy, the kernel often runs
+a process that was woken at once and on the same core, in the middle of the writer's work.
 """
 
 from __future__ import annotations
@@ -21,33 +21,34 @@ class SharedQueue:
 
     def __init__(self, record: np.dtype, capacity: int, context: BaseContext) -> None:
         self.lost = 0
-        """Records that found no room."""
+        """Number of records that were lost because the queue was full."""
         self.capacity = capacity
         self._memory = SharedArrays({"records": ((capacity,), record), "put": ((1,), "i8"), "taken": ((1,), "i8")})
         self._free = context.Semaphore(capacity)
         self._filled = context.Semaphore(0)
         self._next = 0
         self._unannounced = 0
-        """Records that were put since the reader was woken last."""
+        """Number of records that were put since the reader was last woken."""
 
     @property
     def put_count(self) -> int:
-        """Records that were put."""
+        """Number of records that were put."""
         return int(self._memory["put"][0])
 
     @property
     def taken_count(self) -> int:
-        """Records that were taken."""
+        """Number of records that were taken."""
         return int(self._memory["taken"][0])
 
     @property
     def waiting_count(self) -> int:
-        """Records that were put and not taken yet."""
+        """Number of records that were put and not taken yet."""
         return self.put_count - self.taken_count
 
     @contextlib.contextmanager
     def put(self) -> Iterator[Any | None]:
-        """The record to fill, put when the block is left; None if there is no room, which is counted."""
+        """Context with the record to fill, which is put at the end of the ``with`` block. If the queue is full, the
+        value is None and the record is counted as lost."""
         if not self._free.acquire(block=False):
             self.lost += 1
             yield None
@@ -62,13 +63,13 @@ class SharedQueue:
         self._memory["put"][0] += 1
 
     def wake(self) -> None:
-        """Let the reader take what was put."""
+        """Wake the reader, so that it takes the records that were put."""
         while self._unannounced:
             self._unannounced -= 1
             self._filled.release()
 
     def take(self, timeout: float) -> Any | None:
-        """The oldest record, a copy; waits up to ``timeout`` [s] for one, then None."""
+        """Remove the oldest record and return a copy. Waits up to ``timeout`` [s] for one, then returns None."""
         if not self._filled.acquire(timeout=timeout):
             return None
         record = self._memory["records"][self._next].copy()

@@ -1,8 +1,8 @@
-"""A child process that starts before it is known what it shall do: it imports its modules, then receives its function.
+"""A child process that starts before its function is known: it imports its modules, then receives the function.
 
 Imports take most of the time in which a process starts. The command line starts the sensor process while it still
-imports what the client itself needs (:func:`start_early`); so this module imports nothing large. A process may also
-stand by, having imported all, until another one fails.
+imports the modules of the client itself (:func:`start_early`), so this module imports nothing large. A process may also
+stand by, with all modules imported, until another one fails.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from typing import Any
 from vinesim.core import allocator
 
 ROS_MODULES = ("vinesim.client.processes.ros_worker", "vinesim.ros.robot_node", "vinesim.ros.simulation_node")
-"""What a ROS process needs."""
+"""Modules that a ROS process imports."""
 SENSOR_REHEARSAL = "vinesim.client.processes.sensor_rehearsal"
-"""What a sensor process that stands by does beforehand."""
+"""Module whose function ``rehearse`` a sensor process calls before it stands by."""
 STANDBY_NICENESS = 5
-"""By how much nicer than its parent a process is until it stands by."""
+"""Difference between the niceness of a process and that of its parent, until the process stands by."""
 CONTEXT = multiprocessing.get_context("spawn")
 _started_early: dict[tuple[str, ...], SpawnedProcess] = {}
 """Processes that :func:`spawn` has not returned yet, by their modules."""
 
 
 def _import_and_run(modules: Sequence[str], pipe: Connection, rehearsal: str) -> None:
-    """The life of the process; it ends if the parent ends before it has sent a function."""
+    """Main function of the process. It returns if the parent ends before it has sent a function."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent
     allocator.keep_large_blocks_apart()
     allocator.trim_regularly()
@@ -54,7 +54,7 @@ def _import_and_run(modules: Sequence[str], pipe: Connection, rehearsal: str) ->
 
 
 def _import(modules: Sequence[str]) -> None:
-    gc.disable()  # a fifth of the time, and all that is imported stays
+    gc.disable()  # collection takes a fifth of the time of imports, and imported objects stay anyway
     for name in modules:
         with contextlib.suppress(ImportError):  # reported where it is needed
             importlib.import_module(name)
@@ -74,12 +74,12 @@ class SpawnedProcess:
     """A daemon process that has imported ``modules``, or is about to, and a pipe to it."""
 
     def __init__(self, title: str, modules: Sequence[str], rehearsal: str = "") -> None:
-        """With a ``rehearsal``, the process stands by: it also calls the function ``rehearse`` of the module of this
-        name, all that in a thread that is nicer than this process, and says when it has done so."""
+        """``rehearsal``: name of a module. If it is given, the process stands by: it imports ``modules`` and calls the
+        function ``rehearse`` of that module, in a thread of higher niceness than this process, and then reports."""
         self.pipe, end = CONTEXT.Pipe()
-        """This end of the pipe."""
+        """The parent's end of the pipe."""
         self.stands_by = False
-        """Whether it runs and has rehearsed, as of the last :meth:`look`."""
+        """Whether the process ran and had rehearsed at the last :meth:`look`."""
         self.process = CONTEXT.Process(
             target=_import_and_run, args=(tuple(modules), end, rehearsal), name=title, daemon=True
         )
@@ -87,7 +87,7 @@ class SpawnedProcess:
         end.close()
 
     def look(self) -> bool:
-        """Whether the process runs; brings :attr:`stands_by` up to date. For one thread, before :meth:`run`."""
+        """Update :attr:`stands_by`. Returns whether the process runs. Call it from one thread, before :meth:`run`."""
         runs = self.process.is_alive()
         with contextlib.suppress(EOFError, OSError):
             self.stands_by = runs and (self.stands_by or (self.pipe.poll() and self.pipe.recv() == "standing by"))
@@ -104,7 +104,7 @@ class SpawnedProcess:
 
         Locks and semaphores of :data:`CONTEXT` may be among the arguments.
         """
-        # multiprocessing refuses to pickle its locks unless it is spawning a process: this one is one that it spawned
+        # multiprocessing pickles its locks only while it spawns a process, so the process that it spawned is set here
         multiprocessing.context.set_spawning_popen(self.process._popen)  # type: ignore[attr-defined]
         try:
             message = ForkingPickler.dumps((function, arguments))
@@ -114,7 +114,7 @@ class SpawnedProcess:
 
 
 def sensor_modules(ros: bool) -> tuple[str, ...]:
-    """What a sensor process needs, with a ROS node or without."""
+    """Modules that a sensor process imports, with a ROS node or without."""
     usual = ("vinesim.sensors.camera.camera", "vinesim.sensors.lidar.lidar")
     modules = ("vinesim.client.processes.sensor_worker", "vinesim.sensors.scheduler", *usual)
     if not ros:

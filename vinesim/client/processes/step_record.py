@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     from vinesim.robot.description.description import RobotDescription
 
 MAX_CONTACTS = 32
-"""Contacts of one robot that a record holds; further ones of the same step are left out and counted."""
+"""Number of contacts of one robot that a record holds. Further contacts of the same step are left out and counted."""
 
 _CONTACT = np.dtype([("link", "i4"), ("body", "i4"), ("position", "f8", 3), ("force", "f8", 3), ("distance", "f8")])
 
 
 class StepRecords:
-    """The layout of the records of one robot; constant, small, and the same in both processes."""
+    """The layout of the records of one robot. It is constant and small, and both processes have the same."""
 
     def __init__(self, actor: str, description: RobotDescription, series_stiffness: np.ndarray) -> None:
-        """``series_stiffness``: [joint] N m/rad or N/m of the series elastic elements."""
+        """``series_stiffness``: [joint] stiffness of the series elastic elements [N m/rad or N/m]."""
         self.actor = actor
         self.joints = description.joints
         self.transforms = tuple(description.moving_joints.frames)
@@ -47,7 +47,7 @@ class StepRecords:
         )
         ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
         self._parts = tuple((slice(e - math.prod(shape), e), shape) for e, shape in zip(ends, shapes, strict=True))
-        """Place in ``state`` and shape of each part of it, in the order in which :meth:`write` puts them there."""
+        """Slice of ``state`` and shape of each part of the state, in the order in which :meth:`write` stores them."""
         self._body_sensors_start = ends[10]
         self.dtype = np.dtype(
             [
@@ -61,9 +61,10 @@ class StepRecords:
         )
 
     def write(self, record: Any, time: float, sample: RobotSample | None) -> int:
-        """Fill a record: the time [s], and the state unless None. Returns the number of contacts left out.
+        """Fill a record with the ``time`` [s] and, unless it is None, the state. Returns the number of contacts left
+        out.
 
-        What follows from the joints, transforms and elastic elements, is left to :meth:`read`.
+        Transforms and elastic elements are not stored: :meth:`read` computes them from the joints.
         """
         record["time"], record["has_state"] = time, sample is not None
         if sample is None:
@@ -103,7 +104,7 @@ class StepRecords:
         return len(sample.contacts) - count
 
     def read(self, record: Any) -> RobotSample:
-        """The state in a record that has one."""
+        """Returns the state that a record holds. The record must have a state."""
         now = float(record["time"])
         state = record["state"]
         parts = [state[place].reshape(shape) for place, shape in self._parts]

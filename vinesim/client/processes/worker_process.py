@@ -1,7 +1,7 @@
 """A child process of the client that is started again when it fails, dies or hangs, and never ends the client's loop.
 
-Its threads here start it, send it messages and take its messages, so that the loop never waits for it. What the two
-share in memory is made anew for every run of the process: a process that dies while it holds a lock leaves no trace.
+Threads of the client start it, send it messages and receive its messages, so that the loop never waits for it. The
+shared memory is created again for every run of the process, so a process that dies while it holds a lock does no harm.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ log = logging.getLogger(__name__)
 EXIT_TIMEOUT = 1.2
 """How long a process that failed may take to end [s]."""
 CLOSE_TIMEOUT = 10.0
-"""The same for one that was asked to: it ends the picture that it is at, on a busy machine."""
+"""How long a process that was asked to end may take [s]: it completes its present picture, on a busy machine."""
 STABLE_TIME = 10.0
-"""A process that ran this long before it failed is started again at once [s]; else there is a pause before. A start
-takes two seconds of one core."""
+"""A process that ran this long before it failed is started again at once [s]. After a shorter run there is a pause
+first. A start takes two seconds of one core."""
 STANDBY_DELAY = 2.0
-"""A process has been ready for so long before another one stands by [s]."""
+"""Time for which a process must have been ready before another one is started to stand by [s]."""
 HANG_TIMEOUT = 15
-"""A process that was ready and then sends nothing for this long hangs, and is started again [s]. It reports to the
-client five times a second, unless it renders a picture or writes files. Time in which it waits for a CPU does not
-count: to start it again would only load a busy machine more."""
+"""A process that was ready and then sends nothing for this long is taken to hang, and is started again [s]. A process
+reports to the client five times a second, unless it renders a picture or writes files. Time in which it waits for a CPU
+does not count: to start it again would only load a busy machine more."""
 START_TIMEOUT = 300
-"""The same for a process that is not ready: a first run may compile kernels [s]."""
+"""A process that is not ready and sends nothing for this long is taken to hang [s]. A first run may compile kernels."""
 HOLD_TIMEOUT = 3.0
-"""A process that has done nothing for so long, though it could, holds the loop no longer [s]."""
+"""A process that has done nothing for this long, though it had a CPU, no longer holds the loop [s]."""
 IDLE_LOOK_PERIOD = 0.1
-"""Time between two looks at what a process does that holds the loop [s]."""
+"""Time between two checks whether a process that holds the loop is idle [s]."""
 LONGEST_PAUSE = 60.0
-"""Pauses double with every failure, up to this [s]."""
+"""Longest pause before a process is started again [s]. Pauses double with every failure, up to this."""
 
 
 class WorkerError(RuntimeError):
@@ -55,8 +55,8 @@ class WorkerError(RuntimeError):
 
 
 def cpu_use(pid: int) -> tuple[float, bool]:
-    """CPU time of a process [s], and whether any of its threads runs or waits for a CPU now; 0 and False if it has
-    ended, and where there is no /proc."""
+    """CPU time of a process [s], and whether any of its threads runs or waits for a CPU now. They are 0 and False if it
+    has ended, and on systems without /proc."""
     try:
         place = pathlib.Path("/proc") / str(pid)
         # The name, in brackets, may hold blanks; behind it come state, ..., user time, system time (proc_pid_stat(5)).
@@ -69,10 +69,10 @@ def cpu_use(pid: int) -> tuple[float, bool]:
 
 
 class IdleTime:
-    """How long a process has done nothing although it could [s]: time in which it waits for a CPU does not count.
+    """How long a process has done nothing although it could [s]. Time in which it waits for a CPU does not count.
 
-    Time between two looks counts for a second at most: after both processes were stopped for an hour, as a shell does
-    it, only one second has passed.
+    The time between two calls of :meth:`look` counts as one second at most. So if a shell stops both processes for an
+    hour, only one second counts.
     """
 
     def __init__(self, pid: int) -> None:
@@ -82,12 +82,12 @@ class IdleTime:
         self._looked = time.monotonic()
 
     def end(self) -> None:
-        """The process has done something."""
+        """End the idle time, because the process has done something."""
         self.seconds = 0.0
         self._looked = time.monotonic()
 
     def look(self) -> float:
-        """Add the time since the last look; the sum."""
+        """Add the idle time since the last call. Returns the sum [s]."""
         now = time.monotonic()
         passed = min(now - self._looked, 1.0)
         used, wants_cpu = cpu_use(self._pid)
@@ -98,7 +98,7 @@ class IdleTime:
 
 
 def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
-    """The whole life of a process: ``work``, until it returns, fails, or the client's process has ended.
+    """Main function of a process: call ``work`` until it returns, fails, or the client's process has ended.
 
     ``title`` names the process in its log and in ``ps -o comm``: "sensor process".
     """
@@ -118,17 +118,17 @@ def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
         with contextlib.suppress(OSError):
             pipe.send(("failed", f"{type(error).__name__}: {error}"))
         code = 1
-    # All is closed. Taking the interpreter down in order would only delay the client, which waits.
+    # All is closed. An orderly shutdown of the interpreter would only delay the client, which waits.
     logging.shutdown()
     sys.stdout.flush()
     os._exit(code)
 
 
 def report_ready(pipe: Connection, niceness: int) -> None:
-    """Tell the client that this process is ready, and let the client's loop come before it from now on.
+    """Tell the client that this process is ready, and give the client's loop precedence over it from now on.
 
-    With its ``niceness`` and class it does not take the core of the loop that wakes it (docs/decisions/
-    sensor-process.md). Until it is ready it has the niceness of the client: what is missed is urgent then.
+    With its ``niceness`` and scheduling class it does not take the core from the loop that wakes it (docs/decisions/
+    sensor-process.md). Until it is ready it has the niceness of the client, because the start is urgent.
     """
     if hasattr(os, "nice"):
         os.nice(niceness)
@@ -140,7 +140,7 @@ def report_ready(pipe: Connection, niceness: int) -> None:
 
 
 class Shared(Protocol):
-    """What the client and one run of the process share in memory."""
+    """Shared memory of the client and one run of the process."""
 
     def close(self) -> None: ...
 
@@ -162,7 +162,7 @@ class Run(Generic[S]):
         threading.Thread(target=self._send, name=f"to {spawned.process.name}", daemon=True).start()
 
     def send(self, kind: str, value: Any = None) -> None:
-        """Send a message in order; a thread packs and writes it."""
+        """Send a message after the earlier ones. A thread packs and writes it."""
         self._outgoing.put((kind, value))
 
     def _send(self) -> None:
@@ -171,7 +171,8 @@ class Run(Generic[S]):
                 self.pipe.send(message)
 
     def end(self) -> None:
-        """Release what is left of a process that ends or should have; only the supervising thread may wait for it."""
+        """Release the resources of a process that ends or should have ended. Only the supervising thread may wait for
+        the process."""
         self._outgoing.put(None)
         self.process.join(EXIT_TIMEOUT)
         if self.process.is_alive():
@@ -184,8 +185,8 @@ class Hold:
     """A time in which one run of a process holds the client's steps."""
 
     def __init__(self, run: Run[Any], title: str, consequence: str, progress: Callable[[], object]) -> None:
-        """``progress()`` changes whenever the process has done something. ``consequence``: what follows if it does
-        nothing for :data:`HOLD_TIMEOUT`, for the log."""
+        """The value of ``progress()`` changes whenever the process has done something. ``consequence``: text for the
+        log about the effect if the process does nothing for :data:`HOLD_TIMEOUT`."""
         self.run = run
         self._title = title
         self._consequence = consequence
@@ -196,7 +197,7 @@ class Hold:
         self._is_logged = False
 
     def is_over(self) -> bool:
-        """Whether the process has done nothing for :data:`HOLD_TIMEOUT`; the first time that is logged."""
+        """Whether the process has done nothing for :data:`HOLD_TIMEOUT`. The first such time is logged."""
         if (now := time.monotonic()) >= self._next_look:
             self._next_look = now + IDLE_LOOK_PERIOD
             if (progress := self._progress()) != self._seen:
@@ -217,13 +218,13 @@ class Hold:
 class WorkerProcess(Generic[S]):
     """Keeps one process running. ``title`` names it in messages: "the sensor process of picker".
 
-    ``target(config, shared, pipe)`` runs in the process when that has imported ``modules``; it sends ("ready", None)
-    when it is, ("failed", text) before it ends with an error, and ends at ("stop", None) or when the pipe is closed.
-    While it is ready it sends some message at least every :data:`HANG_TIMEOUT`, else it is killed and started again.
-    ``share(context)`` makes what is shared with one run. ``receive(kind, value)`` takes all other messages, and
-    ("restarted", None) before those of a further run, in a thread.
+    ``target(config, shared, pipe)`` runs in the process after the process has imported ``modules``. It sends
+    ("ready", None) when it is ready, and ("failed", text) before it ends with an error. It ends at ("stop", None) or
+    when the pipe is closed. While it is ready it sends some message at least every :data:`HANG_TIMEOUT`, otherwise it
+    is killed and started again. ``share(context)`` creates the shared memory of one run. ``receive(kind, value)`` is
+    called in a thread with all other messages, and with ("restarted", None) before the messages of a further run.
 
-    With a ``rehearsal``, another process stands by while one is ready, and takes its place if it fails; see
+    With a ``rehearsal``, another process stands by while one is ready, and replaces it if it fails; see
     :class:`SpawnedProcess`.
     """
 
@@ -242,7 +243,7 @@ class WorkerProcess(Generic[S]):
         self.restarts = 0
         """How often the process was started again."""
         self.restart_time = 0.0
-        """From the start of the last further run until it was ready [s]."""
+        """Time from the last restart of the process until it was ready [s]."""
         self._modules = modules
         self._target = target
         self._config = config
@@ -251,7 +252,7 @@ class WorkerProcess(Generic[S]):
         self._rehearsal = rehearsal
         self._standby: SpawnedProcess | None = None
         self._standby_due = 0.0
-        """When another process may stand by, at the earliest [s]."""
+        """Earliest time at which another process may be started to stand by [s]."""
         self._closing = threading.Event()
         self._started = 0.0
         """When the newest run started [s]."""
@@ -265,7 +266,7 @@ class WorkerProcess(Generic[S]):
     # ------------------------------------------------------------------ for the loop
 
     def current(self) -> Run[S]:
-        """The run to share memory with; call it in one thread only, as memory of a former run is released here."""
+        """The present run. Call it in one thread only, because it releases the memory of the run before."""
         if self._newest is not self._current:
             former = self._current
             self._current = self._newest
@@ -279,7 +280,7 @@ class WorkerProcess(Generic[S]):
 
     @property
     def standby_pid(self) -> int | None:
-        """Process id of the one that stands by; None if there is none."""
+        """Process id of the process that stands by; None if there is none."""
         standby = self._standby
         return standby.process.pid if standby is not None and standby.stands_by else None
 
@@ -291,13 +292,14 @@ class WorkerProcess(Generic[S]):
     # ------------------------------------------------------------------ outside the loop
 
     def wait_until_ready(self, timeout: float) -> None:
-        """Wait for the first run to be ready; :class:`WorkerError` if it fails, or after ``timeout`` [s]."""
+        """Wait until the first run is ready. Raises :class:`WorkerError` if it fails, or after ``timeout`` [s]."""
         if not self._first_result.wait(timeout):
             raise WorkerError(f"{self.title} was not ready within {timeout:.0f} s")
         self.raise_failure()
 
     def raise_failure(self) -> None:
-        """:class:`WorkerError` if the first run failed before it was ready; none follows it then. Waits for nothing."""
+        """Raise :class:`WorkerError` if the first run failed before it was ready. The process is not started again
+        then. This method does not wait."""
         if self._failure:
             raise WorkerError(f"{self.title} failed: {self._failure}")
 
@@ -324,7 +326,7 @@ class WorkerProcess(Generic[S]):
     # ------------------------------------------------------------------ the supervising thread
 
     def _start(self) -> Run[S]:
-        """A run by the process that stands by, or by a new one."""
+        """Start a run, in the process that stands by or in a new one."""
         shared = self._share(CONTEXT)
         standby = self._standby
         self._standby = None
@@ -337,7 +339,7 @@ class WorkerProcess(Generic[S]):
         return Run(spawn(self.title, self._modules), self._target, self._config, shared)
 
     def _keep_standby(self, run: Run[S]) -> None:
-        """Start a process that stands by when that is due, and again if it has ended."""
+        """Start a process that stands by when it is due, and again if it has ended."""
         if not self._rehearsal or run.ready_since is None:
             return
         now = time.monotonic()
@@ -386,7 +388,7 @@ class WorkerProcess(Generic[S]):
             log.error("%s failed again: %s; further attempts follow without a message", self.title, reason)
 
     def _serve(self, run: Run[S]) -> str:
-        """Take the messages of a run until it ends or hangs; why it did."""
+        """Take the messages of a run until it ends or hangs. Returns the reason."""
         reason = ""
         silence = IdleTime(run.process.pid or 0)
         while silence.seconds < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):

@@ -12,11 +12,12 @@ from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_64, Bus, Publisher, Su
 
 OPEN_MARGIN = 0.3
 CLOSE_MARGIN = 0.8
-"""[m] A cell is opened this far beyond the distance of its layer, and closed that far: others know the own position
-late, and one who walks along an edge does not open and close in turn."""
+"""[m] A cell is opened within the distance of its layer plus OPEN_MARGIN, and closed beyond that distance plus
+CLOSE_MARGIN. Others know this actor's position late, and an actor that walks along an edge must not open and close
+cells in turn."""
 
 STEP = 0.1
-"""[m] The cells are chosen anew after so much motion."""
+"""[m] The cells are chosen again after the actor has moved this far."""
 
 
 class CellChannels:
@@ -31,13 +32,13 @@ class CellChannels:
         self._bus = bus
         self.interest_radius = interest.check_radius(interest_radius)
         self.position = np.zeros(3)
-        """Of the actor [m], world."""
+        """Position of the actor in the world [m]."""
         self.centre: Cell | None = None
         """Cell in the middle of the window; None before the first :meth:`update`."""
         self.subscriptions: dict[Cell, tuple[Subscription, Subscription]] = {}
-        """Of states and of events."""
+        """Subscriptions to states and to events, by cell."""
         self.publishers: dict[Cell, tuple[Publisher, Publisher]] = {}
-        """Of states and of events."""
+        """Publishers of states and of events, by cell."""
         self.changes = 0
         """How often channels were opened or closed."""
 
@@ -78,25 +79,26 @@ class CellChannels:
 class TreeChannels:
     """The channels of states of moving trees that are open now, layer by layer.
 
-    Keys: ``tree/<x>/<y>/<actor>`` for all within the interest radius, ``near/<x>/<y>/<actor>`` for what only those near
-    the tree need besides (:data:`vinesim.net.replication.interest.TREE_LAYERS`). An actor subscribes to the cells
-    within the distance of a layer, not to a window: a tree that is farther away is not received.
+    Keys: ``tree/<x>/<y>/<actor>`` for all actors within the interest radius, ``near/<x>/<y>/<actor>`` for additional
+    states that only actors near the tree need (:data:`vinesim.net.replication.interest.TREE_LAYERS`). An actor
+    subscribes to the cells within the distance of a layer, not to a window: a tree that is farther away is not
+    received.
     """
 
     def __init__(self, bus: Bus, interest_radius: float) -> None:
         """``interest_radius`` [m]: distance of the first layer, and the largest of all."""
         self._bus = bus
         self.distances = tuple(min(layer.distance, interest_radius) for layer in TREE_LAYERS)
-        """Of each layer [m]."""
+        """Distance of each layer [m]."""
         self.subscriptions: tuple[dict[Cell, Subscription], ...] = tuple({} for _ in TREE_LAYERS)
         self.publishers: tuple[dict[Cell, Publisher], ...] = tuple({} for _ in TREE_LAYERS)
         self._position: np.ndarray | None = None
         self._owned: set[Cell] = set()
 
     def update(self, position: np.ndarray, owned: set[Cell]) -> None:
-        """Follow the own ``position`` [3] m and the cells of trees that are ``owned``.
+        """Follow the actor's ``position`` [3] m and the cells of the trees that it owns (``owned``).
 
-        Publishers are open where the actor can touch a tree, before it does, and where it owns one.
+        Publishers are open in the cells where the actor owns a tree or could touch one.
         """
         moved = self._position is None or _distance(position, self._position) > STEP
         if not moved and owned == self._owned:
@@ -122,5 +124,5 @@ class TreeChannels:
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
-    """On the ground, of two positions [3] m."""
+    """Distance on the ground between two positions [3] m."""
     return math.hypot(a[0] - b[0], a[1] - b[1])

@@ -9,13 +9,13 @@ from __future__ import annotations
 import dataclasses
 
 PING_WINDOW = 8
-"""Pings that are remembered."""
+"""Number of pings that are remembered."""
 
 MAX_SLEW_RATE = 0.01
 """Largest rate of change of the offset in use [s/s]. GUESSED."""
 
 STEP_THRESHOLD = 0.5
-"""An estimate farther away than this is taken at once: it is another server, not drift [s]. GUESSED."""
+"""An estimate that differs by more than this is used at once: it is another server, not drift [s]. GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -62,10 +62,10 @@ class ClockEstimate:
     """Server's clock minus own clock as used now [s]."""
 
     def with_ping(self, ping: Ping) -> ClockEstimate:
-        """With one more ping. Until the first eight have arrived the best estimate is used at once.
+        """Returns the estimate with one more ping. Until the first eight have arrived the best offset is used at once.
 
-        One that contradicts the offset in use by more than its round trip explains is of another server, or of one
-        whose clock was set: the earlier pings are forgotten.
+        If a ping contradicts the offset in use by more than its round trip explains, it comes from another server, or
+        the server's clock was set. The earlier pings are forgotten then.
         """
         if self.pings and abs(ping.offset - self.offset) >= STEP_THRESHOLD + 0.5 * ping.round_trip:
             return ClockEstimate((ping,), ping.offset)
@@ -75,7 +75,7 @@ class ClockEstimate:
         return ClockEstimate(pings, best if settling and best is not None else self.offset)
 
     def advanced(self, dt: float) -> ClockEstimate:
-        """``dt`` [s] later, slewed towards the estimate."""
+        """Returns the estimate after ``dt`` [s], with the offset in use slewed towards the best one."""
         best = estimate(self.pings)
         if best is None or best == self.offset:
             return self

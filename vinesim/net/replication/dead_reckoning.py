@@ -16,16 +16,17 @@ TREE_VELOCITY_DECAY = 0.080
 from 60 to 120 ms the errors differ by 4 %."""
 
 POSITION_ERROR = 0.005
-"""A state is due when copies are wrong by more than this [m] ..."""
+"""A state is published if copies are wrong by more than this [m] (see also the next two constants)."""
 
 ANGLE_ERROR = float(np.radians(1.0))
-"""... or by more than this [rad] ..."""
+"""A state is published if copies are wrong by more than this [rad]."""
 
 HEARTBEAT_PERIOD = 1.0
-"""... or when nothing was published for this long [s] while the object is awake."""
+"""A state is published if nothing was published for this long [s] while the object is awake."""
 
 MAX_CLOCK_SKEW = 1.0
-"""A state from farther in the future counts as made now + this [s]; otherwise it would be newer than all later ones."""
+"""Largest time by which the stamp of a state may be in the future [s]. A later stamp is reduced to this, because the
+state would otherwise be newer than all later ones."""
 
 BLEND_TIME = 0.100
 """Time in which 95 % of a correction is blended into what is shown [s]; velocities are taken at once."""
@@ -98,8 +99,8 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def needs_update(
     position_error: np.ndarray, angle_error: np.ndarray, silence: np.ndarray, tolerance: float = 1.0
 ) -> np.ndarray:
-    """Which objects are due [k] bool: copies wrong by 5 mm or 1 degree, each times ``tolerance``, or silent for a
-    heartbeat."""
+    """[k] bool Whether the state of each object must be published: its copies are wrong by more than 5 mm or 1 degree,
+    each times ``tolerance``, or its ``silence`` [k] s exceeds a heartbeat."""
     wrong = (position_error > tolerance * POSITION_ERROR) | (angle_error > tolerance * ANGLE_ERROR)
     return wrong | (silence >= HEARTBEAT_PERIOD - 1e-9)
 
@@ -107,6 +108,6 @@ def needs_update(
 def blend_weight(age: float | np.ndarray) -> float | np.ndarray:
     """Share of a correction that is still hidden ``age`` [s] after it: 1, falling to 5 % in 100 ms.
 
-    Exponential, so that it does not matter that the next pose arrives, and blending restarts, every 17 ms.
+    The share decays exponentially. So it does not matter that every 17 ms a new pose arrives and blending restarts.
     """
     return np.exp(-3.0 * np.maximum(age, 0.0) / BLEND_TIME)

@@ -1,11 +1,11 @@
-"""What actors tell each other directly, apart from poses and states of objects: forces so far.
+"""Messages that actors send each other directly, apart from poses and states of objects: forces so far.
 
-A :class:`MessageSync` of each kind sends and receives. :func:`make_syncs` lists them all. The receiver gives each the
-messages of its kind, the replicator the values of each step to publish; what it knows stands in the inbox of each step
-under its kind.
+Each kind of message has a :class:`MessageSync`, which sends and receives it. :func:`make_syncs` makes them all. The
+receiver passes the messages of a kind to its sync, and the replicator passes the values of each step to publish. The
+inbox of each step has the present value of each sync under its kind.
 
-Forces are computed by the client of the actor that applies them, and applied by the client of what is pushed; keys
-``force/<to>/<from>`` (``docs/decisions/forces-between-clients.md``).
+The client of the actor that pushes computes the forces, and the client that owns the pushed robot or tree applies them.
+Keys: ``force/<to>/<from>`` (``docs/decisions/forces-between-clients.md``).
 
 Wrenches: the mean wrench of a person's hands on each link of a robot over a sixtieth of a second, best effort, during
 contact. The robot's client applies the last message for :data:`WRENCH_MAX_AGE`, and in its simulation copies of
@@ -13,8 +13,8 @@ people's hands do not collide with robots: no contact counts twice. Only people 
 no harder than two hands can.
 
 Couplings: the virtual couplings (:class:`vinesim.net.codec.forces.Coupling`) of one actor to all trees of one owner,
-while it touches them. The owner replies with those of its own contacts, for the copies of these trees. With one actor
-at a tree nothing is sent.
+while the actor touches them. The owner replies with the couplings of its own contacts, for the copies of these trees.
+If only one actor is at a tree, nothing is sent.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ MAX_POSE_AGE = 1.0
 """An actor whose last pose is older than this pushes nothing [s]."""
 
 WRENCH_MAX_AGE = 0.1
-"""A wrench is applied for so long after it arrived [s], unless a newer one does."""
+"""Time for which a wrench is applied after its arrival [s], unless a newer one arrives."""
 
 HAND_FORCE = 100.0
 """Largest force of one hand [N] (CANOPIES D6.4, section 3.1.1)."""
@@ -60,15 +60,16 @@ HAND_LEVER = 1.0
 """Lever of that force about the centre of mass of a link [m], which bounds the moment. GUESSED."""
 
 MAX_PUSHING_PEOPLE = 4
-"""All people together push a robot no harder than so many of them. GUESSED."""
+"""All people together push a robot no harder than this number of people could. GUESSED."""
 
 REACH = 1.2
 """Farthest centre of mass of a link that a hand touches [m], from the palm: half of a long link, and the way of a
 running person until the pose arrives. GUESSED."""
 
 COUPLING_MAX_AGE = 0.2
-"""Couplings hold for so long after they arrived [s], unless newer ones do. They are springs, stable also when they are
-old; over a link of 100 +- 40 ms that loses 4 %, messages come up to 0.15 s apart, and 0.1 s let the bunch jump."""
+"""Time for which couplings hold after their arrival [s], unless newer ones arrive. They are springs, which are stable
+also when they are old. Over a link with a delay of 100 +- 40 ms and a loss of 4 %, messages come up to 0.15 s apart; a
+value of 0.1 s let the bunch jump."""
 
 ARM_REACH = 2.5
 """Farthest anchor of a coupling from the base of its actor on the ground [m]: a long arm. GUESSED."""
@@ -81,18 +82,18 @@ class MessageSync:
     """Messages of one kind to and from one actor."""
 
     kind: ClassVar[int]
-    """Of :data:`vinesim.net.codec.messages.MESSAGES`."""
+    """Kind of the messages, a key of :data:`vinesim.net.codec.messages.MESSAGES`."""
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
         """Take a message of a peer at own time ``now`` and network ``time`` [s]; ``MessageError`` if it is invalid."""
         raise NotImplementedError
 
     def current(self, now: float) -> Any:
-        """What holds at own time ``now`` [s] of all that was received: for the inbox."""
+        """Returns the received values that are valid at own time ``now`` [s], for the inbox."""
 
     def publish(self, value: Any, now: float, time: float) -> list[bytes]:
-        """Publish what the own actor says in the step at own time ``now`` and network ``time`` [s], None if nothing;
-        the messages that were sent."""
+        """Publish the ``value`` of the own actor in the step at own time ``now`` and network ``time`` [s]; None: it has
+        nothing to say. Returns the messages that were sent."""
         return []
 
     def remove_peer(self, name: str) -> None:
@@ -110,7 +111,7 @@ class _Partner:
     due: float
     """Own time of the next message [s]."""
     is_active: bool = False
-    """The last message was not empty."""
+    """Whether the last message to it was not empty."""
 
 
 class ForceSync(MessageSync):
@@ -140,13 +141,13 @@ class ForceSync(MessageSync):
             self._received[sender] = arrived, dataclasses.replace(message, time=message.time + step)
 
     def _is_outdated(self, sender: str, message: Any) -> bool:
-        """Whether a message is not newer than the last one of its sender; that is counted."""
+        """Whether a message is not newer than the last one of its sender. Outdated messages are counted."""
         is_outdated = sender in self._received and message.time <= self._received[sender][1].time
         self._counters.dropped += is_outdated
         return is_outdated
 
     def _recent(self, now: float, max_age: float) -> list[tuple[str, Any]]:
-        """Senders and their last messages, of those that arrived within the last ``max_age`` [s]."""
+        """Senders whose last message arrived within the last ``max_age`` [s], and that message."""
         return [
             (sender, message)
             for sender, (arrived, message) in sorted(self._received.items())
@@ -154,13 +155,13 @@ class ForceSync(MessageSync):
         ]
 
     def _add_partners(self, names: Iterable[str], now: float) -> None:
-        """Be ready to send to these actors from own time ``now`` [s] on."""
+        """Add these actors as partners, to whom messages may be sent from own time ``now`` [s] on."""
         for name in names:
             if name not in self._partners:
                 self._partners[name] = _Partner(self._bus.publisher(f"force/{name}/{self._name}"), now)
 
     def _send(self, partner: _Partner, payload: bytes, now: float, *, is_empty: bool) -> list[bytes]:
-        """Send a message that is due; the messages that were sent: this one, or none without a subscriber."""
+        """Send a message that is due. Returns the messages that were sent: this one, or none without a subscriber."""
         partner.due = max(partner.due, now - SEND_PERIOD) + SEND_PERIOD
         partner.is_active = not is_empty
         return [payload] if partner.publisher.put(payload) else []
@@ -172,8 +173,10 @@ def _recent_pose(actor: RemotePose, time: float) -> HumanUpdate | RobotUpdate | 
 
 
 def limit(wrenches: dict[str, np.ndarray], hands: int, hand_force: float) -> tuple[dict[str, np.ndarray], bool]:
-    """Wrenches [6] by link, all reduced alike to what so many hands of ``hand_force`` [N] can do; whether that was
-    needed."""
+    """Scale the wrenches [6], by link, with a common factor to what ``hands`` hands of ``hand_force`` [N] can exert.
+
+    Returns the wrenches, and whether they were reduced.
+    """
     force = sum(float(np.linalg.norm(wrench[:3])) for wrench in wrenches.values())
     moment = sum(float(np.linalg.norm(wrench[3:])) for wrench in wrenches.values())
     excess = max(force, moment / HAND_LEVER) / (max(hands, 1) * hand_force)
@@ -183,7 +186,7 @@ def limit(wrenches: dict[str, np.ndarray], hands: int, hand_force: float) -> tup
 
 
 def hands_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> frozenset[str]:
-    """Hands of a person that can touch a link with this centre of mass [3] m; None: there is no such link."""
+    """Hands of a person that can touch a link with its centre of mass at ``centre`` [3] m; None: there is no link."""
     if centre is None:
         return frozenset()
     hands = {"left": update.pose.left, "right": update.pose.right}
@@ -193,8 +196,8 @@ def hands_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> frozen
 def limit_by_hands(
     wrenches: dict[str, np.ndarray], reach: dict[str, frozenset[str]], hand_force: float
 ) -> tuple[dict[str, np.ndarray], bool]:
-    """Wrenches [6] by link, reduced to what the hands within ``reach`` of each link can do, and all of them together;
-    whether that was needed."""
+    """Reduce the wrenches [6], by link, to what the hands within ``reach`` of each link can exert, and all of these
+    hands together. Returns the wrenches, and whether they were reduced."""
     is_limited = False
     for link, wrench in wrenches.items():
         reduced, is_reduced = limit({link: wrench}, len(reach[link]), hand_force)
@@ -225,14 +228,15 @@ class WrenchSync(ForceSync):
         hand_force: float = HAND_FORCE,
         link_centre: LinkCentre = lambda _: None,
     ) -> None:
-        """``hand_force`` [N]: limit of each hand. ``link_centre``: of the own robot; without it people push nothing."""
+        """``hand_force`` [N]: limit of each hand. ``link_centre(link)``: centre of mass of a link of the own robot;
+        without this function people cannot push the robot."""
         super().__init__(bus, name, counters)
         self._hand_force = hand_force
         self._link_centre = link_centre
         self._pushes: dict[str, _Push] = {}
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take the wrenches of a person, and count what is not used.
+        """Take the wrenches of a person, and count the ones that are not used.
 
         Raises :class:`MessageError` if the message is invalid or not from a person.
         """
@@ -253,7 +257,7 @@ class WrenchSync(ForceSync):
         self._received[hello.name] = now, WrenchMessage(message.time, reached)
 
     def current(self, now: float) -> dict[str, np.ndarray]:
-        """Sum of the wrenches [6] of all people on each own link, by link name; limited as a whole."""
+        """Sum of the wrenches [6] of all people on each link of the own robot, by link name. The total is limited."""
         links: dict[str, np.ndarray] = {}
         for _, message in self._recent(now, WRENCH_MAX_AGE):
             for link, wrench in message.wrenches.items():
@@ -268,7 +272,8 @@ class WrenchSync(ForceSync):
         self._pushes.pop(name, None)
 
     def publish(self, value: Mapping[str, dict[str, np.ndarray]] | None, now: float, time: float) -> list[bytes]:
-        """Publish the wrenches of this step on others' robots, by robot and link; the messages that were sent."""
+        """Publish the wrenches of this step on others' robots, by robot and link. Returns the messages that were
+        sent."""
         wrenches = value or {}
         self._add_partners(wrenches, now)
         sent = []
@@ -346,7 +351,7 @@ class CouplingSync(ForceSync):
         }
 
     def publish(self, value: Iterable[Coupling] | None, now: float, time: float) -> list[bytes]:
-        """Publish the couplings of this step; the messages that were sent."""
+        """Publish the couplings of this step. Returns the messages that were sent."""
         couplings = self._by_partner(value or (), now)
         self._add_partners(couplings, now)
         sent = []
@@ -358,7 +363,8 @@ class CouplingSync(ForceSync):
         return sent
 
     def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
-        """Couplings by the peer that gets them: the owner of the tree, or who touches the own tree, too."""
+        """Couplings by the peer that receives them: the owner of the tree or, for an own tree, each peer that touches
+        it, too."""
         found: dict[str, list[Coupling]] = {}
         for coupling in couplings:
             tree = int(self._model.body_tree[coupling.body])
@@ -370,7 +376,7 @@ class CouplingSync(ForceSync):
 
 
 def _check_body(body: int, model: Model) -> None:
-    """Raise :class:`MessageError` unless there is such a body and it can be held: wood or a bunch."""
+    """Raise :class:`MessageError` unless the index ``body`` exists and the body can be held: it is wood or a bunch."""
     if body >= len(model.body_tree):
         raise MessageError(f"a coupling to body {body}; there are {len(model.body_tree)}")
     tree = int(model.body_tree[body])
@@ -389,9 +395,9 @@ def make_syncs(
     hand_force: float = HAND_FORCE,
     link_centre: LinkCentre = lambda _: None,
 ) -> tuple[MessageSync, ...]:
-    """All kinds of messages that the actor ``name`` and its ``peers`` send each other directly, but voices.
+    """Make the syncs of all messages, except voices, that actor ``name`` and its ``peers`` send each other directly.
 
-    ``owner(object_id)``: name of the actor that owns an object. The others: see :class:`WrenchSync`.
+    ``owner(object_id)``: name of the actor that owns an object. For the other arguments see :class:`WrenchSync`.
     """
     bus.subscribe(f"force/{name}/*", KEEP_LAST_64)
     return (

@@ -30,18 +30,19 @@ INTEREST_RADIUS = 5.0
 """Default distance within which an actor receives states of objects that peers move [m]."""
 
 POSE_RATE = 60.0
-"""Poses that an actor makes a second. Each leaves on one layer only; a receiver takes the layers that it needs."""
+"""Number of poses that an actor publishes a second. Each goes to one layer only. A receiver subscribes to the layers
+that it needs."""
 
 
 class PoseLayer(NamedTuple):
     """A share of the poses of an actor, under a key of its own."""
 
     suffix: str
-    """Of the key ``a/<actor>``."""
+    """Suffix that is appended to the key ``a/<actor>``."""
     every: int
-    """With all layers above it in the list, every so many of the poses."""
+    """This layer and all layers before it in the list together carry every ``every``-th pose."""
     distance: float
-    """[m] Actors within it subscribe to the layer."""
+    """[m] Actors within this distance subscribe to the layer."""
 
 
 POSE_LAYERS = (
@@ -50,25 +51,27 @@ POSE_LAYERS = (
     PoseLayer("/near", 2, 6.0),
     PoseLayer("", 1, 3.0),
 )
-"""5 Hz for all, and 15, 30 and 60 Hz within 12, 6 and 3 m: the rate falls with the distance, so that what moves at a
-given speed moves by the same angle between two poses, seen from the receiver. Hands touch within 3 m."""
+"""Layers of poses: 5 Hz for all actors, and 15, 30 and 60 Hz within 12, 6 and 3 m. The rate falls with the distance so
+that an actor of a given speed moves by the same angle between two poses, seen from the receiver. Hands touch within
+3 m."""
 
 LAYER_HYSTERESIS = 1.2
-"""A layer is received until its actor is farther away than its distance by this factor."""
+"""A layer is received until the actor is farther away than this factor times the distance of the layer."""
 
 TREE_CELL_SIZE = 2.0
-"""Edge of a cell of the states of trees [m]: small, so that few arrive that are farther away than a layer reaches."""
+"""Edge of a cell of the states of trees [m]. It is small so that few states arrive from trees beyond the distance of a
+layer."""
 
 
 class TreeLayer(NamedTuple):
     """A share of the states of trees, under a family of keys of its own."""
 
     family: str
-    """First chunk of the key."""
+    """First chunk of the keys."""
     distance: float
-    """[m] Actors within it receive the layer; of the first, at most the interest radius counts."""
+    """[m] Actors within this distance receive the layer. For the first layer the interest radius is the upper bound."""
     tolerance: float
-    """A state leaves when the copies of those who receive no further layer are wrong by so many times
+    """A state is sent if the copies of receivers that receive no further layer are wrong by this factor times
     :data:`~vinesim.net.replication.dead_reckoning.POSITION_ERROR` or
     :data:`~vinesim.net.replication.dead_reckoning.ANGLE_ERROR`."""
 
@@ -91,7 +94,7 @@ def cells_of(positions: np.ndarray, size: float = CELL_SIZE) -> np.ndarray:
 
 
 def tree_cells_within(position: np.ndarray, distance: float) -> set[Cell]:
-    """Cells of the states of trees of which a point is within ``distance`` [m] of ``position`` [2 or 3] m."""
+    """Cells of the states of trees that have a point within ``distance`` [m] of ``position`` [2 or 3] m."""
     low, high = (np.floor((position[:2] + way * distance) / TREE_CELL_SIZE).astype(int) for way in (-1.0, 1.0))
     x, y = (np.arange(low[axis], high[axis] + 1) for axis in (0, 1))
     # how far the nearest edge of each column and row is away
@@ -121,7 +124,7 @@ def move_window(middle: Cell | None, position: np.ndarray) -> Cell:
 
 
 def check_radius(near: float) -> float:
-    """The radius [m] if a window covers it; ValueError with the bound otherwise."""
+    """Returns the radius ``near`` [m] if a window covers it. Otherwise raises ValueError with the bound."""
     if not 0.0 < near <= MAX_INTEREST_RADIUS:
         raise ValueError(
             f"near = {near} m: must be above 0 and at most {MAX_INTEREST_RADIUS} m, what 3x3 "
@@ -140,11 +143,13 @@ def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.
 
 
 def count_layers(distance: float, now: int) -> int:
-    """How many of :data:`POSE_LAYERS` are received from an actor at ``distance`` [m], if there are so many ``now``."""
+    """Number of :data:`POSE_LAYERS` to receive from an actor at ``distance`` [m], with hysteresis. ``now``: number of
+    layers that are received at present."""
     factors = (LAYER_HYSTERESIS if number < now else 1.0 for number in range(len(POSE_LAYERS)))
     return sum(distance <= layer.distance * factor for layer, factor in zip(POSE_LAYERS, factors, strict=True))
 
 
 def pose_layer(before: int, number: int) -> int:
-    """The layer of the poses after ``before`` up to ``number``, of which one is sent: the lowest of theirs."""
+    """Layer on which one pose is sent for all poses after number ``before`` up to ``number``: the lowest of their
+    layers."""
     return next(i for i, layer in enumerate(POSE_LAYERS) if number // layer.every != before // layer.every)

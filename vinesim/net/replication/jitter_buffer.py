@@ -1,8 +1,9 @@
 """Jitter buffer: poses of a peer are shown after a fixed delay, interpolated between two received ones; pure.
 
-Extrapolation shows peers where they should be now and is wrong when they turn meanwhile. A buffer waits: while every
-sample arrives within its delay, what is shown is exactly the motion of the peer, however unevenly samples arrive. The
-price is that delay. Off by default, because a hand that is shown late is touched where it no longer is.
+Extrapolation shows peers where they should be now, and is wrong if they turn meanwhile. A buffer waits: while every
+sample arrives within its delay, the shown motion is exactly the motion of the peer, however unevenly samples arrive.
+The price is that delay. The buffer is off by default, because a hand that is shown late is touched where it no longer
+is.
 """
 
 from __future__ import annotations
@@ -26,19 +27,20 @@ class JitterBuffer:
     """Samples of one peer in the order of their times; immutable."""
 
     delay: float = 0.0
-    """Delay of what is shown [s]; 0 extrapolates to now instead."""
+    """Delay of the shown state [s]; 0 extrapolates to now instead."""
     times: tuple[float, ...] = ()
     """Network times of the samples [s], strictly increasing."""
     states: tuple[np.ndarray, ...] = ()
     rates: tuple[np.ndarray, ...] = ()
-    """Their time derivatives [1/s], used after the newest sample."""
+    """Time derivatives of the samples [1/s], used after the newest sample."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.delay <= MAX_DELAY:
             raise ValueError(f"jitter buffer of {1e3 * self.delay:g} ms: give 0 to {1e3 * MAX_DELAY:g} ms")
 
     def insert(self, time: float, state: np.ndarray, rate: np.ndarray) -> JitterBuffer:
-        """With one more sample, in whatever order they arrive; of two of the same time the first is kept."""
+        """Returns the buffer with one more sample. Samples may arrive in any order. If two have the same time, the
+        first is kept."""
         at = bisect.bisect_left(self.times, time)
         if at < len(self.times) and self.times[at] == time:
             return self
@@ -49,9 +51,9 @@ class JitterBuffer:
         return JitterBuffer(self.delay, put(self.times, time), put(self.states, state), put(self.rates, rate))
 
     def sample(self, now: float) -> np.ndarray:
-        """The state to show at ``now`` [s]: that of ``delay`` earlier, interpolated linearly between two samples.
+        """The state to show at ``now`` [s]: the state at ``now - delay``, interpolated linearly between two samples.
 
-        Before the first sample it is that one; after the newest it is extrapolated as without a buffer.
+        Before the first sample it is the first sample. After the newest it is extrapolated as without a buffer.
         """
         before, after, share, since = self._between(now)
         if before == after:
@@ -59,14 +61,15 @@ class JitterBuffer:
         return (1.0 - share) * self.states[before] + share * self.states[after]
 
     def rate(self, now: float) -> np.ndarray:
-        """Time derivative of what is shown at ``now`` [1/s]: as sent by the peer, not a finite difference."""
+        """Time derivative of the state shown at ``now`` [1/s], as sent by the peer, not a finite difference."""
         before, after, share, since = self._between(now)
         if before == after:
             return self.rates[before] * float(0.0 <= since <= dead_reckoning.MAX_EXTRAPOLATION)
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:
-        """Indices of the two samples around ``now``, equal at an end; the share between them; time since the first."""
+        """Indices of the two samples around ``now``, which are equal at an end; the interpolation weight between them;
+        the time since the first of the two [s]."""
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)
         if after in (0, len(self.times)):

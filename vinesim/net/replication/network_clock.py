@@ -1,9 +1,9 @@
 """Network time of one client: the world's time, as the server's replies let the client know it at every moment.
 
 Pings measure the offset between two real-time clocks, the client's and the server's; whatever the factor of the
-world, that offset stays constant. Each reply also says which time the world has at which time of the server's clock,
-and how fast it passes. From both follows the world's time now. Own time runs at the factor of the world and is slewed
-towards it.
+world, that offset stays constant. Each reply also gives a time of the server's clock, the world's time then, and the
+real-time factor. The world's time now follows from both. Own time runs at the factor of the world and is slewed towards
+the world's time.
 
 Key: the query ``clock/<actor>``, which also reports how fast the actor's client can follow (:mod:`vinesim.net.pace`).
 """
@@ -22,22 +22,22 @@ from vinesim.net.transport.bus import Bus
 log = logging.getLogger(__name__)
 
 PING_PERIOD = (0.05, 0.2)
-"""Real time between pings [s]: until twice the window is filled, and later."""
+"""Real time between pings [s]: at first, until twice the number of :data:`PING_WINDOW` pings, and after that."""
 
 SETTLE_TIMEOUT = 2.0
-"""A server that does not reply within this real time is not waited for any longer [s]."""
+"""Longest real time for which a client waits for a server's first reply [s]."""
 
 MAX_REPLY_AGE = 2.0
-"""A reply to an older question says nothing of how fast the world runs now [s]."""
+"""A reply to a ping older than this does not tell the present speed of the world [s]."""
 
 CURRENT_AGE = 0.75
-"""Network time is current if the server has answered a question that is not older than this [s]."""
+"""Network time is current if the server has answered a ping that is not older than this [s]."""
 
 SLEW_TIME = 0.5
 """Time constant with which own time approaches the world's time [s]."""
 
 MAX_SLEW = 0.25
-"""Largest share by which own time runs faster or slower for that."""
+"""Largest share by which own time runs faster or slower while it approaches the world's time."""
 
 
 class NetworkClock:
@@ -49,25 +49,25 @@ class NetworkClock:
     def __init__(self, bus: Bus, now: float | None = None, offset: float = 0.0) -> None:
         """``now``: real time [s], if known; ``offset``: first estimate of network time minus own time [s]."""
         self.estimate = ClockEstimate()
-        """Server's real time minus the client's."""
+        """Estimate of the server's real time minus the client's [s]."""
         self.factor = 1.0
-        """How many times as fast as real time the world's time passes, by the server's last reply."""
+        """Real-time factor of the world, by the server's last reply."""
         self.cause = ""
-        """What limits that factor, by the same reply; empty if nothing does."""
+        """What limits the factor, by the server's last reply. Empty if nothing limits it."""
         self.offset = offset
         """Network time minus own time [s]."""
         self.report: Callable[[], PaceReport | None] = lambda: None
-        """How fast this client can follow, to be sent with the next ping; None: it slows no world."""
+        """Returns how fast this client can follow, to be sent with the next ping. None: it does not slow the world."""
         self._bus = bus
         self._now = now
         self._started = now
         self._own = 0.0 if now is None else now
         self._rate = 1.0
-        """How fast own time passes, with slewing."""
+        """Rate at which own time passes, with slewing [s/s]."""
         self._known: tuple[float, float] | None = None
         """Real time of the server's clock, and the world's time then [s], by its last reply."""
         self._answered = -math.inf
-        """Real time of the last question that the server has answered [s]."""
+        """Real time of the last ping that the server has answered [s]."""
         self._pinged = -math.inf
         self._ping_count = 0
 
@@ -88,7 +88,7 @@ class NetworkClock:
 
     @property
     def is_settled(self) -> bool:
-        """The server has replied, or has not within :data:`SETTLE_TIMEOUT`."""
+        """Whether the server has replied, or :data:`SETTLE_TIMEOUT` has passed without a reply."""
         assert self._now is not None
         assert self._started is not None
         return bool(self.estimate.pings) or self._now - self._started > SETTLE_TIMEOUT
@@ -98,7 +98,7 @@ class NetworkClock:
         return now - self._answered <= CURRENT_AGE
 
     def advance(self, now: float) -> float:
-        """Go on to real time ``now`` [s]; the own time then [s]."""
+        """Advance to real time ``now`` [s]. Returns the own time then [s]."""
         own = self.own(now)
         self.estimate = self.estimate.advanced(now - self._now if self._now is not None else 0.0)
         self._now = now
@@ -151,7 +151,8 @@ class NetworkClock:
         return world + self.factor * (self._now + self.estimate.offset - real) - self.time
 
     def _slew(self) -> None:
-        """Run faster or slower until network time is the world's time; what is farther away is another clock."""
+        """Run faster or slower until network time equals the world's time. If they differ by :data:`STEP_THRESHOLD` or
+        more, the clock is another one, and its time is taken at once."""
         away = self._away()
         if abs(away) >= STEP_THRESHOLD:
             self.offset = self.offset + away

@@ -1,4 +1,4 @@
-"""Claims on all objects as one client knows them, and what follows: who owns, who is silent, what to correct.
+"""Claims on all objects as one client knows them. They tell who owns an object, who is silent, and what to correct.
 
 The order of claims is defined in :mod:`vinesim.net.replication.authority`. Times are network time [s].
 """
@@ -16,7 +16,7 @@ CORRECTION_PERIOD = 0.2
 """Shortest time between two corrections of one object [s]. GUESSED."""
 
 OWNER_TIMEOUT = 3.0
-"""An owner that has sent nothing about its object for so long no longer counts as its owner [s]: three heartbeats."""
+"""An owner that has sent nothing about its object for this long no longer counts as the owner [s]: three heartbeats."""
 
 LONG_AGO = -1e9
 
@@ -32,33 +32,35 @@ class ObjectRecord:
     previous: Claim = UNTOUCHED
     """The claim before this client took the object."""
     announced: bool = False
-    """Whether a peer can know the claim."""
+    """Whether the claim was published, so that a peer may know it."""
     silent: bool = False
-    """The owner has left or timed out: the claim still holds, in case it returns, but it owns nothing."""
+    """Whether the owner has left or timed out. The claim still holds, in case the owner returns, but until then the
+    object has no owner."""
     published_at: float = LONG_AGO
     """Time of the newest state."""
     received_at: float = LONG_AGO
-    """When the newest message about it arrived."""
+    """Time at which the newest message about the object arrived."""
     listener_count: int = 0
-    """Peers within the interest radius when its state was last published."""
+    """Number of peers within the interest radius when the object's state was last published."""
     published_to_all_at: float = LONG_AGO
-    """Of a tree: time of the newest own state that was published to all listeners."""
+    """For a tree: time of the newest own state that was published to all listeners."""
     near_listener_count: int = 0
-    """Of a tree: number of peers near enough for its full rate when its state was last published."""
+    """For a tree: number of peers near enough for its full rate when its state was last published."""
     corrected_at: float = LONG_AGO
-    """When the claim was last repeated as a correction."""
+    """Time at which the claim was last repeated as a correction."""
 
 
 class Ownership:
     """The claims on all objects that were ever touched."""
 
     def __init__(self, name: str, live: Container[str]) -> None:
-        """``name``: of the own actor; ``live``: names of the peers that are present, a view that the caller keeps."""
+        """``name``: the own actor's name. ``live``: names of the peers that are present; the caller updates it."""
         self.name = name
         self._live = live
         self._known: collections.defaultdict[int, ObjectRecord] = collections.defaultdict(ObjectRecord)
         self.siblings: tuple[Ownership, ...] = ()
-        """Of the other actors of the same client: what they own is not heard from them, but seen here."""
+        """Claims of the other actors of the same client. They send no messages about the objects that they own to this
+        actor, so it reads their claims here."""
         self.owned: set[int] = set()
         self.remote: set[int] = set()
         self._losing_claims: list[tuple[int, Claim]] = []
@@ -113,7 +115,7 @@ class Ownership:
         self._take(object_id, authority.claim_by_touch(self.claim(object_id), self.name, False))
 
     def _merge_sibling(self, object_id: int) -> None:
-        """Hold the claim of the other actor of the same client that owns an object, unless a greater is known."""
+        """If another actor of the same client owns the object, adopt its claim, unless a greater claim is known."""
         sibling = None if object_id in self.owned else self._owning_sibling(object_id)
         if sibling is not None and not authority.wins(self.claim(object_id), sibling.claim(object_id)):
             self._adopt(object_id, sibling.claim(object_id), sibling[object_id].touching)
@@ -134,7 +136,7 @@ class Ownership:
         self.owned.add(object_id)
 
     def release(self, object_id: int) -> Claim:
-        """Release an object at rest; the claim under which to publish that."""
+        """Release an object at rest. Returns the claim under which to publish its release."""
         known = self._known[object_id]
         held = known.claim
         self.owned.discard(object_id)
@@ -156,9 +158,9 @@ class Ownership:
     # ------------------------------------------------------------ what others say
 
     def receive_state(self, object_id: int, claim: Claim, touching: bool, published_at: float, time: float) -> bool:
-        """Merge the claim of a received state; whether the state is to be accepted.
+        """Merge the claim of a received state. Returns whether to accept the state.
 
-        ``published_at`` [s]: time in the message; ``time`` [s]: now. At rest the claim has no owner.
+        ``published_at`` [s]: time in the message; ``time`` [s]: now. If the object is at rest, the claim has no owner.
         """
         known = self._known[object_id]
         published_at = min(published_at, time + dead_reckoning.MAX_CLOCK_SKEW)
@@ -186,7 +188,7 @@ class Ownership:
             self._losing_claims.append((object_id, claim))
 
     def receive_retained(self, object_id: int, claim: Claim, touching: bool, time: float) -> bool:
-        """Merge the claim of a retained record; whether its pose holds now."""
+        """Merge the claim of a retained record. Returns whether the pose in the record holds now."""
         known = self._known[object_id]
         if claim != known.claim and not authority.wins(claim, known.claim):
             return False
@@ -195,7 +197,7 @@ class Ownership:
         return True
 
     def _adopt(self, object_id: int, claim: Claim, touching: bool) -> None:
-        """Hold a claim that a peer made or repeated."""
+        """Adopt a claim that a peer made or repeated."""
         known = self._known[object_id]
         known.claim = claim
         known.touching = touching
@@ -211,10 +213,10 @@ class Ownership:
     # ------------------------------------------------------------ what follows
 
     def remove_actor(self, name: str, time: float, successor: Callable[[int], str]) -> None:
-        """An actor has left: what it still moved goes to ``successor(object_id)``.
+        """Handle an actor that has left: each object that it still moved goes to the actor ``successor(object_id)``.
 
-        Its claims still hold, in case it returns; it is only marked silent. Otherwise two clients might never agree
-        again.
+        The claims of the actor that left still hold, in case it returns. They are only marked as silent. Otherwise two
+        clients might never agree again.
         """
         for object_id in sorted(object_id for object_id, known in self._known.items() if known.claim.owner == name):
             known = self._known[object_id]
@@ -224,7 +226,7 @@ class Ownership:
                 self.take_over(object_id)
 
     def shift_time(self, step: float) -> None:
-        """The network clock was set by ``step`` [s]."""
+        """Shift all stored times, because the network clock was set by ``step`` [s]."""
         for known in self._known.values():
             known.published_at += step
             known.received_at += step
@@ -232,7 +234,7 @@ class Ownership:
             known.corrected_at += step
 
     def expire(self, time: float) -> None:
-        """Mark owners as silent that have timed out; their claims still hold."""
+        """Mark owners that have timed out as silent. Their claims still hold."""
         for object_id in self.remote:
             known = self._known[object_id]
             if time - known.received_at > OWNER_TIMEOUT:
@@ -249,7 +251,8 @@ class Ownership:
         return released
 
     def corrections(self, time: float) -> list[int]:
-        """Objects that were claimed with outdated sequences: repeating the claim restores agreement after a loss."""
+        """Objects that a peer claimed with outdated sequences. To publish their claim again restores agreement after a
+        loss."""
         losing = self._losing_claims
         self._losing_claims = []
         corrections = []

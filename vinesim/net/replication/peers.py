@@ -1,8 +1,8 @@
 """The peers of one actor: liveliness, greetings, their poses, and the common clock.
 
-Keys: ``a/<actor>/far``, ``a/<actor>/mid``, ``a/<actor>/near`` and ``a/<actor>`` share the poses of an actor: the nearer
-a peer, the more of them it receives (:data:`vinesim.net.replication.interest.POSE_LAYERS`). And the queries
-``hello/<actor>`` and ``clock/<actor>``.
+Keys: the poses of an actor are divided among ``a/<actor>/far``, ``a/<actor>/mid``, ``a/<actor>/near`` and
+``a/<actor>``. A nearer peer subscribes to more of them (:data:`vinesim.net.replication.interest.POSE_LAYERS`). Queries
+use ``hello/<actor>`` and ``clock/<actor>``.
 """
 
 from __future__ import annotations
@@ -51,11 +51,11 @@ class PeerRegistry:
         self._jitter_buffer = JitterBuffer(jitter_buffer).delay
         self._local_actors: set[str] = set()
         self._alive: frozenset[str] | None = None
-        """Live names when all of them were known or rejected; None while a hello is missing."""
+        """Names that were live when all of them were known or rejected; None while a hello is missing."""
         self.clock = NetworkClock(bus)
         self.known: dict[str, RemotePose] = {}
         self.seen_names: set[str] = set()
-        """Peers that were ever admitted: their last retained records may arrive after they have left."""
+        """Names of all peers that were ever admitted. Their last retained records may arrive after they have left."""
         greeting = encode_hello(hello)
         bus.join(greeting)
         bus.declare_queryable(f"hello/{hello.name}", lambda _: greeting)
@@ -68,7 +68,7 @@ class PeerRegistry:
         self._layers = [bus.publisher(f"a/{hello.name}{layer.suffix}") for layer in interest.POSE_LAYERS]
         bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_LAST_1)
         self._pose_number: int | None = None
-        """Of the last pose that was due."""
+        """Number of the last pose that was due. None before the first."""
         self._phase = zlib.crc32(hello.name.encode()) % 1024 / 1024.0 * interest.POSE_LAYERS[0].every
 
     def positions(self) -> dict[str, np.ndarray]:
@@ -88,7 +88,7 @@ class PeerRegistry:
         self._alive = None
 
     def poll_liveliness(self, now: float) -> list[str]:
-        """Query new peers for their hello and the clock when due; the names of peers that have left."""
+        """Query new peers for their hello, and the server for its clock, when due. Returns the peers that have left."""
         live_names = self.bus.alive()
         if live_names == self._alive:
             self.clock.ping_if_due()
@@ -113,8 +113,8 @@ class PeerRegistry:
         return gone
 
     def keep_clock(self, now: float) -> None:
-        """Between steps that are far apart: go on to real time ``now`` [s], ping the clock when due and take its
-        replies; other replies wait for :meth:`process_replies`."""
+        """Advance the clock to real time ``now`` [s] between steps that are far apart: ping the server when due, and
+        take its replies. Other replies wait for :meth:`process_replies`."""
         self.clock.advance(now)
         self.clock.ping_if_due()
         others: list[Reply] = []
@@ -130,7 +130,7 @@ class PeerRegistry:
         self._unread += tuple(others)
 
     def process_replies(self) -> tuple[list[Hello], list[Reply]]:
-        """Take hellos and clock replies; the peers that joined, and the other replies."""
+        """Take hellos and clock replies. Returns the peers that joined, and the other replies."""
         joined: list[Hello] = []
         others: list[Reply] = []
         answers = (*self._unread, *self.bus.replies())
@@ -171,7 +171,8 @@ class PeerRegistry:
         yield hello
 
     def _reject(self, name: str, why: str) -> None:
-        """Ignore a newcomer; :class:`WorldMismatch` if the peer was here first, for then this actor is wrong."""
+        """Ignore a peer that joined after this actor. Raises :class:`WorldMismatch` if the peer was here first, because
+        this actor does not belong to the world then."""
         text = f"{name!r} {why}: start both with the same scene, seed and release of vinesim"
         if name in self._initial_names:
             raise WorldMismatch(text)
@@ -213,13 +214,14 @@ class PeerRegistry:
                 actor.near.append(self.bus.subscribe(f"a/{name}{layer.suffix}", KEEP_LAST_1))
 
     def publish_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
-        """Publish the own pose, 60 times a second on one of the layers; encoded only if that has a subscriber."""
+        """Publish the own pose, 60 times a second, each time on one of the layers. It is encoded only if that layer has
+        a subscriber."""
         number = math.floor(now * interest.POSE_RATE + self._phase + 1e-6)
         before = self._pose_number
         if number == before:
             return
         self._pose_number = number
-        if before is None:  # those who come at once need not speak at once for ever
+        if before is None:  # actors that join at the same moment need not publish at the same moments for ever
             return
         publisher = self._layers[interest.pose_layer(before, number)]
         if publisher.matching:

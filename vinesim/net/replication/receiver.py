@@ -1,4 +1,4 @@
-"""Incoming half of replication: what arrived on the bus is decoded, judged by its claim and put into an inbox."""
+"""Incoming half of replication: messages from the bus are decoded, checked by their claims and put into an inbox."""
 
 from __future__ import annotations
 
@@ -31,39 +31,41 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
 MAX_EARLY_MESSAGES = 100
-"""Messages of one sender."""
+"""Largest number of early messages of one sender."""
 
 MAX_EARLY_BYTES = 1 << 20
-"""Payload bytes of one sender [B]: the largest message."""
+"""Largest size of the early messages of one sender [B]: that of the largest message."""
 
 MAX_EARLY_SENDERS = 64
-"""Senders with messages."""
+"""Largest number of senders with early messages."""
 
 MAX_EARLY_TOTAL = 4 << 20
-"""Payload bytes of all senders [B]."""
+"""Largest size of the early messages of all senders [B]."""
 
 
 @dataclasses.dataclass(slots=True)
 class Inbox:
-    """What arrived for one step. States are extrapolated to now; times are those of the client's own clock."""
+    """States and messages that arrived for one step. States are extrapolated to now. Times are own times."""
 
     joined: list[Hello] = dataclasses.field(default_factory=list)
     left: list[str] = dataclasses.field(default_factory=list)
     robots: dict[str, RobotUpdate] = dataclasses.field(default_factory=dict)
-    """Every robot of a peer, in every step: extrapolated by at most 150 ms, corrections blended over 100 ms."""
+    """Poses of all robots of peers, by name, in every step: extrapolated by at most 150 ms, with corrections blended
+    over 100 ms."""
     people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
-    """The same for people."""
+    """Poses of all people of peers, by name, in every step: extrapolated and blended like those of robots."""
     messages: dict[int, Any] = dataclasses.field(default_factory=dict)
-    """What holds now of what peers have told this actor, by kind:
+    """Direct messages from peers to this actor that are valid now, by kind: the values of
     :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
     """Trees with a new state: the last state of each, extrapolated by at most 150 ms."""
     objects: list[ObjectUpdate] = dataclasses.field(default_factory=list)
     """Every box and free bunch that a peer moves, in every step, extrapolated by at most 150 ms."""
     records: list[tuple[RetainedRecord, bool]] = dataclasses.field(default_factory=list)
-    """New retained records, and whether their poses hold. They do not if a newer claim is known; cuts always hold."""
+    """New retained records, and whether the pose in each holds. It does not if a newer claim is known. Cuts always
+    hold."""
     released: list[int] = dataclasses.field(default_factory=list)
-    """Objects that have lost their remote owner: they are at rest, or the owner has left."""
+    """Ids of objects that have lost their remote owner: they are at rest, or the owner has left."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -80,8 +82,8 @@ class _Step:
 
 
 class EarlyMessages:
-    """Messages (key, payload) of senders that have not been admitted yet: they wait, for records are published only
-    once.
+    """Messages (key, payload) of senders that have not been admitted yet. They are kept because records are published
+    only once.
 
     Their number and size are bounded, and live senders displace those that are not live.
     """
@@ -100,7 +102,7 @@ class EarlyMessages:
         return sum(self._sizes.values())
 
     def put(self, sender: str, key: str, payload: bytes, is_live: Callable[[str], bool]) -> int:
-        """Keep a message if there is room; the number of messages that were discarded: this one or others.
+        """Keep a message if there is room. Returns the number of messages that were discarded, this one or others.
 
         ``is_live(sender)``: whether a sender may be admitted soon.
         """
@@ -129,7 +131,7 @@ class EarlyMessages:
 
 
 class Receiver:
-    """Takes over what peers and the server send."""
+    """Applies the messages that peers and the server send."""
 
     def __init__(self, state: ReplicationState) -> None:
         self._state = state
@@ -137,7 +139,7 @@ class Receiver:
         """Messages with retained records whose author has not been admitted yet."""
 
     def receive(self, now: float, offset: float) -> Inbox:
-        """Everything since the last call; ``offset`` [s]: network time minus own time ``now`` [s].
+        """Returns everything that arrived since the last call. ``offset`` [s]: network time minus own time ``now`` [s].
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
@@ -221,8 +223,8 @@ class Receiver:
             self._receive_trees(decode_trees(payload, state.model.tree_size), sender, step)
 
     def _keep_early(self, sender: str, key: str, payload: bytes) -> int:
-        """Keep records of an actor that may be admitted soon until then, for they are published only once; the number
-        of messages that were discarded."""
+        """Keep a message with records until its sender, who may be admitted soon, is admitted, because records are
+        published only once. Returns the number of messages that were discarded."""
         peers = self._state.peers
         if not is_valid_name(sender) or peers.is_rejected(sender):
             return 1
@@ -262,9 +264,9 @@ class Receiver:
     def _receive_record(
         self, cell: Cell, record: RetainedRecord, sender: str, step: _Step, *, is_remote: bool = True
     ) -> None:
-        """Merge a record; if that changed anything, the client gets it unless its own actor published it.
+        """Merge a record. If it changed anything, the client receives it, unless its own actor published it.
 
-        One that cannot be true of the model is dropped, and the others of its message are not.
+        A record that contradicts the model is dropped. Other records of the same message are kept.
         """
         state = self._state
         try:

@@ -17,7 +17,7 @@ TELEPORT_DISTANCE = 1.0
 """A correction larger than this is shown at once instead of blended [m]. GUESSED."""
 
 FAR_SAMPLE_PERIOD = 0.1
-"""Poses of peers that are not near are computed anew only so often [s]; their messages arrive every 200 ms."""
+"""Time between two computations of the pose of a peer that is not near [s]. Its messages arrive every 200 ms."""
 
 _BASE = np.arange(3, 7)[None]
 _HIPS = slice(7 * POINT_NAMES.index("hips"), 7 * POINT_NAMES.index("hips") + 3)
@@ -34,18 +34,18 @@ class RemotePose:
         self.joints = hello.joints
         self.update: RobotUpdate | HumanUpdate | None = None
         self.near: list[Subscription] = []
-        """Of the faster layers of its poses; empty while it is far."""
+        """Subscriptions to the faster layers of the peer's poses; empty while it is far."""
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
         """Indices of the quaternions in the flat pose [k, 4]."""
         self._place = _HIPS if hello.kind == "human" else slice(3)
-        """Slice of the flat pose with the position that shows a teleport."""
+        """Slice of the flat pose with the position by which a teleport is recognised."""
         self._state = self._rate = self._correction = np.zeros(0)
         self._cached: RobotUpdate | HumanUpdate | None = None
 
     def receive(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
-        """Take a pose at network ``time`` [s]; False if it is not newer. Raises :class:`MessageError` if it does not
-        fit the peer."""
+        """Take a pose at network ``time`` [s]. Returns False if it is not newer than the last one. Raises
+        :class:`MessageError` if it does not fit the peer."""
         if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
             raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
         if update.time > time + dead_reckoning.MAX_CLOCK_SKEW:
@@ -74,7 +74,8 @@ class RemotePose:
         return True
 
     def shift_time(self, step: float) -> None:
-        """The network clock was set by ``step`` [s]; a jitter buffer begins anew."""
+        """Shift all stored times, because the network clock was set by ``step`` [s]. A jitter buffer keeps only the
+        newest pose."""
         if self.update is not None:
             self.update = dataclasses.replace(self.update, time=self.update.time + step)
             self.moved_at += step
@@ -83,7 +84,8 @@ class RemotePose:
             self._buffer = JitterBuffer(self._buffer.delay).insert(self.update.time, self._state, self._rate)
 
     def sample(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
-        """The pose at network ``time``, to be shown at own time ``now`` [s]; of a distant peer up to 100 ms old."""
+        """The pose at network ``time`` [s], to be shown at own time ``now`` [s]. For a distant peer it may be up to
+        100 ms old."""
         if self._cached is None or self.near or not 0.0 <= now - self._cached.time < FAR_SAMPLE_PERIOD:
             self._cached = self._at(time, now)
         return self._cached
@@ -117,7 +119,8 @@ class RemotePose:
         )
 
     def _buffer_sample(self, time: float) -> None:
-        """Insert the newest pose into the jitter buffer, its quaternions on the same side as the previous ones."""
+        """Insert the newest pose into the jitter buffer. Its quaternions get the sign that is nearest to the previous
+        ones."""
         if self._buffer.states:
             before = self._buffer.states[-1]
             turns = self._turns
@@ -137,7 +140,7 @@ class RemotePose:
 
 
 def _numbers(update: RobotUpdate | HumanUpdate) -> tuple[np.ndarray, np.ndarray]:
-    """A pose as flat numbers, and their rates."""
+    """A pose as a flat array, and the array of its rates."""
     if isinstance(update, HumanUpdate):
         points = update.pose.points
         rate = np.concatenate(

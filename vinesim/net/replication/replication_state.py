@@ -1,4 +1,4 @@
-"""What receiving and sending share: peers, claims, streams, retained records and the channels of the interest cells."""
+"""State that receiver and sender share: peers, claims, streams, retained records, channels of the interest cells."""
 
 from __future__ import annotations
 
@@ -57,9 +57,9 @@ class ReplicationState:
             link_centre=link_centre,
         )
         self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (*direct, self.voices)}
-        """What actors tell each other directly, by kind of message."""
+        """Senders and receivers of the direct messages between actors, by kind of message."""
         self.siblings: tuple[ReplicationState, ...] = ()
-        """Of the other actors of the same client."""
+        """Replication states of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)
         self.tree_stream = TreeStream(model)
         self.object_stream = ObjectStream()
@@ -94,7 +94,7 @@ class ReplicationState:
         return authority.choose_successor(self.position_of(object_id), self.owner_candidates())
 
     def shift_time(self, step: float) -> None:
-        """The network clock was set by ``step`` [s]: times that were noted by it follow."""
+        """Shift all stored network times, because the network clock was set by ``step`` [s]."""
         for peer in self.peers.known.values():
             peer.shift_time(step)
         self.ownership.shift_time(step)
@@ -109,7 +109,7 @@ class ReplicationState:
 
 
 def put_counted(publisher: Publisher, payload: bytes, traffic: Traffic) -> bool:
-    """Publish and count; False, and nothing is counted, without a subscriber."""
+    """Publish and count a message. Without a subscriber, nothing is sent or counted, and the result is False."""
     if not publisher.put(payload):
         return False
     traffic.count_out(payload)

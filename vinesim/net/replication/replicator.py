@@ -77,10 +77,11 @@ class Replicator:
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self.step_time: Callable[[], float] | None = None
-        """Of a client whose steps follow the world's clock: time of the world at the present step [s]. It counts for
-        all that is sent and shown in that step, however late the step is; without it the moment of the call counts."""
+        """Returns the world's time at the present step [s], for a client whose steps follow the world's clock. All
+        states that are sent and shown in a step have this time, however late the step is. None: they have the time of
+        the call."""
         self.received_at = 0.0
-        """Own time of the last :meth:`receive` [s]: of the states in its inbox."""
+        """Own time of the last :meth:`receive` [s], to which the states in its inbox belong."""
         self._last_sent = -1e9
         self._offset = self.offset
 
@@ -91,7 +92,7 @@ class Replicator:
 
     @property
     def voices(self) -> VoiceSync:
-        """What this actor says and hears."""
+        """The sender and receiver of voices of this actor."""
         return self._state.voices
 
     @property
@@ -100,8 +101,8 @@ class Replicator:
         return self._state.cells.interest_radius
 
     def share_client(self, siblings: Iterable[Replicator]) -> None:
-        """The other actors of the same client: they share its simulation, so nothing is exchanged with them, and of
-        what they own nothing is taken over."""
+        """Set the other actors of the same client. They share its simulation, so no messages are exchanged with them,
+        and none of the objects that they own is taken over."""
         states = tuple(sibling._state for sibling in siblings)
         self._state.siblings = states
         self._state.ownership.siblings = tuple(state.ownership for state in states)
@@ -139,7 +140,7 @@ class Replicator:
         return {name: peer.hello for name, peer in self._state.peers.known.items()}
 
     def peer_positions(self) -> list[np.ndarray]:
-        """Positions [3] m of the peers whose pose is known, spectators as well: who may receive states of objects."""
+        """Positions [3] m of the peers whose pose is known, including spectators. They may receive object states."""
         return list(self._state.peers.positions().values())
 
     @property
@@ -149,21 +150,21 @@ class Replicator:
 
     @property
     def real_time_factor(self) -> float:
-        """How many times as fast as real time the world's time passes; 1 unless a server says otherwise."""
+        """Real-time factor of the world; 1 unless a server reports another."""
         return self._state.peers.clock.factor
 
     @property
     def pace_cause(self) -> str:
-        """Which client limits the world's real-time factor, and by what: "picker: sensors"; empty if none does."""
+        """Client that limits the world's real-time factor, and the cause: "picker: sensors". Empty if none does."""
         return self._state.peers.clock.cause
 
     def report_pace(self, report: Callable[[], PaceReport | None]) -> None:
-        """Tell the server with every ping how fast this client can follow: what ``report`` returns."""
+        """Send the value of ``report()``, how fast this client can follow, to the server with every ping."""
         self._state.peers.clock.report = report
 
     def keep_clock(self, now: float) -> None:
-        """Ping the clock when due and take its replies, while no step is made: network time goes on, and the server
-        knows that this client lives."""
+        """Ping the server's clock when due, and take its replies, while no step is made. So network time advances, and
+        the server knows that this client lives."""
         self._state.peers.keep_clock(now)
         self._follow_clock()
 
@@ -177,7 +178,7 @@ class Replicator:
 
     @property
     def has_clock(self) -> bool:
-        """Whether a server has told its clock, so that network time is its time."""
+        """Whether a server has reported its clock, so that network time is the server's time."""
         return bool(self._state.peers.clock.estimate.pings)
 
     @property
@@ -212,22 +213,22 @@ class Replicator:
         messages: Mapping[int, Any] = MappingProxyType({}),
         carried_on: Iterable[int] = (),
     ) -> list[TreeUpdate]:
-        """Publish one step; return the states of trees at rest that left, as all copies hold them.
+        """Publish one step. Returns the states of trees at rest that were sent, quantised as all copies hold them.
 
         ``pose``: of this actor; its ``time`` is replaced. A spectator passes its viewpoint, without joints.
         ``read(object_id)``: joints ([n, 4], [n, 3] rad/s) of a tree, pose [7] and velocity [6] of another object;
         called only for objects that a peer may need.
         ``touched``: objects in contact with this actor; boxes and bunches only while they move in their parent's frame.
         ``moving``: objects that move by themselves; trees and boxes of other owners are ignored.
-        ``grabbed``: objects that this actor grabbed, picked or cut in this step; ``detached``: those of them that left
-        their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
+        ``grabbed``: objects that this actor grabbed, picked or cut in this step. ``detached``: the objects among them
+        that left their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
         ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest.
         ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
         ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
-        ``messages``: what this actor tells others in this step, by kind:
+        ``messages``: values that this actor sends to others in this step, by kind of message:
         :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`.
-        ``carried_on``: objects at rest on this actor that it has carried on so far that their records are published
-        again, with the place where they are now.
+        ``carried_on``: objects at rest on this actor that it has carried so far that their records are published again,
+        with their present place.
         """
         state = self._state
         self._follow_clock()

@@ -3,7 +3,8 @@
 A last-writer-wins map: merging is a join of a semilattice, so that equal sets of records give equal maps, in whatever
 order and however often they arrive. Of two records of one object the one with the greater claim holds
 (:func:`authority.wins`); an author therefore never publishes two different records under one claim. Cuts accumulate:
-the winner takes over the loser's. The server keeps one such map for a world, every client one of what it has received.
+the winner takes over the cuts of the loser. The server keeps one such map for a world, and every client keeps a map of
+the records that it has received.
 Source: M. Shapiro et al., Conflict-free Replicated Data Types, 2011.
 """
 
@@ -19,14 +20,14 @@ from vinesim.net.replication.interest import Cell
 
 
 class RetainedState:
-    """The winning record of every object. An object is in one cell: that of its greatest claim."""
+    """The winning record of every object. An object is in one cell: the cell of the record with its greatest claim."""
 
     def __init__(self) -> None:
         self._cell_of: dict[int, Cell] = {}
         self._records: dict[Cell, dict[int, RetainedRecord]] = {}
 
     def merge(self, cell: Cell, record: RetainedRecord) -> bool:
-        """Merge a record that was published under ``cell``; whether that changed anything."""
+        """Merge a record that was published under ``cell``. Returns whether that changed anything."""
         held = self.get(record.object)
         if held is None:
             self._put(cell, record)

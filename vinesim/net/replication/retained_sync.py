@@ -1,7 +1,7 @@
 """Retained records between a client and the server: published until received, received from peers, queried by cell.
 
-A record is published once, wherever the peers are, because the server keeps it. After the server was gone the client
-publishes all of its own records again, for the new one may know nothing.
+A record is published once, wherever the peers are, because the server keeps it. After the server was lost, the client
+publishes all of its own records again, because a new server may have none.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL, Bus, Publisher, Subscription
 
 QUERY_TIMEOUT = 0.5
-"""Time after which the server is asked again, doubled each time [s] ..."""
+"""Time after which the server is first queried again if it has not replied [s]. The time is doubled for each query."""
 
 MAX_QUERY_PERIOD = 8.0
-"""... up to this time [s], until it has replied."""
+"""Longest time between two queries to a server that has not replied [s]."""
 
 TYPICAL_RECORD_SIZE = 110
 """Upper estimate of an encoded record without the state of a tree [B]."""
 
 
 class RetainedSync:
-    """The retained state as one client knows it, and what it still has to publish."""
+    """The retained state as one client knows it, and the records that it still has to publish."""
 
     def __init__(self, bus: Bus, counters: Counters) -> None:
         self.bus = bus
@@ -41,7 +41,7 @@ class RetainedSync:
         self._is_disconnected = False
         self._window_changes = -1
         self._next_query = math.inf
-        """When the server is asked next [s]."""
+        """Time of the next query to the server [s]."""
 
     def publish(self, cell: Cell, record: RetainedRecord) -> None:
         """Queue an own record about an object in ``cell``."""
@@ -53,7 +53,7 @@ class RetainedSync:
         self._pending.setdefault(cell, {})[record.object] = record
 
     def merge(self, cell: Cell, record: RetainedRecord) -> bool:
-        """Merge a record of a peer or the server; whether that changed anything."""
+        """Merge a record of a peer or the server. Returns whether that changed anything."""
         is_new = self.state.merge(cell, record)
         if is_new and record.author != self.bus.name:
             held = self.state.get(record.object)
@@ -63,9 +63,9 @@ class RetainedSync:
         return is_new
 
     def update_window(self, window: Collection[Cell], changes: int, now: float) -> None:
-        """Subscribe to records of these cells and query the server for those that are new.
+        """Subscribe to the records of the cells in ``window``, and query the server for cells that are new.
 
-        ``changes``: how often the window has changed; while that and all else stays the same, nothing is done.
+        ``changes``: number of changes of the window so far. While it and all else stays the same, nothing is done.
         """
         is_disconnected = bool(self.bus.status_message)
         if (
@@ -100,7 +100,7 @@ class RetainedSync:
         self._next_query = min((due for due, _ in self._asked.values()), default=math.inf)
 
     def mark_answered(self, cell: Cell) -> None:
-        """The server has replied for a cell."""
+        """Note that the server has replied for a cell."""
         self._asked.pop(cell, None)
 
     def flush(self) -> None:

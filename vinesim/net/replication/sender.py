@@ -1,7 +1,7 @@
-"""Outgoing half of replication: claims, states of what moves, states at rest and retained records.
+"""Outgoing half of replication: claims, states of moving objects, states at rest and retained records.
 
-States leave only when a peer is near the object and subscribes to its cell, and only when the copies of the peers would
-otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record leaves once, wherever the peers
+A state is sent only if a peer is near the object and subscribes to its cell, and only if the copies of the peers would
+otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record is sent once, wherever the peers
 are: the server keeps it.
 """
 
@@ -32,8 +32,8 @@ from vinesim.scene.ids import is_tree, parse_object_name
 from vinesim.scene.values import TreeUpdate
 
 ADOPTION_DELAY = 0.5
-"""An object that moves without an owner for so long [s] is taken over by the nearest actor, which then publishes where
-it comes to rest. GUESSED."""
+"""If an object moves without an owner for this long [s], the nearest actor takes it over, and later publishes where it
+comes to rest. GUESSED."""
 
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
@@ -65,10 +65,10 @@ class Sender:
     def __init__(self, state: ReplicationState) -> None:
         self._state = state
         self._orphans: dict[int, float] = {}
-        """Since when [s, own clock] a moving object has had no owner."""
+        """Own time since which each moving object has had no owner [s], by object id."""
 
     def send(self, step: LocalStep) -> list[TreeUpdate]:
-        """Publish one step; return the states of trees at rest that left, as all copies hold them."""
+        """Publish one step. Returns the states of trees at rest that were sent, quantised as all copies hold them."""
         state = self._state
         touched = set(step.touched)
         for object_id in sorted(step.grabbed):
@@ -122,7 +122,7 @@ class Sender:
     # ------------------------------------------------------------ moving
 
     def _publish_trees(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
-        """Publish, layer by layer and cell by cell, the states of trees of which the copies are wrong."""
+        """Publish, layer by layer and cell by cell, the states of trees whose copies are wrong."""
         state = self._state
         stream = self._state.tree_stream
         channels = self._state.tree_channels
@@ -162,8 +162,8 @@ class Sender:
     def _find_due_trees(
         self, entries: list[ObjectRecord], listeners: list[np.ndarray], contact: list[bool], step: LocalStep
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Which of the trees last read to publish on either layer, [k] bool each: the copies of its receivers are
-        wrong, or a listener, claim or contact is new."""
+        """For each of the two layers, [k] bool: whether to publish each of the trees that were last read. A tree is
+        published if the copies of the layer's receivers are wrong, or a listener, claim or contact is new."""
         stream = self._state.tree_stream
         (all_, near) = listeners
         silence = step.time - np.array([(entry.published_to_all_at, entry.published_at) for entry in entries]).T
@@ -172,7 +172,8 @@ class Sender:
             dead_reckoning.needs_update(*error, since, layer.tolerance)
             for error, since, layer in zip(errors, silence, TREE_LAYERS, strict=True)
         ]
-        # some who are farther away hear the second layer too: it ends when all near have left, their copies do not
+        # Some peers farther away receive the second layer, too. It ends when all near peers have left, but these copies
+        # remain.
         wrong[0] |= (near == 0) & dead_reckoning.needs_update(*errors[1], silence[1], TREE_LAYERS[0].tolerance)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
             wrong[0][row] |= all_[row] > entry.listener_count or entry.touching != touching
@@ -184,7 +185,7 @@ class Sender:
         return for_all, wrong[1] & (near > 0) & ~for_all
 
     def _publish_objects(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
-        """Publish, cell by cell, the states of boxes and bunches of which the copies are wrong."""
+        """Publish, cell by cell, the states of boxes and bunches whose copies are wrong."""
         state = self._state
         stream = self._state.object_stream
         entries = [state.ownership[object_id] for object_id in active]
@@ -224,7 +225,7 @@ class Sender:
         contact: list[bool],
         step: LocalStep,
     ) -> np.ndarray:
-        """Which objects to publish [k] bool: the prediction is wrong, or a listener, claim or contact is new."""
+        """[k] bool Whether to publish each object: its prediction is wrong, or a listener, claim or contact is new."""
         silence = step.time - np.array([entry.published_at for entry in entries])
         due = dead_reckoning.needs_update(*self._state.object_stream.prediction_error(active, silence), silence)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
@@ -234,7 +235,7 @@ class Sender:
         return due & (listeners > 0)
 
     def _announce(self, events: Publisher | None, objects: list[tuple[int, ObjectRecord]]) -> None:
-        """Publish the claims among those of ``objects`` that no peer can know yet."""
+        """Publish the claims on ``objects`` that no peer can know yet."""
         new = [(object_id, entry.claim, entry.touching) for object_id, entry in objects if not entry.announced]
         if new and events is not None:
             put_counted(events, encode_claims(new), self._state.counters.event)
@@ -242,7 +243,7 @@ class Sender:
     # ------------------------------------------------------------ rest and retained records
 
     def _publish_at_rest(self, object_ids: list[int], step: LocalStep) -> list[TreeUpdate]:
-        """Release owned objects that have come to rest; the states of trees that left."""
+        """Release owned objects that have come to rest. Returns the states of trees that were sent."""
         settled = []
         for object_id in object_ids:
             if not is_tree(object_id):
@@ -285,7 +286,8 @@ class Sender:
     def _publish_object_at_rest(self, object_id: int, step: LocalStep) -> None:
         """Publish where an object rests in the frame of its support, as a retained record.
 
-        One without a body here was taken over from an actor that left: that is undone, for nothing new is known of it.
+        An object without a body in this simulation was taken over from an actor that left. The claim is undone, because
+        this client knows nothing new about the object.
         """
         state = self._state
         if not step.has_body(object_id):
@@ -328,7 +330,7 @@ class Sender:
         self._state.retained.publish(cell, msgspec.structs.replace(record, cut=cut))
 
     def _encode_tree(self, tree: int, claim: Claim, step: LocalStep, flags: int) -> tuple[bytes, TreeUpdate]:
-        """State of a tree as a message, and as receivers decode it; at rest its rates are zero."""
+        """State of a tree as a message, and as receivers decode it. If the tree is at rest, its rates are zero."""
         q, qd = step.read(tree)
         numbers, x, xd = step.detached_roots(tree)
         rate_factor = 0.0 if flags & RESTING else 1.0
@@ -353,7 +355,7 @@ def _columns(objects: list[tuple[int, ObjectRecord]]) -> ClaimColumns:
 
 
 def _within_range(pose: np.ndarray) -> tuple[float, float, float, float, float, float, float]:
-    """A pose [7] as a record has it."""
+    """A pose [7] in the format of a record."""
     x, y, z = np.clip(pose[:3], -LARGEST_COORDINATE, LARGEST_COORDINATE).tolist()
     qx, qy, qz, qw = pose[3:].tolist()
     return x, y, z, qx, qy, qz, qw

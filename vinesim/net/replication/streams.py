@@ -1,7 +1,7 @@
-"""What was last published of each moving object, how wrong the copies are by now, and the messages that correct them.
+"""The last published state of each moving object, the present error of its copies, and the messages that correct them.
 
-:class:`TreeStream` for trees, which stay in their cells, :class:`ObjectStream` for boxes and free bunches, which do
-not. Sender and receiver keep the same quantised values and extrapolate them alike
+:class:`TreeStream` is for trees, which stay in their cells. :class:`ObjectStream` is for boxes and free bunches, which
+do not. Sender and receiver keep the same quantised values and extrapolate them in the same way
 (:mod:`vinesim.net.replication.dead_reckoning`).
 """
 
@@ -21,10 +21,11 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import ObjectUpdate, TreeUpdate
 
 StateReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
-"""State and rate of one object: joints of a tree ([n, 4], [n, 3] rad/s), pose and velocity of another ([7], [6])."""
+"""Function that returns state and rate of one object: joints of a tree ([n, 4], [n, 3] rad/s), or pose [7] and velocity
+[6] of a box or bunch."""
 
 DetachedRoots = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Bodies that were cut angle a tree: indices [k] in the tree, positions [k, 3] m, velocities [k, 3] m/s."""
+"""Bodies that were cut off a tree: indices [k] in the tree, positions [k, 3] m, velocities [k, 3] m/s."""
 
 NO_ROOTS: DetachedRoots = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
@@ -53,13 +54,14 @@ class TreeStream:
         self.middle = _tree_centres(model)
         self.cell = [tuple(cell) for cell in interest.cells_of(self.middle).tolist()]
         self.layer_cell = [tuple(cell) for cell in interest.cells_of(self.middle, interest.TREE_CELL_SIZE).tolist()]
-        """Cell under which the states of each tree leave."""
+        """Cell under which the states of each tree are published."""
         body_count = len(model.body_mass)
         layers = len(interest.TREE_LAYERS)
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
         self._lever_arm = _lever_arms(model)
         self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (layers, body_count, 1))
-        """What those hold who receive all layers up to each."""
+        """[layer, body, 4] Last published quaternions, as copies of peers hold them that receive all layers up to this
+        one."""
         self._published_rate = np.zeros((layers, body_count, 4))
         self._published_roots: tuple[dict[int, DetachedRoots], ...] = tuple({} for _ in range(layers))
         self._active: tuple[int, ...] | None = None
@@ -68,7 +70,7 @@ class TreeStream:
         self._roots: list[DetachedRoots] = []
 
     def read(self, active: tuple[int, ...], read: StateReader, cut: Callable[[int], DetachedRoots]) -> None:
-        """Read the states of these trees, to be judged and encoded."""
+        """Read the states of the trees ``active``, for :meth:`prediction_error` and :meth:`encode`."""
         if self._active != active:
             self._active = active
             self._sizes = self.model.tree_size[list(active)].astype(np.int64)
@@ -80,8 +82,8 @@ class TreeStream:
         self._roots = [cut(tree) for tree in active]
 
     def prediction_error(self, layer: int, silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of the copies of peers who receive no further layer, [k] m and [k] rad, of the trees last read;
-        ``silence`` [k] s since the last state that they got."""
+        """Errors [k] m and [k] rad of the copies of the trees that were last read, at peers that receive no layer after
+        ``layer``. ``silence`` [k]: time since the last state that these peers received [s]."""
         assert self._active is not None
         bodies = self._order
         horizon = dead_reckoning.clamp_age(silence)
@@ -102,8 +104,8 @@ class TreeStream:
         return position, np.maximum.reduceat(angle, self._starts)
 
     def encode(self, rows: list[int], published: ClaimColumns, time: float, layer: int) -> list[bytes]:
-        """Messages about some rows of the trees last read; they become the last published state of ``layer`` and of
-        all after it."""
+        """Messages about some rows of the trees that were last read. Their states become the last published ones of
+        ``layer`` and of all layers after it."""
         assert self._active is not None
         here = [self._active[row] for row in rows]
         part: slice | np.ndarray = slice(None)
@@ -175,11 +177,11 @@ class ObjectStream:
         return self._pose[:, :3]
 
     def cells(self, active: tuple[int, ...]) -> list[Cell]:
-        """Cells under which they are published [k]."""
+        """Cells under which the objects ``active`` are published [k]."""
         return [self._cell[object_id] for object_id in active]
 
     def prediction_error(self, active: tuple[int, ...], silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors of the peers' copies by now [k] m and [k] rad; ``silence`` [k] s since the last state."""
+        """Present errors of the peers' copies [k] m and [k] rad. ``silence`` [k]: time since the last state [s]."""
         unknown: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
         published = [self._published.get(object_id, unknown) for object_id in active]
         pose = np.array([pose for pose, _ in published])
@@ -191,7 +193,8 @@ class ObjectStream:
         )
 
     def encode(self, rows: list[int], published: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
-        """Messages about some rows of the objects that were last judged; they become the last published state."""
+        """Messages about some rows of the objects of the last :meth:`positions`. Their states become the last published
+        ones."""
         ids = np.array([self._active[row] for row in rows])
         batch = ObjectStates(time, ids, *published.columns(), self._pose[rows], self._velocity[rows])
         payloads, received = encode_objects(batch, cell)
@@ -210,7 +213,7 @@ class ObjectStream:
         self._received.pop(object_id, None)
 
     def shift_time(self, step: float) -> None:
-        """The network clock was set by ``step`` [s]."""
+        """Shift all stored times, because the network clock was set by ``step`` [s]."""
         for object_id, update in self._received.items():
             self._received[object_id] = dataclasses.replace(update, time=update.time + step)
 

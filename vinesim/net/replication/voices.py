@@ -1,8 +1,9 @@
-"""Voices: what an actor says, and what those within hearing reach say, if anything of this client listens.
+"""Voices: speech of this actor and, if this client listens, of the actors within hearing reach.
 
-Keys ``voice/<actor>``, a frame of 20 ms in each message as the speaker coded it, and ``voice/<actor>/pcm``, the same as
-PCM16 for those who cannot decode Opus: it is made only while one of them listens. Best effort. A hearer subscribes to
-the actors within reach, and to no spectator that it may not hear; a key without a subscriber costs nothing.
+Keys: ``voice/<actor>`` has a frame of 20 ms in each message, as the speaker coded it. ``voice/<actor>/pcm`` has the
+frame as PCM16, for hearers that cannot decode Opus; it is made only while one of them listens. Both are best effort. A
+hearer subscribes to the actors within reach, except spectators that it may not hear. A key without a subscriber costs
+nothing.
 """
 
 from __future__ import annotations
@@ -26,13 +27,14 @@ from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 MAX_WAITING = 1024
-"""Frames that wait to be taken; older ones are dropped."""
+"""Largest number of frames that wait to be taken. Older frames are dropped."""
 
 MAX_AGE = 2.0
 """[s] Frames that began earlier before the present, or later after it, are refused."""
 
 BURST = 25.0
-"""Frames that a speaker may send at once beyond those of the passing time: what a link held back for half a second."""
+"""Number of frames that a speaker may send at once in addition to the frames of the passing time: half a second, for
+which a link may have held frames back."""
 
 
 ROBOT_MOUTH = np.array([0.0, 0.0, 1.2])
@@ -40,7 +42,8 @@ ROBOT_MOUTH = np.array([0.0, 0.0, 1.2])
 
 
 def mouth(kind: str, pose: RobotUpdate | HumanUpdate) -> np.ndarray:
-    """Where an actor of a ``kind`` speaks [3] m: a person's head, a spectator's eyes, above a robot's base."""
+    """Position from which an actor of a ``kind`` speaks [3] m: a person's head, a spectator's eyes, or a point above a
+    robot's base."""
     if isinstance(pose, HumanUpdate):
         return pose.pose.head[:3]
     return pose.base_q[:3] + (ROBOT_MOUTH if kind == "robot" else 0.0)
@@ -52,7 +55,7 @@ class Heard(NamedTuple):
     speaker: Hello
     frame: VoiceFrame
     place: np.ndarray
-    """[3] m Where the speaker was when it arrived."""
+    """[3] m Position of the speaker when the frame arrived."""
 
 
 class _Source:
@@ -61,10 +64,10 @@ class _Source:
     def __init__(self, subscription: Subscription, now: float) -> None:
         self.subscription = subscription
         self.credit, self.credited = BURST, now
-        """Frames that it may send now, and when they were counted [s]."""
+        """Number of frames that the speaker may send now, and the time at which it was computed [s]."""
 
     def admit(self, now: float) -> bool:
-        """Whether a frame keeps to the pace of sound, a quarter faster at most."""
+        """Whether to accept a frame: frames may arrive at most a quarter faster than real time."""
         self.credit = min(BURST, self.credit + 1.25 / FRAME * max(now - self.credited, 0.0))
         self.credited = now
         if self.credit < 1.0:
@@ -85,13 +88,13 @@ class VoiceSync(MessageSync):
         self.listens = False
         """Whether this actor wants to hear."""
         self.decodes_opus = True
-        """Whether all that listens here decodes Opus."""
+        """Whether all listeners of this client can decode Opus."""
         self._made: list[Publisher] = []
-        """Empty until this actor speaks."""
+        """Publishers of this actor's voice. Empty until it speaks."""
         self._numbers = [0, 0]
         self._sources: dict[str, _Source] = {}
         self._is_plain = False
-        """Whether :attr:`_sources` are those without Opus."""
+        """Whether :attr:`_sources` subscribe to the keys with PCM16."""
         self._heard: collections.deque[Heard] = collections.deque(maxlen=MAX_WAITING)
 
     @property
@@ -116,8 +119,8 @@ class VoiceSync(MessageSync):
         return may_hear(self._hello.kind, "human", self._bus.spectators_speak_to)
 
     def say(self, time: float, codec: Codec, data: bytes, *, is_main: bool = True) -> None:
-        """Send a frame that began at network ``time`` [s]. PCM16 goes to those without Opus;
-        ``is_main``: to the others, too."""
+        """Send a frame that began at network ``time`` [s]. PCM16 goes to the hearers without Opus and, if ``is_main``,
+        to the others, too."""
         if not self.may_speak:
             return
         for which, applies in enumerate((is_main, codec is Codec.PCM16)):
@@ -128,7 +131,7 @@ class VoiceSync(MessageSync):
                     self._counters.voice.count_out(payload)
 
     def update_interest(self, peers: Mapping[str, RemotePose], here: np.ndarray, now: float) -> None:
-        """Listen to those of the ``peers`` within reach of ``here`` [3] m that may be heard, and to no others."""
+        """Listen to exactly the ``peers`` that are within reach of ``here`` [3] m and may be heard."""
         if self._is_plain == self.decodes_opus:
             self._is_plain = not self.decodes_opus
             self._drop(self._sources.keys())
@@ -149,8 +152,8 @@ class VoiceSync(MessageSync):
             self._sources[name] = _Source(self._bus.subscribe(key, KEEP_LAST_64), now)
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a frame at own time ``now`` and network ``time`` [s]; :class:`MessageError` if it is none, or nothing of
-        the present."""
+        """Take a frame at own time ``now`` and network ``time`` [s]. Raises :class:`MessageError` if the payload is no
+        frame, or its time is too far from the present."""
         source = self._sources.get(sender.hello.name)
         pose = sender.update
         if source is None or pose is None or not source.admit(now):

@@ -35,7 +35,8 @@ class AdmissionControl:
         max_actors: int | None = None,
         spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE,
     ) -> None:
-        """``scene``: the only one allowed, in every world. ``max_actors``: over all worlds. None: no such limit."""
+        """``scene``: the only scene allowed in every world. ``max_actors``: largest number of actors of all worlds
+        together. None: no such limit."""
         self._required_scene = scene
         self._max_actors = max_actors
         self._spectators_speak_to = spectators_speak_to
@@ -44,11 +45,11 @@ class AdmissionControl:
         self._alive: dict[tuple[str, str], set[str]] = {}
         self._admitted: dict[tuple[str, str], tuple[str, float]] = {}
         self._spectators: set[tuple[str, str]] = set()
-        """Those of the admitted who publish no records."""
+        """World and name of the admitted spectators, who publish no records."""
         self.joined = 0
         """Number of joins since the start."""
         self.refused = 0
-        """Hellos that were rejected."""
+        """Number of hellos that were rejected."""
 
     @property
     def actors(self) -> list[str]:
@@ -77,18 +78,18 @@ class AdmissionControl:
         return self._required_scene or self._scenes.get(world, SceneId())
 
     def pin_scene(self, world: str, scene: SceneId) -> None:
-        """Fix the scene of a world of which records are retained, even when no actor is there."""
+        """Fix the scene of a world that has retained records, even while it has no actor."""
         self._scenes[world] = scene
         self._pinned.add(world)
 
     def on_join(self, world: str, name: str, session: str) -> None:
-        """A session with this name is live."""
+        """Note that a session with this name is live."""
         sessions = self._alive.setdefault((world, name), set())
         self.joined += not sessions
         sessions.add(session)
 
     def on_leave(self, world: str, name: str, session: str) -> None:
-        """A session is no longer live."""
+        """Note that a session is no longer live."""
         actor = (world, name)
         sessions = self._alive.get(actor, set())
         sessions.discard(session)
@@ -99,7 +100,7 @@ class AdmissionControl:
         self._forget(world)
 
     def forget_actors(self) -> None:
-        """No session is connected any more."""
+        """Forget all actors, because no session is connected any more."""
         self._alive.clear()
         self._admitted.clear()
         self._spectators.clear()
@@ -141,7 +142,7 @@ class AdmissionControl:
         return Welcome(reason, *self.scene_of(world), self._spectators_speak_to)
 
     def _find_objection(self, world: str, name: str, session: str, hello: Hello) -> str:
-        """Why an actor cannot be admitted; empty if it can."""
+        """Returns why an actor cannot be admitted, or "" if it can."""
         if hello.name != name:
             return f"{name!r} introduces itself as {hello.name!r}"
         admitted = self._admitted.get((world, name), (session, 0.0))[0]

@@ -18,31 +18,31 @@ from vinesim.scene.triangles import MAX_BYTES, TrianglesError, decode_triangles,
 log = logging.getLogger(__name__)
 
 Actor = tuple[str, str]
-"""World and name."""
+"""World and name of an actor."""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeshLimits:
-    """How much the server keeps."""
+    """Limits for the meshes that the server keeps."""
 
     count: int = 4096
-    """Meshes."""
+    """Number of meshes."""
     total: int = 256 << 20
-    """Bytes of all, parts of incomplete ones included."""
+    """Size of all meshes, including parts of incomplete ones [B]."""
     per_actor: int = 64 << 20
-    """Bytes of those that one actor offers, shared ones included."""
+    """Size of the meshes that one actor offers, including shared ones [B]."""
     count_per_actor: int = 256
-    """Meshes that one actor offers."""
+    """Number of meshes that one actor offers."""
 
 
 @dataclasses.dataclass(slots=True)
 class MeshCounters:
-    """What became of offered and requested meshes."""
+    """Counts of offered and requested meshes, by their fate."""
 
     kept: int = 0
     """Meshes that were complete and right."""
     corrupt: int = 0
-    """... that were complete, but had another digest or were no triangles."""
+    """Meshes that were complete, but had another digest or were no triangles."""
     refused: int = 0
     """Offers beyond a limit."""
     served: int = 0
@@ -53,7 +53,7 @@ class MeshCounters:
 class _Kept:
     payload: bytes
     holders: set[Actor]
-    """Actors that are there and have offered it."""
+    """Present actors that have offered the mesh."""
 
 
 class MeshStore:
@@ -63,11 +63,11 @@ class MeshStore:
         self.limits = limits
         self.counters = MeshCounters()
         self._kept: dict[str, _Kept] = {}
-        """Those asked for or offered last come last."""
+        """Complete meshes by digest. The mesh that was last requested or offered is the last one."""
         self._incomplete: dict[Actor, tuple[MeshPart, bytearray]] = {}
-        """Of each actor the mesh that it is sending: its first part without data, and what has arrived."""
+        """Mesh that each actor is sending: its first part without data, and the bytes that have arrived."""
         self._bytes = 0
-        """Of all in :attr:`_kept`."""
+        """Size of all meshes in :attr:`_kept` [B]."""
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -92,7 +92,7 @@ class MeshStore:
         return MeshPart(digest, size, offset, kept.payload[offset : offset + MAX_PART])
 
     def offer(self, actor: Actor, part: MeshPart) -> MeshWanted:
-        """Take a part that an actor offers; what it shall send next."""
+        """Take a part that an actor offers. Returns the part that the actor shall send next."""
         with self._lock:
             kept = self._kept.get(part.digest)
             if kept is not None:
@@ -115,14 +115,14 @@ class MeshStore:
         return self._complete(actor, part, bytes(arrived))
 
     def release(self, actor: Actor) -> None:
-        """An actor has left: what it offered alone may make room for other meshes."""
+        """Note that an actor has left. Meshes that only it offered may be removed to make room for others."""
         with self._lock:
             self._incomplete.pop(actor, None)
             for kept in self._kept.values():
                 kept.holders.discard(actor)
 
     def _complete(self, actor: Actor, part: MeshPart, payload: bytes) -> MeshWanted:
-        """Keep a mesh all of which has arrived, if it is what its digest says."""
+        """Keep a mesh that has arrived completely, if its content has its digest."""
         try:  # without the lock: of a large mesh this takes milliseconds
             if digest_of(payload) != part.digest:
                 raise TrianglesError("its digest is another")

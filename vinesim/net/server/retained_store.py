@@ -28,7 +28,7 @@ MAX_REPLY = 64_000
 """Largest reply of a snapshot [B], unless a single record is larger."""
 
 MAX_OBJECTS = 100_000
-"""Objects of one world with a retained record."""
+"""Largest number of objects of one world with a retained record."""
 
 SYNC_PERIOD = 0.5
 """Time after which appended records are forced to the disk [s]."""
@@ -37,10 +37,10 @@ RETRY_PERIOD = 5.0
 """Time between two attempts to write after a disk error [s]."""
 
 MAX_QUEUED = 10_000
-"""Messages in the queue; further ones are dropped."""
+"""Largest number of messages in the queue. Further ones are dropped."""
 
 MAX_QUEUED_BYTES = 64 << 20
-"""Payload bytes of the same [B]."""
+"""Largest size of the messages in the queue [B]."""
 
 
 class Quota(NamedTuple):
@@ -53,10 +53,11 @@ class Quota(NamedTuple):
 
 
 MAX_EARLY = 1000
-"""Messages that wait for the admission of their author, who may publish before it is admitted again."""
+"""Largest number of messages that wait for the admission of their author, who may publish before it is admitted
+again."""
 
 MAX_EARLY_BYTES = 16 << 20
-"""Payload bytes of the same [B]."""
+"""Largest size of the messages that wait for the admission of their author [B]."""
 
 BURST_TIME = 5.0
 """Time [s] of its quota that an actor may use at once."""
@@ -99,18 +100,18 @@ class _TokenBucket:
 
 @dataclasses.dataclass(slots=True)
 class StoreCounters:
-    """What became of published records."""
+    """Counts of messages with published records, by their fate."""
 
     received: int = 0
     """Messages with records."""
     malformed: int = 0
-    """... that could not be decoded."""
+    """Messages that could not be decoded."""
     over_quota: int = 0
-    """... of actors beyond their quota."""
+    """Messages of actors beyond their quota."""
     rejected: int = 0
-    """... of worlds without an admitted actor, of too many objects, or beyond the queue."""
+    """Messages of worlds without an admitted actor, about too many objects, or beyond the queue."""
     errors: int = 0
-    """... that ended in an unexpected error."""
+    """Messages that caused an unexpected error."""
     snapshots: int = 0
     """Queries for the records of a cell."""
 
@@ -137,7 +138,7 @@ class RetainedStore:
         self._wakeup = threading.Event()
         self._closing = False
         self.status_message = ""
-        """Empty, or why nothing can be written now; records then stay in memory until it can."""
+        """Reason why nothing can be written now, or "". Records stay in memory until they can be written."""
         self._thread = threading.Thread(target=self._run, name="retained store", daemon=True)
         self._thread.start()
 
@@ -261,7 +262,7 @@ class RetainedStore:
             return ""
 
     def _ingest(self, key: str, payload: bytes) -> str:
-        """Merge the records of one message; the name of the world if it must be synced, else empty."""
+        """Merge the records of one message. Returns the name of the world if its journal must be synced, else ""."""
         chunks = key.split("/")
         world = chunks[0]
         where = chunks[2:-1]
@@ -307,7 +308,7 @@ class RetainedStore:
         return world if is_changed else ""
 
     def _merge(self, world: str, cell: Cell, record: RetainedRecord) -> bool:
-        """Merge a record and append it to the journal; whether that changed a world with a journal."""
+        """Merge a record and append it to the journal. Returns whether that changed a world with a journal."""
         records = self._states[world]
         with self._lock:
             if not records.merge(cell, record):
@@ -331,7 +332,7 @@ class RetainedStore:
         self._journals[world] = Journal(path, world, self._scenes[world], self._states[world])
 
     def _try_write(self, write: Callable[[], object]) -> bool:
-        """Write; after an error records stay in memory until writing succeeds. Whether it did."""
+        """Call ``write``. After an error, records stay in memory until writing succeeds. Returns whether it did."""
         try:
             write()
             return True

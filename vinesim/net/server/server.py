@@ -40,7 +40,7 @@ LISTEN = "tcp/127.0.0.1:7447"
 """Default endpoint: this machine alone, Zenoh's port."""
 
 LEASE = 1000
-"""A server that is silent for this long is taken to be gone [ms]: half of what actors are granted."""
+"""A server that is silent for this long is taken to be gone [ms]: half of the time that actors are granted."""
 
 
 RELEASE_TIMEOUT = 5.0
@@ -53,7 +53,7 @@ link went (Zenoh 1.10). If the next router is there sooner, they do not tell it 
 
 
 MAX_EMPTY_WORLDS = 64
-"""Worlds without actors whose clocks go on."""
+"""Largest number of worlds without actors whose clocks continue."""
 
 
 class PortTaken(BusError):
@@ -86,10 +86,10 @@ class Server:
     ) -> None:
         """Listen on endpoints like ``tcp/0.0.0.0:7447``; port 0 chooses a free one, see :attr:`endpoint`.
 
-        ``connect``: routers or servers to link to. A linked server only routes; of linked servers the one that connects
-        to none admits and retains. ``state_folder``: folder of the journals; without one the state lives as long as the
-        server. ``scene``: the only one allowed. ``max_actors``: at a time. ``spectators_speak_to``:
-        who hears them. ``certificates``: folder of a server, see
+        ``connect``: routers or servers to link to. A linked server only routes. Among linked servers, the one that
+        connects to none admits actors and retains records. ``state_folder``: folder of the journals; without one the
+        state lives as long as the server. ``scene``: the only scene allowed. ``max_actors``: largest number of actors
+        at a time. ``spectators_speak_to``: who hears spectators. ``certificates``: folder of a server, see
         :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
         again when its files change. ``real_time_factor``: how many times as fast as real time its worlds run; None:
         each as fast as its clients can follow, at most 1.
@@ -120,19 +120,19 @@ class Server:
             raise PortTaken(listen[0], str(error.strerror)) from error
         self._fixed_factor = real_time_factor
         self._start = time.monotonic(), time.time()
-        """Real time, and the time at which all worlds begin [s]: the time of day, a later step of which moves no
-        world."""
+        """Real time at the start, and the time at which all worlds begin [s]: the time of day. A later step of the time
+        of day does not change the time of any world."""
         self._clocks: dict[str, WorldClock] = {}
         """The clock of each world."""
         self.pings = 0
-        """Queries of the clock."""
+        """Number of queries of the clock."""
         self.foreign = 0
-        """Messages with records under the name of another session."""
+        """Number of messages with records that came under the name of another session."""
         self._malformed = 0
         self._admission = AdmissionControl(scene, max_actors, spectators_speak_to)
         self._lock = threading.Lock()
         self._session_lock = threading.Lock()
-        """While the router is closed and opened again."""
+        """Held while the router is closed and opened again."""
         self._stop = threading.Event()
         self._warned: set[str] = set()
         self.store = None if linked else RetainedStore(state_folder, quota)
@@ -152,7 +152,7 @@ class Server:
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 
     def _access_settings(self) -> dict[str, Any]:
-        """Zenoh's settings of who may connect and say what; :class:`CertificateError` if a certificate is unusable."""
+        """Zenoh's settings for access control. Raises :class:`CertificateError` if a certificate is unusable."""
         if self._certificates is None:
             return {} if self._linked else server_answers_config(ROOT)
         from vinesim.net.transport import certificates
@@ -196,7 +196,7 @@ class Server:
 
     @property
     def malformed(self) -> int:
-        """Messages and queries that could not be decoded."""
+        """Number of messages and queries that could not be decoded."""
         return self._malformed + (self.store.counters.malformed if self.store is not None else 0)
 
     def _clock(self, world: str) -> WorldClock:

@@ -1,9 +1,9 @@
-"""TLS and access control of Zenoh: which certificate may publish, subscribe and query what; everything else is denied.
+"""TLS and access control of Zenoh: keys that each certificate may publish, subscribe to and query. All else is denied.
 
 Every actor has a certificate with its name as common name. It may subscribe to its whole world, query, and publish only
 under keys that end with its own name. A robot also offers its meshes to the server, under its own name. A spectator
-publishes only its presence, its hello, its viewpoint and its voice. The rules are applied by the router, so a foreign
-key ends there.
+publishes only its presence, its hello, its viewpoint and its voice. The router applies the rules, so a message under a
+foreign key ends there.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ _EVERYTHING = [
 
 
 def authority_folder(folder: pathlib.Path) -> pathlib.Path:
-    """Where the key of the authority of a folder of certificates lies by default."""
+    """Default folder of the authority's key for a folder of certificates."""
     folder = folder.absolute() if not folder.name else folder
     return folder.with_name(f"{folder.name}-authority")
 
@@ -89,8 +89,8 @@ def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
 
 
 def server_answers_config(root: str) -> dict[str, Any]:
-    """Access control of a server without certificates under ``root`` (like ``vs/1``): what actors ask the server, no
-    other program that connects to it answers."""
+    """Access control of a server without certificates under ``root`` (like ``vs/1``): no other program that connects to
+    the server can answer queries that actors send to the server."""
     questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**")]
     rule = {
         "id": "answers of the server",

@@ -26,7 +26,7 @@ KEEP_ALL = 10_000
 """History depth that keeps all samples, in order: events. The number only bounds memory in a flood."""
 
 MAX_STORED_BYTES = 64 << 20
-"""Payload bytes that wait to be polled [B]."""
+"""Largest size of the payloads that wait to be polled [B]."""
 
 
 class BusError(RuntimeError):
@@ -45,7 +45,7 @@ class NameTaken(BusError):
 
 
 class JoinRejected(BusError):
-    """The server rejects this actor; the text is the server's."""
+    """The server rejects this actor. The text is the server's reason."""
 
 
 class Reply(NamedTuple):
@@ -66,7 +66,7 @@ class Publisher(Protocol):
         ...
 
     def put(self, payload: bytes) -> bool:
-        """Send without blocking. Returns False, sends nothing and counts nothing without a subscriber."""
+        """Send without blocking. Without a subscriber, nothing is sent or counted, and the result is False."""
         ...
 
     def close(self) -> None:
@@ -91,17 +91,17 @@ class Bus(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Received samples that were discarded because the store was full or the sample too large."""
+        """Number of received samples that were discarded because the store was full or the sample too large."""
         ...
 
     foreign: int
-    """Samples and replies that were dropped because their session does not hold the name they came under."""
+    """Number of samples and replies that were dropped because their session does not hold the name in their key."""
     failures: int
-    """Puts, declarations and queries that the network refused; none of them raises."""
+    """Number of puts, declarations and queries that the network refused. None of them raises."""
 
     @property
     def status_message(self) -> str:
-        """Empty, or why the network is unreachable now."""
+        """Returns why the network is unreachable now, or "" if it is reachable."""
         ...
 
     def join(self, greeting: bytes) -> None:
@@ -129,8 +129,7 @@ class Bus(Protocol):
         ...
 
     def query(self, key: str, payload: bytes = b"") -> None:
-        """Send a query to all queryables that match ``key``; :meth:`replies` returns what comes back, if anything
-        does."""
+        """Send a query to all queryables that match ``key``. :meth:`replies` returns the replies, if any arrive."""
 
     def replies(self) -> list[Reply]:
         """Replies that arrived since the last call."""
@@ -143,12 +142,12 @@ class Bus(Protocol):
 
     @property
     def spectators_speak_to(self) -> SpectatorsSpeakTo:
-        """Who hears spectators in this world, as the server has said; people unless it has."""
+        """Who hears spectators in this world, as the server has set it. People, if the server has not set it."""
         ...
 
     @property
     def admissions(self) -> int:
-        """How often a server has admitted this actor: 0 without one, once more for each that is started again."""
+        """How often a server has admitted this actor: 0 without a server, one more whenever a server starts again."""
         ...
 
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
@@ -195,7 +194,7 @@ class SampleStore:
                 self.overflowed += 1
 
     def take(self) -> list[tuple[str, bytes]]:
-        """Remove and return all samples in order of arrival, without those beyond the depth of their key."""
+        """Remove and return all samples in order of arrival. Samples beyond the depth of their key are dropped."""
         with self._lock:
             taken = self._samples
             self._samples = collections.deque()

@@ -12,14 +12,14 @@ from vinesim.net.transport.bus import BusError
 log = logging.getLogger(__name__)
 
 WATCH_PERIOD = 1.0
-"""Time between two looks at a folder [s]."""
+"""Time between two checks of a folder [s]."""
 
 WARNING_PERIOD = 86400.0
 """Time between two warnings of one certificate that is about to expire [s]."""
 
 
 class CertificateWatch:
-    """The folder of a server or a client, looked at once a :data:`WATCH_PERIOD` by a thread that may read files."""
+    """Watches the folder of a server or client. A thread that may read files checks it once a :data:`WATCH_PERIOD`."""
 
     def __init__(self, folder: pathlib.Path) -> None:
         self._folder = folder
@@ -29,7 +29,7 @@ class CertificateWatch:
     def has_changed(self) -> bool:
         """Whether files were added, replaced or removed and then left alone for a period; True once for each change.
 
-        Certificate and key are two files: what was written a moment ago may be half of a change.
+        Certificate and key are two files, so a file that was just written may be only half of a change.
         """
         seen = self._seen
         self._seen = self._state()
@@ -40,7 +40,7 @@ class CertificateWatch:
         return True
 
     def warn(self) -> None:
-        """Log the certificates that are about to expire, at first, after a change and once a day."""
+        """Log the certificates that are about to expire: at the first call, after a change, and once a day."""
         if time.monotonic() < self._next_warning:
             return
         self._next_warning = time.monotonic() + WARNING_PERIOD

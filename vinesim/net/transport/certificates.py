@@ -1,9 +1,9 @@
 """Certificates for secured links: one authority, one certificate for each actor.
 
 ``server.pem`` and ``server.key`` belong to the server; ``NAME.pem`` and ``NAME.key`` to an actor, who needs only those
-two and ``ca.pem``. The key of the authority, ``ca.key``, lies in a folder of its own: who has it can make certificates
-for every name, so no server and no client takes a folder that holds it. The role of an actor is the organisational
-unit of its certificate. Keys are elliptic (P-256), readable only by their owner.
+two and ``ca.pem``. The key of the authority, ``ca.key``, lies in a folder of its own. Whoever has it can make
+certificates for every name, so servers and clients refuse a folder that holds it. The role of an actor is the
+organisational unit of its certificate. Keys are elliptic (P-256), readable only by their owner.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ AUTHORITY_YEARS = 10
 CERTIFICATE_DAYS = 825
 """Validity of the certificate of an actor or a server [d]."""
 WARNING_DAYS = 30
-"""A certificate that is valid for less is warned of [d]."""
+"""A certificate that expires within this time causes a warning [d]."""
 
 
 class CryptographyMissing(RuntimeError):
@@ -62,7 +62,9 @@ def create(
     days: float = CERTIFICATE_DAYS,
     authority: pathlib.Path | None = None,
 ) -> list[pathlib.Path]:
-    """Create the certificate of an actor, and at first use those of the authority and the server; the paths written.
+    """Create the certificate of an actor and, at first use, the certificates of the authority and the server.
+
+    Returns the paths of the files that were written.
 
     ``hosts``: for ``server``, names and addresses under which clients reach it, besides those of this machine; its
     certificate is replaced. ``authority``: folder of ``ca.key``, by default ``folder`` with ``-authority`` appended.
@@ -159,7 +161,8 @@ def expiring(folder: pathlib.Path) -> list[str]:
 
 
 def _authority_of(folder: pathlib.Path, authority: pathlib.Path) -> list[pathlib.Path]:
-    """Create the authority if there is none, and copy its certificate to ``folder``; the paths written."""
+    """Create the authority if there is none, and copy its certificate to ``folder``. Returns the paths that were
+    written."""
     own = authority / f"{CA_NAME}.pem"
     public = folder / f"{CA_NAME}.pem"
     has_key = (authority / f"{CA_NAME}.key").exists()
@@ -268,7 +271,7 @@ def _save(
 
 
 def _write(path: pathlib.Path, content: bytes, mode: int) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically: after an error, ``path`` is unchanged."""
     part = path.with_name(f"{path.name}.part")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

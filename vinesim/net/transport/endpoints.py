@@ -1,4 +1,5 @@
-"""Endpoints of servers and clients as text, and the two links between them: a stream and datagrams; pure.
+"""Endpoints of servers and clients as text, and the two links between a client and a server: a stream and datagrams.
+All functions but those that look for free ports are pure.
 
 ``tcp`` and ``tls`` carry everything. ``udp`` and ``quic`` use the same port number and carry best-effort messages
 (poses) without head-of-line blocking. ``tls`` and ``quic`` need certificates on both sides.
@@ -22,7 +23,7 @@ _MIXED = {"udp": "?rel=1;mixed_rel=auto", "quic": "?mixed_rel=auto"}
 
 
 class Endpoint(NamedTuple):
-    """A place to listen on or to connect to."""
+    """An address to listen on or to connect to."""
 
     protocol: str
     host: str
@@ -33,7 +34,7 @@ class Endpoint(NamedTuple):
 
     @property
     def locator(self) -> str:
-        """In Zenoh's notation."""
+        """The endpoint in Zenoh's notation."""
         return f"{self}{_MIXED.get(self.protocol, '')}"
 
     @property
@@ -61,7 +62,8 @@ class Endpoint(NamedTuple):
 
 
 def parse(text: str, *, secured: bool = False) -> Endpoint:
-    """``PROTOCOL/HOST:PORT``; :class:`vinesim.core.errors.UsageError` for anything else, or a protocol without TLS."""
+    """Parse the text ``PROTOCOL/HOST:PORT``. Raises :class:`vinesim.core.errors.UsageError` for anything else and, if
+    ``secured``, for a protocol without TLS."""
     allowed = ("tls", "quic") if secured else ("tcp", "udp")
     protocol, _, address = text.partition("/")
     host, colon, port = address.rpartition(":")
@@ -77,8 +79,8 @@ def parse(text: str, *, secured: bool = False) -> Endpoint:
 
 
 def default_listen(*, secured: bool = False, insecure: bool = False) -> tuple[str, ...]:
-    """Endpoints of a server by default, a stream and datagrams: this machine alone, unless ``secured`` by certificates
-    or told to be ``insecure``; then all interfaces."""
+    """Default endpoints of a server, a stream and datagrams. They listen on this machine only, or on all interfaces if
+    the server is ``secured`` by certificates or allowed to be ``insecure``."""
     host = "0.0.0.0" if secured or insecure else "127.0.0.1"
     return tuple(f"{protocol}/{host}:{PORT}" for protocol in (("tls", "quic") if secured else ("tcp", "udp")))
 
@@ -100,11 +102,12 @@ class Links(NamedTuple):
     bulk: Endpoint
     """A stream: events, queries, snapshots, everything large."""
     live: Endpoint | None
-    """Datagrams: poses and states. None: they use the stream, too."""
+    """Datagrams: poses and states. None: poses and states use the stream, too."""
 
 
 def client_links(connect: str, *, secured: bool = False) -> Links:
-    """Both links to a remote server, only a stream on this machine (the cheapest); ``udp/``, ``quic/`` ask for both."""
+    """Both links to a remote server. To a server on this machine only the stream, which is the cheapest, unless the
+    protocol ``udp/`` or ``quic/`` asks for both."""
     endpoint = parse(connect, secured=secured)
     if endpoint.datagrams:
         return Links(endpoint.counterpart, endpoint)
@@ -112,7 +115,7 @@ def client_links(connect: str, *, secured: bool = False) -> Links:
 
 
 def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endpoint, ...]:
-    """Endpoints to listen on, port 0 replaced by one number that is free for streams and datagrams alike."""
+    """Endpoints to listen on. Port 0 is replaced by one number that is free for both streams and datagrams."""
     wanted = [parse(text, secured=secured) for text in listen]
     if not wanted:
         raise UsageError("a server that listens nowhere: give --listen at least once")
@@ -127,7 +130,8 @@ def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endp
 
 
 def can_listen(endpoint: Endpoint) -> bool:
-    """Whether no socket listens at an endpoint: Zenoh 1.10 may release that of datagrams 0.1 s after its session."""
+    """Whether no socket listens at an endpoint. Zenoh 1.10 may release the socket of datagrams 0.1 s after its
+    session."""
     family = socket.AF_INET6 if endpoint.host.startswith("[") else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM if endpoint.datagrams else socket.SOCK_STREAM) as probe:
         if not endpoint.datagrams:

@@ -14,7 +14,7 @@ from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Repl
 from vinesim.net.transport.name_holders import bound_name
 
 MAX_KNOWN_KEYS = 10_000
-"""Keys of which a bus remembers whether it subscribes to them."""
+"""Largest number of keys for which a bus remembers whether it subscribes to them."""
 
 
 class MemoryHub:
@@ -36,13 +36,13 @@ class MemoryHub:
         self.loss = loss
         self.duplicated = duplicated
         self.down = False
-        """True: partitioned. Nothing passes, and every member sees only itself."""
+        """Whether the network is partitioned: no message passes, and every member sees only itself."""
         self.binds_names = True
-        """False: members may send and answer under the names of others, as if no bus checked it."""
+        """Whether the bus checks names. False: members may send and answer under the names of others."""
         self.rejection_reason: Callable[[bytes], str] = lambda greeting: ""
-        """Why the emulated server rejects a hello; empty: it admits the actor."""
+        """Returns why the emulated server rejects a hello, or "" if it admits the actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
-        """What the emulated server says of them."""
+        """Who hears spectators, as the emulated server sets it."""
         self._random = random.Random(seed)
         self._order = 0
         self._pending: list[tuple[float, int, Callable[[], None]]] = []
@@ -54,7 +54,7 @@ class MemoryHub:
         """Sorted names of the members that subscribe to a key, until subscriptions or members change."""
 
     def bus(self, name: str, *, live: bool = True) -> MemoryBus:
-        """Add a member; :class:`NameTaken` if the name is live. Not ``live``: it has no liveliness token."""
+        """Add a member. Raises :class:`NameTaken` if the name is live. If not ``live``, it has no liveliness token."""
         if name in self._members:
             raise NameTaken(name, "memory")
         bus = MemoryBus(self, name)
@@ -70,7 +70,7 @@ class MemoryHub:
         return bus
 
     def advance(self, dt: float) -> None:
-        """Advance the clock by ``dt`` [s] and deliver in order what arrives until then."""
+        """Advance the clock by ``dt`` [s] and deliver the samples that arrive until then, in order."""
         end = self.time + dt
         while self._pending and self._pending[0][0] <= end + 1e-12:
             self.time, _, action = heapq.heappop(self._pending)
@@ -95,7 +95,7 @@ class MemoryHub:
         return self._subscribers[key]
 
     def forget_subscribers(self) -> None:
-        """Subscriptions or members have changed."""
+        """Clear the stored subscribers, because subscriptions or members have changed."""
         self._subscribers.clear()
 
     def send(self, sender: str, key: str, payload: bytes, reliable: bool) -> None:
@@ -129,8 +129,8 @@ class MemoryHub:
                     self._schedule(functools.partial(respond, self._members[name], served_key))
 
     def fetch(self, sender: str, key: str, payload: bytes) -> list[bytes]:
-        """Ask every other member with a matching queryable, at once, whatever the delay: callers do not wait for the
-        clock."""
+        """Ask every other member with a matching queryable. Replies come at once, without the delay, because callers
+        cannot wait for the clock."""
         if self.down:
             return []
         return [
@@ -158,7 +158,7 @@ class MemoryHub:
             (self._visible_names[observer].add if there else self._visible_names[observer].discard)(name)
 
     def _is_foreign(self, bus: MemoryBus, source: str, key: str) -> bool:
-        """Whether a member sends under another's name; then it is counted."""
+        """Whether a member sends under another's name. Such messages are counted."""
         is_foreign = self.binds_names and bound_name(key) not in ("", source)
         bus.foreign += is_foreign
         return is_foreign
@@ -215,7 +215,8 @@ class MemoryBus:
         self._store = SampleStore()
         self._subscriptions: list[MemorySubscription] = []
         self._depths: dict[str, int] = {}
-        """Of the deepest subscription to each key that was asked for, 0 without one; until subscriptions change."""
+        """Depth of the deepest subscription to each key that was looked up, 0 without a subscription. Cleared when
+        subscriptions change."""
 
     @property
     def dropped(self) -> int:

@@ -1,11 +1,12 @@
 """Names of actors and the sessions that hold them: a message under a name counts only from the session that holds it.
 
 A session holds a name from its liveliness token ``live/<name>/<session>`` on. If a second session declares a token of
-the same name, those who saw the first keep to it; those who first see both believe neither until one is left. What
-arrives after a session has left still counts as its own, for the last records of an actor may be under way.
+the same name, members that saw the first token keep to it. Members that see both tokens at first believe neither until
+one is left. Messages of a session that arrive after it has left still count, because the last records of an actor may
+be under way.
 
-Without TLS a session itself says which one it is: this keeps programs apart that use vinesim or Zenoh as they are,
-not one that was written to deceive (``docs/network.md``).
+Without TLS a session states its own identity. This keeps programs apart that use vinesim or Zenoh as they are, but not
+a program that was written to deceive (``docs/network.md``).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import threading
 from vinesim.net.codec.messages import FAMILIES, sender_of
 
 MAX_FORMER_SESSIONS = 8
-"""Sessions of one name that have left and are still remembered."""
+"""Largest number of sessions of one name that have left and are still remembered."""
 
 BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello"}
 """First chunks of the keys that belong to one actor."""
@@ -36,13 +37,13 @@ class NameHolders:
         """Whether a session is live, by name and session."""
         self._holder: dict[str, str] = {}
         self._disputed: set[str] = set()
-        """Names of which several sessions were there before this one."""
+        """Names that several sessions held before this session joined."""
         self._lock = threading.Lock()
         self.live = own
-        """Names of which a session is live."""
+        """Names that have a live session."""
 
     def start(self, tokens: list[tuple[str, str]]) -> None:
-        """Take the name and session of all tokens that were there before."""
+        """Take the name and session of all tokens that existed before this session joined."""
         for name, session in tokens:
             self.update(name, session, True)
         with self._lock:
@@ -52,7 +53,7 @@ class NameHolders:
                     self._choose(name)
 
     def update(self, name: str, session: str, is_live: bool) -> None:
-        """A session has declared or withdrawn the token of a name."""
+        """Note that a session has declared (``is_live``) or withdrawn the token of a name."""
         with self._lock:
             sessions = self._sessions.setdefault(name, {})
             if not is_live and session not in sessions:
@@ -68,7 +69,7 @@ class NameHolders:
             self.live = self._own.union(there)
 
     def holder(self, name: str) -> str:
-        """The session that holds a name, or held it last; empty: none."""
+        """The session that holds a name, or held it last. Empty if there is none."""
         return self._holder.get(name, "")
 
     def _choose(self, name: str) -> None:

@@ -1,7 +1,7 @@
 """Admission of an actor by the vinesim server of a world, and again by every server that starts later.
 
-A server that was restarted does not know which actors are there. A querier with a matching listener notices it, and
-the hello is sent again.
+A server that was restarted does not know which actors are present. A querier with a matching listener notices the new
+server, and the hello is sent again.
 """
 
 from __future__ import annotations
@@ -47,30 +47,31 @@ class ServerAdmission:
         self._is_secured = is_secured
         self._submit = submit
         self.is_served = True
-        """The server of this world is there, or there never was one."""
+        """Whether the server of this world is present, or there never was a server."""
         self.rejection = ""
-        """Empty, or why a server that was restarted rejects this actor."""
+        """Reason why a server that was restarted rejects this actor, or "" if none does."""
         self.count = 0
         """How often a server has admitted this actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
-        """Who hears spectators, as the server that admitted this actor has said."""
+        """Who hears spectators, as the server that admitted this actor has set it."""
         self._servers: frozenset[str] | None = None
         """The session that admitted this actor, if any did; None: it has not joined."""
         self._declared: list[object] = []
         self._querier: zenoh.Querier | None = None
-        """Knows whether a server is announced; None before the first hello."""
+        """Querier that knows whether a server is announced; None before the first hello."""
         self._was_announced = False
-        """Whether there was ever a server, though perhaps none of its replies arrived."""
+        """Whether a server was ever announced, even if none of its replies arrived."""
         self._hello = b""
         self._is_join_submitted = False
 
     def is_server(self, replier: zenoh.EntityGlobalId | None) -> bool:
-        """Whether answers for all actors (clock, retained records) count from here: from the server that admitted this
-        one; from any for a program that never joins."""
+        """Whether to accept answers for all actors (clock, retained records) from ``replier``: it must be the server
+        that admitted this actor. A program that never joins accepts any."""
         return self._servers is None or (replier is not None and str(replier.zid) in self._servers)
 
     def join(self, hello: bytes) -> None:
-        """Send an encoded hello; :class:`JoinRejected` if a server rejects it. Without a server nothing happens."""
+        """Send an encoded hello. Raises :class:`JoinRejected` if a server rejects it. Without a server nothing
+        happens."""
         welcomes = self._query(hello)
         if welcomes and welcomes[0].refused:
             raise JoinRejected(welcomes[0].refused)
@@ -104,7 +105,7 @@ class ServerAdmission:
             self._submit_join()
 
     def watch(self) -> None:
-        """Called from time to time: mend what Zenoh's threads reported late or in another order.
+        """Correct the state if Zenoh's threads reported events late or in another order. Called from time to time.
 
         A server may be reported as gone before the reply in which it admitted this actor is read, or after its
         successor was reported, or before it is reported itself: then the present state of the querier counts.
@@ -144,7 +145,7 @@ class ServerAdmission:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
 
     def _query(self, hello: bytes) -> list[Welcome]:
-        """Replies of all servers, first the one that counts; an unreadable reply counts as a rejection."""
+        """Replies of all servers. The first is the one that counts. An unreadable reply counts as a rejection."""
         replies = self._session.get(
             self._key, payload=hello, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
         )

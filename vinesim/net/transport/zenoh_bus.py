@@ -1,11 +1,12 @@
 """The bus over Zenoh (eclipse-zenoh 1.10): client sessions to one router, without scouting and without listening.
 
-Publishers have exact keys, so that without a subscriber not one byte is sent. Callbacks only store, and the threads
-that read the network call them: else Zenoh keeps a Python thread for every subscription, a hundred in a client. Poses
-are best effort and may be dropped; events are reliable and are sent by a thread of the bus, as sending them may block.
+Publishers have exact keys, so that without a subscriber not one byte is sent. Callbacks only store samples, and the
+threads that read the network call them. Otherwise Zenoh would keep a Python thread for every subscription, a hundred in
+a client. Poses are best effort and may be dropped. Events are reliable, and a thread of the bus sends them, because
+sending them may block.
 
-Poses and states have a session of their own, over datagrams, wherever the server is on another machine, so that neither
-a lost packet nor a large snapshot delays them. Where no datagrams pass they share the stream with everything else.
+If the server is on another machine, poses and states have a session of their own, over datagrams, so that neither a
+lost packet nor a large snapshot delays them. If no datagrams pass, they share the stream with everything else.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ from vinesim.net.transport.zenoh_session import (
 log = logging.getLogger(__name__)
 
 ROOT = "vs/1"
-"""First chunks of every key: the version of the key layout; the world follows."""
+"""First chunks of every key: the version of the key layout. The name of the world follows."""
 
 WORLD = "vineyard"
 """Default name of a world."""
@@ -55,7 +56,7 @@ WATCH_PERIOD = 0.5
 """Time between two checks whether datagrams pass [s]."""
 
 SILENCE_TIMEOUT = 3.0
-"""Datagrams are given up after so long without them while the stream works [s]."""
+"""If no datagram arrives for this long while the stream works, datagrams are given up [s]."""
 
 DATAGRAM_RETRY_PERIOD = 10.0
 """Time between two attempts to send poses over datagrams again [s]."""
@@ -64,13 +65,14 @@ FETCH_TIMEOUT = 10.0
 """Time limit of :meth:`ZenohBus.fetch` [s]: large replies over slow links."""
 
 MAX_PENDING_PUTS = 10_000
-"""Reliable messages that wait to be sent; further ones are refused."""
+"""Largest number of reliable messages that wait to be sent. Further ones are refused."""
 
 MAX_PENDING_BYTES = 32 << 20
-"""Payload bytes of the same [B]."""
+"""Largest size of the reliable messages that wait to be sent [B]."""
 
 MAX_PENDING_REPLIES = 1000
-"""Replies to queries that wait for :meth:`ZenohBus.replies`; further ones are discarded and counted."""
+"""Largest number of replies to queries that wait for :meth:`ZenohBus.replies`. Further ones are discarded and
+counted."""
 
 
 class ZenohBus:
@@ -87,8 +89,8 @@ class ZenohBus:
     ) -> None:
         """Enter ``world`` as ``name`` through the server at ``connect`` (:func:`endpoints.client_links`).
 
-        Not ``live``: without a liveliness token, invisible to others. ``certificates``: folder with ``ca.pem`` and this
-        actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then ``tls/`` or ``quic/``.
+        If not ``live``, it has no liveliness token and is invisible to others. ``certificates``: folder with ``ca.pem``
+        and this actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then ``tls/`` or ``quic/``.
 
         Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the name is live,
         and :class:`vinesim.core.errors.UsageError` if the name or the world cannot be part of a key or the endpoint is
@@ -116,13 +118,13 @@ class ZenohBus:
         self._pose_watch: object = None
         self._probe: threading.Thread | None = None
         self._probed: zenoh.Session | None = None
-        """Session of datagrams that pass again, until poses are moved to it."""
+        """Session whose datagrams pass again, until poses are moved to it."""
         self._next_probe = time.monotonic() + DATAGRAM_RETRY_PERIOD
         self.unreliable: set[BusPublisher | BusSubscription] = set()
         """Publishers and subscriptions of the pose session."""
         self._session = self._pose_session = open_client(links.bulk, self._credentials)
         self.source = zenoh.SourceInfo(self._session.id, 0)
-        """Stated with every sample, also of the session of poses: the session that holds the name."""
+        """Id of the session that holds the name. It is sent with every sample, including those of the pose session."""
         self._admission = ServerAdmission(
             self._session,
             self._prefix,

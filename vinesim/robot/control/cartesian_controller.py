@@ -80,7 +80,7 @@ class CartesianController:
         self._pointing = InverseKinematics(weights, (3, 2))
         """Inverse kinematics of a tip on a line, and of the tool's x axis."""
         self._orienting = InverseKinematics(weights, (3, 3))
-        """The same, and of the tool's whole orientation."""
+        """Inverse kinematics of a tip on a line, and of the tool's whole orientation."""
         self._home = description.home[self._joints]
         moving = description.moving_joints
         self._shoulder = moving.frames[moving.names.index(arm.joints[0])][1]
@@ -228,7 +228,8 @@ class InverseKinematics:
         """[row, joint] and [row]: rows of all tasks, in order; velocities along them that are asked for."""
         self.posture_rates = np.zeros(joints)
         self.rates = np.zeros(joints)
-        """[joint] rates towards a posture for what the tasks leave free, and the result; rad/s or m/s."""
+        """[joint] Input: rates towards a posture, used in the null space of the tasks. Output: the result [rad/s or
+        m/s]."""
         self.min_rates = np.zeros(joints)
         self.max_rates = np.zeros(joints)
         """[joint] bounds of the rates [rad/s or m/s]."""

@@ -1,7 +1,7 @@
 """Runs the controllers of one robot: each joint obeys the controller that was commanded last, and no other.
 
-A command to one controller ends the goals of all others that move any of its joints. Goals have ids, given by whoever
-sends them; how they ended is told by :meth:`ControllerManager.take_results`.
+A command to one controller ends the goals of all others that move any of its joints. The sender of a goal gives it an
+id. :meth:`ControllerManager.take_results` returns the results of goals that have ended.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class GoalResult:
     text: str = ""
     """Why it failed; empty if it did not."""
     gripper: GripperState | None = None
-    """Of a gripper."""
+    """State of the gripper, for a goal of a gripper; otherwise None."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -42,7 +42,7 @@ class _ActiveGoal:
 
     id: bytes
     trajectory: GoalHandle | None
-    """None for grippers."""
+    """Handle of the trajectory; None for grippers."""
 
 
 class ControllerManager:
@@ -54,16 +54,17 @@ class ControllerManager:
         joints = robot.description.joints
         self.desired = robot.setpoint.copy()
         self.desired_velocity = np.zeros(len(joints))
-        """[joint] what the controllers ask for in this step [rad or m, rad/s or m/s]."""
+        """[joint] Desired velocity of the controllers in this step [rad/s or m/s]; :attr:`desired` is the position [rad
+        or m]."""
         self._indices = {spec.name: robot.joint_indices(spec.joints) for spec in self.specs.values()}
         self._owner: list[str | None] = [None] * len(joints)
-        """[joint] the controller that moves it."""
+        """[joint] Name of the controller that moves the joint, or None."""
         self._follows = np.zeros(len(joints), bool)
-        """[joint] whether that is a trajectory controller."""
+        """[joint] Whether a trajectory controller moves the joint."""
         self._trajectories: dict[str, TrajectoryController] = {}
         self._grippers: dict[str, GripperController] = {}
         self._goals: dict[str, _ActiveGoal] = {}
-        """By controller."""
+        """Active goals by name of the controller."""
         self._results: list[GoalResult] = []
         self._gains: dict[str, dict[str, np.ndarray]] = {}
 
@@ -93,7 +94,7 @@ class ControllerManager:
             self._goals[name] = _ActiveGoal(goal, handle)
 
     def stop_trajectory(self, name: str) -> None:
-        """End what a trajectory controller does and hold its joints."""
+        """End the motion of a trajectory controller and hold its joints."""
         self._spec(name, ControllerKind.JOINT_TRAJECTORY)
         if name in self._trajectories:
             self._trajectories[name].cancel()
@@ -101,7 +102,7 @@ class ControllerManager:
             self._end(name, Outcome.CANCELED, "an empty trajectory stopped it")
 
     def start_gripper(self, name: str, position: float, effort: float | None, time: float, goal: bytes) -> None:
-        """Give a gripper a goal; what ``position`` and ``effort`` mean is said by its :class:`GripperController`."""
+        """Give a gripper a goal. Its :class:`GripperController` defines the meaning of ``position`` and ``effort``."""
         spec = self._spec(name, ControllerKind.GRIPPER)
         try:
             if name not in self._grippers:

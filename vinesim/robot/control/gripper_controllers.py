@@ -1,4 +1,4 @@
-"""What grippers of each kind do with a goal of ``control_msgs/GripperCommand``, and how it ends.
+"""Controllers for each kind of gripper: they execute goals of ``control_msgs/GripperCommand`` and report their results.
 
 The kinds are declared in :mod:`vinesim.robot.description.grippers`; :data:`CONTROLLERS` has one controller for each.
 """
@@ -17,24 +17,26 @@ GOAL_TOLERANCE = 2e-3
 STALL_SPEED = 1e-3
 """[m/s or rad/s] A gripper that moves slower is stalled; the default of ``gripper_action_controller``."""
 STALL_DURATION = 0.3
-"""[s] for which it must be so slow. GUESSED: a tenth of the time that it takes to close."""
+"""[s] Time for which a gripper must be slower than :data:`STALL_SPEED` to be stalled. GUESSED: a tenth of the time that
+it takes to close."""
 
 
 class GripperController(abc.ABC):
     """The grippers of one kind at one group of a robot; they have one goal at a time."""
 
     def __init__(self, robot: Robot, group: str) -> None:
-        """Raises :class:`CommandError` if the robot has none of the kind there."""
+        """Raises :class:`CommandError` if the robot has no gripper of this kind at ``group``."""
         self.robot = robot
         self.group = group
 
     @abc.abstractmethod
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """Take a goal at ``time`` [s]; ``effort`` None: all there is. :class:`CommandError` if it is unfit."""
+        """Take a goal at ``time`` [s]. ``effort`` None: the gripper's own limit. Raises :class:`CommandError` if the
+        goal is unfit."""
 
     @abc.abstractmethod
     def state(self, time: float) -> GripperState:
-        """How far the goal is at ``time`` [s]; called in every step of it."""
+        """State of the present goal at ``time`` [s]. Called in every step while there is a goal."""
 
     @abc.abstractmethod
     def cancel(self, time: float) -> None:
@@ -42,7 +44,7 @@ class GripperController(abc.ABC):
 
 
 class FingersController(GripperController):
-    """Moves fingers to an opening; to hold what they hold, they keep pressing when the goal has ended.
+    """Moves fingers to an opening. They keep pressing after the goal has ended, so that they hold their object.
 
     Goal: the opening [m or rad], and the largest effort of each finger [N or N m]; see :meth:`Robot.command_gripper`.
     Result: the opening, and the largest effort of a finger; stalled if something is between the fingers.
@@ -111,4 +113,4 @@ class CutterController(GripperController):
 
 
 CONTROLLERS: dict[str, type[GripperController]] = {"fingers": FingersController, "cutter": CutterController}
-"""By kind of gripper."""
+"""Classes of controllers: kind of gripper -> class."""

@@ -13,7 +13,8 @@ POSITION_TOLERANCE = 0.01
 HEADING_TOLERANCE = 0.01
 """[rad] A heading with a smaller error is reached. GUESSED"""
 DECELERATION = 0.5
-"""Of the base before a waypoint [m/s2] and before a heading [rad/s2]; half of what vinebot's tracks can do."""
+"""Deceleration of the base before a waypoint [m/s2] and before a heading [rad/s2]: half of the largest one of vinebot's
+tracks."""
 LOOKAHEAD_DISTANCE = 0.4
 """[m] A base beside its line steers for the point this far ahead on the line. GUESSED"""
 STUCK_TIMEOUT = 4.0

@@ -26,9 +26,9 @@ INTERFACE_OF_KIND = {
 }
 """The command interface of ros2_control that each kind of controller needs of its joints."""
 FINGERS_CONTROLLER = "gripper"
-"""What a TOML file may call the kind of a controller of fingers, besides ``fingers``."""
+"""Second name for the kind of a controller of fingers in a TOML file, besides ``fingers``."""
 MIN_ARM_JOINTS = 4
-"""A group with a tool, or with so many joints, is an arm: it gets an impedance controller."""
+"""A group with a tool, or with at least this number of joints, is an arm. It gets an impedance controller."""
 
 
 def command_interfaces(urdf: str) -> dict[str, set[str]]:
@@ -43,9 +43,10 @@ def command_interfaces(urdf: str) -> dict[str, set[str]]:
 def make_controllers(
     sidecar: Sidecar, driven: Sequence[str], interfaces: Mapping[str, set[str]], file: pathlib.Path
 ) -> tuple[ControllerSpec, ...]:
-    """The controllers of a robot with these ``driven`` joints, sorted by name; ``interfaces``: by joint, empty: all.
+    """The controllers of a robot with these ``driven`` joints, sorted by name.
 
-    :class:`DescriptionError` if one of the ``sidecar`` names a joint, group or gripper that is not there.
+    ``interfaces``: command interfaces of each joint; if empty, all joints have all interfaces. Raises
+    :class:`DescriptionError` if a controller of the ``sidecar`` names a joint, group or gripper that does not exist.
     """
     if sidecar.controllers is not None:
         specs = [_checked(name, one, sidecar, driven, file) for name, one in sidecar.controllers.items()]
@@ -100,7 +101,7 @@ def _checked(
 
 
 def _of_gripper(name: str, kind: str, group: str, sidecar: Sidecar) -> ControllerSpec:
-    """The controller ``name`` of the grippers of a ``kind`` that a ``group`` has."""
+    """The controller ``name`` for the grippers of a ``kind`` at a ``group``."""
     joints = sidecar.groups[group].joints if GRIPPER_KINDS[kind].moves_joints else ()
     return ControllerSpec(name, ControllerKind.GRIPPER, joints, group, kind)
 

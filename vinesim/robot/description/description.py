@@ -29,28 +29,28 @@ class RobotDescription:
     drives: tuple[Drive, ...]
     """In the URDF's order; mimicking joints have none."""
     home: np.ndarray
-    """[joint] rad or m"""
+    """[joint] Home positions [rad or m]."""
     groups: dict[str, JointGroup]
     moving_joints: MovingJoints
     fixed_frames: tuple[tuple[str, str], ...]
     """(parent frame, child frame) of every fixed joint: ``/tf_static``."""
     fixed_poses: np.ndarray
-    """[fixed, 7] child in parent."""
+    """[fixed, 7] Pose of the child in the parent, for each of :attr:`fixed_frames`."""
     link_anchors: dict[str, tuple[str, np.ndarray]]
-    """Of every link: the moving link (or the root) it is fixed to, and its pose [7] there."""
+    """For every link, by name: the moving link (or the root) to which it is fixed, and its pose [7] there."""
     sensors: tuple[RenderedMount, ...]
-    """All that is rendered, in the order of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    """All rendered sensors, in the order of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
     sensor_pacing: SensorPacing
     grippers: tuple[AnyGripper, ...]
     controllers: tuple[ControllerSpec, ...]
-    """What ROS may command, by which interface; sorted by name."""
+    """Controllers by which ROS may command the robot, sorted by name."""
     base_limits: BaseLimits
     mass: float
-    """[kg]"""
+    """Total mass [kg]."""
     notes: tuple[str, ...]
-    """What was changed or derived at loading, one line each."""
+    """Changes and derived values of the loading, one line each."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
     """Corners [face, 3, 3] m of meshes that came over the network, by the file name that ``urdf`` gives them."""
     is_remote: bool = False
@@ -63,7 +63,7 @@ class RobotDescription:
 
     @property
     def cutters(self) -> tuple[Cutter, ...]:
-        """Those of the grippers that cut."""
+        """The grippers that cut."""
         return tuple(gripper for gripper in self.grippers if isinstance(gripper, Cutter))
 
     def sensors_of(self, kind: str) -> tuple[RenderedMount, ...]:
@@ -76,8 +76,11 @@ class RobotDescription:
         return np.array([order[name] for name in self.groups[group].joints], int)
 
     def finger_travel(self, fingers: np.ndarray) -> tuple[float, float]:
-        """By how much a gripper opens per position of its driven ``fingers`` [k] indices, all at one, and its opening
-        at position 0 [m or rad]. Sliding fingers that mimic a driven one count, turning ones are its linkage."""
+        """Opening of a gripper as a linear function of the common position of its driven fingers.
+
+        Returns the slope, and the opening at position 0 [m or rad]. ``fingers`` [k]: indices of the driven fingers.
+        Sliding fingers that mimic a driven one count, too. Turning ones do not: they are its linkage.
+        """
         moving = self.moving_joints
         is_driven = np.isin(moving.names, self.joints)
         counts = np.isin(moving.drive_index, fingers) & (is_driven | (moving.half_angle[:, 0] == 0.0))

@@ -15,11 +15,11 @@ from vinesim.robot.description.urdf import Joint, Robot, joint_limits
 from vinesim.scene.values import Drive
 
 ACCELERATION_TIME = 0.02
-"""[s] In which full effort brings a drive to full speed if its armature is not given. GUESSED"""
+"""[s] Time in which full effort brings a drive to full speed, if its armature is not given. GUESSED"""
 FULL_EFFORT_ANGLE = 0.05
 """[rad] Position error at which a servo gives full effort if its gains are not given. GUESSED"""
 FULL_EFFORT_DISTANCE = 0.005
-"""[m] The same for a prismatic joint. GUESSED"""
+"""[m] Position error at which a prismatic joint's servo gives full effort if its gains are not given. GUESSED"""
 STANDARD_GRAVITY = 9.80665
 """[m/s2]"""
 CENTRED_SHARE = 0.1
@@ -27,7 +27,7 @@ CENTRED_SHARE = 0.1
 
 
 def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.ndarray:
-    """Home [joint] rad or m of the driven joints: their groups', else the middle of the range."""
+    """Home positions [joint] rad or m of the driven joints: those of their groups, else the middle of the range."""
     home = np.array([_default_home(joint) for joint in driven])
     order = [joint.name for joint in driven]
     for group in groups.values():
@@ -37,7 +37,8 @@ def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.nda
 
 
 def _default_home(joint: Joint) -> float:
-    """Middle of the range [rad or m], so elbows are bent the way they bend; zero if near to it or continuous."""
+    """Middle of the range [rad or m], so that elbows are bent in their direction. It is 0 if the middle is near 0 or
+    the joint is continuous."""
     if joint.type == "continuous":
         return 0.0
     limits = joint_limits(joint)
@@ -111,8 +112,8 @@ def _make_drive(
 
 
 def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[str, float], dict[str, float]]:
-    """What each moving joint carries with the robot at home: mass [kg], or inertia about its origin [kg m2]; and the
-    effort [N or N m] that the weight of it takes, without its sign.
+    """The load of each moving joint with the robot at home. Returns the mass [kg] or the inertia about the joint's
+    origin [kg m2], and the magnitude of the effort that the weight takes [N or N m].
 
     The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.
     """

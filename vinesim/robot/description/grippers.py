@@ -17,10 +17,10 @@ from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, descripti
 
 
 class Gripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
-    """What holds or cuts, at one place of a robot; an entry of ``grippers`` with its ``kind``."""
+    """A gripper, which holds or cuts at one place of a robot: an entry of ``grippers`` with its ``kind``."""
 
     group: str
-    """The joint group that it is or belongs to; commands name it by that."""
+    """The joint group that the gripper is or belongs to. Commands name the gripper by its group."""
 
     moves_joints: ClassVar[bool] = False
     """Whether its controller moves the joints of the group, so that no trajectory controller gets them."""
@@ -42,7 +42,7 @@ class Gripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field
 
 
 class Fingers(Gripper, frozen=True, tag="fingers"):
-    """The joints of a group as fingers that close on what is between them, and hold it by friction."""
+    """The joints of a group as fingers, which close on an object between them and hold it by friction."""
 
     moves_joints: ClassVar[bool] = True
 
@@ -53,15 +53,15 @@ class Cutter(Gripper, frozen=True, tag="cutter"):
     frame: str
     """The link that carries it."""
     half: tuple[float, float, float]
-    """Half edges of the space [m]; the second is how far to either side wood is caught."""
+    """Half edges of the space [m]. The second one is the distance to either side within which wood is caught."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Its centre in ``frame`` [m]."""
     force: float | None = None
-    """Largest force with which it cuts [N]; without it, it cuts whatever is in its mouth."""
+    """Largest force with which it cuts [N]. None: it cuts whatever is in its mouth."""
 
     @property
     def controller(self) -> str:
-        """See :class:`Gripper`: not the name that fingers of the same group have."""
+        """Name of the cutter's controller. It differs from the name for fingers of the same group."""
         stem = self.group.replace("gripper", "cutter") if "gripper" in self.group else f"{self.group}_cutter"
         return f"{stem}_controller"
 
@@ -81,14 +81,15 @@ class Cutter(Gripper, frozen=True, tag="cutter"):
 
 
 AnyGripper = Fingers | Cutter
-"""All kinds."""
+"""Union of all kinds of grippers."""
 
 GRIPPER_KINDS: dict[str, type[Gripper]] = {str(kind.__struct_config__.tag): kind for kind in get_args(AnyGripper)}
-"""By name."""
+"""Classes of grippers: name of the kind -> class."""
 
 
 def guess_fingers(groups: Iterable[str], cutters: Collection[Cutter]) -> tuple[Fingers, ...]:
-    """Fingers of a robot whose file does not list its grippers: groups called gripper or hand, or with a cutter."""
+    """Fingers of a robot whose file does not list its grippers: groups with gripper or hand in their name, or with a
+    cutter."""
     cut = {cutter.group for cutter in cutters}
     return tuple(Fingers(name) for name in groups if "gripper" in name or "hand" in name or name in cut)
 
@@ -96,9 +97,9 @@ def guess_fingers(groups: Iterable[str], cutters: Collection[Cutter]) -> tuple[F
 def warn_of_unlisted_fingers(
     groups: Mapping[str, Collection[str]], fingers: Collection[Fingers], joints: Collection[Joint], assumed: list[str]
 ) -> None:
-    """Add to ``assumed`` the groups that look like fingers, and are none by their names.
+    """Add to ``assumed`` the groups whose joints look like fingers, but whose names do not.
 
-    Fingers are joints of a group that start at the same link, those that mimic one included. ``groups``: names of the
+    Fingers are joints of a group that start at the same link, including joints that mimic one. ``groups``: names of the
     driven joints of each group.
     """
     named = {gripper.group for gripper in fingers}

@@ -71,4 +71,4 @@ SENSOR_GUESSES: dict[str, Callable[[etree._Element, list[str]], tuple[RenderedMo
     CameraMount.kind: guess_cameras,
     LidarMount.kind: guess_lidars,
 }
-"""By kind of sensor; of other kinds there is none where the TOML file names none."""
+"""Functions that guess the sensors of a robot: kind of sensor -> function. Other kinds of sensors are not guessed."""

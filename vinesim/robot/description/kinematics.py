@@ -16,15 +16,15 @@ class MovingJoints:
 
     names: tuple[str, ...]
     frames: tuple[tuple[str, str], ...]
-    """(parent frame, child frame) of each."""
+    """[joint] (parent frame, child frame)."""
     drive_index: np.ndarray
     """[joint] index of the drive that moves it, its own or the one that it mimics."""
     multiplier: np.ndarray
-    """[joint] 1"""
+    """[joint] Joint position per drive position [1]."""
     offset: np.ndarray
-    """[joint] rad or m"""
+    """[joint] Joint position at drive position 0 [rad or m]."""
     origin: np.ndarray
-    """[joint, 7] child in parent at position 0."""
+    """[joint, 7] Pose of the child in its parent at joint position 0."""
     translation: np.ndarray
     """[joint, 3] translation of the child in its parent per metre; zero for a joint that turns."""
     rotation: np.ndarray
@@ -33,7 +33,7 @@ class MovingJoints:
     """[joint, 1] half of the angle per position: 1/2, or 0 for a joint that slides."""
 
     def poses(self, position: np.ndarray) -> np.ndarray:
-        """Child in parent [joint, 7] for drive positions [drive] rad or m."""
+        """Poses of the child in its parent [joint, 7] for drive positions [drive] rad or m."""
         q = self.multiplier * position[self.drive_index] + self.offset
         half = self.half_angle * q[:, None]
         poses = np.empty((len(q), 7))
@@ -63,7 +63,7 @@ def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:
 
 
 def link_anchors(base: str, order: list[Joint]) -> dict[str, tuple[str, np.ndarray]]:
-    """Of every link the moving link (or the root ``base``) it is fixed to, and its pose [7] there.
+    """For every link, by name: the moving link (or the root ``base``) to which it is fixed, and its pose [7] there.
 
     ``order``: all joints from the root outwards.
     """

@@ -58,7 +58,8 @@ from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorPacing
 log = logging.getLogger(__name__)
 
 BOLTED_EFFORT = (1e6, 1e6)
-"""[N], [N m] With which the base of a robot that is bolted down is held: a robot's pushes move it by micrometres."""
+"""[N], [N m] Largest force and moment that hold the base of a robot that is bolted down. A robot's pushes move it by
+micrometres."""
 
 
 def load_description(
@@ -70,10 +71,10 @@ def load_description(
 ) -> RobotDescription:
     """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
 
-    ``is_remote``: its text came over the network, so no file that it names is opened; its meshes are those of
-    ``received``, corners [face, 3, 3] by digest, and boxes where there are none. ``sidecar``: instead of the TOML file
-    beside the URDF.
-    Raises :class:`DescriptionError` in one line if it cannot be simulated.
+    ``is_remote``: its text came over the network, so no file that it names is opened. Its meshes are taken from
+    ``received`` (digest -> corners [face, 3, 3] m); meshes that are not there become boxes. ``sidecar`` replaces the
+    TOML file beside the URDF.
+    Raises :class:`DescriptionError`, with one line of text, if the robot cannot be simulated.
     """
     file = _locate(str(name))
     root = read_xml(file)
@@ -132,7 +133,8 @@ def _locate(name: str) -> pathlib.Path:
 
 
 def _sensors(sidecar: Sidecar, root: etree._Element, notes: list[str]) -> tuple[RenderedMount, ...]:
-    """The sensors of the TOML file; of a kind that it does not name, those guessed from the URDF (``notes``)."""
+    """The sensors of the TOML file. For kinds that it does not name, sensors are guessed from the URDF and added to
+    ``notes``."""
     found: list[RenderedMount] = []
     for kind in SENSOR_KINDS:
         given = sidecar.mounts(kind)
@@ -155,7 +157,7 @@ def _assemble(
     *,
     is_remote: bool,
 ) -> RobotDescription:
-    """The description of a checked ``robot``; ``base``: its root link, ``order``: its joints outwards."""
+    """The description of a checked ``robot``. ``base``: its root link. ``order``: its joints from the root outwards."""
     driven = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None]
     names = [joint.name for joint in driven]
     anchors = link_anchors(base, order)

@@ -23,25 +23,25 @@ from vinesim.scene import triangles
 MESH_FORMATS = (".stl", ".obj", ".msh")
 """File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""
 MAX_STL_FACES = 200_000
-"""Of an STL file that MuJoCo reads."""
+"""Largest number of faces of an STL file that MuJoCo reads."""
 MIN_BOX_EDGE = 1e-4
 """[m] Smallest edge of a box in place of a mesh, which may be flat."""
 
 
 MAX_MESHES = 256
-"""Most meshes of one robot that are asked for; a robot with more is seen as boxes for the rest."""
+"""Largest number of meshes of one robot that are requested from its client. Further meshes are shown as boxes."""
 
 MAX_ROBOT_BYTES = 64 << 20
-"""Size of all meshes of one robot that are asked for [B]."""
+"""Largest total size of the meshes of one robot that are requested from its client [B]."""
 
 
 class MeshOffer(NamedTuple):
     """A mesh that a URDF names, by its digest."""
 
     file: str
-    """As the URDF names it: on the machine that wrote the text, and never opened on another."""
+    """File name in the URDF. It is a path on the machine that wrote the URDF, and is never opened on another."""
     size: int
-    """Of its triangles, encoded [B]."""
+    """Size of its encoded triangles [B]."""
 
 
 def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
@@ -106,9 +106,9 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
 
 
 def list_meshes(urdf: str) -> dict[str, MeshOffer]:
-    """The meshes that a URDF offers, by digest, in its order; without those beyond what one robot may have.
+    """The meshes that a URDF offers, by digest, in its order. Meshes beyond the limits of one robot are left out.
 
-    ``urdf`` may come over the network: what is no URDF offers none.
+    ``urdf`` may come over the network. A text that is no URDF offers no meshes.
     """
     found: dict[str, MeshOffer] = {}
     try:
@@ -130,7 +130,7 @@ def list_meshes(urdf: str) -> dict[str, MeshOffer]:
 
 
 def read_triangles(file: str) -> np.ndarray:
-    """Corners [face, 3, 3] m of a mesh file, binary32; the errors of its format if it is unreadable."""
+    """Corners [face, 3, 3] m of a mesh file, binary32. Raises the errors of its format if the file is unreadable."""
     if file.lower().endswith(".stl") and _is_binary_stl(file):
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         with open(file, "rb") as opened:
@@ -175,7 +175,7 @@ def replace_unopened_meshes(
 
 
 def _is_binary_stl(filename: str) -> bool:
-    """Whether physics can read an STL file: binary, as its size tells, and of no more faces than are allowed."""
+    """Whether physics can read an STL file: it is binary, by its size, and has at most :data:`MAX_STL_FACES` faces."""
     with open(filename, "rb") as file:
         header = file.read(84)
     faces = int.from_bytes(header[80:84], "little")
@@ -183,17 +183,17 @@ def _is_binary_stl(filename: str) -> bool:
 
 
 class _Facts(NamedTuple):
-    """What others must know of a mesh file."""
+    """Properties of a mesh file that other clients need."""
 
     bounds: np.ndarray
-    """Lower and upper corner [2, 3] m before it is scaled."""
+    """Lower and upper corner of the mesh [2, 3] m before scaling."""
     digest: str
-    """Of its triangles; empty if it has too many to be sent, or none."""
+    """Digest of its triangles. Empty if it has none, or too many to be sent."""
     faces: int
 
 
 def _facts(mesh: etree._Element, file: pathlib.Path) -> _Facts:
-    """What others must know of a mesh; :class:`DescriptionError` if its file is unreadable."""
+    """Properties of a mesh that other clients need. Raises :class:`DescriptionError` if its file is unreadable."""
     name = mesh.get("filename")
     try:
         return _file_facts(name, pathlib.Path(name).stat().st_mtime_ns)
@@ -203,7 +203,7 @@ def _facts(mesh: etree._Element, file: pathlib.Path) -> _Facts:
 
 @functools.lru_cache(1024)  # a mesh is often there as visual and collision shape, and for several robots
 def _file_facts(name: str, modified: int) -> _Facts:
-    """The same of a mesh file that was ``modified`` then [ns]."""
+    """Properties of a mesh file that was last modified at ``modified`` [ns]."""
     corners = read_triangles(name)
     points = corners.reshape(-1, 3)
     bounds = np.array([points.min(axis=0), points.max(axis=0)], float)

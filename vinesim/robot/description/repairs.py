@@ -18,11 +18,11 @@ from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, pa
 MOUNT = "world_mount"
 """Name that the root link ``world`` gets: a robot with a root of this name is bolted down."""
 RANGE = ("lower", "upper")
-"""Attributes of a ``<limit>``; both at 0 or not given say nothing of a joint that turns."""
+"""Attributes of a ``<limit>``. If a joint turns and both are 0 or missing, its range is taken to be unknown."""
 DEFAULT_EFFORT = {"revolute": 10.0, "continuous": 10.0, "prismatic": 100.0}
-"""[N m or N] Effort of a joint that gives none or 0, beside the weight that it carries. GUESSED"""
+"""[N m or N] Effort of a joint whose effort is 0 or missing, in addition to the weight that it carries. GUESSED"""
 DEFAULT_VELOCITY = {"revolute": 1.0, "continuous": 1.0, "prismatic": 0.1}
-"""[rad/s or m/s] Velocity of a joint that gives none or 0. GUESSED"""
+"""[rad/s or m/s] Velocity limit of a joint whose limit is 0 or missing. GUESSED"""
 DEFAULT_MASS = 1e-3
 """[kg] Mass of a moving link without any. GUESSED"""
 GYRATION_RADIUS = 0.05
@@ -30,7 +30,7 @@ GYRATION_RADIUS = 0.05
 NEGLIGIBLE_MOMENT = 1e-6
 """[kg m2] A principal moment below 0 by no more than this is a rounding error. GUESSED"""
 LEAST_MOMENT = 1e-12
-"""[kg m2] Principal moments up to this are none."""
+"""[kg m2] Principal moments up to this count as 0."""
 LEAST_MOMENT_SHARE = 1e-3
 """Share of the largest principal moment to which rounding errors are raised."""
 

@@ -19,22 +19,22 @@ from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorMode, Sensor
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """How the base may be driven."""
+    """Limits for the motion of the base."""
 
     linear: float = 0.5
     """Largest speed [m/s]."""
     angular: float = 0.8
     """Largest rate of turn [rad/s]."""
     linear_acceleration: float = 1.0
-    """[m/s2]"""
+    """Largest linear acceleration [m/s2]."""
     angular_acceleration: float = 2.0
-    """[rad/s2]"""
+    """Largest angular acceleration [rad/s2]."""
     effort: tuple[float, float] = (800.0, 400.0)
     """Largest force [N] and moment [N m]."""
     timeout: float = 0.5
-    """Time without a command after which it stops [s]."""
+    """Time without a command after which the base stops [s]."""
     slip: tuple[float, float] = (0.0, 0.0)
-    """Share of the tracks' travel that is lost on the ground, ahead and in turns; odometry measures the travel."""
+    """Shares of the tracks' travel that are lost by slip, ahead and in turns. Odometry measures the whole travel."""
 
 
 class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -48,16 +48,16 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     armature: tuple[float, ...] | None = msgspec.field(name="rotor", default=None)
     """Inertias of motor and gear seen from the joint [kg m2 or kg]."""
     series_stiffness: tuple[float, ...] | None = msgspec.field(name="elastic", default=None)
-    """Stiffnesses of the springs between gear and joint [N m/rad or N/m]; without them the position gains count."""
+    """Stiffnesses of the springs between gear and joint [N m/rad or N/m]. None: the position gains are used."""
     series_damping: tuple[float, ...] | None = msgspec.field(name="elastic_damping", default=None)
-    """Their damping [N m s/rad or N s/m]."""
+    """Dampings of these springs [N m s/rad or N s/m]."""
     home: tuple[float, ...] | None = None
-    """[rad or m]"""
+    """Home positions [rad or m]."""
     tool: str = ""
     """Frame whose x axis points out of the hand, if the group is an arm."""
 
     def arrays(self) -> dict[str, tuple[float, ...] | None]:
-        """Everything that has one value a joint, by its key in the file."""
+        """The attributes that have one value for each joint, by their keys in the file."""
         return {
             "stiffness": self.stiffness,
             "damping": self.damping,
@@ -73,7 +73,7 @@ class SensorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     mode: SensorMode = SensorMode.LIVE
     least_rate: float = SensorPacing().least_rate
-    """[Hz]"""
+    """Lowest rate of the sensors, see :class:`vinesim.scene.values.SensorPacing` [Hz]."""
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,7 +82,7 @@ class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kind: str
     """A :class:`~vinesim.scene.values.ControllerKind`, or a kind of gripper."""
     joints: tuple[str, ...] = ()
-    """Those of ``group`` unless given."""
+    """Its joints; the joints of ``group`` unless given."""
     group: str = ""
     """A joint group; a gripper needs one."""
 
@@ -100,20 +100,20 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     cutters: tuple[Cutter, ...] = ()
     """Further ``grippers``, all cutters, so that ``kind`` may be left out."""
     friction: dict[str, float] = {}
-    """Coulomb coefficient [1] by link, of all that touches the link; instead of the URDF's ``mu1``."""
+    """Coulomb friction coefficient [1] of contacts with a link, by link. It replaces the URDF's ``mu1``."""
     controllers: dict[str, Controller] | None = None
-    """By name; None: those that :mod:`vinesim.robot.description.controllers` derives from the groups."""
+    """Controllers by name. None: :mod:`vinesim.robot.description.controllers` derives them from the groups."""
     srdf: str = ""
     """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
     file of the URDF's name that ends with ``.srdf``, if there is one."""
 
     @property
     def all_grippers(self) -> tuple[AnyGripper, ...]:
-        """Those of ``grippers`` and ``cutters``."""
+        """The entries of ``grippers`` and ``cutters``."""
         return (*(self.grippers or ()), *self.cutters)
 
     def mounts(self, kind: str) -> tuple[RenderedMount, ...] | None:
-        """The sensors of a kind; None where the file does not say, and they are to be guessed from the URDF."""
+        """The sensors of a kind. None: the file does not have this kind, and the sensors are guessed from the URDF."""
         return getattr(self, SENSOR_KINDS[kind].table, None)
 
 
@@ -127,11 +127,12 @@ SidecarFile = cast(
         forbid_unknown_fields=True,
     ),
 )
-"""The whole file."""
+"""Type of the whole file: :class:`Sidecar` with one table for each kind of sensor."""
 
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:
-    """The file's content, defaults if there is no file; :class:`DescriptionError` if it has unknown or unfit keys."""
+    """Returns the file's content, or defaults if there is no file. Raises :class:`DescriptionError` if it has unknown
+    or unfit keys."""
     if not file.is_file():
         return Sidecar()
     try:
@@ -144,11 +145,12 @@ MAX_REMOTE_SIDECAR = 1 << 16
 """Longest sidecar that is accepted from another client [B]."""
 
 MAX_REMOTE_NUMBER = 1e7
-"""Largest gain, limit or position in it: ten times those of a robot that is bolted down."""
+"""Largest gain, limit or position in a sidecar from another client: ten times the values of a robot that is bolted
+down."""
 
 
 def encode_sidecar(base: BaseLimits, groups: dict[str, JointGroup]) -> str:
-    """What copies of a robot need on other clients, as JSON: limits of the base, joint groups with their gains.
+    """Data for the copies of a robot on other clients, as JSON: limits of the base, joint groups with their gains.
 
     Sensors and grippers act where the robot is simulated, and are not part of it.
     """

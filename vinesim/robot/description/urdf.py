@@ -19,7 +19,7 @@ MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 """Types of URDF joints that move about or along one axis."""
 
 SOLIDS = ("box", "sphere", "cylinder", "capsule", "mesh")
-"""Elements of a geometry."""
+"""Elements that a ``<geometry>`` may have."""
 NUMBER_COUNTS = {
     ("origin", "xyz"): 3,
     ("origin", "rpy"): 3,
@@ -39,9 +39,10 @@ NUMBER_COUNTS = {
 """Count of numbers in each attribute, by element and attribute."""
 
 MAX_NUMBER = 1e6
-"""Largest number of a URDF [m, kg, kg m2, rad]: more makes the numbers of all that touches the robot inexact."""
+"""Largest number in a URDF [m, kg, kg m2, rad]. Larger ones make the state of everything that touches the robot
+inexact."""
 MAX_LIMIT = 1e17
-"""Largest limit: files give 1e16 where there is none."""
+"""Largest value of a joint limit. Some files give 1e16 for a joint without a limit."""
 _SHAPE_ATTRIBUTES = {
     "box": ("size",),
     "sphere": ("radius",),
@@ -113,7 +114,7 @@ def set_friction(root: etree._Element, friction: Mapping[str, float], file: path
 def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
     """Copy the ``disable_collisions`` of an SRDF ``file`` between links of the URDF into its text; adds to ``notes``.
 
-    So they reach whatever reads that text. Raises :class:`DescriptionError` if the file is missing or no SRDF.
+    So all readers of that text know them. Raises :class:`DescriptionError` if the file is missing or no SRDF.
     """
     if not file.is_file():
         raise description_error(file, "this SRDF is missing", "mend its path in the robot's TOML file")
@@ -176,11 +177,11 @@ class Inertial:
     """Mass of a link and how it is distributed."""
 
     origin: np.ndarray | None
-    """[4, 4] m, centre of mass and principal axes in the link."""
+    """[4, 4] Frame of the inertia in the link, with the centre of mass as its origin [m]."""
     mass: float | None
-    """[kg]"""
+    """Mass [kg]."""
     inertia: np.ndarray | None
-    """[3, 3] kg m2"""
+    """[3, 3] Inertia about the centre of mass, in the axes of ``origin`` [kg m2]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -203,7 +204,7 @@ class Limit:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Mimic:
-    """Position = multiplier x that of another joint + offset."""
+    """Rule of a mimicking joint: its position is multiplier x position of another joint + offset."""
 
     joint: str
     multiplier: float
@@ -212,16 +213,16 @@ class Mimic:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Joint:
-    """What joins two links."""
+    """A joint between two links."""
 
     name: str
     type: str | None
     parent: str
     child: str
     origin: np.ndarray | None
-    """[4, 4] m, child in parent at position 0."""
+    """[4, 4] Transform of the child in the parent at joint position 0 [m]."""
     axis: np.ndarray
-    """[3], in the child."""
+    """[3] Axis of the joint in the child's frame."""
     limit: Limit | None
     mimic: Mimic | None
 
@@ -354,7 +355,7 @@ class JointLimits:
 
 
 def joint_limits(joint: Joint) -> JointLimits:
-    """Limits of a driven joint; ValueError if one that it needs is missing."""
+    """Limits of a driven joint. Raises ValueError if a limit that the joint needs is missing."""
     limit = joint.limit
     if limit is None or limit.effort is None or limit.velocity is None:
         raise ValueError(f"joint {joint.name!r} has no limits of effort and velocity")

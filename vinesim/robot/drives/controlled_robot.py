@@ -1,4 +1,4 @@
-"""A robot that this client controls: commands in, limited set-points out, and what it measures of itself.
+"""A robot that this client controls: it takes commands, gives limited set-points to its servos, and measures its state.
 
 robot = Robot(rigid, load_description("vinebot"), "robot_1")
 robot.command_position([0.3], ["torso_lift_joint"])
@@ -43,7 +43,7 @@ class Robot(RobotInstance):
         index: int = 0,
         pose: np.ndarray | None = None,
     ) -> None:
-        """As :class:`RobotInstance`; it holds its joints at home until commanded."""
+        """The arguments are those of :class:`RobotInstance`. The robot holds its joints at home until commanded."""
         super().__init__(rigid, description, name, index, pose)
         self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
         self._cutters: dict[str, list[Blade]] = {}
@@ -62,7 +62,7 @@ class Robot(RobotInstance):
 
     @property
     def setpoint(self) -> np.ndarray:
-        """[joint] positions that the servos are asked for [rad or m]."""
+        """[joint] Set-points of the servos [rad or m]."""
         return self._servos.setpoint
 
     @property
@@ -115,7 +115,7 @@ class Robot(RobotInstance):
             raise CommandError(f"{self.name} has no drive for {error.args[0]!r}; it drives: {known}") from None
 
     def command_position(self, position: Values, joints: Joints = None) -> None:
-        """Go to positions [rad or m] as fast as the joints may; beyond a limit means to the limit."""
+        """Move to positions [rad or m] as fast as the joints may. A position beyond a limit is clipped to the limit."""
         self._servos.command(*self._validated(position, joints), CommandInterface.POSITION)
 
     def command_velocity(self, velocity: Values, joints: Joints = None) -> None:
@@ -123,7 +123,8 @@ class Robot(RobotInstance):
         self._servos.command(*self._validated(velocity, joints), CommandInterface.VELOCITY)
 
     def command_effort(self, effort: Values, joints: Joints = None) -> None:
-        """Transmit efforts [N m or N] in addition to the weight, which the drives carry; zero lets a joint be moved."""
+        """Apply efforts [N m or N] in addition to the weight, which the drives carry. With effort 0 a joint can be
+        moved by hand."""
         self._servos.command(*self._validated(effort, joints), CommandInterface.EFFORT)
 
     def command_motor_position(self, motor: Values, joints: Joints = None) -> None:
@@ -149,11 +150,11 @@ class Robot(RobotInstance):
         self._servos.reset_gains(self.joint_indices(joints))
 
     def command_gripper(self, group: str, opening: float, effort: float | None = None) -> None:
-        """Open a gripper's fingers to ``opening`` [m] between them (sum over prismatic fingers, those that mimic a
-        driven one included) or [rad]; at most as far as they can.
+        """Open a gripper's fingers to ``opening``, at most as far as they can.
 
-        ``effort`` [N or N m]: the most that each finger may give, the drives' own unless given. Objects between the
-        fingers are held by friction alone.
+        ``opening`` [m]: distance between the fingers (sum over prismatic fingers, including those that mimic a driven
+        one), or [rad]. ``effort`` [N or N m]: largest effort of each finger; the drive's own limit unless given.
+        Objects between the fingers are held by friction alone.
         """
         if group not in self.description.groups:
             known = ", ".join(self.description.groups)
@@ -172,9 +173,9 @@ class Robot(RobotInstance):
         return travel * float(self.rigid.joint_measurements(self.name)[0][fingers].mean()) + offset
 
     def command_cutter(self, group: str, force: float | None = None) -> None:
-        """Close the cutter of a gripper and open it again: what is between its blades in the next step is cut.
+        """Close the cutter of a gripper and open it again. Wood between its blades in the next step is cut.
 
-        ``force`` [N]: with at most so much, the cutter's own limit unless given; what resists more stays.
+        ``force`` [N]: largest force, the cutter's own limit unless given. Wood that resists more is not cut.
         """
         if force is not None and not force > 0.0:
             raise CommandError(f"{self.name}: cutting force {force}; give more than 0, or none for all there is")
@@ -190,7 +191,7 @@ class Robot(RobotInstance):
         return tuple(self._cutters[group])
 
     def command_base(self, linear: float, angular: float, time: float) -> None:
-        """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left; lapses after the timeout."""
+        """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left. A command lapses after the timeout."""
         if not np.isfinite([linear, angular]).all():
             raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
         limits = self.description.base_limits
@@ -250,14 +251,14 @@ class Robot(RobotInstance):
     def measure(
         self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True, **more: Any
     ) -> RobotSample:
-        """As :meth:`RobotInstance.measure`: series elastic elements are left out, too."""
+        """Like :meth:`RobotInstance.measure`. Series elastic elements are left out, too."""
         if body_sensors:
             own = self._own(contacts)
             more |= {"wrenches": self._body_sensors.wrenches(time, own), "imus": self._body_sensors.imus(time)}
         return super().measure(time, contacts, **more)
 
     def update(self, time: float) -> RobotUpdate:
-        """What other clients receive: actual joint states, never commands."""
+        """State of the robot that is sent to other clients: actual joint states, never commands."""
         position, velocity = self.rigid.joint_state(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity, self.lights)

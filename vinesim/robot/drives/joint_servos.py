@@ -27,23 +27,23 @@ ACCELERATION_EFFORT_SHARE = 0.7
 RIGID_DEFLECTION = 0.05
 """[rad or m] Deflection at full effort of a drive for which neither spring nor servo stiffness is given. GUESSED"""
 MIN_DIVISOR = 1e-9
-"""Stiffness, inertia and velocity [SI units] are taken to be at least this where they divide."""
+"""Lower bound of a stiffness, inertia or velocity that is used as a divisor [SI units]."""
 
 
 class CommandInterface(enum.IntEnum):
-    """What a joint is commanded by: the command interfaces of ros2_control, and the motor of a series elastic drive.
+    """Quantity by which a joint is commanded: an interface of ros2_control, or the motor of a series elastic drive.
 
     Source: CANOPIES D6.4, sections 5.2 (position, velocity, effort) and 3.1 (series elastic elements).
     """
 
     POSITION = 0
-    """[rad or m]"""
+    """Position of the joint [rad or m]."""
     VELOCITY = 1
-    """[rad/s or m/s]"""
+    """Velocity of the joint [rad/s or m/s]."""
     EFFORT = 2
-    """[N m or N]"""
+    """Effort of the joint [N m or N]."""
     MOTOR_POSITION = 3
-    """[rad or m] of the motor behind its spring, seen from the joint."""
+    """Position of the motor behind its spring, converted to the joint side [rad or m]."""
 
 
 class CommandError(ValueError):
@@ -59,7 +59,7 @@ class JointServos:
     """The servos of one robot's driven joints; all arrays are [joint], in the order of ``drives``."""
 
     def __init__(self, rigid: RigidWorld, name: str, drives: Sequence[Drive]) -> None:
-        """``name``: the robot's in ``rigid``."""
+        """``name``: the robot's name in ``rigid``."""
         self._rigid = rigid
         self._name = name
         self._drives = tuple(drives)
@@ -81,7 +81,8 @@ class JointServos:
         """[joint] whether gains were commanded, so that the physics must not add damping of its own"""
         self._effort_limit = self.max_effort.copy()
         self._finger_groups: dict[str, np.ndarray] = {}
-        """Fingers that move together: a gripper that drifts with what it holds would be two fingers otherwise."""
+        """Indices of the fingers that move together, by group. Fingers that moved independently would drift to one side
+        with the object that they hold."""
         joints = len(drives)
         self.setpoint = np.zeros(joints)
         self.interface = np.zeros(joints, np.int64)
@@ -161,7 +162,7 @@ class JointServos:
         self._gains_changed = True
 
     def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
-        """Carry the set-points over from links to motors or back, so that nothing jumps."""
+        """Convert the set-points from links to motors or back, so that no joint jumps."""
         if (self.interface[joints] == interface).all():
             return
         before = self.interface[joints] == CommandInterface.MOTOR_POSITION
@@ -192,7 +193,7 @@ class JointServos:
         self._rigid.command(self._name, self.setpoint, rate)
 
     def _prepare_interfaces(self) -> None:
-        """Compute what changes only with the interfaces, gains and limits."""
+        """Compute the values that change only with the interfaces, gains and limits."""
         self._in_effort = self.interface == CommandInterface.EFFORT
         self._in_motor_position = self.interface == CommandInterface.MOTOR_POSITION
         self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
@@ -204,7 +205,7 @@ class JointServos:
         self._max_impulse[:] = ACCELERATION_EFFORT_SHARE * self._rigid.dt * self._effort_limit
 
     def _advance_setpoints(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Advance the set-points by a step; returns their rates [joint] rad/s or m/s."""
+        """Advance the set-points by a step. Returns their rates [joint] rad/s or m/s."""
         self._position[:] = self._middle[:] = position
         self._velocity_now[:], self._inertia[:] = velocity, self._rigid.joint_inertia(self._name)
         for fingers in self._finger_groups.values():
@@ -216,8 +217,9 @@ class JointServos:
         """Joints whose commanded effort would exceed their largest velocity [joint] bool, and the damping [joint]
         N m s/rad or N s/m about that velocity which prevents it.
 
-        90 % of the velocity are free. The velocity is extrapolated by one step, and the brake is no stronger than the
-        commanded effort: a saturated servo does not see how the velocity falls within the step.
+        Below 90 % of the largest velocity there is no damping. The velocity is extrapolated by one step. The damping
+        force never exceeds the commanded effort, because a saturated servo does not see that the velocity falls within
+        the step.
         """
         sign = np.copysign(1.0, velocity)
         brake = 10.0 * self.max_effort / self.max_velocity

@@ -1,8 +1,8 @@
 """Odometry of tracks that slip: pose and velocity of the base as its track encoders measure them.
 
-Tracks measure travel ahead and turns, never motion sideways. Of both the ground loses a constant share, which odometry
-does not know: that share is the standard deviation of what it measures. The covariance of the pose follows to first
-order, by the derivative of the measured pose in the two shares.
+Tracks measure travel ahead and turns, never motion sideways. A constant share of both is lost on the ground. Odometry
+does not know this share, so the share is the standard deviation of its measurements. The covariance of the pose follows
+to first order, from the derivative of the measured pose with respect to the two shares.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ import numpy as np
 from vinesim.core import frames
 
 LEAST_VARIANCE = 1e-6
-"""[m2, rad2, m2/s2, rad2/s2] Added to every variance, so that filters can invert covariances. GUESSED: of encoders that
-resolve a millimetre."""
+"""[m2, rad2, m2/s2, rad2/s2] Added to every variance, so that filters can invert covariances. GUESSED: the variance of
+encoders that resolve a millimetre."""
 
 _EXACT = np.tile(LEAST_VARIANCE * np.eye(3), (2, 1, 1))
 """Covariances of tracks that do not slip."""
 
 
 class TrackOdometry:
-    """Pose since the start, integrated from the travel of tracks of which the ground loses a constant share."""
+    """Pose since the start, integrated from the travel of tracks. A constant share of the travel is lost by slip."""
 
     def __init__(self, linear_slip: float, angular_slip: float, pose: np.ndarray) -> None:
         """``linear_slip``, ``angular_slip``: shares of the travel that are lost, 0 to below 1; ``pose`` [7] at
@@ -30,9 +30,9 @@ class TrackOdometry:
         self._actual = float(pose[0]), float(pose[1]), frames.to_yaw(pose[3:])
         self._measured = 0.0, 0.0, 0.0
         self._by_linear = 0.0, 0.0
-        """Derivative of the measured x and y in the share of the travel that is lost."""
+        """Derivative of the measured x and y with respect to the share of the travel that is lost."""
         self._by_angular = 0.0, 0.0, 0.0
-        """Derivative of the measured x, y and yaw in the share of turns that is lost."""
+        """Derivative of the measured x, y and yaw with respect to the share of turns that is lost."""
 
     def update(self, base_q: np.ndarray) -> np.ndarray:
         """Add the motion to ``base_q`` [7], the actual pose, and return the measured pose [7] since the start."""

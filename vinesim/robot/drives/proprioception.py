@@ -1,4 +1,4 @@
-"""What a robot measures of itself: wrist wrenches, inertial measurement units, series elastic elements."""
+"""A robot's measurements of its own state: wrist wrenches, inertial measurement units, series elastic elements."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ class BodySensors:
         self._distal_links = {mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches}
 
     def wrenches(self, time: float, contacts: Sequence[Contact]) -> tuple[Wrench, ...]:
-        """Wrenches at ``time`` [s]; ``contacts`` of this robot with plants are added, which MuJoCo does not know."""
+        """Wrenches at ``time`` [s]. The forces of this robot's ``contacts`` with plants, which MuJoCo does not know,
+        are added."""
         return tuple(self._wrench(mount, time, contacts) for mount in self._description.wrenches)
 
     def imus(self, time: float) -> tuple[Imu, ...]:

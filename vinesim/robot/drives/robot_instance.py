@@ -34,8 +34,8 @@ class RobotInstance:
     ) -> None:
         """Add the robot to ``rigid`` at ``pose`` [7] (the origin unless given).
 
-        ``name``: the description's unless given. ``index``: number of its instance label.
-        ``is_in_world``: it was added to ``rigid`` already.
+        ``name``: the description's name unless given. ``index``: number of its instance label.
+        ``is_in_world``: whether it was added to ``rigid`` already.
         """
         self.rigid = rigid
         self.description = description
@@ -52,13 +52,13 @@ class RobotInstance:
         self._start = spec.pose[:3].copy()
         self._start_turn = frames.to_matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
-        """[4, 4]: quaternion product with the inverse of the start's, as a matrix"""
+        """[4, 4] Matrix of the quaternion product with the inverse of the orientation at the start."""
         self._tracks_slip = any(description.base_limits.slip)
         self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
 
     @property
     def shown_lights(self) -> Color | None:
-        """What the indicator lights show now, :data:`UNLIT` between flashes; None: off."""
+        """Colour that the indicator lights show now, :data:`UNLIT` between flashes. None: they are off."""
         return self._shown_color
 
     def show_lights(self, time: float) -> None:
@@ -73,13 +73,13 @@ class RobotInstance:
         self.rigid.remove_robot(self.name)
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
-        """State of the robot at ``time`` [s]; of ``contacts`` only its own are kept."""
+        """State of the robot at ``time`` [s], with the robot's own contacts among ``contacts``."""
         measured = self.measure(time, contacts)
         return dataclasses.replace(measured, transform_q=self.description.moving_joints.poses(measured.joints.position))
 
     def measure(self, time: float, contacts: Sequence[Contact] = (), **more: Any) -> RobotSample:
-        """:meth:`sample` without what follows from the joints: :attr:`RobotSample.transform_q` is empty. ``more``:
-        further values of the sample."""
+        """Like :meth:`sample`, without the transforms, which follow from the joints: :attr:`RobotSample.transform_q` is
+        empty. ``more``: further values of the sample."""
         position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         odom_q = self._odometry(base_q)
@@ -99,7 +99,7 @@ class RobotInstance:
         )
 
     def _own(self, contacts: Sequence[Contact]) -> tuple[Contact, ...]:
-        """Those of some contacts that are the robot's."""
+        """The contacts of this robot among ``contacts``."""
         return tuple(c for c in contacts if c.actor == self.name)
 
     def frame_pose(self, frame: str) -> np.ndarray:
@@ -117,7 +117,7 @@ class RemoteRobot(RobotInstance):
     """The copy of a robot that another client controls: pulled to its states, yet it can be held and pushed."""
 
     TELEPORT_DISTANCE = 1.0
-    """[m] Beyond it the copy is placed anew instead of pulled. GUESSED"""
+    """[m] If the copy is farther than this from its state, it is placed there instead of pulled. GUESSED"""
 
     def follow(self, update: RobotUpdate) -> None:
         """Pull the copy to the state of ``update`` from now on.
@@ -137,7 +137,7 @@ class RemoteRobot(RobotInstance):
         self.rigid.follow_remote(self.name, update.base_q, update.base_qd, update.position, update.velocity)
 
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
-        """Place the copy at the update's state; ``here`` [7]: where its base is."""
+        """Place the copy at the update's state. ``here`` [7]: present pose of its base."""
         if abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar: another height needs a new body
             self.rigid.remove_robot(self.name)
             self._shown_color = None

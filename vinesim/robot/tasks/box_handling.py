@@ -1,4 +1,4 @@
-"""What tasks of a carrier with a clamp at either end have in common: take a box, carry it, list the bunches in it.
+"""Base class for tasks of a carrier with a clamp at either end: take a box, carry it, list the bunches in it.
 
 The poses of base, clamps and boxes are read from the physics; boxes are held by friction alone.
 """
@@ -35,7 +35,7 @@ class BoxHandling(Task):
     """A task that moves boxes with clamps."""
 
     GROUPS: tuple[str, ...] = ("lift_front", "clamp_front")
-    """Joint groups that it needs."""
+    """Joint groups that the task needs."""
 
     def __init__(self, physics: Physics, robot: Robot, *, timeout: float) -> None:
         """Raises :class:`CommandError` if the robot lacks one of :attr:`GROUPS`; ``timeout`` [s]."""

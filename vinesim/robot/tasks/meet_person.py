@@ -37,9 +37,9 @@ class MeetPlan:
     path_to_box: np.ndarray
     """[n, 2] m, from the start to a place with room to turn, straight before a long side of the box."""
     path_to_person: np.ndarray
-    """[n, 2] m, from there to the place where it waits."""
+    """[n, 2] m, from that place to the place where the robot waits."""
     heading: float
-    """[rad] there: the box is towards the person."""
+    """[rad] Heading of the robot at the waiting place, with the box towards the person."""
 
 
 class MeetPerson(BoxHandling):

@@ -35,11 +35,11 @@ OPENING_MARGIN = 0.015
 APPROACH_DISTANCE = 0.20
 """[m] Length of the straight approach to the bunch, and of the straight retreat with it. GUESSED"""
 GRASP_FORCE = 25.0
-"""[N] Of each finger: a bunch of 1 kg needs 6 N at a friction of 0.8, the rest is for accelerations."""
+"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction of 0.8; the rest is for accelerations."""
 MIN_GRASP_FORCE = 8.0
 """[N] Contact force of each finger from which on it has grasped something. GUESSED"""
 GRASP_TIME = 0.3
-"""[s] For which all fingers must feel it. GUESSED"""
+"""[s] Time for which all fingers must feel this force. GUESSED"""
 CLOSE_TIMEOUT = 4.0
 """[s] After which closing fingers have grasped nothing. GUESSED"""
 MAX_CUTS = 5
@@ -47,7 +47,7 @@ MAX_CUTS = 5
 POSITION_TOLERANCE = 0.01
 """[m] A hand this near to its goal has reached it. GUESSED"""
 ORIENTATION_TOLERANCE = 0.12
-"""[rad] The same for its orientation. GUESSED"""
+"""[rad] A hand whose orientation is this near to its goal has reached it. GUESSED"""
 CARRY_POSITION = np.array([0.45, 0.12, 1.20])
 """[m] Position of the left hand while the base drives, in the base's frame; mirrored for the right hand."""
 CLEARANCE_ABOVE_RIM = 0.50

@@ -35,9 +35,9 @@ from vinesim.scene.values import ControllerKind, ControllerSpec, RobotSample
 log = logging.getLogger(__name__)
 
 RESULT_TIMEOUT = 10
-"""[s] A result waits so long for whoever asks for it; the default of rcl since Iron."""
+"""[s] Time for which a result is kept for clients that request it: the default of rcl since Iron."""
 MAX_GOALS = 32
-"""Goals of one robot that are executed at once; further ones are rejected."""
+"""Largest number of goals of one robot that are executed at the same time. Further ones are rejected."""
 
 
 class DeferredActionServer(ActionServer):
@@ -125,7 +125,7 @@ class ControllerActions:
             return list(self._goals.values())
 
     def publish_feedback(self, sample: RobotSample) -> None:
-        """Publish to the clients of trajectory goals how far these are."""
+        """Publish the progress of trajectory goals to their clients."""
         places = {name: i for i, name in enumerate(sample.joints.names)}
         for goal in self.goals:
             if isinstance(goal.command, JointTrajectory):
@@ -136,7 +136,7 @@ class ControllerActions:
                 goal.handle.publish_feedback(message)
 
     def finish(self, result: GoalResult) -> None:
-        """Tell a goal's client how it ended; nothing happens if the goal is not known."""
+        """Send the result of a goal to its client. Nothing happens if the goal is not known."""
         with self._lock:
             goal = self._goals.pop(result.goal, None)
         if goal is None:

@@ -32,7 +32,7 @@ from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 log = logging.getLogger(__name__)
 
 BASE_COMMAND = "mobile_base_controller/cmd_vel"
-"""Topic."""
+"""Topic of commands for the base, relative to the node's namespace."""
 MAX_QUEUED = 256
 """Largest number of queued commands; a client that takes them after every step never loses the oldest."""
 
@@ -47,7 +47,7 @@ class CommandQueue:
         self._lock = threading.Lock()
         self._queue: deque[Command] = deque(maxlen=MAX_QUEUED)
         self._logged: set[str] = set()
-        """Reasons that the log has."""
+        """Reasons that were logged already."""
         self.rejected = 0
         """Messages and goals that contradicted themselves, or that left a full queue before the client read them."""
 
@@ -102,7 +102,7 @@ class CommandSubscriptions:
         self._node = node
         self._queue = queue
         self.types: dict[str, str] = {}
-        """By full name of each topic: the type that is taken, ``package/msg/Name``."""
+        """Accepted message type (``package/msg/Name``) by full name of the topic."""
         self._subscribe(TwistStamped, BASE_COMMAND, convert.base_velocity)
         self._subscribe(String, "indicator_lights/command", convert.lights_pattern)
         self._subscribe(ColorRGBA, "indicator_lights/color", convert.lights_color)

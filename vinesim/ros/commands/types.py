@@ -18,7 +18,7 @@ class BaseVelocity:
     """Commanded velocity of the base, in its own axes (TwistStamped on mobile_base_controller/cmd_vel)."""
 
     time: float
-    """Stamp of the sender [s]; 0 if it gave none."""
+    """Time stamp of the sender [s]; 0 if the sender gave none."""
     linear: np.ndarray
     """[3] m/s"""
     angular: np.ndarray
@@ -31,7 +31,8 @@ class ForwardCommand:
 
     controller: str
     values: np.ndarray
-    """[joint] rad or m, rad/s or m/s, N m or N, in the controller's order of joints; NaN leaves a joint alone"""
+    """[joint] Positions, velocities or efforts [rad or m, rad/s or m/s, N m or N] in the controller's order of joints.
+    NaN leaves a joint alone."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -52,7 +53,7 @@ class ElasticCommand:
     controller: str
     joint: str
     position: float
-    """rad or m, seen from behind the gear"""
+    """Position of the motor, converted to the output of the gear [rad or m]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -81,49 +82,49 @@ class JointTrajectory:
     """[point, joint] rad/s or m/s, or None if no point gives any."""
     path_tolerance: JointTolerances | None = None
     goal_tolerance: JointTolerances | None = None
-    """Of an action's goal; None: the controller's."""
+    """Tolerance at the end, for a goal of an action; None: the controller's tolerance."""
     goal_time_tolerance: float | None = None
-    """[s] Likewise."""
+    """[s] Permitted delay of the arrival, for a goal of an action; None: the controller's."""
     goal: bytes | None = None
     """Id of the action's goal; None: it came on a topic, so no client waits for its result."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GripperGoal:
-    """A goal of a gripper (control_msgs/action/GripperCommand); what it means is said by the kind of gripper."""
+    """A goal of a gripper (control_msgs/action/GripperCommand). Its meaning depends on the kind of gripper."""
 
     controller: str
     goal: bytes
     position: float
     max_effort: float | None
-    """None: all there is."""
+    """Largest effort; None: the own limit of the gripper."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LightsPattern:
-    """What the indicator lights say (std_msgs/String on indicator_lights/command)."""
+    """Pattern of the indicator lights (std_msgs/String on indicator_lights/command)."""
 
     pattern: LightPattern
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LightsColor:
-    """In which colour (std_msgs/ColorRGBA on indicator_lights/color)."""
+    """Colour of the indicator lights (std_msgs/ColorRGBA on indicator_lights/color)."""
 
     color: tuple[float, float, float] | None
-    """sRGB from 0 to 1; None: that of the pattern."""
+    """sRGB from 0 to 1; None: the colour of the pattern."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LightsSound:
-    """Whether a tone is heard while they are lit (std_msgs/Bool on indicator_lights/sound)."""
+    """Whether a tone sounds while the indicator lights are lit (std_msgs/Bool on indicator_lights/sound)."""
 
     is_on: bool
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LoudspeakerSound:
-    """Sound to be played behind what plays (audio_common_msgs/AudioData on speaker/audio)."""
+    """Sound to be played after the sound that plays now (audio_common_msgs/AudioData on speaker/audio)."""
 
     pcm: bytes
     """PCM16 of 16 kHz, mono."""
@@ -131,7 +132,7 @@ class LoudspeakerSound:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CancelGoal:
-    """A goal is to end."""
+    """Request to cancel a goal."""
 
     goal: bytes
 
@@ -172,14 +173,14 @@ class GoalResult:
 
 
 class SimulationAction(enum.StrEnum):
-    """What a node asks of the simulation, in the words of simulation_interfaces."""
+    """Kinds of requests of a node to the simulation, named as in simulation_interfaces."""
 
     GET_STATE = "get_simulation_state"
     PLAY = "play"
     PAUSE = "pause"
     STEP = "step_simulation"
     CANCEL_STEPS = "cancel_steps"
-    """The end of a :attr:`STEP` before its last step; the request has the number of that one, which is answered."""
+    """End a :attr:`STEP` before its last step. The request has the number of the STEP request, which is answered."""
     GET_ENTITIES = "get_entities"
     GET_SPAWNABLES = "get_spawnables"
     SPAWN = "spawn_entity"
@@ -189,7 +190,7 @@ class SimulationAction(enum.StrEnum):
 
 
 class Refusal(enum.StrEnum):
-    """Why a request was not done, as the results of simulation_interfaces tell it."""
+    """Reasons for which a request was not done, as in the results of simulation_interfaces."""
 
     UNSUPPORTED = "feature unsupported"
     NOT_FOUND = "not found"
@@ -242,14 +243,14 @@ class Spawnable:
     uri: str
     description: str
     low: tuple[float, float, float]
-    """[m] Lower corner of the room that it takes, about its pose."""
+    """[m] Lower corner of its bounding box, relative to its pose."""
     high: tuple[float, float, float]
-    """[m] Upper corner."""
+    """[m] Upper corner of its bounding box, relative to its pose."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class EntityArguments:
-    """Of :attr:`SimulationAction.SPAWN`, ``DELETE`` and ``SET_ENTITY_STATE``."""
+    """Arguments of :attr:`SimulationAction.SPAWN`, ``DELETE`` and ``SET_ENTITY_STATE``."""
 
     name: str
     pose: np.ndarray | None = None
@@ -267,14 +268,14 @@ class SimulationRequest:
     number: int
     action: SimulationAction
     steps: int = 0
-    """Of :attr:`SimulationAction.STEP`."""
+    """Number of steps of a :attr:`SimulationAction.STEP`."""
     wants_progress: bool = False
-    """Of :attr:`SimulationAction.STEP`: whether the simulation sends a :class:`StepProgress` after each step."""
+    """For :attr:`SimulationAction.STEP`: whether the simulation sends a :class:`StepProgress` after each step."""
     entity: EntityArguments | None = None
     keep_state: bool = False
-    """Of :attr:`SimulationAction.RESET`: only spawned entities go."""
+    """For :attr:`SimulationAction.RESET`: only spawned entities are removed."""
     keep_spawned: bool = False
-    """Of :attr:`SimulationAction.RESET`: spawned entities stay, where they were spawned."""
+    """For :attr:`SimulationAction.RESET`: spawned entities stay, at the place where they were spawned."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
