@@ -92,6 +92,8 @@ class SensorProcess:
         self._moved_trees = np.zeros(len(model.tree_first), bool)
         """[tree] Whether the tree moved since the last snapshot that was written."""
         self._is_overdue = False
+        self._written_time = -np.inf
+        """Simulated time of the last snapshot that was written [s]."""
         ros = ros and middleware.unavailable_reason() is None
         config = SensorConfig(
             name,
@@ -162,7 +164,15 @@ class SensorProcess:
         else:
             latest = time_of_snapshot(float(wanted["horizon"][0]), physics.dt)
             is_behind = self.worker.is_ready and physics.time + 0.5 * physics.dt > latest
-        if self._is_overdue and (is_behind or self.is_lockstep):
+        # The process may wait for a snapshot while the step waits for the process: after a time without subscribers, no
+        # snapshot was written.
+        is_starved = (
+            is_behind
+            and not self.is_lockstep
+            and wanted["shown"][0] == self._snapshot_count
+            and physics.time > self._written_time
+        )
+        if is_starved or (self._is_overdue and (is_behind or self.is_lockstep)):
             self._write(self.client)
             self._wake()
             is_behind = True
@@ -222,6 +232,7 @@ class SensorProcess:
                 self.missed_snapshots += 1
                 return
             self._snapshot_count += 1
+            self._written_time = physics.time
             trees = np.flatnonzero(self._moved_trees)
             self._moved_trees[:] = False
             bodies = physics.plants.bodies_of(trees)
