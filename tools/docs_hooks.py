@@ -1,4 +1,4 @@
-"""Hooks of the documentation site (mkdocs.yml): pages that are lists of what the project has."""
+"""Hooks of the documentation site (mkdocs.yml) that generate the list of modules and the list of decisions."""
 
 from __future__ import annotations
 

@@ -161,7 +161,7 @@ class _Stage:
     """Further sensors that look from the camera's place."""
 
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
-        """The picture from a viewpoint, and a description in words of what is in sight."""
+        """Returns the picture from a viewpoint, and a text that counts the visible bunches, berries and cut points."""
         from vinesim.scene.camera_geometry import depth_millimetres
         from vinesim.sensors import ground_truth
         from vinesim.sensors.camera.camera import Camera

@@ -14,7 +14,7 @@ from vinesim.client.processes.child_process import Process, ProcessFailed
 from vinesim.client.processes.ros_listener import RosListener
 
 POLL_PERIOD = 0.05
-"""Wall time between two checks of what is still missing [s]."""
+"""Wall time between two checks whether all programs, sensors and topics of the demo are ready [s]."""
 PROGRESS_MARK = "vinesim: "
 """Prefix of the lines in which a process reports its progress."""
 LINE_PERIOD = 5.0

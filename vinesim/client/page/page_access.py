@@ -1,7 +1,7 @@
 """Access to a page from other machines of the network: by https and with a token.
 
-Browsers allow headsets and microphones only on https pages. The token is needed because whoever opens the page can move
-the person.
+Browsers allow headsets and microphones only on https pages. A page without a token could be opened
+by anyone on the network, and its user moves the person.
 """
 
 from __future__ import annotations

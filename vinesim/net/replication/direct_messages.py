@@ -19,6 +19,7 @@ If only one actor is at a tree, nothing is sent.
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 from collections.abc import Callable, Container, Iterable, Mapping
 from typing import Any, ClassVar
@@ -78,17 +79,17 @@ LinkCentre = Callable[[str], np.ndarray | None]
 """Centre of mass [3] m of a link of the own robot; None if it has no such link."""
 
 
-class MessageSync:
+class MessageSync(abc.ABC):
     """Messages of one kind to and from one actor."""
 
     kind: ClassVar[int]
     """Kind of the messages, a key of :data:`vinesim.net.codec.messages.MESSAGES`."""
 
+    @abc.abstractmethod
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
         """Take a message of a peer at own time ``now`` and network ``time`` [s]; ``MessageError`` if it is invalid."""
-        raise NotImplementedError
 
-    def current(self, now: float) -> Any:
+    def current(self, now: float) -> Any:  # noqa: B027 - optional
         """Returns the received values that are valid at own time ``now`` [s], for the inbox."""
 
     def publish(self, value: Any, now: float, time: float) -> list[bytes]:
@@ -96,10 +97,10 @@ class MessageSync:
         nothing to say. Returns the messages that were sent."""
         return []
 
-    def remove_peer(self, name: str) -> None:
+    def remove_peer(self, name: str) -> None:  # noqa: B027 - optional
         """An actor has left."""
 
-    def shift_time(self, step: float) -> None:
+    def shift_time(self, step: float) -> None:  # noqa: B027 - optional
         """The network clock was set by ``step`` [s]."""
 
 
