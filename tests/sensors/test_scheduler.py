@@ -255,3 +255,19 @@ def test_sensors_that_nobody_wants_hold_nothing(view) -> None:
     wanted.append(CameraOutput.NONE)
     assert scheduler.horizon() == np.inf
     assert scheduler.sustainable_factor() == np.inf
+
+
+def test_a_subscriber_that_returns_holds_nothing_before_the_first_snapshot_that_it_is_rendered_from(view) -> None:
+    """While nobody looks, the client writes no snapshot. A promise that dated from the last one would hold its steps at
+    once, and the next snapshot would never come."""
+    wanted = [CameraOutput.ALL]
+    scheduler = SensorScheduler(
+        sensor_scenes.empty(), [ScheduledSensor(_camera(), Inbox(), lambda: wanted[-1], rate=10.0)]
+    )
+    scheduler.advance(dataclasses.replace(view, time=1.0), POSES)
+    wanted.append(CameraOutput.NONE)
+    assert scheduler.horizon() == np.inf
+    wanted.append(CameraOutput.ALL)
+    assert scheduler.horizon() == np.inf
+    scheduler.advance(dataclasses.replace(view, time=9.0), POSES)
+    assert scheduler.horizon() == pytest.approx(9.18)

@@ -154,7 +154,14 @@ class SensorScheduler:
 
     def horizon(self) -> float:
         """Simulated time [s] that the world must not pass before a newer snapshot is taken. Beyond it a wanted sensor
-        would fall below the rate that its mode promises. Infinite if no sensor is wanted."""
+        would fall below the rate that its mode promises. Infinite if no sensor is wanted.
+
+        Call it regularly, also while no snapshots come: the promise to a sensor that is not wanted ends here, and begins
+        again with the first snapshot that the sensor takes.
+        """
+        for one in self.sensors:
+            if not one.wanted():
+                self._taken.pop(one.name, None)
         return min(
             (max(self._taken[one.name] + self._gap(one), self._due_time(one)) for one in self._wanted()), default=np.inf
         )
