@@ -156,8 +156,8 @@ class SensorScheduler:
         """Simulated time [s] that the world must not pass before a newer snapshot is taken. Beyond it a wanted sensor
         would fall below the rate that its mode promises. Infinite if no sensor is wanted.
 
-        Call it regularly, also while no snapshots come: the promise to a sensor that is not wanted ends here, and begins
-        again with the first snapshot that the sensor takes.
+        Call it regularly, also while no snapshots come. The promise to a sensor that is not wanted ends here, and
+        begins again with the first snapshot that the sensor takes.
         """
         for one in self.sensors:
             if not one.wanted():
