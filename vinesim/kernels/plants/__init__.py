@@ -51,7 +51,8 @@ neighbours in memory. Sums over children are read and stored, not added in place
 a GPU's far cache.
 
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
-``body_dynamics`` (one body and its joint), ``prediction`` (the three passes over one tree), ``eight_trees`` and ``lane_records`` (over
-eight at once, on a CPU), ``first_mode`` (substeps), ``energy_budget``, ``impulse_response``, ``integration``, ``floating_components`` (what has been cut
-off), ``joint_wrench``, ``fastest_tree``, ``gather_scatter`` (rows between host and device).
+``body_dynamics`` (one body and its joint), ``prediction`` (the three passes over one tree), ``eight_trees`` (the same
+over eight trees at once, on a CPU), ``lean_prediction`` (the same with little memory traffic, on a GPU), ``first_mode``
+(substeps), ``energy_budget``, ``impulse_response``, ``integration``, ``floating_components`` (cut-off parts),
+``joint_wrench``, ``tree_checks``, ``gather_scatter`` (rows between host and device).
 """

@@ -1,7 +1,12 @@
-"""Records of eight trees: for each body 8 x :data:`RECORD` numbers, with each number stored side by side for all eight.
+"""Prediction of eight trees of one topology at once: one lane of a SIMD vector is one tree.
 
-One lane of a record is one tree. The inputs of a tree are copied into its lane before a walk, and its results are
-copied out afterwards; see :mod:`vinesim.kernels.plants.eight_trees`.
+The same walk as :mod:`vinesim.kernels.plants.prediction` with the same functions of one body, on a CPU only. Everything
+that a walk needs of eight trees is copied into records; LLVM then makes one vector instruction of eight iterations of
+the loops over ``lane`` (docs/decisions/eight-trees.md says what that requires of them). Lanes are independent, so a tree
+gets the same bits whichever trees share its vector, and the same bits as in a prediction alone.
+
+A record has 8 x :data:`RECORD` numbers for each body, with each number stored side by side for all eight trees. The
+inputs of a tree are copied into its lane before a walk, and its results are copied out afterwards.
 """
 
 import warp as wp
@@ -220,13 +225,7 @@ def store_tree(
         prediction_out.joint_qd_free[k] = vec3_at(own, END + 8 * 12)
 
 
-# Prediction of eight trees of one topology at once: one lane of a SIMD vector is one tree.
-#
-# The same walk as :mod:`vinesim.kernels.plants.prediction` with the same functions of one body, on a CPU only. All
-# that a walk needs of eight trees is copied into records (:mod:`vinesim.kernels.plants.eight_trees`); LLVM then makes
-# one vector instruction of eight turns of the loops over ``lane`` (docs/decisions/eight-trees.md says what that asks
-# of them). Lanes know nothing of each other, so that a tree gets the same bits whichever trees share its vector, and
-# those of a prediction alone.
+# Walks over eight trees.
 
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
