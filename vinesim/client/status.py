@@ -1,4 +1,4 @@
-"""Status of a client, for display once a second, and its report at the end of a run."""
+"""Status of a client, for display once a second, its faults, and its report at the end of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Geometry of pictures: intrinsic matrix, rays, projection and its inverse, depth in millimetres, coloured points."""
+"""Geometry of pictures: intrinsic matrix, rays, lens distortion, projection and its inverse, depth, coloured points."""
 
 from __future__ import annotations
 

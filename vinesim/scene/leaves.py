@@ -1,4 +1,4 @@
-"""The outline of a vine leaf: five lobes, saw teeth, and a sinus where the petiole joins.
+"""Leaves: the outline of a blade (five lobes, saw teeth, a sinus at the petiole), and leaves at the nodes of shoots.
 
 The outline is in polar form around the petiole's junction, with theta = 0 at the tip. A lobe at angle t with its tip at
 distance L is the wedge ``r = L / (cos D + kappa |sin D|)``, D = theta - t; the blade is the union of its lobes. All

@@ -1,4 +1,4 @@
-"""The head of a spinning lidar, and which of its rows and columns a primitive may cover.
+"""Rasteriser of a spinning lidar: which rows and columns a primitive may cover, and the nearest primitive of each ray.
 
 A primitive is bound by balls, one or several along a cone or cylinder; boxes, cylinders and leaves also by the corners of
 a box.

@@ -1,4 +1,4 @@
-"""Build one message package: from definitions to a Python package; runs in a process of its own.
+"""Message packages that no package index carries: built from definitions, installed, made into wheels, described.
 
 The rosidl generators that come with the rclpy wheels turn definitions into C, g++ into libraries and one Python
 extension. Sources of a kind are compiled together, which spares the compiler reading the same headers for each.
