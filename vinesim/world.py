@@ -42,9 +42,6 @@ from vinesim.wires.deflected_wires import DeflectedWires
 from vinesim.wires.elastic_supports import ElasticSupports
 from vinesim.wires.wire_segments import WireShapes
 
-MIN_TREES_FOR_THREADS = 16
-"""Minimum number of awake trees for which worker threads are used: two groups of eight, 30 us of work. TUNED."""
-
 
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and the contacts, grasps and detachments between them.
@@ -58,21 +55,19 @@ class Physics:
         *,
         parameters: PhysicsParameters = PhysicsParameters(),
         device: str = "cpu",
-        threads: int = 1,
         detachment: bool = True,
     ) -> None:
         """Args:
         model: constants of the vineyard.
         parameters: all numbers of the physics.
         device: ``"cpu"`` or ``"cuda"``, see :class:`ArticulationSolver`.
-        threads: number of CPU threads that share the contacts of plants, see :class:`ArticulationSolver`.
         detachment: whether bunches detach when they are pulled too hard.
         """
         p = parameters
         self.model = model
         self.parameters = p
         self.state = State.at_rest(model)
-        self.plants = ArticulationSolver(model, self.state, p, device=device, threads=threads)
+        self.plants = ArticulationSolver(model, self.state, p, device=device)
         warn_of_raised_damping(model, p.dt, p.phi)
         self.rigid = RigidWorld(model, parameters=p)
         self.elastic_supports = ElasticSupports(self.plants, p)
@@ -131,8 +126,6 @@ class Physics:
 
     def step(self) -> None:
         """Advance by ``dt``. Commands received before the call act in this step."""
-        if len(self.plants.awake) >= MIN_TREES_FOR_THREADS:
-            self.plants.launch_pool.wake()  # while MuJoCo works
         for _, stage in self.stages:
             stage()
         self.tick += 1

@@ -195,7 +195,7 @@ def test_of_what_another_compiles_only_the_own_part_is_waited_for(fake: Fake) ->
 
 
 def test_a_module_of_which_compilers_die_costs_the_others_nothing(fake: Fake, caplog: pytest.LogCaptureFixture) -> None:
-    packages = ("rigid.human_kinematics", "robot.inverse_kinematics", "shared_launch")
+    packages = ("rigid.human_kinematics", "robot.inverse_kinematics", "stereo.stereo_input")
     assert compile_kernels(packages) == 2
     assert CompiledModules().missing(module_names(packages)) == ["rigid.human_kinematics"]
     assert "rigid.human_kinematics was not compiled beforehand: the compiler ended with exit code -9" in caplog.text
@@ -203,5 +203,5 @@ def test_a_module_of_which_compilers_die_costs_the_others_nothing(fake: Fake, ca
 
 
 def test_a_module_that_cannot_be_compiled_is_logged(fake: Fake, caplog: pytest.LogCaptureFixture) -> None:
-    assert compile_kernels(("rigid.joint_servos", "shared_launch")) == 1
+    assert compile_kernels(("rigid.joint_servos", "stereo.stereo_input")) == 1
     assert "rigid.joint_servos was not compiled beforehand: no" in caplog.text

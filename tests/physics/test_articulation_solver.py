@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-import gc
-import threading
 from collections.abc import Callable
 
 import numpy as np
@@ -9,7 +7,6 @@ import pytest
 import warp as wp
 
 from tests.support.clustered_trees import clustered, momenta, moving
-from tests.support.waiting import deadline
 from vinesim.core import frames
 from vinesim.kernels.graph import TIERS
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -557,7 +554,7 @@ def test_invalid_clusters_are_refused_with_the_reason(change: dict[str, float], 
 
 
 def trees_of_different_size(rng: np.random.Generator, count: int = 7) -> Model:
-    """Trees of different sizes, so that partitions of threads and rows of device buffers are uneven."""
+    """Trees of different sizes, so that rows of device buffers are uneven."""
     trees = []
     for i in range(count):
         tree = TreeBuilder(frames.pose(np.array([0.0, i, 2.0])))
@@ -619,14 +616,14 @@ def filled_with_nan(make: Callable[..., wp.array]) -> Callable[..., wp.array]:
     return made
 
 
-def test_threads_and_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_buffers_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("empty", "empty_like"):  # whatever reads memory before it is written shall show
         monkeypatch.setattr(wp, name, filled_with_nan(getattr(wp, name)))
-    single_threaded, response = run_with_events()
+    in_place, response = run_with_events()
     copies = [{"buffers": DeviceBuffers("cpu", interleave=lanes)} for lanes in (1, 3)]
-    for options in ({"threads": 2}, *copies):
+    for options in copies:
         arrays, measured = run_with_events(**options)
-        assert arrays == single_threaded, options
+        assert arrays == in_place, options
         np.testing.assert_array_equal(measured, response)
 
 
@@ -656,7 +653,7 @@ def test_advance_equals_repeated_predict_and_integrate() -> None:
     runs = []
     for in_one_call in (False, True):
         model = trees_of_different_size(np.random.default_rng(2))
-        plants = ArticulationSolver(model, State.at_rest(model), threads=2)
+        plants = ArticulationSolver(model, State.at_rest(model))
         plants.wake(np.arange(6))
         plants.state.joint_qd[:, 1] = 0.5
         step(plants)
@@ -672,26 +669,10 @@ def test_advance_equals_repeated_predict_and_integrate() -> None:
     assert runs[0] == runs[1]
 
 
-def test_threads_end_with_their_solver() -> None:
-    gc.collect()
-    before = set(threading.enumerate())
-    model = canes(1)
-    plants = ArticulationSolver(model, State.at_rest(model), threads=3)
-    workers = set(threading.enumerate()) - before
-    assert len(workers) == 2
-    del plants
-    gc.collect()
-    for thread in workers:
-        thread.join(deadline(10.0))
-        assert not thread.is_alive()
-
-
 def test_unavailable_devices_are_refused_with_the_reason() -> None:
     model = canes(1)
     with pytest.raises(DeviceUnavailable, match="device 'tpu': give cpu, cuda or cuda:N"):
         ArticulationSolver(model, State.at_rest(model), device="tpu")
-    with pytest.raises(ValueError, match="0 threads on cpu"):
-        ArticulationSolver(model, State.at_rest(model), threads=0)
     if wp.get_cuda_device_count() == 0:
         with pytest.raises(DeviceUnavailable, match=r"'cuda': Warp sees no NVIDIA GPU here .* use cpu") as error:
             ArticulationSolver(model, State.at_rest(model), device="cuda")

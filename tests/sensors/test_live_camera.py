@@ -9,7 +9,7 @@ import warp as wp
 from tests.support import sensor_scenes
 from tests.support.long_rows import each_once
 from vinesim.core import frames
-from vinesim.kernels.launch import ThreadPool
+from vinesim.core.thread_pool import ThreadPool
 from vinesim.kernels.stereo import stereo_depth
 from vinesim.scene.values import CameraFrame, CameraOutput
 from vinesim.sensors.camera.camera import QUALITIES, Camera, CameraSpec

@@ -58,7 +58,6 @@ class Simulation:
         sleep: bool | None = None,
         detach: bool = True,
         device: str = "cpu",
-        threads: int = 1,
     ) -> None:
         """Build the world; it does not move until :meth:`step`.
 
@@ -69,7 +68,6 @@ class Simulation:
             sleep: whether trees at rest fall asleep; it replaces ``parameters.sleep``.
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
-            threads: number of CPU threads that share the contacts of plants.
         """
         self.scene: Scene | None = None
         """The simulated scene; None for a model or canes."""
@@ -86,7 +84,7 @@ class Simulation:
         """All numbers of the physics; they cannot be changed later."""
         self.device = device
         """Device for stepping plants and for sensors."""
-        self.physics = Physics(model, parameters=self.parameters, device=device, threads=threads, detachment=detach)
+        self.physics = Physics(model, parameters=self.parameters, device=device, detachment=detach)
         """The underlying physics, for functions that this class does not offer."""
         self.robots: dict[str, Robot] = {}
         """Robots by name; their commands take effect in the next step."""

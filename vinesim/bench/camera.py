@@ -20,7 +20,7 @@ import trimesh
 
 from vinesim.bench.scenes import interleaved_medians
 from vinesim.core import frames
-from vinesim.kernels.launch import MAX_THREADS, usable_cores
+from vinesim.core.thread_pool import MAX_THREADS, usable_cores
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.model import Model
 from vinesim.scene.spec import load_scene

@@ -145,39 +145,34 @@ def _one_core() -> Iterator[None]:
 def _compare_with_mujoco(
     case: str, bench: str, model: Model, robots: list[RobotSpec], steps: int
 ) -> Iterator[Measurement]:
-    """Step the same scene here (with one thread and two) and in MuJoCo, in turns of ``steps``.
+    """Step the same scene here and in MuJoCo, in turns of ``steps``, by processor time.
 
-    One thread is compared by its processor time, which other programs change little; two by the time that passes.
     Contacts are counted after all turns: to count them takes longer than a step.
     """
     reference = MujocoScene(model, robots)
-    ours = [Physics(model)]
-    if len(model.tree_first) > 1:
-        ours.append(Physics(model, threads=2))
-    for physics in ours:
-        for robot in robots:
-            physics.add_robot(robot)
-        scenes.keep_awake(physics, np.arange(len(model.tree_first)))
-    for world in (*ours, reference):
+    physics = Physics(model)
+    for robot in robots:
+        physics.add_robot(robot)
+    scenes.keep_awake(physics, np.arange(len(model.tree_first)))
+    worlds = (physics, reference)
+    for world in worlds:
         for i in range(SETTLE_STEPS):
             _command(world.rigid, robots, i)
             world.step()
-    tick = [SETTLE_STEPS] * (len(ours) + 1)
+    tick = [SETTLE_STEPS] * 2
 
     def run(which: int) -> None:
-        world = (*ours, reference)[which]
+        world = worlds[which]
         for _ in range(steps):
             _command(world.rigid, robots, tick[which])
             world.step()
             tick[which] += 1
 
-    times = scenes.interleaved_times(*(lambda i=i: run(i) for i in range(len(tick))))
-    counts = [*(_pressing(physics) for physics in ours), reference.plant_contact_count()]
-    for i, threads in enumerate(("one thread, processor time", "two threads")[: len(ours)]):
-        value, peer = (1e3 / steps * times[1 - i, [i, -1]]).tolist()
-        text = f"{case}; {counts[i]} contacts, peer {counts[-1]}; {threads}"
-        name = f"MuJoCo {mujoco.mj_versionString()} discrete"
-        yield Measurement(bench, text, value, "ms/tick", name, peer, peer / value)
+    times = scenes.interleaved_times(lambda: run(0), lambda: run(1))
+    value, peer = (1e3 / steps * times[1]).tolist()
+    count = f"{_pressing(physics)} contacts, peer {reference.plant_contact_count()}"
+    name = f"MuJoCo {mujoco.mj_versionString()} discrete"
+    yield Measurement(bench, f"{case}; {count}; one thread, processor time", value, "ms/tick", name, peer, peer / value)
 
 
 def _pressing(physics: Physics) -> int:

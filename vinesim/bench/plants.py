@@ -47,9 +47,9 @@ def cane_scene(count: int) -> Model:
     return assemble([plain_cane(0.5 * i) for i in range(count)])
 
 
-def warmed_up_solver(model: Model, awake: int, threads: int = 1) -> ArticulationSolver:
+def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
     """A solver with its first trees awake and every kernel loaded."""
-    plants = ArticulationSolver(model, State.at_rest(model), threads=threads)
+    plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(awake))
     run_steps(plants, 5)
     return plants
@@ -63,10 +63,10 @@ def run_steps(plants: ArticulationSolver, count: int) -> None:
 
 
 def plant_measurements() -> Iterator[Measurement]:
-    """64 canes awake, without contacts: on one thread, by its processor time, and on two, by the time that passes."""
+    """64 canes awake, without contacts, by processor time."""
     steps = 40
     model = cane_scene(CANE_COUNT)
-    alone, shared = (warmed_up_solver(model, CANE_COUNT, threads) for threads in (1, 2))
+    plants = warmed_up_solver(model, CANE_COUNT)
     mujoco_model = compile_plants(model)
     data = mujoco.MjData(mujoco_model)
     for _ in range(5):
@@ -76,12 +76,8 @@ def plant_measurements() -> Iterator[Measurement]:
         for _ in range(steps):
             mujoco.mj_step(mujoco_model, data)
 
-    times = (
-        1e3 / steps * interleaved_times(lambda: run_steps(alone, steps), lambda: run_steps(shared, steps), mujoco_steps)
-    )
+    times = 1e3 / steps * interleaved_times(lambda: run_steps(plants, steps), mujoco_steps)
     name = f"MuJoCo {mujoco.mj_versionString()} discrete"
-    for i, threads in enumerate(("one thread, processor time", "two threads")):
-        ours, reference = times[1 - i, [i, -1]].tolist()
-        yield Measurement(
-            "plants", f"{CANE_COUNT} canes awake, {threads}", ours, "ms/tick", name, reference, reference / ours
-        )
+    ours, reference = times[1].tolist()
+    case = f"{CANE_COUNT} canes awake, one thread, processor time"
+    yield Measurement("plants", case, ours, "ms/tick", name, reference, reference / ours)

@@ -116,15 +116,9 @@ class ClientOptions:
         str,
         typer.Option(
             help="Where plants are simulated, cameras and lidars compute: cpu, cuda or cuda:N. For plants alone a GPU "
-            "pays from 200 awake trees, beside four threads from 1,000."
+            "pays from 200 awake trees."
         ),
     ] = "cpu"
-    threads: Annotated[
-        int,
-        typer.Option(
-            min=1, help="Threads for the contacts of plants on the CPU; pays from 100 awake trees, on free cores."
-        ),
-    ] = 1
     seconds: Seconds = None
     out: Annotated[pathlib.Path | None, typer.Option(help="Folder for pictures, trace and report.json.")] = None
     status: StatusFormat = "text"
@@ -249,7 +243,3 @@ def check_options(options: ClientOptions) -> None:
         raise UsageError(f"--outfit {options.outfit}: there is no such outfit; give one of {known}")
     find_device(options.device)
     renderer_selection.check_renderer(options.renderer, options.device)
-    if options.threads > 1 and options.device != "cpu":
-        raise UsageError(
-            f"--threads {options.threads} --device {options.device}: threads are for the CPU; leave one of the two out"
-        )

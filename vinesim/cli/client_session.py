@@ -102,7 +102,6 @@ class ClientSession:
             "interest_radius": options.interest_radius,
             "jitter_buffer": 1e-3 * options.jitter_buffer,
             "device": options.device,
-            "threads": options.threads,
             "executor": self.enter(ThreadPoolExecutor(1, "spawner")),
         }
 

@@ -105,7 +105,6 @@ class Client:
         interest_radius: float = interest.INTEREST_RADIUS,
         jitter_buffer: float = 0.0,
         device: str = "cpu",
-        threads: int = 1,
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
     ) -> None:
@@ -121,7 +120,7 @@ class Client:
         self.model = model
         self.scene = scene
         self._new_physics = functools.partial(
-            Physics, model, parameters=scene.physics, device=device, threads=threads, detachment=self.picking
+            Physics, model, parameters=scene.physics, device=device, detachment=self.picking
         )
         self.physics = self._new_physics()
         self.physics.wind = wind_of(scene)

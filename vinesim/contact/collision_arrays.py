@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import functools
 
@@ -14,7 +13,7 @@ from vinesim.core import frames
 from vinesim.core.warp_arrays import SharedArrays, share, zeros
 from vinesim.kernels.contact import broadphase, structs
 from vinesim.kernels.contact.friction_law import Surface
-from vinesim.kernels.launch import BoundLaunch, bind_launch
+from vinesim.kernels.graph import KernelLaunch
 from vinesim.plants.articulation_solver import ArticulationSolver, spans
 from vinesim.rigid.collision_geoms import RigidGeoms, concatenate, persistent_names
 from vinesim.rigid.rigid_world import RigidWorld
@@ -136,8 +135,8 @@ _GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if f
 class RigidArrays:
     """Geoms and degrees of freedom of the rigid world, from one compilation of the world to the next.
 
-    The arrays have room for all geoms that the world can list, so kernels stay bound to them when hands open and close
-    and when bunches take bodies. :meth:`update` writes the geoms that are listed now.
+    The arrays have room for all geoms that the world can list, so they keep their memory when hands open and close and
+    when bunches take bodies. :meth:`update` writes the geoms that are listed now.
     """
 
     def __init__(
@@ -199,8 +198,6 @@ class RigidArrays:
         )
         qvel, qacc = (share(values, wp.float64) for values in (data.qvel, data.qacc))
         self._free_velocities = [kernel_parameters, qvel, qacc]
-        self.dofs = ctypes.c_int32(world.nv)
-        """Number of degrees of freedom."""
         self.factors = SharedArrays(
             structs.RigidFactors,
             tree_dof=world.tree_dofadr,
@@ -260,8 +257,10 @@ class RigidArrays:
         return number[former]
 
     @functools.cached_property
-    def take_free_velocities(self) -> BoundLaunch:
+    def take_free_velocities(self) -> KernelLaunch:
         """Launch that reads each dof's free velocity of the coming step, and by how much plants changed it in the last
         step.
         """
-        return bind_launch(broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct])
+        return KernelLaunch(
+            broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct], threads=self.world.nv
+        )

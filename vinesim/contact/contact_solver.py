@@ -74,7 +74,7 @@ class ContactSolver:
         self._arrays = PlantArrays(model, plants, self.capsules)
         self._rigid_arrays: RigidArrays | None = None
         self.detection = ContactDetection(plants, self._arrays, self.parameters, numbers)
-        self.impulses = ImpulseSolver(plants, rigid, self._arrays, self.parameters, numbers, wires)
+        self.impulses = ImpulseSolver(plants, rigid, self.detection, self.parameters, numbers, wires)
         self._wires = wires
         self._deflected = np.zeros(0, int)
         self._update_rigid_world()
@@ -124,7 +124,7 @@ class ContactSolver:
             plants.wake(reached)
             plants.predict(reached)
         if detection.candidates is not candidates:
-            self.impulses.bind_launches(detection)
+            self.impulses.make_graphs()
         return plants.awake
 
     def _find_contacts(self, awake: np.ndarray) -> None:
@@ -132,7 +132,7 @@ class ContactSolver:
         detection = self.detection
         impulses = self.impulses
         capacity = self.impulses.capacity
-        impulses.find_contacts()
+        impulses.find_contacts(len(awake))
         counters = detection.counters.tolist()
         count = counters[structs.CONTACTS]
         overflow = counters[structs.OVERFLOW]
@@ -274,4 +274,4 @@ class ContactSolver:
         self._rigid_arrays = arrays = RigidArrays(self.rigid, self.remote_actors, self._kernel_parameters, previous)
         self._generation = self.rigid.generation
         self.detection.set_rigid_world(arrays)
-        self.impulses.set_rigid_world(arrays, self.detection, previous)
+        self.impulses.set_rigid_world(arrays, previous)

@@ -2,19 +2,17 @@
 
 The stages of a step: :meth:`ContactDetection.find_near_trees` (broadphase of actors and all trees), then, with the
 prediction of the plants known, :meth:`ContactDetection.find_reached_trees` (sleeping trees that awake trees touch) and
-:attr:`ContactDetection.narrowphase` (contacts of the awake trees). Kernels are bound to their arrays once for each
-listing of the rigid world, as a bound launch costs a fifth of a plain launch.
+:attr:`ContactDetection.narrowphase` (contacts of the awake trees). Each stage is a graph of kernels
+(:mod:`vinesim.kernels.graph`), made again when an array is allocated again.
 """
 
 from __future__ import annotations
-
-import ctypes
 
 import numpy as np
 import warp as wp
 
 from vinesim.contact.collision_arrays import PlantArrays, RigidArrays
-from vinesim.core.warp_arrays import SharedArrays, entry, share
+from vinesim.core.warp_arrays import SharedArrays, share
 from vinesim.kernels.contact import (
     broadphase,
     narrowphase_plants,
@@ -23,19 +21,13 @@ from vinesim.kernels.contact import (
     structs,
     sweep_order,
 )
-from vinesim.kernels.launch import BoundLaunch, bind_launch
-from vinesim.kernels.shared_launch import ONCE
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.collision_geoms import PLANE_HALF_SIZE
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.wires.deflected_wires import DeflectedWires
 
 AABB_BLOCK = int(structs.AABB_BLOCK)
-TREES_PER_CHUNK = {"boxes": 8, "rigid": 2, "plants": 4}
-"""Kernel family -> number of trees that a thread takes at a time, 3 to 8 us of work.
-
-DERIVED from the times of one tree of 17 bodies.
-"""
 MAX_PASSING_BUNCHES = 4
 """Number of picked bunches that can pass through one tree at the same time. A further bunch touches it at once."""
 PAIRS_AT_ONCE = 64
@@ -60,13 +52,12 @@ class ContactDetection:
         self.parameters = parameters
         self._kernel_parameters = kernel_parameters
         trees = len(arrays.trees.is_fine)
-        self._order = np.arange(trees, dtype=np.int32)
         self._sorted_rows = np.zeros((2, trees), np.int32)
         self._is_near = np.zeros(trees, np.bool_)
         self._is_reached = np.zeros(trees, np.bool_)
         self._clearances = SharedArrays.zeros(structs.Clearances, len(arrays.capsules.body))
         self._passing = np.full((trees, MAX_PASSING_BUNCHES), -1, np.int32)
-        self.counters = np.zeros(structs.COUNTERS, np.int32)
+        self.counters = plants.buffers.pinned(np.zeros(structs.COUNTERS, np.int32))
         """[COUNTERS] Counts that the kernels write. :mod:`vinesim.kernels.contact.structs` names the entries."""
         self.tree_boxes = SharedArrays.zeros(structs.Aabbs, trees)
         self._wood_boxes = SharedArrays.zeros(structs.Aabbs, trees)
@@ -75,12 +66,6 @@ class ContactDetection:
         self._block_boxes = SharedArrays.zeros(structs.Aabbs, blocks)
         self._listed: np.ndarray | None = None
         """Awake trees that the kernels' lists hold. None after the lists were filled with other trees."""
-        self._block_count = ctypes.c_int32()
-        """Number of blocks that these trees belong to."""
-        self._searching_trees = ctypes.c_int32()
-        """Number of awake trees that are compared with sleeping trees."""
-        self._paired_trees = ctypes.c_int32()
-        """Number of awake trees that are compared with each other."""
         self.slots = np.arange(parameters.max_contacts_per_tree)
         self._room = 0
 
@@ -100,7 +85,7 @@ class ContactDetection:
         self._static_bounded = False
 
     def _allocate_candidates(self, trees: int) -> None:
-        """Allocate the candidate arrays for ``trees`` awake trees, and bind the kernels to them."""
+        """Allocate the candidate arrays for ``trees`` awake trees, and make the graphs of the kernels on them."""
         self._room, slots = trees, len(self.slots)
         static = min(self.rigid_arrays.static, self.parameters.max_static_geoms_per_tree)
         near = self.rigid_arrays.capacity - self.rigid_arrays.static + static
@@ -114,7 +99,7 @@ class ContactDetection:
             skipped_geoms=np.zeros(trees, np.int32),
             near_pairs=np.zeros((trees * PAIRS_AT_ONCE, 2), np.int32),
         )
-        self._bind_launches()
+        self._make_graphs()
 
     # ------------------------------------------------------------------ broadphase
 
@@ -122,8 +107,8 @@ class ContactDetection:
         """Update the bounding boxes of ``trees`` [k] and of their blocks to the present poses of the bodies."""
         self._list(trees)
         self._listed = None
-        self._searching_trees.value = 0
-        self._find_reached_trees()
+        self.counters[structs.SEARCHING_TREES] = 0
+        self._find_reached_trees(len(trees))
         self.compare_anew()
 
     def _list(self, trees: np.ndarray) -> None:
@@ -131,7 +116,7 @@ class ContactDetection:
         blocks = np.unique(trees // AABB_BLOCK)
         self.arrays.trees.awake[: len(trees)], self._blocks[: len(blocks)] = trees, blocks
         self.counters[structs.AWAKE_TREES] = len(trees)
-        self._block_count.value = len(blocks)
+        self.counters[structs.CHANGED_BLOCKS] = len(blocks)
 
     def compare_anew(self) -> None:
         """Make the next step compare all capsules of awake trees with those of sleeping trees.
@@ -170,7 +155,7 @@ class ContactDetection:
 
     def _bound_static_geoms(self) -> None:
         """Compute the bounding boxes of the blocks of static geoms. The ground's box has no lower end."""
-        self._geom_aabbs(self.rigid_arrays.count)
+        self._bound_all_geoms()
         first = self.rigid_arrays.movable
         states = self.rigid_arrays.geom_states
         boxes = self._static_blocks
@@ -210,9 +195,10 @@ class ContactDetection:
                 self._allocate_candidates(2 * len(awake))
         count = len(awake)
         sleep = among_plants and len(awake) < len(self._is_reached)
-        self._paired_trees.value = count if among_plants else 0
-        self._searching_trees.value = count if sleep else 0  # a tree that falls asleep calls compare_anew()
-        self._find_reached_trees()
+        self.counters[structs.PAIRED_TREES] = count if among_plants else 0
+        # a tree that falls asleep calls compare_anew()
+        self.counters[structs.SEARCHING_TREES] = count if sleep else 0
+        self._find_reached_trees(count)
         if not sleep:
             return _NO_TREES
         reached = self._is_reached.nonzero()[0]
@@ -224,10 +210,10 @@ class ContactDetection:
         found = np.flatnonzero(self.slots < self.candidates.count[:trees, None])
         return np.sort(found[np.argsort(self.candidates.gap.ravel()[found], kind="stable")[:count]])
 
-    # ------------------------------------------------------------------ launches
+    # ------------------------------------------------------------------ graphs
 
-    def _bind_launches(self) -> None:
-        """Bind every kernel to its arrays."""
+    def _make_graphs(self) -> None:
+        """Make the graphs of all stages on the arrays that are allocated now."""
         parameters = self._kernel_parameters
         plants = self.arrays
         rigid = self.rigid_arrays
@@ -242,99 +228,86 @@ class ContactDetection:
         wood_boxes = self._wood_boxes.struct
         actor_boxes = self._actor_boxes.struct
         block_boxes = self._block_boxes.struct
-        order = share(self._order, wp.int32)
         candidates = self.candidates.struct
+        counters = share(self.counters, wp.int32)
+        movable, listed = (geoms.count[k : k + 1] for k in range(2))
+        most_movable = rigid.capacity - rigid.static
 
-        def bind_shared(kernel: wp.Kernel, given: list, results: list, chunk: str) -> BoundLaunch:
-            """Bind a kernel over trees to its arrays, as a launch whose work the threads of the plants share."""
-            pool = self.plants.launch_pool
-            launch = bind_launch(kernel, given, results, index_list="order", partitions=pool.size)
-            return pool.share([launch], TREES_PER_CHUNK[chunk])
+        def bound_geoms(count: wp.array, most: int) -> KernelLaunch:
+            given = [parameters, geoms, count, rigid.bodies.struct]
+            return KernelLaunch(broadphase.geom_aabbs, given, [geom_states], threads=most)
 
-        self._geom_aabbs = bind_launch(broadphase.geom_aabbs, [parameters, geoms, rigid.bodies.struct], [geom_states])
-        actor_aabbs = bind_launch(
-            broadphase.actor_aabbs, [actors, geoms, rigid.bodies.struct, geom_states], [actor_boxes]
-        )
-        mark_near_trees = bind_launch(
-            broadphase.mark_near_trees,
-            [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
-            [share(self._is_near, wp.bool), share(self.counters, wp.int32)],
-        )
-        tree_aabbs = bind_shared(
-            broadphase.tree_aabbs,
-            [parameters, capsules, order, trees, bodies],
-            [capsule_states, wood_boxes, tree_boxes],
-            "boxes",
-        )
-        block_aabbs = bind_launch(broadphase.block_aabbs, [share(self._blocks, wp.int32), tree_boxes], [block_boxes])
-        find_reached_trees = bind_shared(
-            sleeping_trees.find_reached_trees,
-            [parameters, capsules, order, trees, block_boxes, tree_boxes, bodies, capsule_states],
-            [self._clearances.struct, share(self._is_reached, wp.bool)],
-            "boxes",
-        )
-        find_rigid_contacts = bind_shared(
-            narrowphase_rigid.find_rigid_contacts,
-            [
-                parameters,
-                self.parameters.max_static_geoms_per_tree,
-                capsules,
-                geoms,
-                order,
-                trees,
-                tree_boxes,
-                bodies,
-                capsule_states,
-                rigid.bodies.struct,
-                rigid.hulls.struct,
-                geom_states,
-                self._static_blocks.struct,
-            ],
-            [self._passing_bunches.struct, candidates],
-            "rigid",
-        )
-        sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
-        sort_awake_trees = bind_launch(
-            sweep_order.sort_awake_trees, [trees, tree_boxes], [share(self.counters, wp.int32), sorted_rows, scratch]
-        )
-        find_plant_contacts = bind_shared(
-            narrowphase_plants.find_plant_contacts,
-            [
-                parameters,
-                capsules,
-                order,
-                sorted_rows,
-                share(self.counters, wp.int32),
-                trees,
-                tree_boxes,
-                wood_boxes,
-                bodies,
-                capsule_states,
-            ],
-            [candidates],
-            "plants",
-        )
-        sequence = self.plants.launch_pool.sequence
-        awake = entry(self.counters, structs.AWAKE_TREES)
-        self._find_near_trees = sequence(
-            [
-                (rigid.take_free_velocities, rigid.dofs),
-                (self._geom_aabbs, entry(rigid.geoms.count)),
-                (actor_aabbs, entry(rigid.actors.count)),
-                (mark_near_trees, ctypes.c_int32(len(self._blocks))),
-            ]
+        self._bound_all_geoms = KernelGraph(bound_geoms(listed, rigid.capacity))
+        self._find_near_trees = KernelGraph(
+            rigid.take_free_velocities,
+            bound_geoms(movable, most_movable),
+            KernelLaunch(
+                broadphase.actor_aabbs,
+                [actors, geoms, rigid.bodies.struct, geom_states],
+                [actor_boxes],
+                threads=most_movable,
+            ),
+            KernelLaunch(
+                broadphase.mark_near_trees,
+                [actors, capsules, trees, capsule_states, block_boxes, tree_boxes, actor_boxes, geom_states],
+                [share(self._is_near, wp.bool), counters],
+                threads=len(self._blocks),
+            ),
         )
         # without the boxes of blocks, actors near a tree that was dragged out of its block would be missed
-        self._find_reached_trees = sequence(
-            [
-                (tree_aabbs, awake),
-                (block_aabbs, self._block_count),
-                (find_reached_trees, self._searching_trees),
-            ]
+        self._find_reached_trees = KernelGraph(
+            KernelLaunch(
+                broadphase.tree_aabbs,
+                [parameters, capsules, counters, trees, bodies],
+                [capsule_states, wood_boxes, tree_boxes],
+            ),
+            KernelLaunch(broadphase.block_aabbs, [counters, share(self._blocks, wp.int32), tree_boxes], [block_boxes]),
+            KernelLaunch(
+                sleeping_trees.find_reached_trees,
+                [parameters, capsules, counters, trees, block_boxes, tree_boxes, bodies, capsule_states],
+                [self._clearances.struct, share(self._is_reached, wp.bool)],
+            ),
         )
-        self.narrowphase = [
-            (find_rigid_contacts, awake),
-            (sort_awake_trees, ONCE),
-            (find_plant_contacts, self._paired_trees),
-        ]
-        """Launches that fill ``candidates`` for the listed awake trees, each with its number of threads."""
+        sorted_rows, scratch = (share(rows, wp.int32) for rows in self._sorted_rows)
+        self.narrowphase = (
+            KernelLaunch(
+                narrowphase_rigid.find_rigid_contacts,
+                [
+                    1,
+                    parameters,
+                    self.parameters.max_static_geoms_per_tree,
+                    capsules,
+                    geoms,
+                    counters,
+                    trees,
+                    tree_boxes,
+                    bodies,
+                    capsule_states,
+                    rigid.bodies.struct,
+                    rigid.hulls.struct,
+                    geom_states,
+                    self._static_blocks.struct,
+                ],
+                [self._passing_bunches.struct, candidates],
+                threads=1,
+            ),
+            KernelLaunch(
+                sweep_order.sort_awake_trees, [trees, tree_boxes], [counters, sorted_rows, scratch], threads=1
+            ),
+            KernelLaunch(
+                narrowphase_plants.find_plant_contacts,
+                [
+                    parameters,
+                    capsules,
+                    sorted_rows,
+                    counters,
+                    trees,
+                    tree_boxes,
+                    wood_boxes,
+                    bodies,
+                    capsule_states,
+                ],
+                [candidates],
+            ),
+        )
+        """Launches that fill ``candidates`` for the listed awake trees."""

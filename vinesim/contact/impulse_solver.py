@@ -11,29 +11,20 @@ import math
 import numpy as np
 import warp as wp
 
-from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, material_pairs
+from vinesim.contact.collision_arrays import RigidArrays, material_pairs
 from vinesim.contact.detection import ContactDetection
 from vinesim.contact.row_response import RowResponse
 from vinesim.core import frames
-from vinesim.core.warp_arrays import SharedArrays, entry, share, zeros
+from vinesim.core.warp_arrays import SharedArrays, share, zeros
 from vinesim.kernels.contact import delassus, forces, islands, jacobians, projected_gauss_seidel, structs
 from vinesim.kernels.contact.friction_law import Steps, Surface
 from vinesim.kernels.contact.island_system import IslandSystem
-from vinesim.kernels.launch import BoundLaunch, bind_launch
-from vinesim.kernels.shared_launch import ONCE
+from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.wires.deflected_wires import DeflectedWires, WireContacts
 
-ITEMS_PER_CHUNK = {
-    "write_contact_rows": 16,
-    "respond_rigidly": 16,
-    "assemble_delassus": 16,
-    "solve_islands": 1,
-    "store_warm_start": 48,
-}
-"""Kernel -> number of contacts or islands that a thread takes at a time: 5 us of work or more."""
 MATRIX_CONTACTS = 16
 """Number of contacts in a block for which the matrices have room at first. They grow if blocks are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
@@ -47,22 +38,25 @@ class ImpulseSolver:
         self,
         plants: ArticulationSolver,
         rigid: RigidWorld,
-        arrays: PlantArrays,
+        detection: ContactDetection,
         parameters: PhysicsParameters,
         kernel_parameters: structs.Parameters,
         wires: DeflectedWires | None = None,
     ) -> None:
-        """``wires``: the trellis wires that deflect under contact forces. If None, all wires are rigid."""
+        """``detection`` finds the candidates. ``wires``: the trellis wires that deflect under contact forces; if None,
+        all wires are rigid.
+        """
+        self._detection = detection
+        self._counters = counters = detection.counters
         self._wires = None if wires is None else WireContacts(wires)
         self._at_wires = np.zeros(0, int)
         self.plants = plants
         self.rigid = rigid
-        self.arrays = arrays
         self.parameters = parameters
         self._kernel_parameters = kernel_parameters
         self._pairs = material_pairs(parameters)
         n = self.capacity = parameters.contact_capacity
-        self.response = response = RowResponse(plants, n)
+        self.response = response = RowResponse(plants, n, counters)
         slots = {"body_slot": response.body_slot, "other_slot": response.other_slot}
         self.contacts = SharedArrays.zeros(structs.Contacts, n, **slots)
         self.warm_start = SharedArrays.zeros(structs.WarmStart, n, count=np.zeros(1, np.int32))
@@ -85,7 +79,6 @@ class ImpulseSolver:
                 "sweeps",
             )
         }
-        self._items = np.arange(3 * n, dtype=np.int32)
         self._matrix = np.zeros(9 * MATRIX_CONTACTS * n)
         self._row_arrays = {
             "plant_jacobian": response.jacobian,
@@ -123,9 +116,7 @@ class ImpulseSolver:
         self.unfinished = 0
         """How often the solve of an island ended at the largest number of sweeps, perhaps outside its tolerance."""
 
-    def set_rigid_world(
-        self, rigid_arrays: RigidArrays, detection: ContactDetection, previous: RigidArrays | None
-    ) -> None:
+    def set_rigid_world(self, rigid_arrays: RigidArrays, previous: RigidArrays | None) -> None:
         """Take over the rigid world after it was compiled again. The warm start is kept by the names of the geoms."""
         self.rigid_arrays = rigid_arrays
         if previous is not None:
@@ -135,7 +126,7 @@ class ImpulseSolver:
                 if 0 <= geom < len(previous.names):
                     other[k] = at.get(previous.names[geom], REMOVED_GEOM)
         self._allocate()
-        self.bind_launches(detection)
+        self.make_graphs()
 
     def renumber_geoms(self, number: np.ndarray) -> None:
         """Renumber the geoms of the warm start: ``number`` [geom] is a former geom's new index, -1 if it is gone."""
@@ -193,7 +184,7 @@ class ImpulseSolver:
     @property
     def island_count(self) -> int:
         """Number of islands in the last solve."""
-        return int(self._detection.counters[structs.ISLANDS])
+        return int(self._counters[structs.ISLANDS])
 
     @property
     def sweeps(self) -> int:
@@ -205,26 +196,27 @@ class ImpulseSolver:
         self.bodies = self.touched.body[:0]
         self.wrenches = self._wrench[:0]
         self.rigid_force = None
-        self._detection.counters[structs.ISLANDS] = self.warm_start.count[0] = 0
+        self._counters[structs.ISLANDS] = self.warm_start.count[0] = 0
 
-    def find_contacts(self) -> None:
-        """List the contacts of the listed awake trees, the plant bodies in contact, and the islands.
+    def find_contacts(self, trees: int) -> None:
+        """List the contacts of the ``trees`` listed awake trees, the plant bodies in contact, and the islands.
 
         If there are too many contacts, no islands are built; see :meth:`build_islands`.
         """
         self.rigid_arrays.bodies.tree_island[:] = self.rigid.islands
-        self._find_contacts()
+        self._find_contacts(trees)
 
     def build_islands(self) -> None:
         """Build the islands of the contacts that are listed now."""
-        self._build_islands(1)
+        self._counters[structs.HAVE_ROOM] = 1
+        self._build_islands()
 
     def solve(self, count: int) -> None:
         """Find the impulses of the first ``count`` contacts, and their effect on plants and on rigid bodies."""
         n = count
         if self._make_room():
-            self._build_islands(1)
-        counters = self._detection.counters
+            self.build_islands()
+        counters = self._counters
         self._padded_rows = int(self.islands.row_start[counters[structs.BLOCKS]])
         self._most_contacts = max(self._most_contacts, n)
         if self._wires is not None:
@@ -234,7 +226,7 @@ class ImpulseSolver:
         if self.rigid.mj_data.nefc and self.rigid.is_constrained(self._touched_rigid_bodies(n)):
             self._solve_constrained(n)
         else:
-            self._solve()
+            self._solve(n)
         self.unfinished += int(counters[structs.UNFINISHED])
         self.warm_start.count[0] = n
         self.bodies = self.touched.body[: counters[structs.BODIES]]
@@ -242,26 +234,26 @@ class ImpulseSolver:
 
     def _solve_constrained(self, count: int) -> None:
         """Solve the contacts when MuJoCo's constraints bind rigid bodies: MuJoCo then computes their response."""
-        self._write_rows()
+        self._write_rows(count)
         self._rigid_spans[:count] = 0, self.rigid.mj_model.nv
         self._respond_constrained(by_rows(self.rows.rigid_jacobian[:count]))
-        self._assemble_and_solve()
+        self._assemble_and_solve(count)
         self._follow_constraints(count)
-        self._store()
+        self._store(count)
 
     def _make_room(self) -> bool:
         """Make room for the matrices and responses of the contacts.
 
         Returns whether the contacts must be listed again.
         """
-        counters = self._detection.counters
+        counters = self._counters
         entries = int(counters[structs.MATRIX_ENTRIES])
         larger = entries > len(self._matrix)
         if larger:
             self._matrix = np.zeros(2 * entries)
             self._allocate()
         if self.response.make_room(int(counters[structs.RESPONSE_NUMBERS])) or larger:
-            self.bind_launches(self._detection)
+            self.make_graphs()
         return larger
 
     def _end_at_wires(self, count: int, wires: WireContacts) -> None:
@@ -354,17 +346,21 @@ class ImpulseSolver:
         other = self.contacts.other[:count]
         return self.rigid_arrays.geoms.body[other[other >= 0]]
 
-    def bind_launches(self, detection: ContactDetection) -> None:
-        """Bind every kernel to its arrays. Call this again when ``detection`` has new candidate arrays."""
-        self._detection = detection
+    def make_graphs(self) -> None:
+        """Make the graphs of all stages on the arrays that are allocated now.
+
+        Call this again when the detection has allocated its arrays again.
+        """
         p = self.parameters
         parameters = self._kernel_parameters
         rigid = self.rigid_arrays
-        capsules = self.arrays.capsules.struct
-        bodies = self.arrays.bodies.struct
+        plants = self._detection.arrays
+        capsules = plants.capsules.struct
+        bodies = plants.bodies.struct
         geoms = rigid.geoms.struct
         rigid_bodies = rigid.bodies.struct
-        candidates = detection.candidates.struct
+        factors = rigid.factors.struct
+        candidates = self._detection.candidates.struct
         contacts = self.contacts.struct
         island_lists = self.islands.struct
         rows = self.rows.struct
@@ -372,64 +368,91 @@ class ImpulseSolver:
         system = self.system.struct
         side_groups = self.response.groups.struct
         response = share(self.response.numbers, wp.float32)
-        counters = share(detection.counters, wp.int32)
+        counters = share(self._counters, wp.int32)
         touched = self.touched.struct
-        items = share(self._items, wp.int32)
 
-        def bind_shared(kernel: wp.Kernel, model: list, given: list, results: list) -> BoundLaunch:
-            """Bind a kernel over contacts or islands to its arrays, as a launch that the plants' threads share."""
-            pool = self.plants.launch_pool
-            launch = bind_launch(kernel, [*model, items, *given], results, index_list="items", partitions=pool.size)
-            return pool.share([launch], ITEMS_PER_CHUNK[kernel.key])
-
-        compact_candidates = bind_launch(islands.compact_candidates, [candidates], [contacts, counters])
-        self._build_islands = bind_launch(
+        compact_candidates = KernelLaunch(islands.compact_candidates, [candidates], [contacts, counters], threads=1)
+        build_islands = KernelLaunch(
             islands.build_islands,
             [capsules, geoms, bodies, rigid_bodies, candidates],
             [counters, touched, contacts, island_lists, side_groups],
+            threads=1,
         )
-        write_contact_rows = bind_shared(
+        write_contact_rows = KernelLaunch(
             jacobians.write_contact_rows,
-            [parameters, share(self._pairs, Surface), capsules, geoms],
-            [bodies, rigid_bodies, rigid.factors.struct, candidates, warm_start],
+            [
+                1,
+                parameters,
+                share(self._pairs, Surface),
+                capsules,
+                geoms,
+                counters,
+                bodies,
+                rigid_bodies,
+                factors,
+                candidates,
+                warm_start,
+            ],
             [share(self._rigid_spans, wp.vec2i), contacts, rows],
+            threads=1,
         )
-        respond_rigidly = bind_shared(
-            delassus.respond_rigidly, [geoms], [rigid_bodies, rigid.factors.struct, contacts], [rows]
+        respond_rigidly = KernelLaunch(
+            delassus.respond_rigidly, [geoms, counters, rigid_bodies, factors, contacts], [rows]
         )
-        assemble_delassus = bind_shared(
-            delassus.assemble_delassus, [], [contacts, touched, island_lists, side_groups, response], [rows]
+        assemble_delassus = KernelLaunch(
+            delassus.assemble_delassus, [counters, contacts, touched, island_lists, side_groups, response], [rows]
         )
-        self._solve_islands = bind_shared(
+        solve_islands = KernelLaunch(
             projected_gauss_seidel.solve_islands,
-            [parameters, p.solver_sweeps, p.solver_newton_steps, p.solver_newton_contacts, p.solver_tolerance, geoms],
-            [contacts],
+            [
+                parameters,
+                p.solver_sweeps,
+                p.solver_newton_steps,
+                p.solver_newton_contacts,
+                p.solver_tolerance,
+                geoms,
+                counters,
+                contacts,
+            ],
             [island_lists, system, rows],
         )
-        store_warm_start = bind_shared(
-            forces.store_warm_start, [parameters], [island_lists, system, rows], [contacts, warm_start]
+        stored = (
+            KernelLaunch(
+                forces.store_warm_start, [parameters, counters, island_lists, system, rows], [contacts, warm_start]
+            ),
+            KernelLaunch(forces.count_unfinished, [p.solver_sweeps, island_lists], [counters], threads=1),
+            KernelLaunch(
+                forces.accumulate_wrenches,
+                [parameters, counters, contacts, rows],
+                [share(self._wrench, wp.float64)],
+                threads=1,
+            ),
         )
-        count_unfinished = bind_launch(forces.count_unfinished, [p.solver_sweeps, island_lists], [counters])
-        accumulate_wrenches = bind_launch(
-            forces.accumulate_wrenches, [parameters, counters, contacts, rows], [share(self._wrench, wp.float64)]
-        )
-        sequence = self.plants.launch_pool.sequence
-        of_contacts, of_groups, of_islands, have_room = (
-            entry(detection.counters, place)
-            for place in (structs.CONTACTS, structs.GROUPS, structs.ISLANDS, structs.HAVE_ROOM)
-        )
-        rows_first = [(write_contact_rows, of_contacts), (self.response.launch, of_groups)]
-        solved = [(assemble_delassus, of_contacts), (self._solve_islands, of_islands)]
-        stored = [(store_warm_start, of_contacts), (count_unfinished, ONCE), (accumulate_wrenches, ONCE)]
-        self._find_contacts = sequence(
-            [
-                *detection.narrowphase,
-                (compact_candidates, ONCE),
-                (self._build_islands, have_room),
-            ]
-        )
-        self._solve = sequence([*rows_first, (respond_rigidly, of_contacts), *solved, *stored])
-        self._write_rows, self._assemble_and_solve, self._store = map(sequence, (rows_first, solved, stored))
+        self._find_contacts = KernelGraph(*self._detection.narrowphase, compact_candidates, build_islands)
+        self._build_islands = KernelGraph(build_islands)
+        self._solve_islands = KernelGraph(solve_islands)
+        self._assemble_and_solve = KernelGraph(assemble_delassus, solve_islands)
+        self._store = KernelGraph(*stored)
+        after_response = (respond_rigidly, assemble_delassus, solve_islands, *stored)
+        if self.plants.buffers.device.is_cpu:
+            self._write_rows = KernelGraph(write_contact_rows, self.response.launch)
+            self._solve = KernelGraph(write_contact_rows, self.response.launch, *after_response)
+            return
+        write_rows = KernelGraph(write_contact_rows)
+        respond = KernelGraph(self.response.launch, device=str(self.plants.buffers.device))
+        solve = KernelGraph(*after_response)
+
+        def write_and_respond(count: int) -> None:
+            write_rows(count)
+            respond()
+            self.plants.buffers.synchronize()
+
+        def solve_with_response(count: int) -> None:
+            write_and_respond(count)
+            solve(count)
+
+        self._write_rows = write_and_respond
+        self._solve = solve_with_response
 
 
 def by_rows(jacobian: np.ndarray) -> np.ndarray:

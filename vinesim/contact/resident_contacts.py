@@ -21,7 +21,7 @@ from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.tree_solver import TreeSearch, TreeSystem
 from vinesim.kernels.contact.tree_views import GROUP
-from vinesim.kernels.launch import THREADS_PER_BLOCK, bind_launch
+from vinesim.kernels.graph import THREADS_PER_BLOCK, KernelGraph, KernelLaunch
 from vinesim.kernels.plants import structs as plant_structs
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import WARP_SIZE
@@ -40,9 +40,6 @@ FIRST_LANES = 16
 """Number of GPU threads that share a tree with few contacts; each thread solves one row."""
 WARPS = 132 * 32
 """Number of GPU warps that solve at the same time: as many as a GPU with 132 multiprocessors holds."""
-
-Launches = list[tuple[Any, int]]
-"""Bound kernels, each with its number of threads."""
 
 
 class ResidentContacts:
@@ -79,7 +76,7 @@ class ResidentContacts:
         self._take_over_plants(PlantArrays(model, plants, plant_capsules(model)))
         self._take_over_geoms(RigidArrays(rigid, set(), self._numbers, None))
         self._allocate()
-        self._before, self._solves, self._after = self._bind()
+        self._before, self._solve_most, self._solve_busy, self._after = self._make_graphs()
         self._beside = None if self._device.is_cpu else wp.Stream(self._device, priority=-1)
 
     def _check(self, rigid: RigidWorld) -> None:
@@ -175,8 +172,10 @@ class ResidentContacts:
         self._rigid_bodies = self._on_device(structs.RigidBodies, rigid.bodies.struct)
         self._hulls = self._on_device(structs.Hulls, rigid.hulls.struct)
         self._geom_states = self._on_device(structs.GeomStates, rigid.geom_states.struct)
-        given = [self._numbers, self._geoms, self._rigid_bodies]
-        wp.launch(broadphase.geom_aabbs, rigid.count, inputs=given, outputs=[self._geom_states], device=device)
+        given = [self._numbers, self._geoms, self._geoms.count[1:], self._rigid_bodies]
+        KernelGraph(
+            KernelLaunch(broadphase.geom_aabbs, given, [self._geom_states], threads=rigid.count), device=str(device)
+        )()
         low, high = (getattr(self._geom_states, name).numpy() for name in ("low", "high"))
         low[rigid.geoms.kind[: len(low)] == 0, 2] = -PLANE_HALF_SIZE
         self._geom_states.low.assign(low)
@@ -233,10 +232,9 @@ class ResidentContacts:
 
     # ------------------------------------------------------------------ kernels
 
-    def _bind(self) -> tuple[Launches, Launches, Launches]:
-        """Bind every kernel of a step to its arrays, with its number of threads.
-
-        Returns the launches before the solves, the solves, and the launches after them.
+    def _make_graphs(self) -> tuple[KernelGraph, KernelGraph, KernelGraph, KernelGraph]:
+        """Returns the graphs of a step's kernels: before the solves, the solve of most trees, the solve of trees with
+        many contacts, and after the solves.
         """
         p = self.parameters
         plants = self.plants.launches
@@ -275,15 +273,15 @@ class ResidentContacts:
             first_lanes = (FIRST_LANES,)
             search = ()
 
-        def bound(kernel: Any, count: int, *given: Any) -> tuple[Any, int]:
-            block = THREADS_PER_BLOCK if count == trees else FULL_BLOCK
-            return bind_launch(kernel, list(given), [], device=device, block=block), count
+        def launch(kernel: Any, threads: int, *given: Any) -> KernelLaunch:
+            block = THREADS_PER_BLOCK if threads == trees else FULL_BLOCK
+            return KernelLaunch(kernel, given, threads=threads, block=block)
 
         is_round = np.isin(self._geoms.kind.numpy(), (PLANE, SPHERE, CAPSULE)).all()
         find = tree_narrowphase.find_round_tree_contacts if is_round else tree_narrowphase.find_tree_contacts
         compliances = fill(tree_delassus.BodyCompliances, P="M", Q="H", R="J")  # unused memory after the prediction
         before = [
-            bound(
+            launch(
                 tree_narrowphase.list_near_pairs,
                 trees,
                 parameters,
@@ -296,7 +294,7 @@ class ResidentContacts:
                 self._capsule_states,
                 contacts,
             ),
-            bound(
+            launch(
                 find,
                 trees * self.slots,
                 parameters,
@@ -312,8 +310,10 @@ class ResidentContacts:
                 contacts,
                 self.candidates,
             ),
-            bound(tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source),
-            bound(
+            launch(
+                tree_narrowphase.number_tree_contacts, trees, trees, self.slots, few, contacts, self.contacts.source
+            ),
+            launch(
                 tree_islands.predict_impacted_trees,
                 trees,
                 plants.parameters,
@@ -329,7 +329,7 @@ class ResidentContacts:
                 scratch,
                 prediction,
             ),
-            bound(
+            launch(
                 tree_islands.write_tree_rows,
                 entries * self.slots,
                 parameters,
@@ -346,7 +346,7 @@ class ResidentContacts:
                 self.contacts,
                 self.rows,
             ),
-            bound(
+            launch(
                 tree_delassus.respond_at_contacts,
                 trees,
                 model,
@@ -359,7 +359,7 @@ class ResidentContacts:
                 compliances,
                 self._response,
             ),
-            bound(
+            launch(
                 tree_delassus.write_delassus,
                 entries * self.slots,
                 model,
@@ -374,64 +374,62 @@ class ResidentContacts:
                 self._system,
             ),
         ]
-        solves = [
-            bound(solve, of_most, *numbers, trees, width, *first_lanes, contacts, self._system, *search),
-            bound(
-                tree_islands.solve_busy_trees,
-                self._groups * lanes,
-                *numbers,
-                trees,
-                width,
-                lanes,
-                self._groups,
-                contacts,
-                self._system,
-                self._dense,
-                self._dense_search,
-            ),
-        ]
-        after = [
-            bound(
-                tree_islands.apply_tree_impulses,
-                trees,
-                parameters,
-                model,
-                arrays["body_branches"],
-                onset,
-                trees,
-                width,
-                self._bodies.q,
-                self.rows,
-                self._system,
-                factors,
-                self._was_in_contact,
-                arrays["tree_euler_steps"],
-                contacts,
-                self.contacts,
-                self._warm_start,
-                arrays["body_wrench"],
-                work,
-                scratch,
-                prediction,
-            ),
-        ]
-        return before, solves, after
+        solve_most = launch(solve, of_most, *numbers, trees, width, *first_lanes, contacts, self._system, *search)
+        solve_busy = launch(
+            tree_islands.solve_busy_trees,
+            self._groups * lanes,
+            *numbers,
+            trees,
+            width,
+            lanes,
+            self._groups,
+            contacts,
+            self._system,
+            self._dense,
+            self._dense_search,
+        )
+        after = launch(
+            tree_islands.apply_tree_impulses,
+            trees,
+            parameters,
+            model,
+            arrays["body_branches"],
+            onset,
+            trees,
+            width,
+            self._bodies.q,
+            self.rows,
+            self._system,
+            factors,
+            self._was_in_contact,
+            arrays["tree_euler_steps"],
+            contacts,
+            self.contacts,
+            self._warm_start,
+            arrays["body_wrench"],
+            work,
+            scratch,
+            prediction,
+        )
+        return (
+            KernelGraph(*before, device=device),
+            KernelGraph(solve_most, device=device),
+            KernelGraph(solve_busy, device=device),
+            KernelGraph(after, device=device),
+        )
 
     def solve(self) -> None:
         """Launch the kernels that run between the prediction and the integration of a step. For ``advance()``."""
-        for launch, count in self._before:
-            launch(count)
-        (solve_most, of_most), (solve_busy, of_busy) = self._solves
+        self._before()
         if self._beside is None:
-            solve_most(of_most)
-            solve_busy(of_busy)
+            self._solve_most()
+            self._solve_busy()
         else:  # on two streams: few trees are busy, but each takes long
             with wp.ScopedStream(self._beside):
-                solve_busy(of_busy)
-            solve_most(of_most)
+                self._solve_busy()
+            self._solve_most()
             self._device.stream.wait_stream(self._beside)
-        for launch, count in self._after:
-            launch(count)
+        self._after()
 
     # ------------------------------------------------------------------ results
 

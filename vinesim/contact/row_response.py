@@ -8,16 +8,14 @@ import warp as wp
 from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import row_response
 from vinesim.kernels.contact.structs import SideGroups
-from vinesim.kernels.launch import BoundLaunch, bound, join_partitions
+from vinesim.kernels.graph import KernelLaunch
 from vinesim.kernels.plants.structs import ArticulationModel, Factors
 from vinesim.plants.articulation_solver import ArticulationSolver
 
 NUMBERS_PER_CONTACT = 256
 """Number of response values for each contact for which there is room at first. The room grows when more are needed."""
-GROUPS_PER_CHUNK = 2
-"""Number of groups of contact sides that a thread takes at a time: 4 us of work."""
 ROWS_ON_A_GPU = 256
-"""Number of groups that a GPU works on at once."""
+"""Number of threads on a GPU: the groups that it works on at the same time."""
 
 
 class RowResponse:
@@ -28,7 +26,8 @@ class RowResponse:
     read all of these.
     """
 
-    def __init__(self, plants: ArticulationSolver, contacts: int) -> None:
+    def __init__(self, plants: ArticulationSolver, contacts: int, counters: np.ndarray) -> None:
+        """``contacts``: largest number of contacts. ``counters`` [COUNTERS] holds the number of groups."""
         self.plants = plants
         buffers = plants.buffers
         self.jacobian = buffers.pinned(np.zeros((3 * contacts, 12)))
@@ -36,7 +35,7 @@ class RowResponse:
         self.body_slot, self.other_slot = (buffers.pinned(np.zeros(contacts, np.int32)) for _ in range(2))
         lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in SideGroups.vars}
         self.groups = SharedArrays(SideGroups, **lists)
-        self._contacts = contacts
+        self._counters = counters
         self._there = SideGroups()
         for name, data in lists.items():
             setattr(self._there, name, buffers.reach(data, wp.int32, name))
@@ -55,46 +54,30 @@ class RowResponse:
     def _bind(self) -> None:
         plants = self.plants
         buffers = self.plants.buffers
-        given = [
+        device = buffers.device
+        counters, *given = (
             buffers.reach(data, wp.int32, "list of responses")
-            for data in (self.body, self.tree_end, self.body_slot, self.other_slot)
-        ]
-        items = wp.array(np.arange(2 * self._contacts), dtype=wp.int32, device=buffers.device)
-        slots = wp.array(buffers.slots, dtype=wp.int32, device=buffers.device)
+            for data in (self._counters, self.body, self.tree_end, self.body_slot, self.other_slot)
+        )
         size = buffers.max_tree_size
-        jacobian = buffers.reach(self.jacobian, wp.float64, "jacobian")
-        numbers = buffers.reach(self.numbers, wp.float32, "response")
-        self._rows = 1 if buffers.device.is_cpu else ROWS_ON_A_GPU
-
-        def bind() -> BoundLaunch:
-            scratch = row_response.ResponseScratch()
-            scratch.is_on_path = wp.empty(self._rows * size, dtype=wp.bool, device=buffers.device)
-            scratch.values = wp.empty(
-                self._rows * size * row_response.BODY_NUMBERS, dtype=wp.float32, device=buffers.device
-            )
-            return plants.launches.record(
-                row_response.respond_to_groups,
+        threads = 1 if device.is_cpu else ROWS_ON_A_GPU
+        scratch = row_response.ResponseScratch()
+        scratch.is_on_path = wp.empty(threads * size, dtype=wp.bool, device=device)
+        scratch.values = wp.empty(threads * size * row_response.BODY_NUMBERS, dtype=wp.float32, device=device)
+        self.launch = KernelLaunch(
+            row_response.respond_to_groups,
+            [
                 plants.launches.fill(ArticulationModel),
                 size,
-                self._rows,
-                slots,
-                items,
+                threads,
+                wp.array(buffers.slots, dtype=wp.int32, device=device),
+                counters,
                 *given,
-                jacobian,
+                buffers.reach(self.jacobian, wp.float64, "jacobian"),
                 self._there,
                 plants.launches.fill(Factors),
-                scratch,
-                numbers,
-                index_list="items",
-            )
-
-        pool = plants.launch_pool
-        respond = pool.share([join_partitions([bind() for _ in range(pool.size)])], GROUPS_PER_CHUNK)
-
-        def respond_in_parts(groups: int, first: int = 0, partition: int = 0) -> None:
-            for start in range(first, first + groups, self._rows):
-                respond(min(self._rows, first + groups - start), start)
-            buffers.synchronize()
-
-        self.launch = respond if buffers.device.is_cpu else bound(respond_in_parts)
-        """Launch that fills :attr:`numbers` for groups. All groups must touch trees of the last prediction."""
+            ],
+            [scratch, buffers.reach(self.numbers, wp.float32, "response")],
+            threads=threads,
+        )
+        """Launch that fills :attr:`numbers` for all groups. All must touch trees of the last prediction."""

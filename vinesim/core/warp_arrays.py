@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from typing import Any
 
 import numpy as np
@@ -42,14 +41,6 @@ def share(data: np.ndarray, dtype: Any) -> wp.array:
     if data.size and array.ptr != data.ctypes.data:
         raise ValueError(f"an array of {data.shape} {data.dtype} is not contiguous: Warp would work on a copy")
     return array
-
-
-def entry(data: np.ndarray, place: int = 0) -> ctypes.c_int32:
-    """Entry ``place`` of a contiguous int32 array as a ctypes integer over the same memory.
-
-    It serves as the number of threads of a launch in a sequence of launches.
-    """
-    return ctypes.c_int32.from_buffer(data.data, data.itemsize * place)
 
 
 def zeros(dtype: Any, shape: tuple[int, ...]) -> np.ndarray:

@@ -30,12 +30,11 @@ import warp as wp
 import vinesim.kernels
 from vinesim.core import disk_cache, progress
 from vinesim.core.progress import ProgressLine
-from vinesim.kernels.launch import usable_cores
+from vinesim.core.thread_pool import usable_cores
 
 log = logging.getLogger(__name__)
 
 PHYSICS_PACKAGES = (
-    "shared_launch",
     "plants",
     "wires",
     "contact",

@@ -28,7 +28,6 @@ from vinesim.core import frames
 from vinesim.core.errors import checked_index
 from vinesim.core.warp_arrays import share
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
-from vinesim.kernels.launch import BoundLaunch, bind_launch
 from vinesim.kernels.plants import first_mode, structs
 from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
 from vinesim.kernels.plants.energy_budget import (
@@ -49,7 +48,6 @@ from vinesim.kernels.plants.kinematics import forward_kinematics
 from vinesim.kernels.plants.lean_prediction import predict_lean
 from vinesim.kernels.plants.prediction import predict
 from vinesim.kernels.plants.tree_checks import find_fastest
-from vinesim.kernels.shared_launch import LaunchPool
 from vinesim.plants.contact_loads import ContactLoads
 from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.plants.ties import RootRests, TieTable, turning_damping
@@ -90,7 +88,6 @@ class ArticulationSolver:
         dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
             them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
-        threads: number of threads that share the contacts on a CPU (the result is the same to the bit).
         fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
             ``PhysicsParameters``, and :mod:`vinesim.plants.fault_guard`.
         geometric_stiffness: include in the implicit solve the stiffness that weight and pull give to hanging bodies.
@@ -109,7 +106,6 @@ class ArticulationSolver:
         dt: float | None = None,
         phi: float | None = None,
         device: str = "cpu",
-        threads: int = 1,
         fast_rate: float | None = None,
         max_rate: float | None = None,
         fault_rate: float | None = None,
@@ -121,8 +117,6 @@ class ArticulationSolver:
         dt = p.dt if dt is None else dt
         phi = p.phi if phi is None else phi
         buffers = DeviceBuffers(device) if buffers is None else buffers
-        if not isinstance(threads, int) or threads < 1 or (threads > 1 and not buffers.device.is_cpu):
-            raise ValueError(f"{threads} threads on {device}: 1 or more on cpu; a GPU needs none, leave threads at 1")
         if not 0.0 < dt < math.inf or not 0.5 <= phi <= 1.0:
             raise ValueError(f"dt {dt} s, phi {phi}: need a finite dt above 0 and phi from 0.5 to 1")
         validate(model, state)
@@ -135,7 +129,6 @@ class ArticulationSolver:
         self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
         self.buffers = buffers
         """The memory in which arrays live, for NumPy and for kernels."""
-        self.threads = threads
         self.tick = 0
         """Number of integrations so far."""
         self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
@@ -143,9 +136,6 @@ class ArticulationSolver:
         self._allocate(phi)
         self.phi[model.body_tree[model.tie_body[model.tie_stiffness * dt**2 > p.stiff_tie_mass]]] = 1.0
         self._pin_arrays()
-        self.launch_pool = LaunchPool(threads)
-        """Threads that share the launches of contacts."""
-        weakref.finalize(self, self.launch_pool.close)
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self.onset_steps = numbers["contact_steps"] - 1  # steps with phi = 1 after contact began
         self.launches = KernelLaunches(self, numbers, MAX_SUBSTEPS if substeps else 1)
@@ -1122,10 +1112,6 @@ class KernelLaunches:
     def graph(self, *launches: KernelLaunch) -> KernelGraph:
         """A graph of launches that follow each other on the device."""
         return KernelGraph(*launches, device=str(self.buffers.device))
-
-    def record(self, kernel: Any, *arguments: object, **options: Any) -> BoundLaunch:
-        """The launch of a contact kernel with its arguments, for :attr:`ArticulationSolver.launch_pool`."""
-        return bind_launch(kernel, self._named(arguments), [], device=str(self.buffers.device), **options)
 
     def _named(self, arguments: Sequence[object]) -> list[Any]:
         return [self._arrays[value] if isinstance(value, str) else value for value in arguments]

@@ -8,6 +8,8 @@ import warp as wp
 
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,
+    AWAKE_TREES,
+    CHANGED_BLOCKS,
     NEAR_ASLEEP,
     Aabbs,
     Actors,
@@ -86,12 +88,18 @@ def geom_aabbs(
     parameters: Parameters,
     geoms: Geoms,
     # in
+    count: wp.array(dtype=wp.int32),
     rigid: RigidBodies,
     # out
     states_out: GeomStates,
 ):
-    """One thread per geom. Compute the motion of its centre, and its box, grown by its possible motion in the step."""
+    """One thread per geom. Compute the motion of its centre, and its box, grown by its possible motion in the step.
+
+    count: [1] number of geoms.
+    """
     g = wp.tid()
+    if g >= count[0]:
+        return
     rotation = rigid.xmat[geoms.id[g]]
     center = rigid.xpos[geoms.id[g]] + rotation * geoms.center[g]
     body = geoms.body[g]
@@ -161,7 +169,7 @@ def tree_aabbs(
     parameters: Parameters,
     capsules: Capsules,
     # in
-    order: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     trees: Trees,
     bodies: PlantBodies,
     # out
@@ -171,9 +179,12 @@ def tree_aabbs(
 ):
     """One thread per tree. Compute its capsules in the world, their boxes, and the boxes of the tree and of its wood.
 
-    Thread i takes the tree ``trees.awake[order[i]]``.
+    Thread i takes the tree ``trees.awake[i]``.
     """
-    tree = trees.awake[order[wp.tid()]]
+    row = wp.tid()
+    if row >= counters[AWAKE_TREES]:
+        return
+    tree = trees.awake[row]
     is_fine = trees.is_fine[tree]
     dt = wp.float32(parameters.dt)
     low = wp.vec3(FAR)
@@ -240,6 +251,8 @@ def actor_aabbs(
     MuJoCo puts no body to sleep that plants press on.
     """
     actor = wp.tid()
+    if actor >= actors.count[0]:
+        return
     first = actors.start[actor]
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
@@ -254,13 +267,17 @@ def actor_aabbs(
 @wp.kernel
 def block_aabbs(
     # in
+    counters: wp.array(dtype=wp.int32),
     blocks: wp.array(dtype=wp.int32),
     boxes: Aabbs,
     # out
     block_boxes_out: Aabbs,
 ):
     """One thread per block of 32 boxes. Compute the box around them. Thread i takes the block ``blocks[i]``."""
-    block = blocks[wp.tid()]
+    place = wp.tid()
+    if place >= counters[CHANGED_BLOCKS]:
+        return
+    block = blocks[place]
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
     for i in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, boxes.low.shape[0])):

@@ -13,6 +13,7 @@ import warp as wp
 from vinesim.kernels.contact.islands import padded
 from vinesim.kernels.contact.row_response import EIGHT
 from vinesim.kernels.contact.structs import (
+    CONTACTS,
     Contacts,
     Geoms,
     Islands,
@@ -63,7 +64,7 @@ def respond_rigidly(
     # model
     geoms: Geoms,
     # in
-    items: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     rigid: RigidBodies,
     factors: RigidFactors,
     contacts: Contacts,
@@ -71,7 +72,9 @@ def respond_rigidly(
     rows_out: Rows,
 ):
     """One thread per contact: M^-1 j of its three rows j, of one kinematic tree of MuJoCo."""
-    c = items[wp.tid()]
+    c = wp.tid()
+    if c >= counters[CONTACTS]:
+        return
     other = contacts.other[c]
     if other >= 0 and geoms.dof[other] >= 0:
         last_dof = geoms.dof[other]
@@ -159,7 +162,7 @@ def clear_entries(values: wp.array(dtype=wp.float64), at: int, count: int):
 @wp.kernel
 def assemble_delassus(
     # in
-    items: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     contacts: Contacts,
     touched: TouchedBodies,
     islands: Islands,
@@ -169,7 +172,9 @@ def assemble_delassus(
     rows_out: Rows,
 ):
     """One thread per contact: the plants' entries of J M^-1 J^T of its three rows with all rows of its block."""
-    c = items[wp.tid()]
+    c = wp.tid()
+    if c >= counters[CONTACTS]:
+        return
     block = contacts.block[c]
     first = islands.block_start[block]
     pitch = islands.row_start[block + 1] - islands.row_start[block]

@@ -60,7 +60,7 @@ def store_warm_start(
     # model
     parameters: Parameters,
     # in
-    items: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     islands: Islands,
     system: IslandSystem,
     rows: Rows,
@@ -69,7 +69,9 @@ def store_warm_start(
     warm_start_out: WarmStart,
 ):
     """One thread per contact. Write its impulse as a force on the plant, and the warm start of the next step."""
-    c = items[wp.tid()]
+    c = wp.tid()
+    if c >= counters[CONTACTS]:
+        return
     velocity = three(3 * c, rows.velocity_free) + contact_velocity(
         contacts_out.place[c], contacts_out.block[c], contacts_out.island[c], islands, rows.delassus, system
     )

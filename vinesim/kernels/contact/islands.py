@@ -340,7 +340,12 @@ def build_islands(
     islands_out: Islands,
     groups_out: SideGroups,
 ):
-    """One thread in all. List the plant bodies in contact, sorted, each once, and divide the contacts into islands."""
+    """One thread in all. List the plant bodies in contact, sorted, each once, and divide the contacts into islands.
+
+    Does nothing if there is no contact, or no room for all contacts (``HAVE_ROOM``).
+    """
+    if counters_out[HAVE_ROOM] == 0:
+        return
     contact_count = counters_out[CONTACTS]
     slots = candidates.feature.shape[1]
     body_count = int(0)

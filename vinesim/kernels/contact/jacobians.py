@@ -10,6 +10,7 @@ import warp as wp
 from vinesim.kernels.contact.body_motion import to_double, velocity_at
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.structs import (
+    CONTACTS,
     Candidates,
     Capsules,
     Contacts,
@@ -180,31 +181,23 @@ def write_rows(
     write_bias(c, parameters, end_gap, contacts_out, warm_start, rows_out)
 
 
-@wp.kernel
-def write_contact_rows(
-    # model
+@wp.func
+def write_rows_of_contact(
+    c: int,
     parameters: Parameters,
     pairs: wp.array2d(dtype=Surface),
     capsules: Capsules,
     geoms: Geoms,
-    # in
-    items: wp.array(dtype=wp.int32),
     bodies: PlantBodies,
     rigid: RigidBodies,
     factors: RigidFactors,
     candidates: Candidates,
     warm_start: WarmStart,
-    # out
     spans_out: wp.array(dtype=wp.vec2i),
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per contact. Write its three rows.
-
-    spans_out: [contact] range of degrees of freedom in which its rows of the rigid Jacobian and of the rigid response
-    are not 0. Entries outside of it are not written.
-    """
-    c = items[wp.tid()]
+    """Write the three rows of contact ``c``, and clear the entries of its rigid rows that the last step wrote."""
     slots = candidates.feature.shape[1]
     span = spans_out[c]
     for dof in range(span[0], span[1]):
@@ -232,6 +225,49 @@ def write_contact_rows(
         contacts_out,
         rows_out,
     )
+
+
+@wp.kernel
+def write_contact_rows(
+    # model
+    threads: int,
+    parameters: Parameters,
+    pairs: wp.array2d(dtype=Surface),
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    counters: wp.array(dtype=wp.int32),
+    bodies: PlantBodies,
+    rigid: RigidBodies,
+    factors: RigidFactors,
+    candidates: Candidates,
+    warm_start: WarmStart,
+    # out
+    spans_out: wp.array(dtype=wp.vec2i),
+    contacts_out: Contacts,
+    rows_out: Rows,
+):
+    """Write the three rows of each contact. Thread i takes the contacts i, i + threads, i + 2 threads ...
+
+    spans_out: [contact] range of degrees of freedom in which its rows of the rigid Jacobian and of the rigid response
+    are not 0. Entries outside of it are not written.
+    """
+    for c in range(wp.tid(), counters[CONTACTS], threads):
+        write_rows_of_contact(
+            c,
+            parameters,
+            pairs,
+            capsules,
+            geoms,
+            bodies,
+            rigid,
+            factors,
+            candidates,
+            warm_start,
+            spans_out,
+            contacts_out,
+            rows_out,
+        )
 
 
 @wp.func

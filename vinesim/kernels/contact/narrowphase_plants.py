@@ -12,6 +12,7 @@ from vinesim.kernels.contact.candidates import Candidate, curvature_gap, is_smoo
 from vinesim.kernels.contact.distance import segment_segment_distance, vec6d
 from vinesim.kernels.contact.structs import (
     AWAKE_TREES,
+    PAIRED_TREES,
     SORT_AXIS,
     Aabbs,
     Candidates,
@@ -168,7 +169,6 @@ def find_plant_contacts(
     parameters: Parameters,
     capsules: Capsules,
     # in
-    order: wp.array(dtype=wp.int32),
     sorted_rows: wp.array(dtype=wp.int32),
     counters: wp.array(dtype=wp.int32),
     trees: Trees,
@@ -181,9 +181,11 @@ def find_plant_contacts(
 ):
     """One thread per awake tree. Find its contacts with itself and with the trees after it in the order of their boxes.
 
-    Thread i takes position ``order[i]`` in that order: the row ``sorted_rows[order[i]]`` of the candidates.
+    Thread i takes position i in that order: row ``sorted_rows[i]`` of the candidates.
     """
-    place = order[wp.tid()]
+    place = wp.tid()
+    if place >= counters[PAIRED_TREES]:
+        return
     row = sorted_rows[place]
     tree = trees.awake[row]
     count = candidates_out.count[row]

@@ -30,6 +30,7 @@ from vinesim.kernels.contact.distance import (
 )
 from vinesim.kernels.contact.hull_distance import interval_along_hull, segment_hull_distance
 from vinesim.kernels.contact.structs import (
+    AWAKE_TREES,
     Aabbs,
     Candidates,
     Capsules,
@@ -436,15 +437,13 @@ def is_passing(tree: int, bunch: int, by_tree: wp.array2d(dtype=wp.int32)):
     return passing
 
 
-@wp.kernel
-def find_rigid_contacts(
-    # model
+@wp.func
+def find_contacts_of_tree(
+    row: int,
     parameters: Parameters,
     max_static_geoms: int,
     capsules: Capsules,
     geoms: Geoms,
-    # in
-    order: wp.array(dtype=wp.int32),
     trees: Trees,
     tree_boxes: Aabbs,
     bodies: PlantBodies,
@@ -453,16 +452,12 @@ def find_rigid_contacts(
     hulls: Hulls,
     geom_states: GeomStates,
     static_blocks: Aabbs,
-    # out
     passing_out: PassingBunches,
     candidates_out: Candidates,
 ):
-    """One thread per awake tree. Find its contacts with rigid geoms, in the order of (capsule, geom, end).
-
-    Thread i takes the tree ``trees.awake[order[i]]`` and writes the row ``order[i]`` of the candidates. Bunches that
-    passed through the tree and are now clear of it no longer pass through it.
+    """Find the contacts of the tree ``trees.awake[row]`` with rigid geoms, and write them to row ``row`` of the
+    candidates. Bunches that passed through the tree and are now clear of it no longer pass through it.
     """
-    row = order[wp.tid()]
     tree = trees.awake[row]
     near_count = list_near_geoms(
         row,
@@ -556,3 +551,49 @@ def find_rigid_contacts(
     candidates_out.is_impact[row] = is_impact
     candidates_out.count[row] = count
     clear_slots(row, count, candidates_out)
+
+
+@wp.kernel
+def find_rigid_contacts(
+    # model
+    threads: int,
+    parameters: Parameters,
+    max_static_geoms: int,
+    capsules: Capsules,
+    geoms: Geoms,
+    # in
+    counters: wp.array(dtype=wp.int32),
+    trees: Trees,
+    tree_boxes: Aabbs,
+    bodies: PlantBodies,
+    capsule_states: CapsuleStates,
+    rigid: RigidBodies,
+    hulls: Hulls,
+    geom_states: GeomStates,
+    static_blocks: Aabbs,
+    # out
+    passing_out: PassingBunches,
+    candidates_out: Candidates,
+):
+    """Find the contacts of each awake tree with rigid geoms, in the order of (capsule, geom, end).
+
+    Thread i takes the rows i, i + threads, i + 2 threads ...
+    """
+    for row in range(wp.tid(), counters[AWAKE_TREES], threads):
+        find_contacts_of_tree(
+            row,
+            parameters,
+            max_static_geoms,
+            capsules,
+            geoms,
+            trees,
+            tree_boxes,
+            bodies,
+            capsule_states,
+            rigid,
+            hulls,
+            geom_states,
+            static_blocks,
+            passing_out,
+            candidates_out,
+        )

@@ -22,7 +22,7 @@ from vinesim.kernels.contact.island_system import (
     update_rigid_velocity,
 )
 from vinesim.kernels.contact.newton import newton_step
-from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Parameters, Rows
+from vinesim.kernels.contact.structs import ISLANDS, Contacts, Geoms, Islands, Parameters, Rows
 
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
@@ -144,7 +144,7 @@ def solve_islands(
     tolerance: wp.float64,
     geoms: Geoms,
     # in
-    items: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     contacts: Contacts,
     # out
     islands_out: Islands,
@@ -152,7 +152,9 @@ def solve_islands(
     rows_out: Rows,
 ):
     """One thread per island. Solve it; see :func:`solve_island`."""
-    island = items[wp.tid()]
+    island = wp.tid()
+    if island >= counters[ISLANDS]:
+        return
     gather_island(island, geoms, contacts, islands_out, rows_out, system_out)
     solve_island(
         island, max_sweeps, max_newton_steps, max_newton_contacts, tolerance, islands_out, rows_out.delassus, system_out

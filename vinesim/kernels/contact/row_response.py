@@ -9,7 +9,7 @@ tree travel together, in groups of ten: three rows of each are thirty columns, a
 import warp as wp
 
 from vinesim.kernels.contact.islands import padded
-from vinesim.kernels.contact.structs import SideGroups
+from vinesim.kernels.contact.structs import GROUPS, SideGroups
 from vinesim.kernels.plants.structs import ArticulationModel, Factors
 
 wp.set_module_options({"enable_backward": False})
@@ -193,7 +193,7 @@ def respond_to_groups(
     scratch_rows: int,
     place: wp.array(dtype=wp.int32),
     # in
-    items: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     touched: wp.array(dtype=wp.int32),
     tree_end: wp.array(dtype=wp.int32),
     body_slot: wp.array(dtype=wp.int32),
@@ -205,57 +205,60 @@ def respond_to_groups(
     scratch_out: ResponseScratch,
     response_out: wp.array(dtype=float),
 ):
-    """One thread per group. Compute the velocities of its tree's touched bodies by unit impulses along the sides' rows.
+    """Compute, for each group, the velocities of its tree's touched bodies by unit impulses along the sides' rows.
+
+    There are ``scratch_rows`` threads. Thread i takes the groups i, i + scratch_rows, i + 2 scratch_rows ...
 
     touched: [slot] bodies in contact, sorted. tree_end: [slot] slot after the last slot of the same tree. body_slot,
     other_slot: [contact] slots of the contact's sides. place: [body] index under which the kernels store the body.
-    stride: number of bodies in the largest tree. scratch_rows: number of groups for which ``scratch_out`` has room at
-    once.
+    stride: number of bodies in the largest tree. ``scratch_out`` has memory for one tree for each thread.
     """
-    group = items[wp.tid()]
-    start = groups.tree[group]
-    end = tree_end[start]
-    last = place[touched[end - 1]]
-    first = model.tree_first[model.body_tree[last]]
-    bodies = (last - first) / model.pitch + 1
-    row = group % scratch_rows * stride
-    sides = groups.start[group + 1] - groups.start[group]
-    width = padded(3 * sides)
-    mark_paths(first, bodies, row, start, end, place, touched, model, scratch_out)
-    for number in range(sides):
-        side = groups.side[groups.start[group] + number]
-        slot = body_slot[side / 2]
-        if side % 2 == 1:
-            slot = other_slot[side / 2]
-        add_side(side, number, jacobian, scratch_out.values, memory_of(place[touched[slot]], first, row, model.pitch))
-    for i in range(bodies):
-        k = last - i * model.pitch
-        if scratch_out.is_on_path[row + bodies - 1 - i]:
-            carry_inward(
-                scratch_out.values,
-                memory_of(k, first, row, model.pitch),
-                memory_of(model.body_parent[k], first, row, model.pitch),
-                width,
-                factors.D[k],
-                factors.DJ[k],
-                factors.DH[k],
-                factors.lever[k],
-                factors.root_inverse_mass[k],
+    row = wp.tid() * stride
+    for group in range(wp.tid(), counters[GROUPS], scratch_rows):
+        start = groups.tree[group]
+        end = tree_end[start]
+        last = place[touched[end - 1]]
+        first = model.tree_first[model.body_tree[last]]
+        bodies = (last - first) / model.pitch + 1
+        sides = groups.start[group + 1] - groups.start[group]
+        width = padded(3 * sides)
+        mark_paths(first, bodies, row, start, end, place, touched, model, scratch_out)
+        for number in range(sides):
+            side = groups.side[groups.start[group] + number]
+            slot = body_slot[side / 2]
+            if side % 2 == 1:
+                slot = other_slot[side / 2]
+            add_side(
+                side, number, jacobian, scratch_out.values, memory_of(place[touched[slot]], first, row, model.pitch)
             )
-    for i in range(bodies):
-        k = first + i * model.pitch
-        if scratch_out.is_on_path[row + i]:
-            carry_outward(
-                scratch_out.values,
-                memory_of(k, first, row, model.pitch),
-                memory_of(model.body_parent[k], first, row, model.pitch),
-                width,
-                factors.DJ[k],
-                factors.DH[k],
-                factors.lever[k],
+        for i in range(bodies):
+            k = last - i * model.pitch
+            if scratch_out.is_on_path[row + bodies - 1 - i]:
+                carry_inward(
+                    scratch_out.values,
+                    memory_of(k, first, row, model.pitch),
+                    memory_of(model.body_parent[k], first, row, model.pitch),
+                    width,
+                    factors.D[k],
+                    factors.DJ[k],
+                    factors.DH[k],
+                    factors.lever[k],
+                    factors.root_inverse_mass[k],
+                )
+        for i in range(bodies):
+            k = first + i * model.pitch
+            if scratch_out.is_on_path[row + i]:
+                carry_outward(
+                    scratch_out.values,
+                    memory_of(k, first, row, model.pitch),
+                    memory_of(model.body_parent[k], first, row, model.pitch),
+                    width,
+                    factors.DJ[k],
+                    factors.DH[k],
+                    factors.lever[k],
+                )
+        for slot in range(start, end):
+            at = memory_of(place[touched[slot]], first, row, model.pitch)
+            keep_velocities(
+                scratch_out.values, at, width, response_out, groups.response[group] + (slot - start) * 6 * width
             )
-    for slot in range(start, end):
-        at = memory_of(place[touched[slot]], first, row, model.pitch)
-        keep_velocities(
-            scratch_out.values, at, width, response_out, groups.response[group] + (slot - start) * 6 * width
-        )

@@ -12,6 +12,7 @@ from vinesim.kernels.contact.distance import segment_segment_distance
 from vinesim.kernels.contact.narrowphase_plants import plant_candidate
 from vinesim.kernels.contact.structs import (
     AABB_BLOCK,
+    SEARCHING_TREES,
     Aabbs,
     Capsules,
     CapsuleStates,
@@ -108,7 +109,7 @@ def find_reached_trees(
     parameters: Parameters,
     capsules: Capsules,
     # in
-    order: wp.array(dtype=wp.int32),
+    counters: wp.array(dtype=wp.int32),
     trees: Trees,
     block_boxes: Aabbs,
     tree_boxes: Aabbs,
@@ -120,11 +121,14 @@ def find_reached_trees(
 ):
     """One thread per awake tree. Mark the sleeping trees with which it will be in contact before the step ends.
 
-    Thread i takes the tree ``trees.awake[order[i]]``. Capsules that overlap as generated, or nearly do, are in contact
+    Thread i takes the tree ``trees.awake[i]``. Capsules that overlap as generated, or nearly do, are in contact
     only where they come closer than that (:func:`plant_candidate`), so that trees that merely stand together do not
     wake each other.
     """
-    tree = trees.awake[order[wp.tid()]]
+    row = wp.tid()
+    if row >= counters[SEARCHING_TREES]:
+        return
+    tree = trees.awake[row]
     low, high = list_due_capsules(
         wp.float32(parameters.dt), tree, capsules, trees, bodies, capsule_states, clearances_out
     )

@@ -38,7 +38,13 @@ UNFINISHED = wp.constant(13)
 """Islands whose solve ended at the largest number of sweeps."""
 NEAR_ASLEEP = wp.constant(14)
 """Sleeping trees that actors are near to."""
-COUNTERS = 15
+CHANGED_BLOCKS = wp.constant(15)
+"""Blocks of tree boxes that contain an awake tree."""
+SEARCHING_TREES = wp.constant(16)
+"""Awake trees that are compared with sleeping trees."""
+PAIRED_TREES = wp.constant(17)
+"""Awake trees that are compared with each other."""
+COUNTERS = 18
 
 AABB_BLOCK = wp.constant(32)
 """Number of boxes in a block. They share one box around them, so that one comparison can skip them all."""

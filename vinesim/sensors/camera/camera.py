@@ -16,7 +16,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
-from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
+from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.shading import deferred, light_plants, light_points, shadow_maps, tone_rows

@@ -8,7 +8,7 @@ import itertools
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.launch import ThreadPool
+from vinesim.core.thread_pool import ThreadPool
 from vinesim.kernels.shading import deferred, tone_rows
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives

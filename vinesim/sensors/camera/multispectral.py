@@ -18,7 +18,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
-from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
+from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.raster.pinhole import Pinhole
 from vinesim.kernels.shading import illumination, materials
 from vinesim.kernels.shading.shadow_maps import ShadowMap

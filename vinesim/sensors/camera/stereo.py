@@ -17,7 +17,7 @@ import msgspec
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.launch import ThreadPool
+from vinesim.core.thread_pool import ThreadPool
 from vinesim.kernels.raster.pinhole import NEAR_DEPTH, Pinhole
 from vinesim.kernels.stereo import stereo_depth, stereo_input, stereo_rows
 from vinesim.scene.plant_parameters import Number

@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from vinesim.kernels.launch import ThreadPool
+from vinesim.core.thread_pool import ThreadPool
 from vinesim.kernels.shading import deferred, shadow_maps
 from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives

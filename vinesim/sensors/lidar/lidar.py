@@ -20,7 +20,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
-from vinesim.kernels.launch import MAX_THREADS, ThreadPool, usable_cores
+from vinesim.core.thread_pool import MAX_THREADS, ThreadPool, usable_cores
 from vinesim.kernels.lidar import lidar_echoes, lidar_raster
 from vinesim.scene.ids import Organ, label
 from vinesim.scene.plant_parameters import Number

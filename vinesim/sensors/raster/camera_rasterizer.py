@@ -12,7 +12,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
-from vinesim.kernels.launch import ThreadPool
+from vinesim.core.thread_pool import ThreadPool
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.raster.pinhole import EMPTY_KEY, NEAR_DEPTH, Pinhole
