@@ -1,4 +1,5 @@
-"""``python -m benchmarks NAME``: one measurement a line, as ``vinesim bench`` prints them."""
+"""``python -m benchmarks NAME``: runs one benchmark and prints a line for each measurement, as ``vinesim bench``
+does."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ def _announce(line: str) -> None:
 
 
 def _call(path: str) -> Callable[..., Iterator[Measurement]]:
-    """The function at ``module:name``, loaded when its benchmark runs."""
+    """Import a module of this package, and return the function that ``path``, "module:name", stands for."""
     module, _, name = path.partition(":")
     return getattr(importlib.import_module(f"benchmarks.{module}"), name)
 
@@ -60,7 +61,7 @@ def _later(path: str) -> Callable[..., Iterator[Measurement]]:
 
 BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str, dict[str, Any]]]] = {
     "asleep": (_asleep, "a step of a vineyard of ten thousand bunches, of which twenty trees are awake", {}),
-    "picking": (_later("picking:picking"), "pick every bunch within reach, in simulated time", {}),
+    "picking": (_later("picking:picking"), "pick every bunch within reach of a start place, in simulated time", {}),
     "sensors": (
         _later("sensor_accuracy:sensors"),
         "what modelled sensors measure, compared with the truth",
@@ -68,19 +69,19 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     ),
     "sync": (
         _later("replication_delay:sync"),
-        "what network delay does, in simulated time",
+        "effect of network delay on contacts and copies, in simulated time",
         {"plot": {"type": pathlib.Path, "help": "PNG file to draw"}},
     ),
     "traffic": (_later("traffic:traffic"), "bytes that a client of a full vineyard receives and sends", {}),
     "load": (_later("router_load:load"), "many clients on one router, and on two linked routers", {}),
-    "actors": (_later("many_actors:actors"), "64 robots and people with bodies, equal on all clients", {}),
+    "actors": (_later("many_actors:actors"), "64 robots and people with bodies: are all clients equal at the end?", {}),
     "link": (_later("touch_latency:link"), "real clients over emulated links; needs root", {}),
-    "sound": (_later("sound_delay:sound"), "delay of alarms and voices, in simulated time", {}),
+    "sound": (_later("sound_delay:sound"), "delay of alarms and voices between two clients, in simulated time", {}),
     "page": (_later("page_latency:page"), "delay from an input of a person to the state that shows it", {}),
     "voice": (_later("voice_delay:voice"), "delay from the microphone of one browser to the sound of another", {}),
     "fuzz": (
         _fuzz,
-        "broken messages, and well-formed false ones",
+        "effect of corrupted messages, and of well-formed false ones",
         {
             "messages": {"type": int, "default": 100_000, "help": "number of corrupted messages"},
             "false-messages": {
@@ -92,7 +93,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
     ),
     "kill": (
         _kill,
-        "kill programs at random moments, while all others must go on",
+        "kill programs at random moments and check that all others go on",
         {
             "times": {"type": int, "default": 50, "help": "number of programs that are killed"},
             "seed": {"type": int, "default": 1, "help": "seed of the order and the moments"},
@@ -103,11 +104,14 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         "memory, threads and open files in a long run (Linux)",
         {
             "minutes": {"type": float, "default": 60.0, "help": "measured time"},
-            "real-time-factor": {"type": float, "help": "of the world; as fast as all can follow unless given"},
+            "real-time-factor": {
+                "type": float,
+                "help": "rate of the world's time (default: as fast as all clients can follow)",
+            },
         },
     ),
 }
-"""Function, description and options of each benchmark."""
+"""Function, description and command-line options of each benchmark, by name."""
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -122,7 +126,8 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(words: list[str] | None = None) -> int:
-    """Run one benchmark and print its measurements as they come; the exit code."""
+    """Run the benchmark that the command line ``words`` name, print its measurements as they come, and return the exit
+    code."""
     options = vars(_parser().parse_args(words))
     measure, _, _ = BENCHMARKS[options.pop("name")]
     as_json = options.pop("json")
@@ -138,6 +143,6 @@ def main(words: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line sets them
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as the command line of vinesim sets these variables
     os.environ.setdefault("MUJOCO_GL", "disable")
     sys.exit(main())

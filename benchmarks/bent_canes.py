@@ -1,10 +1,10 @@
-"""Fits of canes that are bent by 1 to 1.5 rad, with their shape from a point cloud and as if straight. One JSON
-object a line.
+"""Fits of canes that are bent by 1 to 1.5 rad: once with their shape from a point cloud, once as if they were straight.
+Prints one JSON object a line.
 
     python benchmarks/bent_canes.py
 
-Canes of ``vinesim bench tune`` with an even bow; tracks of 2 s at 30 pictures a second with 2 mm of noise; clouds of
-4,000 points on the bark with 1 mm of noise; start values up to five times off.
+The specimens are the canes of ``vinesim bench tune`` with an even bow. The tracks last 2 s at 30 pictures a second,
+with 2 mm of noise; the clouds have 4,000 points on the bark, with 1 mm of noise; start values are up to five times off.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from vinesim.tune.candidates import COLUMNS, Candidates
 
 BOWS = ((1.1, -0.8), (-0.9, 0.5), (0.3, 1.5))
 ANGLES = (0.0, 45.0, 90.0)
-"""[deg] Of the pull."""
+"""Directions [deg] in which the canes are pulled before their release."""
 
 
 def scan(cane: Specimen, rng: np.random.Generator, count: int = 4000) -> np.ndarray:
-    """Points [n, 3] m on the bark of a cane that hangs at rest."""
+    """Returns ``count`` points [n, 3] m on the bark of a cane that hangs at rest, as a scanner would measure them."""
     marked = msgspec.structs.replace(cane, markers={f"p{i}": 0.01 * i for i in range(1, 101)})
     row = np.zeros((1, len(COLUMNS)))
     row[0, 3:5] = cane.bow

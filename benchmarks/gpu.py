@@ -37,21 +37,22 @@ from vinesim.world import Physics
 TICKS = 100
 PER_TREE = 17
 BARS = ((0.3, 1.975), (0.6, 1.9), (0.85, 1.75))
-"""[m] x, z of the bars that the canes fall on."""
+"""Positions x, z [m] of the bars that the canes fall on."""
 BAR_RADIUS = 0.012
 SWEEPS = 20
-"""Largest number of sweeps: a GPU waits for the tree that takes most."""
+"""Largest number of sweeps of the contact solver in a step: a GPU waits for the tree that needs most sweeps."""
 SCENES = ((2, 10), (8, 64))
 SCENE_STEPS = 120
-"""Bars of two combs, and canes between them; steps."""
+"""Number of steps of a scene. Each entry of ``SCENES`` is a number of bars in two combs, and of canes between the
+bars."""
 PEERS = ("discrete", "implicitfast")
-"""Integrators of mujoco-warp."""
+"""Integrators of mujoco-warp that are compared."""
 CONTACT_CLOCK = 300
-"""Ticks after which canes have come to lie on the bars."""
+"""Number of ticks after which the canes lie on the bars."""
 
 
 def cane(side: float) -> TreeBuilder:
-    """A horizontal cane with a bunch on its tip."""
+    """Returns a horizontal cane along x, at y = ``side`` [m], with a bunch on its tip."""
     tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
     last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
     tree.add_body(
@@ -70,7 +71,7 @@ def cane(side: float) -> TreeBuilder:
 
 
 def bars() -> dict[str, np.ndarray]:
-    """Level bars across the canes."""
+    """Returns the arrays of :class:`Model` for the level bars that lie across the canes, by name."""
     start = np.array([(x, -1.0, z) for x, z in BARS], np.float32)
     end = start * [1, -1, 1]
     return {
@@ -81,7 +82,10 @@ def bars() -> dict[str, np.ndarray]:
 
 
 def forest(count: int, spacing: float = 0.5, **fixed: np.ndarray) -> Model:
-    """So many equal trees side by side, ``spacing`` [m] apart; ``fixed``: what stands among them."""
+    """Returns a model of ``count`` equal trees side by side, ``spacing`` [m] apart.
+
+    ``fixed``: arrays of fixed obstacles among the trees, by their names in :class:`Model`.
+    """
     one = assemble([cane(0.0)], **fixed)
     counts = one.counts()
     model = Model.allocate(**{axis: n * count if axis in ("tree", "body") else n for axis, n in counts.items()})
@@ -100,7 +104,7 @@ def forest(count: int, spacing: float = 0.5, **fixed: np.ndarray) -> Model:
 
 
 def stirred(model: Model, seed: int = 3) -> State:
-    """Everything bent and moving."""
+    """Returns a state in which all joints are bent and moving, at random."""
     rng = np.random.default_rng(seed)
     state = State.at_rest(model)
     state.joint_q[:] = frames.exp(rng.normal(size=(len(model.body_mass), 3)) * 0.05)
@@ -116,7 +120,8 @@ def plants_on(device: str, count: int) -> ArticulationSolver:
 
 
 def canes_on_bars(device: str, count: int) -> tuple[ArticulationSolver, ResidentContacts]:
-    """So many worlds, each with a cane over the bars."""
+    """Returns plants with ``count`` trees at one place, each a world of its own with a cane over the bars; and their
+    contacts."""
     model = forest(count, 0.0, **bars())
     plants = ArticulationSolver(model, stirred(model), device=device)
     plants.wake(np.arange(count))
@@ -125,7 +130,8 @@ def canes_on_bars(device: str, count: int) -> tuple[ArticulationSolver, Resident
 
 
 def contact_trajectory(device: str) -> dict[str, np.ndarray]:
-    """256 canes fall on the bars: where they are after 20 ticks, and how hard they press in the last of 300."""
+    """Let 256 canes fall on the bars; return body poses after 20 ticks, and contact forces [N] and counts of tick
+    300."""
     plants, contacts = canes_on_bars(device, 256)
     plants.upload()
     plants.advance(20, contacts.solve)
@@ -139,7 +145,7 @@ def contact_trajectory(device: str) -> dict[str, np.ndarray]:
 
 
 def trajectory(device: str) -> dict[str, np.ndarray]:
-    """256 trees, 200 ticks; half of them with a push on a body in the first 50."""
+    """Step 256 trees for 200 ticks, every second one pushed in the first 50; return final poses and rates, by name."""
     plants = plants_on(device, 256)
     pushed = np.arange(0, 256, 2) * PER_TREE + 9
     wrench = np.tile([0.3, -0.2, 0.5, 0.01, 0.0, 0.02], (len(pushed), 1))
@@ -155,7 +161,7 @@ def trajectory(device: str) -> dict[str, np.ndarray]:
 
 
 def seconds(work: Callable[[], None], rounds: int = 5) -> float:
-    """Median of some rounds, the first one left out."""
+    """Returns the median wall time [s] of ``rounds`` calls of ``work``, after a call that is not timed."""
     work()
     took = []
     for _ in range(rounds):
@@ -166,7 +172,7 @@ def seconds(work: Callable[[], None], rounds: int = 5) -> float:
 
 
 def peer_scene(with_contacts: bool, integrator: str) -> Any:
-    """The cane in MuJoCo: alone, or with capsules as ours over the bars and the ground."""
+    """Returns the cane as a MuJoCo model: alone, or with contacts between its capsules and the bars and the ground."""
     import mujoco
 
     from vinesim.bench.mujoco_reference import MujocoScene, compile_plants
@@ -187,16 +193,17 @@ def peer_scene(with_contacts: bool, integrator: str) -> Any:
         world.opt.disableflags = 0
         world.opt.impratio = 1.0
         world.opt.jacobian = mujoco.mjtJacobian.mjJAC_AUTO
-    if integrator == "implicitfast":  # ``discrete`` adds dt K of damping by itself
+    if integrator == "implicitfast":  # the integrator ``discrete`` adds damping of dt K by itself
         world.dof_damping[:] = np.repeat(model.joint_damping[:, 1], 3)
         world.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return world
 
 
 def peer_milliseconds(count: int, integrator: str, start: State | None = None) -> tuple[float, float]:
-    """One step of so many worlds in mujoco-warp, each with the same cane, captured into a graph; contacts a world.
+    """Returns the time [ms] of one captured step of ``count`` worlds with one cane each in mujoco-warp, and the
+    contacts a world.
 
-    ``start``: where canes lie on bars, for a scene with contacts.
+    ``start``: state of canes that lie on bars, for a scene with contacts. None: the scene has no contacts.
     """
     import mujoco
     import mujoco_warp  # pyright: ignore[reportMissingImports]
@@ -218,7 +225,7 @@ def peer_milliseconds(count: int, integrator: str, start: State | None = None) -
 
     def steps() -> None:
         for _ in range(TICKS):
-            wp.capture_launch(capture.graph)  # pyright: ignore[reportArgumentType]  (captured above)
+            wp.capture_launch(capture.graph)  # captured above
         wp.synchronize()
 
     took = 1e3 * seconds(steps) / TICKS
@@ -232,7 +239,7 @@ def say(about: dict, case: str, value: float, unit: str) -> None:
 
 
 def compare_contacts(about: dict, theirs: Any, ours: dict[str, np.ndarray]) -> None:
-    """How far canes that fall on bars are from the CPU's, and how far the forces are that bear them."""
+    """Print how far canes that fall on bars are from those on the CPU, and by how much the contact forces differ."""
     apart = np.abs(theirs["contact_early_q"] - ours["contact_early_q"])[:, :3].max()
     say(about, "256 canes fall on bars, 20 ticks: largest distance from the CPU's bodies", 1e3 * float(apart), "mm")
     weight = theirs["contact_force"].sum(0)
@@ -244,8 +251,8 @@ def compare_contacts(about: dict, theirs: Any, ours: dict[str, np.ndarray]) -> N
 
 
 def scene_steps(device: str, bars: int, canes: int) -> tuple[np.ndarray, Physics, float]:
-    """Canes between the bars of two combs that close: where bodies are in each step [step, body, 3] m, the physics, and
-    the median time of a step [ms]."""
+    """Step canes between the bars of two combs that close. Returns positions of bodies [step, body, 3] m, the physics,
+    and the median wall time of a step [ms]."""
     physics = Physics(scenes.cane_row(canes), device=device)
     physics.add_robot(scenes.combs("combs", bars, canes))
     scenes.keep_awake(physics, np.arange(canes))
@@ -261,7 +268,8 @@ def scene_steps(device: str, bars: int, canes: int) -> tuple[np.ndarray, Physics
 
 
 def compare_scenes(about: dict, device: str) -> None:
-    """Whole steps with plants on the GPU beside those on the CPU: contacts and robots are on the CPU in both."""
+    """Compare whole steps with plants on the GPU with whole steps on the CPU. Contacts and robots are on the CPU in
+    both."""
     for comb_bars, canes in SCENES:
         theirs, cpu, cpu_took = scene_steps("cpu", comb_bars, canes)
         ours, gpu, took = scene_steps(device, comb_bars, canes)
@@ -273,7 +281,7 @@ def compare_scenes(about: dict, device: str) -> None:
 
 
 def measure_contacts(about: dict, device: str, count: int, with_peer: bool) -> None:
-    """Canes that lie on bars, beside mujoco-warp if asked."""
+    """Time steps of ``count`` canes that lie on bars; ``with_peer``: compare them with mujoco-warp."""
     plants, contacts = canes_on_bars(device, count)
     plants.upload()
     plants.advance(CONTACT_CLOCK, contacts.solve)
@@ -289,7 +297,7 @@ def measure_contacts(about: dict, device: str, count: int, with_peer: bool) -> N
         "dropped": contacts.dropped,
     }
     say(about | also, case, took, "ms/tick")
-    for integrator in PEERS[:1] if with_peer else ():  # the other one is unstable in contact
+    for integrator in PEERS[:1] if with_peer else ():  # the other integrator is unstable in contact
         theirs, their_contacts = peer_milliseconds(count, integrator, plants.state)
         beside = {
             "peer": f"mujoco-warp {integrator}",

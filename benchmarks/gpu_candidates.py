@@ -1,10 +1,11 @@
-"""Candidates of a fit on a GPU: 10,000 canes let go for three seconds, how long do they take? One JSON object a line.
+"""Candidates of a fit on a GPU: the time for which 10,000 released canes are simulated for three seconds. Prints one
+JSON object a line.
 
     python benchmarks/gpu_candidates.py --reference cpu.npy    # on a machine whose Warp has CPU kernels
     python benchmarks/gpu_candidates.py --compare cpu.npy      # on one with an NVIDIA GPU
 
-The cane of ``vinesim bench tune``; stiffness, damping and pull are drawn at random, markers are read 30 times a second.
-The first run includes making the trees and loading the kernels.
+The specimen is the cane of ``vinesim bench tune``. Stiffness, damping and pull are drawn at random; markers are read 30
+times a second. The first run includes making the trees and loading the kernels.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ CHECKED = 64
 
 
 def drawn(count: int) -> np.ndarray:
-    """Candidates [n, 7] around one cane, pulled sideways."""
+    """Returns trial numbers [count, 7] of candidates around one cane that is pulled sideways."""
     rng = np.random.default_rng(1)
     candidates = np.zeros((count, 7))
     candidates[:, :2] = rng.uniform(-1.0, 1.0, (count, 2))

@@ -1,11 +1,11 @@
-"""A whole client and whole data sets on a GPU, in JSON lines; needs neither ROS nor a network.
+"""A whole client, a camera and the making of a data set on a GPU, in JSON lines; needs neither ROS nor a network.
 
     python benchmarks/gpu_live.py [--device cuda] [--seconds 20] [--images 320] [--only client]
 
-One client as ``vinesim client --device cuda`` starts it: its loop at 100 Hz here, its sensors in a process of their
-own, which renders four D435 (640x480, colour and depth, 30 Hz) and an OS1-64 (64x1024, 10 Hz) that are always wanted.
-Then one camera whose frames are handed to the host as fast as they come, and ``vinesim dataset``, truth included.
-A part that fails says so in a line of its own; the others run.
+The client is set up as ``vinesim client --device cuda`` sets it up: its loop runs here at 100 Hz, its sensors in a
+process of their own. That process renders four D435 (640x480, colour and depth, 30 Hz) and an OS1-64 (64x1024, 10 Hz),
+which are always wanted. Then one camera is measured whose frames are handed to the host as fast as they come, and at
+last ``vinesim dataset`` with its ground truth. If one part fails, a line reports the failure, and the other parts run.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapsho
 
 CAMERAS = 4
 WARM_UP = 3.0
-"""Real time before the count begins [s]."""
+"""Real time before the count of frames begins [s]."""
 RGBD = CameraOutput.RGB | CameraOutput.DEPTH
 
 
 def render_all(config: Any, channel: Any, pipe: Any) -> None:
-    """Entry of the sensor process: as the client's own, but every sensor is wanted without any subscriber."""
+    """Entry point of the sensor process. Unlike the client's own, it renders every sensor without any subscriber."""
     worker: Any = sensor_worker.SensorWorker
     worker._camera_demand = lambda self, name, always: lambda: RGBD
     worker._lidar_demand = lambda self, name: lambda: CameraOutput.DEPTH
@@ -63,7 +63,7 @@ def render_all(config: Any, channel: Any, pipe: Any) -> None:
 
 
 class Report:
-    """Lines of JSON with the name of the device in each."""
+    """Prints lines of JSON that each contain the name of the device."""
 
     def __init__(self, device: str) -> None:
         name = driver = "none"
@@ -83,7 +83,10 @@ class Report:
 
 @contextlib.contextmanager
 def running_client(device: str, plants: str) -> Iterator[tuple[Client, sensor_process.SensorProcess]]:
-    """A client whose robot pushes a bunch again and again; its sensors on ``device``, its plants on ``plants``."""
+    """Yields a client whose robot pushes a bunch again and again, and its sensor process.
+
+    ``device`` computes the sensors, ``plants`` is the device of the plants.
+    """
     scene = load_scene("demo")
     model = generate(scene)
     robot = load_description("vinebot")
@@ -111,14 +114,15 @@ def running_client(device: str, plants: str) -> Iterator[tuple[Client, sensor_pr
 
 
 def measure_client(report: Report, device: str, plants: str, seconds: float) -> None:
-    """Rates of all sensors and the tick beside them, in real time."""
+    """Print the rates of all sensors and of the client's ticks over ``seconds`` [s] of real time."""
     with running_client(device, plants) as (client, sensors):
         loop = RateLoop(client.physics.dt)
         marks = []
         stop = threading.Event()
 
         def watch() -> None:
-            """Note the counts of frames from time to time; the loop does not."""
+            """Note the counts of frames from time to time, in a thread of its own: the client's loop must not wait for
+            it."""
             while not stop.wait(0.25):
                 marks.append((time.perf_counter(), sensors.report()))
 
@@ -142,7 +146,7 @@ def measure_client(report: Report, device: str, plants: str, seconds: float) -> 
 
 
 def measure_camera(report: Report, device: str, seconds: float) -> None:
-    """Frames a second of one camera that moves, handed to the host."""
+    """Print how many frames a second one moving camera renders and hands to the host."""
     model = generate(load_scene("demo"))
     primitives = Primitives(model, device=device)
     primitives.update(rest_snapshot(model))
@@ -166,7 +170,8 @@ def measure_camera(report: Report, device: str, seconds: float) -> None:
 
 
 def measure_dataset(report: Report, device: str, images: int) -> None:
-    """Images a second on disk with their truth: all, and between the first and the last tenth of them."""
+    """Print how many images a second ``vinesim dataset`` writes with their ground truth: over the whole run, and
+    between the first and the last tenth of the images."""
     with tempfile.TemporaryDirectory() as folder:
         out = pathlib.Path(folder) / "set"
         command = [sys.executable, "-m", "vinesim", "dataset", "--images", str(images), "--out", str(out)]
@@ -205,7 +210,7 @@ def main() -> None:
         if given.only in (None, name):
             try:
                 measure()
-            except Exception as fault:  # what the other parts measure is wanted all the same
+            except Exception as fault:  # the measurements of the other parts are wanted nevertheless
                 report.line({"case": name, "error": f"{type(fault).__name__}: {fault}"})
 
 

@@ -1,13 +1,13 @@
-"""Pictures a second of the page on a graphics card, in JSON lines.
+"""Frame rate of the web page on a graphics card, in JSON lines.
 
     python benchmarks/gpu_page.py --record demo.page --scene demo    # where vinesim is installed
     python benchmarks/gpu_page.py --play demo.page                   # where a browser and a graphics card are
 
-A recording holds what a spectator's page is sent: the vineyard, the shapes of a robot that pushes a bunch and of two
-people, and the states of some seconds. Playing needs aiohttp, msgspec, numpy and OpenCV, and sends the states through
-the product's own server to the product's own page. Each size is measured twice: pictures a second as the browser's
-clock asks for them, which it does as often as it can; and the time of a picture from the page's first line to the last
-pixel, with no other one beside it.
+A recording holds all messages that a spectator's page receives: the vineyard, the shapes of a robot that pushes a bunch
+and of two people, and the states of some seconds. ``--play`` needs aiohttp, msgspec, numpy and OpenCV. It sends the
+states through vinesim's own page server to vinesim's own page. Each size of the page is measured twice: first the
+pictures a second that the browser asks for, as often as it can; then the time of a picture from the page's first line
+of script to the last pixel, while no other picture is drawn.
 """
 
 from __future__ import annotations
@@ -30,27 +30,30 @@ from vinesim.web import array_message
 from vinesim.web.page_server import PageServer
 
 VIEWS = {"demo": ((0.2, 0.9, 1.6), (3.0, 1.5, 1.25)), "vsp": ((1.2, 1.3, 1.6), (5.0, 1.3, 1.0)), "tendone": None}
-"""By scene: where the eyes are, and a point that they look at [m]; None: where the page begins."""
+"""Place of the eyes and the point that they look at [m], by scene. None: the view with which the page begins."""
 RECORDED = 300
-"""States."""
+"""Number of states in a recording."""
 STEPS = 2
-"""Between two states."""
+"""Number of simulation steps between two recorded states."""
 STATE_PERIOD = 0.01
-"""Between two states that are played [s]: more than a page can draw, as in the product."""
+"""Time between two states that are played [s]: shorter than the page takes to draw one, as in normal use."""
 SIZES = {"phone": (390, 844, 2.0), "laptop": (1280, 720, 1.0), "desktop": (1920, 1080, 1.0)}
-"""[px, px, px] and how many pixels one of them has on the screen, each way."""
+"""Width and height of the page [px], and how many pixels of the screen one of those has in each direction, by kind."""
 EYES = (2 * 2064, 2208)
-"""[px] Of both eyes of a Quest 3, as iwer emulates it; a headset with half of the rows and columns is measured, too."""
+"""Width and height [px] of both eyes' pictures of a Quest 3 as iwer emulates it. A headset with half of the rows and
+columns is measured, too."""
 FEWER_TRIANGLES = 150_000
-"""That a headset is asked to draw for each eye in one case, to tell the time of triangles from that of pixels."""
+"""Number of triangles for each eye to which a headset is limited in one case. That case separates the time that
+triangles cost from the time that pixels cost."""
 BARS = {"phone": 30.0, "laptop": 60.0, "headset": 72.0}
-"""Pictures a second that the page has to reach there [Hz]."""
+"""Smallest acceptable number of pictures a second, by kind of screen [Hz]."""
 SECONDS = 5.0
 SETTLING = 10.0
-"""[s] In which the page finds out how much it can draw."""
+"""Time [s] in which the page finds out how much it can draw, before a measurement."""
 UNCHANGED = 75
 PATIENCE = 60.0
-"""A headset's scale has settled when so many pictures had the same; and [s] for which that is waited for."""
+"""Longest time to wait for a headset's scale to settle [s]. It has settled when ``UNCHANGED`` pictures in a row had the
+same scale."""
 GPU = (
     "--use-angle=vulkan",
     "--enable-features=Vulkan",
@@ -75,9 +78,9 @@ VIEWPORT_SCALE = """(() => {
     return { x, y, width: Math.floor(scale * width), height: Math.floor(scale * height) };
   };
 })();"""
-"""Runs before the page: where ``device.givesScale`` is set, the emulated headset has views of as many rows and columns
-as the page asks for, from the next picture on (WebXR Device API, dynamic viewport scaling). iwer takes the request and
-ignores it."""
+"""Script that runs before the page. While ``device.givesScale`` is set, the emulated headset's views shrink to the
+scale that the page asks for, from the next picture on (WebXR Device API, dynamic viewport scaling). iwer itself ignores
+the request."""
 WAIT_FOR_PIXELS = """(() => {
   const { viewer } = vinesim, gl = viewer.renderer.getContext(), pixel = new Uint8Array(4), took = viewer.took = [];
   viewer.draw = (frame) => {
@@ -90,18 +93,19 @@ WAIT_FOR_PIXELS = """(() => {
     took.push([performance.now() - begin, drawn - begin]);
   };
 })()"""
-"""From now on every picture is waited for."""
+"""Script after which each picture is drawn to its last pixel before the next one begins, and is timed."""
 DURATIONS = """(() => {
   const { viewer } = vinesim, { took } = viewer;
   delete viewer.draw;
   const middle = (k) => took.map((one) => one[k]).sort((a, b) => a - b)[took.length >> 1];
   return [middle(0), middle(1)];
 })()"""
-"""[ms] Medians of a picture, to its last pixel, and of the script in it; pictures are not waited for any more."""
+"""Script that ends :data:`WAIT_FOR_PIXELS`. Its value is the median time of a picture to its last pixel [ms], and the
+median time of the page's script in it [ms]."""
 
 
 def record(path: pathlib.Path, name: str) -> None:
-    """Write what a page of a scene is sent."""
+    """Write to ``path`` all messages that a page of the scene ``name`` receives."""
     from vinesim.client.client import Client
     from vinesim.client.page.page_world import PageWorld
     from vinesim.client.tasks.motions import LookAt
@@ -128,7 +132,7 @@ def record(path: pathlib.Path, name: str) -> None:
     compile_kernels()
     client = Client(scene, model, robot, MemoryHub().bus("robot"), name="robot", pose=start_pose(scene, 0))
     base = start_pose(scene, 0)
-    with contextlib.suppress(PlacementError):  # then the robot stands
+    with contextlib.suppress(PlacementError):  # without a reachable bunch, the robot stands still
         bunch = find_reachable_bunch(model, spawn_pose(scene, 0))
         centre = bunch_centres(model)[bunch]
         push = PushBunch(client.robot, client.side_of(centre), lambda: centre)
@@ -139,12 +143,12 @@ def record(path: pathlib.Path, name: str) -> None:
     world = PageWorld(client)
 
     class Server:
-        """Takes the place of the page server: it has a viewer, so states are made."""
+        """Stands in for the page server: it reports viewers, so that states are made."""
 
         has_viewers = True
 
         def notify(self) -> None:
-            """Told of each state; :func:`record` reads them from the world."""
+            """Ignore the notice of a new state: :func:`record` reads states from the world."""
 
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("scene", world.scene())
@@ -164,8 +168,7 @@ def record(path: pathlib.Path, name: str) -> None:
 
 
 class Recorded:
-    """The world of a page server that plays a recording again and again: a state each time that :meth:`advance` is
-    called, never two at once."""
+    """A world for the page server that plays a recording in a loop, one state for each call of :meth:`advance`."""
 
     def __init__(self, path: pathlib.Path) -> None:
         with zipfile.ZipFile(path) as archive:
@@ -177,23 +180,23 @@ class Recorded:
         self._sent = 0
 
     def advance(self) -> None:
-        """A state is new."""
+        """Make the next state due."""
         self._count += 1
 
     def scene(self) -> bytes:
-        """The vineyard."""
+        """Returns the recorded message with the vineyard."""
         return self._scene
 
     def plants(self, place: Any) -> bytes:
-        """Nothing else: the page's eyes stay where they are."""
+        """Returns the recorded vineyard for any ``place`` of the eyes: they do not move in this benchmark."""
         return self._scene
 
     def rigid(self) -> bytes:
-        """Shapes of the robot and the people."""
+        """Returns the recorded message with the shapes of the robot and the people."""
         return self._rigid
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """The next state, if one is due."""
+        """Returns the number and the message of the next state, or None if none is due."""
         if self._sent >= self._count:
             return None
         self._sent += 1
@@ -201,15 +204,15 @@ class Recorded:
         return self._sent, array_message.encode(values | {"tick": self._sent}, arrays)
 
     def take(self, page: int, said: Any) -> None:
-        """A spectator moves nothing."""
+        """Ignore a page's input: a spectator moves nothing."""
 
     def leave(self, page: int) -> None:
-        """It may come again."""
+        """Ignore a page that leaves: it may come back."""
 
 
 @contextlib.contextmanager
 def served(world: Recorded) -> Iterator[str]:
-    """Address of the page, whose states come while this lasts."""
+    """Serve the page with the states of ``world`` until the context ends; yields its address."""
     stop = threading.Event()
 
     def run() -> None:
@@ -230,7 +233,7 @@ def served(world: Recorded) -> Iterator[str]:
 def play(
     path: pathlib.Path, graphics: tuple[str, ...], pictures: pathlib.Path | None, query: str
 ) -> Iterator[dict[str, Any]]:
-    """Measure all sizes."""
+    """Play the recording at ``path`` to a page of every size, and yield one result a measurement."""
     world = Recorded(path)
     with browser.browser_page(graphics=graphics) as page, served(world) as address:
         _open(page, world, address + query)
@@ -252,8 +255,11 @@ def play(
 def _headset(
     page: browser.Page, world: Recorded, address: str, eyes: tuple[int, int], pictures: pathlib.Path | None
 ) -> Iterator[dict[str, Any]]:
-    """Measure a headset whose canvas has these pixels: all of them drawn, and as many as the page asks for; at last the
-    canvas alone, which the emulator copies and whose edges the browser smoothes."""
+    """Measure a headset with ``eyes`` [px], width and height of its canvas.
+
+    First all pixels are drawn, then as many as the page asks for. At last the scene is hidden: what remains is the
+    canvas, which the emulator copies and the browser antialiases.
+    """
     case = f"{world.name}, headset, {eyes[0]}x{eyes[1]}"
     _wear(page, world, address, eyes)
     yield from _measure(page, f"{case}, all pixels", BARS["headset"])
@@ -271,10 +277,10 @@ def _headset(
 
 
 SCALE = "vinesim.viewer.headset.scale.value"
-"""Share of rows and columns that a headset's page asks for."""
+"""Expression for the share of rows and columns that the page asks a headset for."""
 PIXELS = """vinesim.viewer.renderer.xr.getCamera().cameras
   .reduce((sum, { viewport }) => sum + viewport.z * viewport.w, 0)"""
-"""Of both eyes, as drawn last."""
+"""Expression for the number of pixels of both eyes in the last picture."""
 
 
 def _open(page: browser.Page, world: Recorded, address: str) -> None:
@@ -286,7 +292,8 @@ def _open(page: browser.Page, world: Recorded, address: str) -> None:
 
 
 def _wear(page: browser.Page, world: Recorded, address: str, eyes: tuple[int, int]) -> None:
-    """Enter a headset on a page that has not yet found out how much it can draw on a screen."""
+    """Enter a headset on a page that is newly loaded, so that it has not yet measured how much it can draw on a
+    screen."""
     _open(page, world, address)
     page.resize(*eyes)
     page.run("vinesim.viewer.resize(), 0")
@@ -295,7 +302,8 @@ def _wear(page: browser.Page, world: Recorded, address: str, eyes: tuple[int, in
 
 
 def _wait_for_scale(page: browser.Page) -> None:
-    """Until a headset's page has asked for the same number of pixels for a while."""
+    """Return when a headset's page has asked for the same scale for ``UNCHANGED`` pictures, or after ``PATIENCE``
+    [s]."""
     ask = f"[{SCALE}, vinesim.frames]"
     end = time.monotonic() + PATIENCE
     scale, since = page.run(ask)
@@ -352,7 +360,7 @@ FAILURE = "window.vinesim?.failure ?? document.body.innerText.slice(0, 300)"
 
 
 def main() -> None:
-    """Record, or print a line for each figure."""
+    """Record, or play a recording and print a line for each figure."""
     parser = argparse.ArgumentParser(description="Pictures a second of the page on a graphics card.")
     parser.add_argument("--record", type=pathlib.Path)
     parser.add_argument("--scene", default="demo", choices=sorted(VIEWS))

@@ -1,9 +1,9 @@
-"""Cameras and lidars on a GPU: do they see what a CPU sees, and how many frames and rays a second? JSON lines.
+"""Cameras and lidars on a GPU: their agreement with a CPU, and their frames and rays a second. Prints JSON lines.
 
     python benchmarks/gpu_sensors.py [--device cuda] [--scene vsp]
 
-First every figure of agreement with the CPU of the same machine, then times: medians of replayed CUDA graphs, so
-that no launch waits for Python, and whole frames as a program gets them.
+First come all comparisons with the CPU of the same machine, then times. Times are medians of replayed CUDA graphs, in
+which no launch waits for Python, and of whole frames that a program receives.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ STAND = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
 
 
 def things() -> RigidVisual:
-    """One solid of each kind, side by side."""
+    """Returns one rigid solid of each kind, side by side."""
     shapes = [("box", 0.2, 0.1, 0.3), ("cylinder", 0.08, 0.2), ("capsule", 0.07, 0.2), ("ellipsoid", 0.1, 0.05, 0.2)]
     at = frames.pose(np.array([[0.3 * i, 0.0, 0.0] for i in range(len(shapes))]))
     return RigidVisual(
@@ -53,7 +53,7 @@ def things() -> RigidVisual:
 
 
 def world(model: Model, device: str) -> tuple[Primitives, Snapshot]:
-    """The vineyard with some solids in it."""
+    """Returns the primitives and a snapshot of the vineyard with some rigid solids in it."""
     primitives = Primitives(model, device=device)
     view = rest_snapshot(model, (things(),), np.array([[1.6, 0.6, 1.2, *frames.from_yaw(0.5)]]))
     primitives.update(view)
@@ -61,7 +61,7 @@ def world(model: Model, device: str) -> tuple[Primitives, Snapshot]:
 
 
 class Report:
-    """Lines of JSON with the name of the device in each."""
+    """Prints lines of JSON that each contain the name of the device."""
 
     def __init__(self, device: str) -> None:
         name = driver = "none"
@@ -78,7 +78,7 @@ class Report:
 
 
 def compare(say: Report, model: Model, device: str) -> None:
-    """What a camera and a lidar see, beside the CPU of the same machine."""
+    """Compare pictures and scans of ``device`` with those of the CPU of the same machine."""
     (ours, _) = world(model, device)
     (theirs, _) = world(model, "cpu")
     spec = CameraSpec.load("pinhole")
@@ -115,7 +115,8 @@ def compare(say: Report, model: Model, device: str) -> None:
 
 
 def milliseconds(work: Callable[[], object], device: str, replays: int = 20, rounds: int = 7) -> float:
-    """Median time of some work on a device: a captured graph, replayed; on a CPU, the work itself."""
+    """Returns the median time [ms] of ``work`` on a device, from a replayed CUDA graph. On a CPU ``work`` is called
+    itself."""
     work()
     if device == "cpu":
         start = time.perf_counter()
@@ -135,7 +136,7 @@ def milliseconds(work: Callable[[], object], device: str, replays: int = 20, rou
 
 
 def rate(work: Callable[[int], object], device: str, count: int = 300) -> float:
-    """How often a second the host gets through some work, the device's share included."""
+    """Returns how many calls of ``work`` a second the host completes, together with their computation on the device."""
     for n in range(20):
         work(n)
     wp.synchronize_device(device)
@@ -147,7 +148,8 @@ def rate(work: Callable[[int], object], device: str, count: int = 300) -> float:
 
 
 def revolution(lasers: int, steps: int) -> np.ndarray:
-    """Directions [ray, 3] of a lidar's revolution, 15 degrees up and down, laser by laser."""
+    """Returns directions [ray, 3] of one revolution of a lidar, from 15 degrees below to 15 above level, laser by
+    laser."""
     height, turn = np.meshgrid(np.radians(np.linspace(-15.0, 15.0, lasers)), np.arange(steps) * (2.0 * np.pi / steps))
     height = height.T.ravel()
     turn = turn.T.ravel()

@@ -1,7 +1,8 @@
-"""``python -m benchmarks kill``: programs of a shared vineyard are killed at random moments, and all others must go on.
+"""``python -m benchmarks kill``: kills programs of a shared vineyard at random moments, and checks that all others go
+on.
 
-Kills come in rounds: in each, one of every kind is killed at a random moment, in random order and no matter what the
-kill before has left undone; then all must go on, and what was killed must be back.
+Kills come in rounds. In each round one program of every kind is killed, at random moments in random order, whether or
+not the others have recovered from the kill before. After the round, all programs must work, the killed ones included.
 """
 
 from __future__ import annotations
@@ -22,31 +23,31 @@ from vinesim.client.processes.child_process import START_TIMEOUT, ProcessFailed
 from vinesim.scene.values import Measurement
 
 KINDS = ("server", "router", "client", "sensors", "ROS node", "ROS listener")
-"""What is killed: a program, or a worker of a robot client."""
+"""Kinds of programs that are killed, and of worker processes of a robot client."""
 ROS_KINDS = ("ROS node", "ROS listener")
-"""These are there only where ROS 2 is."""
+"""Kinds that exist only where ROS 2 is installed."""
 WORKERS = ("sensors", "ROS node")
-"""Processes of a robot client."""
+"""Kinds that are worker processes of a robot client."""
 MEAN_PAUSE = 0.75
-"""Kills of a round come at random moments within this time for each of them [s]."""
+"""Kills of a round come at random moments within this time for each kill [s]."""
 GO_ON_TIMEOUT = 180.0
-"""All must go on within this time after a round [s]; a client that is started again takes most of it."""
+"""All programs must work within this time after a round [s]; a client that is restarted takes most of it."""
 RESTART_BOUND = 3.0
-"""The sensors of a robot are back within this time [s]."""
+"""Largest accepted time until the sensors of a robot work again [s]."""
 
 
 @dataclasses.dataclass
 class Round:
-    """Kills of one round and their effect."""
+    """The kills of one round, and what followed."""
 
     kinds: tuple[str, ...]
-    """In their order."""
+    """Kinds of the killed programs, in the order of the kills."""
     took: float
-    """From the last kill until all went on, with what was killed among them [s]."""
+    """Time from the last kill until all programs worked, the killed ones included [s]."""
     missing: list[str]
-    """What did not go on in time."""
+    """Descriptions of what did not work in time."""
     sensor_restart: float | None = None
-    """From the start of a new sensor process until it was ready [s]."""
+    """Time from the start of a new sensor process until it was ready [s]."""
 
 
 def kill(
@@ -57,10 +58,10 @@ def kill(
     ros: bool = True,
     kinds: Sequence[str] = KINDS,
 ) -> Iterator[Measurement]:
-    """Kill ``times`` programs or a few more, of each of the ``kinds`` as many, with SIGKILL.
+    """Kill about ``times`` programs with SIGKILL, equally many of each of the ``kinds``, and yield the measurements.
 
-    Before each round a bunch is picked. ``announce`` takes a line for each round. :class:`ProcessFailed` if a program
-    ends that was not killed.
+    Before each round a bunch is picked. ``announce`` is called with a line of text after each round. ``ros``: kill
+    programs of ROS, too. Raises :class:`ProcessFailed` if a program ends that was not killed.
     """
     random = np.random.default_rng(seed)
     with (
@@ -83,7 +84,8 @@ def kill(
 
 
 def _run_round(vineyard: Vineyard, kinds: Sequence[str], random: np.random.Generator) -> Round:
-    """Kill one of each kind; a worker of the robot whose client is not killed."""
+    """Kill one program of each kind, in random order. A killed worker belongs to the robot whose client is not
+    killed."""
     vineyard.pick()
     killed, other = (str(name) for name in random.permutation(ROBOTS))
     order = [str(kind) for kind in random.permutation(list(kinds))]
@@ -113,9 +115,10 @@ def _run_round(vineyard: Vineyard, kinds: Sequence[str], random: np.random.Gener
 def _wait_until_all_go_on(
     vineyard: Vineyard, timeout: float, moment: float | None = None, ended: Sequence[int] = ()
 ) -> tuple[float, list[str]]:
-    """How long it took since the kill at a ``moment`` [s], and what does not go on after the ``timeout`` [s].
+    """Wait until all programs work after a kill at a ``moment`` [s]. Returns the time since the kill [s], and what does
+    not work after the ``timeout`` [s].
 
-    Processes ``ended`` must be gone, too.
+    Processes with the ids ``ended`` must be gone, too.
     """
     moment = time.monotonic() if moment is None else moment
     while True:

@@ -1,10 +1,10 @@
 """``python -m benchmarks actors``: 64 robots and people with bodies in one world, compared on all clients at the end.
 
-Each actor is a client of its own with the whole physics, and a copy of every other actor in it. All stand in one
-window of cells, in rows 1.2 m apart, each with a bunch above it and a box before it. Each picks its bunch, which falls
-to the ground, and pushes its box: robots with their base, people with their shins. When all is at rest, the retained
-objects and their owners are compared between all clients. The bus is in memory, the clock simulated: the figures do not
-depend on the machine.
+Every client has the whole physics, some of the actors, and a copy of every other actor. All actors stand within the
+distance in which they receive each other, in rows 1.2 m apart, each with a bunch above it and a box before it. Each
+actor picks its bunch, which falls to the ground, and pushes its box: robots with their base, people with their shins.
+When everything is at rest, the retained objects and their owners are compared between all clients. The bus is in memory
+and the clock simulated: the figures do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -39,50 +39,52 @@ APART = 1.2
 DELAY = 0.02
 JITTER = 0.004
 LOSS = 0.01
-"""Of the network: one way [s], [s], and the share of messages that is lost."""
+"""Network delay one way [s], jitter [s], and share of messages that is lost."""
 PUSH = 0.15
-"""Distance by which each pushes its box [m]."""
+"""Distance by which each actor pushes its box [m]."""
 PUSH_TIME = 1.0
 """Duration of a push [s]."""
 DT = 0.01
 HEIGHT = 1.75
-"""Of people [m]."""
+"""Height of people [m]."""
 CLIENTS = 2
-"""Of the command: each simulates half of the actors, and has copies of the others."""
+"""Number of clients of the command. Each simulates half of the actors, and has copies of the others."""
 MEETING_LIMIT = 10.0
 REST_LIMIT = 20.0
-"""Limits of simulated time [s]: until each has bodies of all others, and until all is at rest."""
+"""Limits of simulated time [s]: until each client has bodies of all actors, and until everything is at rest."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """How far the clients agree when all is at rest."""
+    """How far the clients agree when everything is at rest."""
 
     bodies: int
-    """Actors that have a body on a client, the fewest of all clients."""
+    """Smallest number of actors that have a body on a client."""
     objects: int
-    """Bunches and boxes that were moved and rest by a record, which is the same on all clients to the bit."""
+    """Number of moved bunches and boxes that are at rest by a retained record which is equal on all clients, to the
+    bit."""
     owned: int
-    """Objects that a client still holds for owned by an actor."""
+    """Number of objects that some client still considers owned by an actor."""
     position: float
-    """[m] Largest difference of the position of an object's body between two clients: each settles on its
-    own, beside copies of the actors that lean on it."""
+    """Largest difference of the position of an object's body between two clients [m]. The bodies settle on each client
+    separately, some against copies of actors that lean on them."""
     angle: float
-    """[rad] Largest difference of its rotation."""
+    """Largest difference of the rotation of an object's body between two clients [rad]."""
     tick: float
-    """[s] Processor time of one tick of one client, mean."""
+    """Mean processor time of one tick of one client [s]."""
     faults: dict[str, int]
-    """Faults of all clients together, by name."""
+    """Numbers of faults of all clients together, by name."""
 
 
 def _place(number: int, count: int) -> np.ndarray:
-    """Position [2] m of an actor."""
+    """Returns the position [2] m of the actor ``number`` among ``count`` actors."""
     row = math.ceil(math.sqrt(count))
     return APART * np.array([number % row, number // row], float)
 
 
 def yard(count: int) -> Model:
-    """A short cane with a bunch 0.35 m beside each of ``count`` places, and a box before each."""
+    """Returns a model with a short cane and its bunch 0.35 m from each of ``count`` places, and a box before each
+    place."""
     trees = []
     boxes = []
     for number in range(count):
@@ -98,10 +100,11 @@ def yard(count: int) -> Model:
 
 
 class Crowd:
-    """Clients on one bus in memory, with a server of retained records; every second actor is a person."""
+    """Clients on one bus in memory, with a server of retained records. Every second actor is a person."""
 
     def __init__(self, count: int, robot: RobotDescription, clients: int | None = None) -> None:
-        """``count`` actors that so many ``clients`` share; None: each has a client of its own."""
+        """Start ``count`` actors that are shared out among ``clients`` clients. None: each actor has a client of its
+        own."""
         self.count = count
         self.now = 100.0
         self.model = yard(count)
@@ -148,7 +151,7 @@ class Crowd:
         return encode_records(self._records.in_cell(cell))
 
     def _walk(self, x: float, y: float) -> Callable[[float], HumanPose]:
-        """The pose of a person who walks against its box and stops."""
+        """Returns the pose over time of a person who starts at ``x``, ``y`` [m], walks against a box and stops."""
 
         def source(_: float) -> HumanPose:
             share = min(max((self.now - self._pushing_since) / PUSH_TIME, 0.0), 1.0)
@@ -171,7 +174,7 @@ class Crowd:
         self.now += DT
 
     def until(self, condition: Callable[[], bool], limit: float) -> None:
-        """Tick until ``condition()``; RuntimeError after ``limit`` [s] of simulated time."""
+        """Tick until ``condition()`` is true. Raises RuntimeError after ``limit`` [s] of simulated time."""
         end = self.now + limit
         while not condition():
             if self.now > end:
@@ -179,11 +182,12 @@ class Crowd:
             self.tick()
 
     def meet(self) -> None:
-        """Until each client has a body of every other actor."""
+        """Tick until each client has a body of every other actor."""
         self.until(lambda: min(map(bodies, self.clients)) == self.count, MEETING_LIMIT)
 
     def work(self) -> None:
-        """Each picks its bunch and pushes its box; until all rests, on all clients, by records."""
+        """Let each actor pick its bunch and push its box, and tick until everything is at rest by equal records on all
+        clients."""
         self._pushing_since = self.now
         for number in range(self.count):
             self.clients[number % len(self.clients)].physics.pick(number)
@@ -195,7 +199,7 @@ class Crowd:
         self.until(self._all_at_rest, REST_LIMIT)
 
     def moved(self) -> list[int]:
-        """Objects that were moved: all bunches, and the boxes of which there is a record."""
+        """Returns the ids of the objects that were moved: those of which any client has a retained record."""
         kinds = (ObjectKind.BUNCH, ObjectKind.BOX)
         every = [object_id(kind, number) for kind in kinds for number in range(self.count)]
         return [number for number in every if any(client.replicator.record(number) for client in self.clients)]
@@ -215,7 +219,7 @@ class Crowd:
         return all(record is not None and not record.moving and record == records[0] for record in records)
 
     def agreement(self) -> Agreement:
-        """Compare all clients."""
+        """Compare the moved objects between all clients."""
         moved = self.moved()
         poses = np.array([[_pose_of(client, number) for number in moved] for client in self.clients])
         chord = np.minimum(
@@ -246,12 +250,12 @@ class Crowd:
 
 
 def bodies(client: Client) -> int:
-    """Number of actors that have a body on a client."""
+    """Returns the number of actors that have a body on a client."""
     return len(client.replicators) + len(client.remote_actors)
 
 
 def _pose_of(client: Client, number: int) -> np.ndarray:
-    """Pose [7] of a box or free bunch on one client, with a body or dormant."""
+    """Returns the pose [7] m, 1 of a box or free bunch on one client. The bunch may be dormant."""
     tracker = client.physics.support_tracker
     if number in tracker:
         return tracker.object_state(number)[0]
@@ -261,7 +265,10 @@ def _pose_of(client: Client, number: int) -> np.ndarray:
 
 
 def run_crowd(count: int, robot: RobotDescription, clients: int | None = None) -> Agreement:
-    """Let so many actors meet, work and come to rest; how far their clients agree. Arguments as of :class:`Crowd`."""
+    """Let ``count`` actors meet, work and come to rest, and return how far their clients agree.
+
+    Arguments as of :class:`Crowd`.
+    """
     with contextlib.closing(Crowd(count, robot, clients)) as crowd:
         crowd.meet()
         crowd.work()
@@ -269,7 +276,7 @@ def run_crowd(count: int, robot: RobotDescription, clients: int | None = None) -
 
 
 def actors(count: int = ACTORS) -> Iterator[Measurement]:
-    """Rows for one crowd: carriers and people, on two clients."""
+    """Measure one crowd of ``count`` actors on two clients: half carriers (robots), half people."""
     found = run_crowd(count, load_description("logistic"), CLIENTS)
     case = f"{count} actors with bodies, half carriers, half people, one world, {CLIENTS} clients"
     rows = (

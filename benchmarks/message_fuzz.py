@@ -1,11 +1,12 @@
-"""``python -m benchmarks fuzz``: effect of corrupted messages and of well-formed false ones.
+"""``python -m benchmarks fuzz``: effect of corrupted messages, and of well-formed false ones.
 
-Every message begins as a well-formed one of any kind, whose content may be impossible (records with cuts, parents and
-states of trees, objects that there are not), and is then corrupted: bits flipped, cut off, extended, spliced with
-another, filled with extreme values, sent again later, sent under the key of another kind or under an odd key, or
-replaced by noise or by a megabyte. It comes from an admitted actor, or from a stranger under any name. It reaches a
-client with physics, another client without, and the server's store of records; after every step they are held against
-the laws of :mod:`benchmarks.support.fuzz_world`. well-formed false messages: :mod:`benchmarks.support.false_messages`.
+Every message begins as a well-formed one of any kind. Its content may be impossible: records with cuts, parents and
+states of trees, or of objects that do not exist. The message is then corrupted: bits flipped, cut off, extended,
+spliced with another message, filled with extreme values, sent again later, sent under the key of another kind or under
+an odd key, or replaced by noise or by a megabyte. The sender is an admitted actor, or a stranger under any name. The
+receivers are a client with physics, another client without, and the server's store of records. After every step the
+receivers are checked against the laws of :mod:`benchmarks.support.fuzz_world`. Well-formed false messages come from
+:mod:`benchmarks.support.false_messages`.
 """
 
 from __future__ import annotations
@@ -62,9 +63,9 @@ from vinesim.scene.values import HumanUpdate, Measurement, RobotUpdate
 
 MESSAGE_COUNT = 100_000
 MESSAGES_PER_TICK = 200
-"""Messages in one step of a world under attack: 20,000 a second."""
+"""Number of messages in one step of a world under attack: 20,000 a second."""
 MESSAGES_PER_STEP = 50
-"""Messages in one step: 5,000 a second, as many as eighty robots send."""
+"""Number of messages in one step of a storm: 5,000 a second, as many as eighty robots send."""
 
 _EXTREMES = (
     b"\x00" * 8,
@@ -80,7 +81,7 @@ _EXTREMES = (
 
 
 class Sender(Protocol):
-    """In whose name messages are made."""
+    """The actor that a made message claims as its sender."""
 
     @property
     def name(self) -> str: ...
@@ -89,7 +90,7 @@ class Sender(Protocol):
 
 
 def valid_message(model: Model, actor: Sender, now: float, chance: random.Random) -> tuple[str, bytes]:
-    """A family of keys and a well-formed message as ``actor`` might send it; what it says may be impossible."""
+    """Returns a family of keys and a well-formed message as ``actor`` might send it. Its content may be impossible."""
     kind = chance.choice(("a", "tree", "things", "own", "fact", "force", "voice", "control"))
     claim = Claim(chance.randrange(3), chance.randrange(1 << 16), actor.name)
     if kind == "a":
@@ -144,12 +145,12 @@ def valid_message(model: Model, actor: Sender, now: float, chance: random.Random
 
 
 def _object_id(model: Model, kind: ObjectKind, chance: random.Random) -> int:
-    """Id of an object, now and then of one more than there are."""
+    """Returns the id of an object of the ``kind``, and sometimes one that is one too high."""
     return object_id(kind, chance.randrange(object_counts(model)[kind] + (chance.random() < 0.1) or 1))
 
 
 def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: random.Random) -> bytes:
-    """A state of one tree, now and then with bodies that were cut off it."""
+    """Returns an encoded state of one tree, sometimes with bodies that were cut off it."""
     q, qd = swinging_state(model, tree, now)
     flags = chance.choice((0, TOUCHED, RESTING))
     count = chance.randint(1, min(3, len(q))) if chance.random() < 0.3 else 0
@@ -171,7 +172,8 @@ def _trees_message(model: Model, tree: int, claim: Claim, now: float, chance: ra
 
 
 def _couplings_message(model: Model, now: float, chance: random.Random) -> bytes:
-    """Springs on any bodies, wood, bunches, clusters, now and then one that there is not."""
+    """Returns an encoded message of springs (ties) on any bodies, wood, bunches or clusters, sometimes on one that does
+    not exist."""
     bodies = sorted(chance.sample(range(len(model.body_tree) + 1), chance.randint(0, MAX_COUPLINGS)))
     return encode_couplings(
         CouplingMessage(
@@ -185,7 +187,7 @@ def _couplings_message(model: Model, now: float, chance: random.Random) -> bytes
 
 
 def _record(model: Model, claim: Claim, now: float, chance: random.Random) -> RetainedRecord:
-    """A retained record of any object: parents, cuts and states, true or impossible."""
+    """Returns a retained record of any object, with parents, cuts and states that are true or impossible."""
     kind = chance.choice(tuple(ObjectKind))
     number = _object_id(model, kind, chance)
     x, y, z = (chance.choice((chance.uniform(-3.0, 3.0), chance.uniform(-1e5, 1e5))) for _ in range(3))
@@ -229,11 +231,12 @@ _PARENTS = (
     "box/\u0661",
     "\x00",
 )
-"""Parents of records: boxes that lie in each other, links, and names of nothing."""
+"""Names of parents in records: boxes that lie in each other, links of robots, and names of nothing."""
 
 
 def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Random) -> str:
-    """Key of a message of ``name``; one in ten is of another family, of another cell, too short or too long."""
+    """Returns the key of a message from ``name``. One key in ten is of another family or cell, too short or too
+    long."""
     if chance.random() < 0.1:
         family = chance.choice(("a", "c", "tree", "near", "own", "fact", "force", "voice"))
     x, y = chance.choice(cells)
@@ -258,7 +261,7 @@ def key_of(family: str, name: str, cells: list[interest.Cell], chance: random.Ra
 
 
 def corrupt(payload: bytes, other: bytes, chance: random.Random) -> bytes:
-    """A corrupted copy of a message; sometimes unchanged."""
+    """Returns a corrupted copy of a message, sometimes spliced with the ``other`` one, sometimes unchanged."""
     data = bytearray(payload)
     how = chance.randrange(9)
     if how == 0:
@@ -294,11 +297,12 @@ def storm(
     pool_size: int = 0,
     period: float = 0.001,
 ) -> Iterator[tuple[str, bytes]]:
-    """Corrupted messages without end, each with the key it is sent under; ``names`` of senders instead of the actor's
-    own.
+    """Yields corrupted messages without end, each with its key. ``names``: senders to use instead of the actor's own
+    name.
 
-    ``pool_size``: so many well-formed messages are used many times, each time corrupted anew and with the present time,
-    and replaced one after the other; 0: each is made anew. ``period`` [s]: time between two messages.
+    ``pool_size``: number of well-formed messages that are used many times, each time with another corruption and the
+    present time, and that are replaced one after the other. 0: every message is newly made. ``period``: time between
+    two messages [s].
     """
     chance = random.Random(seed)
     cells = sorted({interest.cell_of(pose[:3]) for pose in model.tree_pose.astype(float)})
@@ -325,21 +329,23 @@ def storm(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Storm:
-    """What is left of a storm against two clients."""
+    """Result of a storm against two clients."""
 
     clients: tuple[FakeClient, FakeClient]
     step_times: np.ndarray
-    """Time of each step of the first client [s]."""
+    """Processor time of each step of the first client [s]."""
     arrived: int
-    """Messages that reached the first client."""
+    """Number of messages that reached the first client."""
 
 
 def run_storm(
     count: int, seed: int = 0, *, is_stranger: bool = False, kind: str = "robot", binds_names: bool = False
 ) -> Storm:
-    """A storm against two clients from an admitted actor of ``kind``, or from a program that never was admitted.
+    """Send ``count`` corrupted messages to two clients: from an admitted actor of ``kind``, or, if ``is_stranger``,
+    from a program that was never admitted.
 
-    Not ``binds_names``: messages under the names of others reach the clients' own checks.
+    ``binds_names``: the bus refuses messages under the names of others; otherwise such messages reach the clients' own
+    checks.
     """
     hub = MemoryHub(delay=0.005, seed=seed)
     hub.binds_names = binds_names
@@ -371,7 +377,7 @@ def run_storm(
         spent.append(time.thread_time() - begin)
         bob.tick(hub.time)
     ada.touching = {1, 2}
-    for _ in range(300):  # and the world goes on
+    for _ in range(300):  # the world goes on after the storm
         hub.advance(0.01)
         for fake_client in (ada, bob):
             fake_client.tick(hub.time)
@@ -379,7 +385,7 @@ def run_storm(
 
 
 def received_count(fake_client: FakeClient | Client) -> int:
-    """Messages that arrived."""
+    """Returns the number of messages that arrived at a client."""
     counters = fake_client.replicator.counters
     families = (counters.actor, counters.environment, counters.event, counters.retained, counters.force, counters.voice)
     return sum(family.messages_in for family in families)
@@ -387,26 +393,27 @@ def received_count(fake_client: FakeClient | Client) -> int:
 
 @dataclasses.dataclass(slots=True)
 class Attack:
-    """What became of the messages of one attack."""
+    """Counts of one attack on a client and the server's store."""
 
     sent: int = 0
     arrived: int = 0
-    """... at the client with physics; of poses and states those that were not replaced before the step."""
+    """Number of messages that arrived at the client with physics; of poses and states only the newest before each step
+    counts."""
     malformed: int = 0
-    """... and were refused by it."""
+    """Number of arrived messages that the client with physics refused as malformed."""
     records: int = 0
-    """Messages with records that reached the server's store."""
+    """Number of messages with records that reached the server's store."""
     checks: int = 0
-    """How often all laws were checked, and held."""
+    """Number of checks of all laws, each of which held."""
     tick: float = 0.0
-    """[s] Processor time of a tick of the client, mean."""
+    """Mean processor time of a tick of the client [s]."""
 
 
 def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool = False) -> Attack:
-    """Send that many corrupted messages into a :class:`FuzzWorld`, from an actor of this ``kind`` or from a stranger.
+    """Send ``count`` corrupted messages into a :class:`FuzzWorld`, from an actor of this ``kind`` or from a stranger.
 
-    Every tenth step the actor's greeting is corrupted as well, and every hundredth one it leaves and comes back. Raises
-    what the product raises, or :class:`benchmarks.support.fuzz_world.LawBroken`.
+    Every tenth step the actor's greeting is corrupted as well, and every hundredth step the actor leaves and comes
+    back. Passes on exceptions of the attacked code, and :class:`benchmarks.support.fuzz_world.LawBroken`.
     """
     done = Attack()
     chance = random.Random(seed)
@@ -436,7 +443,7 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
             if step % 5 == 0:
                 world.check()
                 done.checks += 1
-        world.run(1.0)  # and the world goes on
+        world.run(1.0)  # the world goes on after the attack
         world.check()
         counters = world.client.replicator.counters
         done.sent = (step + 1) * MESSAGES_PER_TICK
@@ -449,7 +456,7 @@ def attack(count: int, seed: int = 0, *, kind: str = "robot", is_stranger: bool 
 
 
 def fuzz(count: int = MESSAGE_COUNT, false_messages: int = 0) -> Iterator[Measurement]:
-    """Rows of the benchmark: ``count`` corrupted messages and ``false_messages`` series of well-formed false ones."""
+    """Measure attacks of ``count`` corrupted messages, and of ``false_messages`` series of well-formed false ones."""
     for case, share, kind, is_stranger in (
         ("a person that was admitted", 0.45, "human", False),
         ("a robot that was admitted", 0.45, "robot", False),

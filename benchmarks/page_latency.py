@@ -1,7 +1,8 @@
-"""``python -m benchmarks page``: latency from an input on a page to the state that contains it, and message sizes.
+"""``python -m benchmarks page``: latency from an input on a page to the state that contains it, and sizes of messages.
 
-A person's client as its users start it; this process stands for the page: it acknowledges each state at once, as a page
-that draws without delay, and moves the person's head to and fro. What a browser needs to draw is not in the figures.
+The client is a person's, started as users start it. This process stands in for the page: it acknowledges each state at
+once, like a page that draws without delay, and moves the person's head to and fro. The figures do not include the time
+that a browser needs to draw.
 """
 
 from __future__ import annotations
@@ -22,20 +23,20 @@ from vinesim.web import array_message
 
 NAME = "person"
 MOVES = 300
-"""Measured moves of the head."""
+"""Number of measured moves of the head."""
 STEP = 0.02
-"""Of the head, to the left and back [m]."""
+"""Distance that the head moves to the left and back [m]."""
 SEEN = 0.5
-"""Share of a move that counts as seen [1]."""
+"""Share of a move after which a state counts as showing it [1]."""
 PAUSE = 0.06
-"""Between two moves [s], and up to a tick more, so that they fall into all phases of the client's steps."""
+"""Time between two moves [s]. Up to one tick is added, so that moves fall into all phases of the client's steps."""
 P50 = 25.0
 P99 = 60.0
-"""Budgets from input to picture [ms], drawing included."""
+"""Budgets of the median and of the 99th percentile from input to picture [ms], drawing included."""
 
 
 def page() -> Iterator[Measurement]:
-    """Latency from an input to the state that shows it, and sizes."""
+    """Measure the latency from an input to the state that shows it, and sizes of messages."""
     with own_processes() as group:
         port = free_port()
         options = ["--role", "human", "--name", NAME, "--page", str(port), "--status", "json"]
@@ -79,7 +80,7 @@ async def _measure(address: str) -> dict[str, Any]:
 
 
 class _Page:
-    """Receives states, acknowledges each at once, and moves the head."""
+    """Connection of a page: receives states, acknowledges each at once, and moves the head."""
 
     def __init__(
         self, session: aiohttp.ClientSession, address: str, socket: aiohttp.ClientWebSocketResponse, head: list[float]
@@ -94,7 +95,7 @@ class _Page:
         self._y = np.nan
         self._tick = -1
         self.sizes: list[int] = []
-        """Of the states since they were counted last [B]."""
+        """Sizes of the states received since the list was last cleared [B]."""
 
     async def settle(self) -> None:
         """Receive until the person's head is among the rigid bodies and stands still."""

@@ -1,8 +1,10 @@
-"""``python -m benchmarks picking``: every bunch in reach of a start place is picked, in simulated time, by clearance.
+"""``python -m benchmarks picking``: picks every bunch within reach of a start place, in simulated time; success by
+clearance.
 
-Each try has a vineyard of its own and the base where the hand has most room about the bunch. It succeeds when the bunch
-has been cut and is in the hand, drawn back to the robot. It is planned and controlled with poses read from the
-simulation: what is measured is arm, hand, blade and canopy, not perception. Jobs and the demo take the freest bunch.
+Each attempt has a vineyard of its own, and the robot's base stands where the hand has most room around the bunch. An
+attempt succeeds when the bunch has been cut, is in the hand and has been drawn back to the robot. Planning and control
+use poses read from the simulation: arm, hand, blade and canopy are tested, perception is not. Robot tasks and the demo
+pick the bunch with the most clearance.
 """
 
 from __future__ import annotations
@@ -21,13 +23,13 @@ from vinesim.scene.values import Measurement
 
 SCENE = "demo"
 REACH = 3.0
-"""[m] Bunches this near to the start place are tried; the base may move."""
+"""Bunches within this distance of the start place are tried [m]; the base may move."""
 CLASSES = (-np.inf, 0.0, 0.005, 0.015, planning.FULL_CLEARANCE, np.inf)
-"""[m] Bounds of the classes of clearance: planned picks have 5 mm at least."""
+"""Bounds of the classes of clearance [m]. Planned picks have a clearance of at least 5 mm."""
 
 
 def class_name(clearance: float) -> str:
-    """The class of a clearance [m]."""
+    """Returns the name of the class that contains a clearance [m]."""
     number = int(np.searchsorted(CLASSES, clearance, side="right")) - 1
     low = 1e3 * CLASSES[number]
     high = 1e3 * CLASSES[number + 1]
@@ -37,7 +39,8 @@ def class_name(clearance: float) -> str:
 
 
 def picking() -> Iterator[Measurement]:
-    """Success over all bunches in reach, by clearance, for the freest, and how many cannot be tried."""
+    """Measure success over all bunches in reach, by clearance, and for the bunch with most clearance; and count the
+    bunches that cannot be tried."""
     scene = load_scene(SCENE)
     model = generate(scene)
     near = spawn_pose(scene, 0)[:2]
@@ -50,7 +53,8 @@ def picking() -> Iterator[Measurement]:
 
 
 def success_measurements(tries: list[PickAttempt]) -> Iterator[Measurement]:
-    """Success of all, of each class, and of the freest; why the others failed; what else came off."""
+    """Yields the success of all attempts, of each class and of the attempt with most clearance; causes of failures; and
+    the number of other bunches that came off."""
     by_class = collections.defaultdict(list)
     for one in sorted(tries, key=lambda one: one.clearance):
         by_class[class_name(one.clearance)].append(one)

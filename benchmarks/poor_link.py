@@ -1,7 +1,9 @@
-"""A link that is slow and loses packets is not a dead one: who is lost over it, and for how long states fail to come.
+"""A slow link that loses packets must not count as a dead one: how often clients lose each other, and for how long
+states fail to arrive.
 
-Two clients without physics, each joined to the server by an emulated link of 50 +- 20 ms that loses 2 % of the packets
-of either direction; from client to client all of that is twice as much. One touches a tree, the other receives it.
+Two clients without physics are each joined to the server by an emulated link of 50 +- 20 ms that loses 2 % of the
+packets in either direction; from client to client delay and loss are twice that. One client touches a tree, the other
+receives the tree's states.
 """
 
 from __future__ import annotations
@@ -18,23 +20,24 @@ from vinesim.net.transport.certificates import create
 from vinesim.scene.values import Measurement
 
 POOR = Link(LinkProfile(0.05, 0.02, 0.02))
-"""Between each client and the server, either way."""
+"""Emulated link between each client and the server, equal in both directions."""
 
 PROTOCOLS = ("tcp", "udp", "tls", "quic")
-"""``udp`` and ``quic`` carry poses and states as datagrams, and all else over ``tcp`` and ``tls``."""
+"""Transports that are measured. ``udp`` and ``quic`` carry poses and states as datagrams; everything else goes over
+``tcp`` and ``tls``, respectively."""
 
 SECONDS = 60.0
-"""How long the clients stay [s]."""
+"""Time for which the clients stay [s]."""
 
 START = 120.0
-"""Time limit for them to meet [s]."""
+"""Time limit for the clients to meet [s]."""
 
 POLL_PERIOD = 0.1
-"""Time between two looks at both clients [s]."""
+"""Time between two queries of both clients [s]."""
 
 
 def poor_link(protocols: tuple[str, ...] = PROTOCOLS, seconds: float = SECONDS) -> Iterator[Measurement]:
-    """Rows for each protocol; RuntimeError if the clients do not meet."""
+    """Measure each protocol for ``seconds`` [s]. Raises RuntimeError if the clients do not meet."""
     for protocol in protocols:
         lost, left, gap = run_poor_link(protocol, seconds)
         case = f"50 +- 20 ms to the server, 2 % lost each way, {protocol}, {seconds:.0f} s"
@@ -44,8 +47,8 @@ def poor_link(protocols: tuple[str, ...] = PROTOCOLS, seconds: float = SECONDS) 
 
 
 def run_poor_link(protocol: str, seconds: float) -> tuple[int, int, float]:
-    """How often a client was seen without its server, how often one left for the other, and the longest time [s]
-    without a state of the tree."""
+    """Returns the number of polls that found a client without its server, the number of times that a client considered
+    the other one gone, and the longest time without a state of the tree [s]."""
     secured = protocol in ("tls", "quic")
     with tempfile.TemporaryDirectory() as folder, NetworkEmulator({"ada": POOR, "bob": POOR}) as net:
         certificates = pathlib.Path(folder) / "certs"

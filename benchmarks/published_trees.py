@@ -1,13 +1,14 @@
-"""Pull-and-release tests of scanned trees, reproduced: the frequencies at which six trees swayed, and those of vinesim.
+"""Reproduces pull-and-release tests of scanned trees: the frequencies at which six trees swayed, and vinesim's.
 
     git clone https://github.com/TobyDJackson/WindAndTrees_FEM
     git clone https://github.com/TobyDJackson/WindAndTrees_NaturalFrequencies
     python benchmarks/published_trees.py WindAndTrees_FEM WindAndTrees_NaturalFrequencies
 
 The trees stand in Wytham Woods: Jackson et al. 2019, Agricultural and Forest Meteorology 265:137, and J. R. Soc.
-Interface 16:20190116. Of each there is a model of cylinders from a laser scan (``QSMs/cyl_data_TfN_*.mat``) and the
-strain of the trunk at 4 Hz after a rope was let go (``PullAndRelease/TN_PK_season.txt``). Nothing is fitted: modulus
-and density are those that the authors list for ash; those of the other species give frequencies within 2.1 %.
+Interface 16:20190116. The data contain, for each tree, a model of cylinders from a laser scan
+(``QSMs/cyl_data_TfN_*.mat``) and the strain of the trunk at 4 Hz after a rope was let go
+(``PullAndRelease/TN_PK_season.txt``). Nothing is fitted: modulus and density are the values that the authors list for
+ash; their values for other species give frequencies within 2.1 % of these.
 """
 
 from __future__ import annotations
@@ -27,22 +28,22 @@ WOOD = RodMaterial(modulus=9.5e9, density=801.0, damping=0.04)
 """Ash, NaturalFrequencies_FieldData.xlsx: 9500 MN/m^2, 801 kg/m^3. Damping GUESSED: a ratio of 0.025 at 0.2 Hz."""
 TREES = (3, 12, 14, 16, 18, 20)
 SAMPLE_RATE = 4.0
-"""[Hz] Of the strain gauges."""
+"""Sample rate of the strain gauges [Hz]."""
 LEAST_FREQUENCY = 0.1
-"""[Hz] Slower motion is drift of the gauges, see :func:`main_frequency`."""
+"""Lowest frequency that counts as sway [Hz]: slower motion is drift of the gauges, see :func:`main_frequency`."""
 PULL = 500.0
-"""[N] Horizontal, at half the tree's height."""
+"""Horizontal pull on the trunk at half the tree's height [N]."""
 SWAY_DURATION = 60.0
-"""[s] After the release."""
+"""Simulated time after the release [s]."""
 
 
 def tree_of_cylinders(cylinders: np.ndarray, wood: RodMaterial) -> TreeBuilder:
-    """A tree of one body a cylinder, in equilibrium as drawn.
+    """Returns a tree with one body for each cylinder, in equilibrium in the shape of the cylinders.
 
     Args:
         cylinders: [k, 9 or more] m, radius, length, start (x, y, z), axis (x, y, z), number of the parent from 1 on
             (0: none); parents before children.
-        wood: of all of them.
+        wood: material of all cylinders.
     """
     radius = cylinders[:, 0]
     length = cylinders[:, 1]
@@ -63,7 +64,8 @@ def tree_of_cylinders(cylinders: np.ndarray, wood: RodMaterial) -> TreeBuilder:
 
 
 def sway(cylinders: np.ndarray, wood: RodMaterial, *, pull: float = PULL) -> np.ndarray:
-    """Direction of the trunk [step, 2] after a pull with ``pull`` [N] at half height was let go, at 100 Hz."""
+    """Simulate a pull of ``pull`` [N] at half the tree's height and its release. Returns the direction of the trunk's
+    second piece at 100 Hz, x and y of its unit vector [step, 2]."""
     parent = cylinders[:, 8].astype(int) - 1
     height = cylinders[:, 4] - cylinders[0, 4]
     stem = [0]
@@ -83,7 +85,8 @@ def sway(cylinders: np.ndarray, wood: RodMaterial, *, pull: float = PULL) -> np.
 
 
 def main_frequency(signal: np.ndarray, rate: float) -> float:
-    """The frequency [Hz] of the highest peak of the spectrum of ``signal`` [k] at ``rate`` [Hz], drift left out."""
+    """Returns the frequency [Hz] of the highest peak of the spectrum of ``signal`` [k] at ``rate`` [Hz], without
+    drift."""
     window = round(10.0 * rate) // 2
     padded = np.pad(signal, window, "edge")
     drift = np.convolve(padded, np.full(2 * window + 1, 1.0 / (2 * window + 1)), "valid")
@@ -94,7 +97,8 @@ def main_frequency(signal: np.ndarray, rate: float) -> float:
 
 
 def measured(folder: pathlib.Path, number: int) -> tuple[str, list[float]]:
-    """Season and frequencies [Hz] of all releases of a tree: without leaves if it was pulled then."""
+    """Returns the season and the measured frequencies [Hz] of all releases of a tree. Releases without leaves are
+    preferred."""
     files = sorted(folder.glob(f"PullAndRelease/T{number}_P*_winter.txt"))
     season = "winter" if files else "summer"
     files = files or sorted(folder.glob(f"PullAndRelease/T{number}_P*_summer.txt"))
@@ -103,8 +107,8 @@ def measured(folder: pathlib.Path, number: int) -> tuple[str, list[float]]:
 
 
 def main() -> None:
-    """Print a table of all trees, and how well trend and size are met."""
-    import scipy.io  # of the developers' tools
+    """Print a table of all trees, and how well vinesim reproduces the order and the size of the frequencies."""
+    import scipy.io  # scipy belongs to the developers' tools
 
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("fem", type=pathlib.Path, help="clone of WindAndTrees_FEM")

@@ -1,10 +1,10 @@
-"""``python -m benchmarks sync``: effect of delay on contacts, on copies, and on two actors at one bunch.
+"""``python -m benchmarks sync``: effect of network delay on contacts, on copies, and on two actors who push one bunch.
 
-Everything but the last rows runs in simulated time over the bus in memory, whose delay, jitter and loss are seeded:
-real clients with their physics, and the same figures on every machine. The last rows are processes over Zenoh and
-emulated links, in real time.
+Everything but the last rows runs in simulated time over the bus in memory, with seeded delay, jitter and loss: real
+clients with their physics, and the same figures on every machine. The last rows are processes over Zenoh and emulated
+links, in real time.
 
-Delays are one way. Jitter is a fifth of the delay to both sides, one message in a hundred is lost.
+Delays are one way. Jitter is plus or minus a fifth of the delay; one message in a hundred is lost.
 """
 
 from __future__ import annotations
@@ -43,31 +43,33 @@ from vinesim.world import Physics
 
 DT = 0.01
 DELAYS = (0.0, 0.020, 0.050, 0.100)
-"""One way [s]."""
+"""Measured delays, one way [s]."""
 
 JITTER = 0.2
 LOSS = 0.01
-"""Share of the delay, to both sides; probability that a message is lost."""
+"""Probability that a message is lost. ``JITTER`` is the largest deviation from the delay, as a share of it."""
 
 LATE = (0.020, 0.050, 0.100, 0.150)
-"""Ages of a state that is extrapolated to now [s]."""
+"""Ages of states that are extrapolated to the present [s]."""
 
 REST_AT = 0.050
-"""The delay at which a pushed bunch is followed until it rests [s]."""
+"""Delay at which a pushed bunch is followed until it rests [s]."""
 
 BUFFERS = (0.0, 0.050, 0.080, 0.100, 0.150)
 BUFFERED_JITTER = (0.0, 0.020, 0.040)
-"""Jitter buffers, and the jitter they are tested with, at 50 ms of delay [s]."""
+"""Jitter at which the jitter buffers are tested, at a delay of 50 ms [s]. ``BUFFERS`` has the lengths of the buffers
+[s]."""
 
 SEEN = 0.001
-"""Rotation of a joint of its tree from which a bunch visibly moves [rad]: about half a millimetre."""
+"""Rotation of a joint from which the tree's bunch counts as visibly moved [rad]: about half a millimetre at the
+bunch."""
 
 
 @functools.cache
 def _load_scene() -> tuple[Scene, Model, RobotDescription]:
-    scene = msgspec.structs.replace(load_scene("demo"), boxes=())  # in their place the second robot will stand
+    scene = msgspec.structs.replace(load_scene("demo"), boxes=())  # the second robot stands in place of the boxes
     model = generate(scene)
-    model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # who fights by the wrong rule would tear the bunch off
+    model.bunch_pull[:] = model.bunch_bend[:] = 1e6  # a client that fights by the wrong rule would tear the bunch off
     return scene, model, load_robot("vinebot")
 
 
@@ -97,7 +99,7 @@ class Pair:
             self.clients.append(client)
         self.first, self.second = self.clients
         self.inbox = Inbox()
-        """What the second client was told in its last tick."""
+        """Messages that the second client received in its last tick."""
         receive = self.second.replicator.receive
 
         def receive_and_keep(now: float) -> Inbox:
@@ -107,17 +109,17 @@ class Pair:
         self.second.replicator.receive = receive_and_keep
 
     def push(self, who: Client, **options: Any) -> PushBunch:
-        """Let a robot push the bunch, once."""
+        """Let the robot of the client ``who`` push the bunch once; returns the task."""
         rest = _trace(who).centre()
         reach = PushBunch(who.robot, who.side_of(rest), lambda: rest, repeat=False, **options)
         who.pre_step.append(reach.control)
         return reach
 
     def enable_naive_authority(self) -> None:
-        """For comparison: each touch takes the tree from its owner, again and again."""
+        """For comparison, let every touch take the tree from its owner, again and again."""
         for client in self.clients:
             rule = functools.partial(_grab, client, client.replicator.send)
-            client.replicator.send = rule  # pyright: ignore[reportAttributeAccessIssue] a bench replaces the method
+            client.replicator.send = rule  # a bench replaces the method
 
     def tick(self) -> None:
         """One step of both clients."""
@@ -127,7 +129,7 @@ class Pair:
         self.now += DT
 
     def meet(self) -> None:
-        """Step until each has a copy of the other and the clock is known."""
+        """Step until each client has a copy of the other's robot and knows the network clock."""
         for _ in range(150):
             self.tick()
         assert self.first.remote_actors
@@ -152,10 +154,10 @@ def _trace(client: Client) -> Trace:
 
 
 class RemoteAuthority:
-    """For comparison: one remote simulation moves all plants, and a client shows what it sends.
+    """For comparison: a remote simulation that alone moves all plants, and a client that shows the states it sends.
 
-    It follows the poses of the robot as any client does, but its own physics decides what they touch; in every step it
-    sends all trees that are awake.
+    The remote simulation follows the poses of the robot as any client does, but its own physics decides what the robot
+    touches. In every step it sends all trees that are awake.
     """
 
     def __init__(self, pair: Pair) -> None:
@@ -169,10 +171,10 @@ class RemoteAuthority:
         self.physics = Physics(pair.model, detachment=False)
         self._copy: RemoteRobot | None = None
         self.joint_q = pair.model.joint_settled[pair.model.bodies_of(pair.tree)].copy()
-        """The watched tree, as shown [body, 4]."""
+        """Joint rotations of the watched tree, as the client shows them [body, 4]."""
 
     def tick(self) -> None:
-        """Before the hub's time goes on."""
+        """Step the remote simulation once, before the time of the hub advances."""
         pair = self.pair
         physics = self.physics
         robot = pair.first.robot
@@ -207,34 +209,38 @@ class RemoteAuthority:
 
 @dataclasses.dataclass
 class RunRows:
-    """States on both clients, one row a step; ``authority`` only until the contact was seen."""
+    """States on both clients, one row a step."""
 
     force: np.ndarray
-    """On the bunch, by the first robot where it is at home, by the second where that is [tick, 2] N."""
+    """Force on the bunch [tick, 2] N: of the first robot in its own client, and of the second robot in its own
+    client."""
     bunch: np.ndarray
     """Displacement of the bunch on both clients [tick, 2, 3] m."""
     tree: np.ndarray
-    """Joint rotations of its tree on both clients and as an authority would show it [tick, 3, body, 4]."""
+    """Joint rotations of the bunch's tree on both clients and as a remote authority would show them [tick, 3, body, 4];
+    the last ones are recorded only until the contact was visible."""
     rate: np.ndarray
-    """Joint rates of the tree where it is pushed [tick, body, 3] rad/s."""
+    """Joint rates of the tree on the first client [tick, body, 3] rad/s."""
     joints: np.ndarray
-    """Of the first robot: as they are, as shown to the second client, as its copy has them [tick, 3, joint]."""
+    """Joint positions of the first robot: its own, as shown to the second client, and of the second client's copy
+    [tick, 3, joint]."""
     speed: np.ndarray
-    """[tick, joint] rad/s, m/s"""
+    """Joint rates of the first robot [tick, joint] rad/s, m/s."""
 
     @property
     def touch(self) -> int:
-        """The first step with a force."""
+        """Index of the first step with a force of the first robot."""
         return int(np.argmax(self.force[:, 0] > 0.0))
 
     def seen(self, who: int) -> float:
-        """Time from the first force until the bunch visibly moves on client ``who`` [s]; 2: the remote authority's."""
+        """Returns the time from the first force until the bunch visibly moves on client ``who`` [s]; 2: the remote
+        authority."""
         turned = dead_reckoning.angle_between(self.tree[self.touch :, who], self.tree[self.touch - 1, who]).max(-1)
         return DT * float(np.argmax(turned > SEEN)) if (turned > SEEN).any() else float("nan")
 
     def divergence(self) -> np.ndarray:
-        """Distance between the clients at the same instant [step] mm, while the bunch is displaced by 2 mm on one of
-        them."""
+        """Returns the distance between the bunches of both clients at the same instant [step] mm, for the steps in
+        which the bunch is displaced by at least 2 mm on one client."""
         moved = np.linalg.norm(self.bunch, axis=-1).max(-1) > 0.002
         return 1e3 * np.linalg.norm(self.bunch[moved, 0] - self.bunch[moved, 1], axis=-1)
 
@@ -266,12 +272,13 @@ class RunRecorder:
         self._rows.append((force, bunch, np.stack(shown), states[0].joint_qd[here].astype(float), joints, speed))
 
     def rows(self) -> RunRows:
-        """All rows."""
+        """Returns all recorded rows."""
         return RunRows(*(np.array(column) for column in zip(*self._rows, strict=True)))
 
 
 def one_push(delay: float, *, quiet: float = 0.0) -> RunRows:
-    """The first robot pushes the bunch, the second looks on; then both clients have ``quiet`` [s] to come to rest."""
+    """Let the first robot push the bunch while the second looks on, then give both clients ``quiet`` [s] to come to
+    rest."""
     pair = Pair(delay)
     pair.meet()
     reach = pair.push(pair.first, hold_time=0.5)
@@ -280,7 +287,7 @@ def one_push(delay: float, *, quiet: float = 0.0) -> RunRows:
     for tick in range(2000):
         recorder.tick()
         if recorder.authority is not None and reach.phase is Phase.HOLD:
-            recorder.authority = None  # it was seen long ago
+            recorder.authority = None  # the remote authority has shown the contact long ago
         if reach.phase is Phase.DONE:
             until = tick
             break
@@ -296,7 +303,8 @@ def one_push(delay: float, *, quiet: float = 0.0) -> RunRows:
 
 
 def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> RunRows:
-    """Both push the bunch at once, from either side; ``naive``: with :meth:`Pair.enable_naive_authority`."""
+    """Let both robots push the bunch at once from opposite sides. ``naive``: with
+    :meth:`Pair.enable_naive_authority`."""
     pair = Pair(delay)
     if naive:
         pair.enable_naive_authority()
@@ -314,9 +322,10 @@ def both_push(delay: float, *, naive: bool = False, hold: float = 4.0) -> RunRow
 
 
 def extrapolation(rows: RunRows, ahead: float) -> tuple[tuple[float, float], tuple[float, float]]:
-    """RMS error of knowing a state ``ahead`` [s] late, with and without its velocity: the tree [rad], the robot [rad].
+    """Returns RMS errors of a state that is ``ahead`` [s] old: of the tree [rad] and of the robot [rad], each with
+    extrapolation by its velocity and without.
 
-    Over the ticks in which the thing moves at all.
+    Only ticks in which the tree or the robot moves count.
     """
     shift = round(ahead / DT)
     tree = rows.tree[:, 0]
@@ -337,7 +346,7 @@ def extrapolation(rows: RunRows, ahead: float) -> tuple[tuple[float, float], tup
 
 
 def count_reversals(signal: np.ndarray, least: float = 0.010) -> int:
-    """How often a signal [step] reverses by at least ``least``."""
+    """Returns how often a signal [step] reverses its direction, by at least ``least`` each time."""
     count = 0
     way = 0
     extreme = float(signal[0])
@@ -355,7 +364,8 @@ def count_reversals(signal: np.ndarray, least: float = 0.010) -> int:
 
 
 def displacement_along(rows: RunRows) -> np.ndarray:
-    """Displacement of the bunch on both clients along the line between the robots [step, 2] m."""
+    """Returns the displacement of the bunch on both clients along the line from the first robot to the bunch [step, 2]
+    m."""
     start = spawn_pose(_load_scene()[0], 0)[:2]
     line = (
         bunch_centres(_load_scene()[1])[find_reachable_bunch(_load_scene()[1], spawn_pose(_load_scene()[0], 0))][:2]
@@ -365,7 +375,8 @@ def displacement_along(rows: RunRows) -> np.ndarray:
 
 
 def oscillation(rows: RunRows) -> tuple[float, float]:
-    """Period [s] with which the bunch oscillates while both push (infinite if it does not), and its span [mm]."""
+    """Returns the period [s] with which the bunch oscillates while both robots push (infinite without oscillation), and
+    the range of its displacement [mm]."""
     both = np.flatnonzero((rows.force > 0.0).any(1))
     pulled = displacement_along(rows)[both[0] + 100 : both[-1]]
     count = max(count_reversals(pulled[:, who]) for who in (0, 1))
@@ -374,9 +385,8 @@ def oscillation(rows: RunRows) -> tuple[float, float]:
 
 
 def buffered(rows: RunRows, delay: float, jitter: float, wait: float, seed: int = 5) -> tuple[float, float]:
-    """Effect of a jitter buffer of ``wait`` [s] on the joints of the robot: RMS error to now, and to the path [mrad].
-
-    The path: where they were ``wait`` earlier. Of the joint with the largest error.
+    """Play the robot's joints through a jitter buffer of ``wait`` [s]. Returns two RMS errors [mrad] of the joint with
+    the largest error: to the present positions, and to the positions ``wait`` earlier, that is to the path.
     """
     chance = np.random.default_rng(seed)
     own = rows.joints[:, 0]
@@ -402,7 +412,7 @@ def buffered(rows: RunRows, delay: float, jitter: float, wait: float, seed: int 
 
 
 def sync(delays: tuple[float, ...] = DELAYS, *, plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    """All rows; ``plot``: file to draw them into."""
+    """Yields all rows of the benchmark; ``plot``: file for a picture of them."""
     lines: list[Measurement] = []
     fights: dict[tuple[float, bool], RunRows] = {}
     for line in _sync(delays, fights):

@@ -1,4 +1,5 @@
-"""The picture of what delay does: latencies, divergence, two who want one thing, and what a jitter buffer buys."""
+"""Draws the results of ``python -m benchmarks sync``: latencies, differences of copies, two robots that push one bunch,
+and the effect of a jitter buffer."""
 
 from __future__ import annotations
 
@@ -11,14 +12,18 @@ from vinesim.scene.values import Measurement
 
 
 def _by_delay(lines: list[Measurement], case: str) -> tuple[list[float], list[float]]:
-    """Delays [ms] and values of all lines ``<delay> ms: <case>``."""
+    """Returns the delays [ms] and values of all lines with the case ``<delay> ms: <case>``."""
     found = [(re.fullmatch(rf"(\d+) ms: {re.escape(case)}", line.case), line.value) for line in lines]
     pairs = sorted((float(match[1]), value) for match, value in found if match)
     return [x for x, _ in pairs], [y for _, y in pairs]
 
 
 def draw(lines: list[Measurement], fights: dict[tuple[float, bool], np.ndarray], to: pathlib.Path) -> None:
-    """Four panels; ``fights``: displacement [tick, 2] mm on both clients by (delay, whether touching takes)."""
+    """Draw four panels into the file ``to``.
+
+    ``fights``: displacement of the bunch [tick, 2] mm on both clients, by delay [s] and by whether every touch took the
+    tree.
+    """
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -29,7 +34,7 @@ def draw(lines: list[Measurement], fights: dict[tuple[float, bool], np.ndarray],
 
     own = "touch to motion, one's own"
     far = "touch to motion, seen by another"
-    latency.plot(*_by_delay(lines, own), "o-", label="one's own bunch, simulated here")
+    latency.plot(*_by_delay(lines, own), "o-", label="the touching client's own bunch")
     latency.plot(*_by_delay(lines, far), "s-", label="the same, seen by another client")
     asked = [(float(line.case.split()[0]), line.peer_value) for line in lines if line.case.endswith(own)]
     latency.plot(*zip(*asked, strict=True), "^-", label="if one authority far away moved it")

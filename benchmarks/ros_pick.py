@@ -2,8 +2,8 @@
 
     python benchmarks/ros_pick.py --seeds 10
 
-Whether the bunch lies in a box is asked of the simulation by simulation_interfaces, from a third process's view: this
-one. One JSON object a line, as ``vinesim bench --json`` prints them. Real time: about a minute a vineyard.
+This third process asks the simulation by simulation_interfaces whether the bunch is in a box. It prints one JSON object
+a line, as ``vinesim bench --json`` does, and takes about a minute of real time for a vineyard.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from vinesim.core import frames
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 EXAMPLE = ROOT / "examples" / "ros" / "pick_a_bunch.py"
 HALF_BOX = (0.30, 0.20)
-"""[m] Half edges of a box of the scene harvest."""
+"""Half the inner length and width of a box of the scene harvest [m]."""
 BOX_HEIGHT = 0.30
-"""[m] A bunch whose middle is higher does not lie in it."""
+"""A bunch whose middle is higher than this is not in a box [m]."""
 MIDDLE = 0.07
-"""[m] From a bunch's upper end, its origin, to its middle."""
+"""Distance from a bunch's upper end, its origin, to its middle [m]."""
 TIMEOUT = 600.0
-"""[s] For one vineyard."""
+"""Time limit for one vineyard [s]."""
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=10, help="vineyards")
-    parser.add_argument("--first", type=int, default=1, help="seed of the first")
+    parser.add_argument("--first", type=int, default=1, help="seed of the first vineyard")
     options = parser.parse_args()
     os.environ |= {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
     succeeded = 0
@@ -50,13 +50,13 @@ def main() -> int:
 
 
 def report(row: dict[str, object]) -> None:
-    """One line."""
+    """Print one JSON line."""
     sys.stdout.write(json.dumps(row) + "\n")
     sys.stdout.flush()
 
 
 def pick(seed: int) -> dict[str, object]:
-    """One vineyard: which bunches were tried, and whether one lies in a box at the end."""
+    """Run one vineyard with this ``seed``; return which bunches were tried, and whether one is in a box at the end."""
     command = [
         sys.executable,
         "-m",
@@ -101,7 +101,7 @@ def pick(seed: int) -> dict[str, object]:
 
 
 def lies_in_a_box(bunch: str) -> bool:
-    """Whether the simulation says that a bunch is between the walls of a box."""
+    """Returns whether the simulation reports ``bunch`` between the walls of a box."""
     import rclpy
 
     from vinesim.ros.messages import message_packages

@@ -1,9 +1,9 @@
 """``python -m benchmarks load``: many clients on one router, and on two linked ones; processes over Zenoh on loopback.
 
-The clients are fake: real sessions and replicators at 60 Hz without physics, several to a process, on a plain so wide
-that each has the neighbours it would have in a vineyard. A probe, two bare sessions of another process, sends poses
-through the same routers and measures delay and loss. Where the clients need the whole machine, the figures describe the
-machine, not the router: the shares of both are reported.
+The clients are fake: real sessions and replicators at 60 Hz without physics, several to a process. They stand on a
+plain so wide that each has as many neighbours as in a vineyard. A probe, which is two bare sessions of another process,
+sends poses through the same routers and measures delay and loss. If the clients need the whole machine, the figures
+describe the machine and not the router; therefore the processor shares of both are reported.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from vinesim.scene.values import Measurement, RobotUpdate
 COUNTS = (10, 30, 100)
 PER_PROCESS = 10
 PER_CORE = 15
-"""Fake clients that one core runs at 60 Hz; with more, the figures would describe how they starve."""
+"""Number of fake clients that one core can run at 60 Hz; with more of them, the cores would be the limit."""
 
 SECONDS = 6.0
 MEETING = 30.0
 """Time limit for all clients to meet [s]."""
 
 APART = 8.0
-"""Distance between neighbours on the plain [m]: each receives four others at the full rate."""
+"""Distance between neighbours on the plain [m]: each client receives four others at the full rate."""
 
 PROBE = """
 import json, struct, sys, threading, time
@@ -74,7 +74,7 @@ with ZenohBus("probe_a", connect=here, world="probe") as a, ZenohBus("probe_b", 
 
 @contextlib.contextmanager
 def router(*options: str) -> Iterator[tuple[str, subprocess.Popen]]:
-    """A server in a process of its own: its endpoint, and the process."""
+    """Start a server in a process of its own with these ``options``; yields its endpoint and the process."""
     command = [
         sys.executable,
         "-m",
@@ -100,14 +100,14 @@ def router(*options: str) -> Iterator[tuple[str, subprocess.Popen]]:
 
 
 def cpu(process: subprocess.Popen) -> float:
-    """CPU time of a process and its threads [s]."""
+    """Returns the processor time of a process and its threads so far [s]."""
     with open(f"/proc/{process.pid}/stat") as file:
         fields = file.read().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measurement]:
-    """``count`` clients, distributed over the routers."""
+    """Measure ``count`` clients that are distributed over the routers ``ends``: endpoint and process of each."""
     side = math.ceil(math.sqrt(count))
     fake_clients = [{"name": f"p{i}", "place": [APART * (i % side), APART * (i // side)]} for i in range(count)]
     groups = [fake_clients[i : i + PER_PROCESS] for i in range(0, count, PER_PROCESS)]
@@ -134,7 +134,7 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
     size = len(encode_pose(RobotUpdate("", 0.0, frames.pose([0.0, 0.0, 0.0]), np.zeros(6), joints, joints)))
     spans = [(a, b, b["now"] - a["now"]) for a, b in zip(before[1], after[1], strict=True)]
     ticks = np.mean([(b["ticks"] - a["ticks"]) / seconds for a, b, seconds in spans])
-    # what arrived, not what a late tick still found: of poses only the newest wait
+    # count messages that arrived, not messages that a late tick still found: the client keeps only the newest pose
     heard = np.mean([(b["bytes_in"] - a["bytes_in"]) / size / seconds for a, b, seconds in spans])
     case = f"{count} clients, {len(ends)} router{'s' * (len(ends) > 1)}"
 
@@ -159,7 +159,8 @@ def run(count: int, ends: list[tuple[str, subprocess.Popen]]) -> Iterator[Measur
 
 
 def load() -> Iterator[Measurement]:
-    """10, 30 and 100 clients on one router, then on two linked ones, as far as there are cores."""
+    """Measure 10, 30 and 100 clients on one router, then on two linked ones, as far as the machine has cores for
+    them."""
     most = PER_CORE * len(os.sched_getaffinity(0))
     yield Measurement("load", "clients that the cores of this machine can play", float(most), "")
     with router() as first:

@@ -1,8 +1,8 @@
 """``python -m benchmarks sensors``: how well the modelled sensors measure a vineyard whose truth is known, with plots.
 
-Depth error and fill rate of a D435 against range (plane, leaves, bunches) beside the maker's formula, ranges of lidars,
-berries that are seen against how much of their bunch is hidden, renderers beside the ray caster. Everything is seeded:
-the same figures every time.
+Four things are measured: depth error and fill rate of a D435 against range (plane, leaves, bunches), compared with the
+maker's formula; ranges of lidars; the share of berries that are visible against the hidden share of their bunch; and
+the renderers, compared with the ray caster. Everything is seeded: the figures are the same every time.
 """
 
 from __future__ import annotations
@@ -31,28 +31,31 @@ from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
 from vinesim.sensors.raster.renderer_selection import RendererUnavailable
 
 RANGES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
-"""At which depth is measured [m]; what lies within a tenth of one counts for it."""
+"""Ranges at which depth is measured [m]; pixels within a tenth of a range count for it."""
 VIEWS_PER_RANGE = 8
-"""Bunches that are looked at from each of the ranges."""
+"""Number of bunches that are looked at from each range."""
 LIDARS = ("vlp16", "os1_64")
 MIXED_RETURN_ERROR = 0.05
-"""A return counts as mixed if its range differs by more than this [m] from the hit of the beam's axis."""
+"""A return counts as mixed if its range differs by more than this from the range on the axis of its beam [m]."""
 SEED = 7
 RENDERER_VIEW = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
-"""Where renderers are compared: from, to [m]."""
+"""Camera position and target [m] for the comparison of renderers."""
 
 
 @dataclasses.dataclass
 class DepthStatistics:
-    """What a camera measured of one kind of thing, by range."""
+    """Depth measured by a camera on one kind of surface, by range."""
 
     error: dict[float, float] = dataclasses.field(default_factory=dict)
-    """Standard deviation, from the median of absolute errors [m]."""
+    """Standard deviation of depth by range, from the median of absolute errors [m]."""
     fill: dict[float, float] = dataclasses.field(default_factory=dict)
-    """Share of the pixels that were measured."""
+    """Share of the pixels with a measured depth, by range."""
 
     def add(self, away: float, exact: np.ndarray, measured: np.ndarray) -> None:
-        """Pixels [k] at one range, if there are enough of them to tell."""
+        """Add the pixels [k] at the range ``away`` [m], if there are enough for statistics.
+
+        ``exact``, ``measured``: depths [k] m; NaN or infinite where nothing was measured.
+        """
         if len(exact) > 500:
             found = np.isfinite(measured)
             self.fill[away] = float(found.mean())
@@ -60,19 +63,19 @@ class DepthStatistics:
 
 
 def depth_noise_formula(spec: CameraSpec, depth: np.ndarray) -> np.ndarray:
-    """The maker's standard deviation of depth: z^2 sigma_d / (f B)."""
+    """Returns the maker's standard deviation of depth [m]: z^2 sigma_d / (f B)."""
     assert spec.stereo is not None
     return np.asarray(depth) ** 2 * spec.stereo.noise.value / (spec.stereo.focal.value * spec.stereo.baseline.value)
 
 
 def _exact_depth(frame: CameraFrame) -> np.ndarray:
-    """[height, width] m"""
+    """Returns the exact depth [height, width] m of a picture."""
     assert frame.exact_depth is not None
     return frame.exact_depth
 
 
 def measure_plane(spec: CameraSpec) -> DepthStatistics:
-    """Frontal, grey, lit by the sun."""
+    """Measure a grey plane that faces the camera and is lit by the sun."""
     found = DepthStatistics()
     for number, away in enumerate(RANGES):
         wall = Shape("box", (0.05, 20.0, 20.0), frames.pose(np.array([away + 0.05, 0.0, 1.0])))
@@ -93,7 +96,7 @@ def measure_plane(spec: CameraSpec) -> DepthStatistics:
 def measure_plants(
     spec: CameraSpec, model: Model, primitives: Primitives, snapshot: Snapshot
 ) -> dict[str, DepthStatistics]:
-    """Leaves and bunches, looked at from all ranges around some bunches."""
+    """Measure leaves and bunches from all ranges around some bunches."""
     rng = np.random.default_rng(SEED)
     camera = Camera(spec, spec.info("optical"), seed=SEED)
     seen: dict[tuple[str, float], list[tuple[np.ndarray, np.ndarray]]] = {}
@@ -114,7 +117,8 @@ def measure_plants(
 
 
 def _towards_a_bunch(rng: np.random.Generator, model: Model, snapshot: Snapshot, away: float) -> np.ndarray:
-    """Pose [7] of an optical frame that looks at some bunch from a distance, from a robot's height."""
+    """Returns the pose [7] of an optical frame that looks at a random bunch from ``away`` [m], at the height of a
+    robot."""
     bunch = int(rng.integers(len(model.bunch_body)))
     pose = snapshot.body_q[model.bunch_body[bunch]].astype(float)
     middle = pose[:3] + frames.rotate(pose[3:], np.array([0.5 * model.bunch_length[bunch], 0.0, 0.0]))
@@ -125,7 +129,8 @@ def _towards_a_bunch(rng: np.random.Generator, model: Model, snapshot: Snapshot,
 
 
 def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, snapshot: Snapshot) -> np.ndarray:
-    """Share of the bunch that is hidden, share of its berries that are seen [bunch in a picture, 2]; whole bunches."""
+    """Returns, for each whole bunch in a picture, the hidden share of the bunch and the visible share of its berries
+    [k, 2]."""
     rng = np.random.default_rng(SEED)
     info = spec.info("optical")
     rows = []
@@ -142,20 +147,21 @@ def measure_berries(spec: CameraSpec, model: Model, primitives: Primitives, snap
 
 @dataclasses.dataclass(frozen=True)
 class RangeStatistics:
-    """One revolution of one lidar in the vineyard."""
+    """Ranges of one revolution of a lidar in the vineyard."""
 
     exact: np.ndarray
-    """[point] m, a thin beam without errors"""
+    """Exact ranges of thin beams [point] m."""
     real: np.ndarray
-    """[point] m"""
+    """Ranges that the modelled lidar measures [point] m."""
     returned: float
-    """Share of the shots that would have hit something in range and came back."""
+    """Share of the shots with a target in range that returned."""
     mixed: float
-    """Share of the returns, before noise, that lie more than OFF from what the middle of their beam meets."""
+    """Share of the returns, before noise, that differ by more than :data:`MIXED_RETURN_ERROR` from the range on the
+    beam's axis."""
 
 
 def measure_ranges(name: str, primitives: Primitives) -> RangeStatistics:
-    """Between two rows of the demo scene, 1 m above the ground."""
+    """Measure with the lidar ``name`` between two rows of the demo scene, 1 m above the ground."""
     pose = frames.pose(np.array([3.7, 1.25, 1.0]))
     spec = LidarSpec.load(name)
 
@@ -176,15 +182,15 @@ def measure_ranges(name: str, primitives: Primitives) -> RangeStatistics:
 
 @dataclasses.dataclass
 class PixelView:
-    """What the pixels of one view see, each [height, width]."""
+    """Depth and primitive in each pixel of one view [height, width]."""
 
     depth: np.ndarray
-    """[m], inf for nothing."""
+    """Depth [m], infinite where there is nothing."""
     primitive: np.ndarray
 
 
 def compare_renderers(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dict[str, PixelView]:
-    """One view by every renderer that runs here on the CPU, and by the ray caster, which is the measure of all."""
+    """Returns one view by every renderer that runs on this CPU, and by the ray caster, which is the reference."""
     info = spec.info("optical")
     pose = look_at(*RENDERER_VIEW)
     lens = pinhole(info, pose)
@@ -205,7 +211,7 @@ def compare_renderers(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dic
 
 
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
-    """Figures of all sensor models; ``plot``: a folder for the pictures."""
+    """Measure all sensor models. ``plot``: folder for the pictures."""
     model = generate(load_scene("demo"))
     primitives = Primitives(model)
     snapshot = rest_snapshot(model)
@@ -241,7 +247,8 @@ def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
 
 
 def _compare(folder: pathlib.Path, pictures: dict[str, PixelView]) -> None:
-    """``sensors-backends.png``: depth by each renderer; magenta where it sees another primitive than the rays."""
+    """Write ``sensors-backends.png``: depth by each renderer, magenta where the primitive differs from the ray
+    caster's."""
     tiles = []
     for look in pictures.values():
         image = depth_colours(look.depth, 5.0)
@@ -258,7 +265,7 @@ def _draw(
     scans: dict[str, RangeStatistics],
     seen: np.ndarray,
 ) -> None:
-    """``sensors-depth.png``, ``sensors-lidar.png`` and ``sensors-berries.png``."""
+    """Write ``sensors-depth.png``, ``sensors-lidar.png`` and ``sensors-berries.png``."""
     import matplotlib as mpl
 
     mpl.use("Agg")

@@ -1,7 +1,7 @@
 """``python -m benchmarks soak``: memory, threads and open files of robots, people and a recorder in a long run.
 
-All are processes as their users start them, on this machine: a server that keeps its state in a folder, robots whose
-sensors publish to ROS listeners, people who hold and pull bunches, and a recorder.
+All programs are processes on this machine, started as users start them: a server that keeps its state in a folder,
+robots whose sensors publish to ROS listeners, people who hold and pull bunches, and a recorder.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import Measurement
 
 MINUTES = 60.0
-"""Measured time unless another one is asked for [min]."""
+"""Default duration of the measurement [min]."""
 SETTLING = 10.0
-"""Memory may grow for so long [min]; a third of shorter runs."""
+"""Time in which memory may grow before it is measured [min]; a third of a run that is shorter than three times this."""
 SAMPLE_PERIOD = 5.0
-"""Between two samples of all processes [s]."""
+"""Time between two samples of all processes [s]."""
 POLL_PERIOD = 0.1
-"""Between two looks at what the processes print [s]."""
+"""Time between two reads of the processes' output [s]."""
 SENSOR_HZ = 1.0
-"""Pictures and scans of each robot in a second of real time [Hz]."""
+"""Rate of pictures and scans of each robot in real time [Hz]."""
 PERSON_DISTANCE = 1.5
-"""From where a person starts to its bunch [m]."""
+"""Distance from a person's start to the person's bunch [m]."""
 GROWTH_BUDGET = 1.0
-"""Growth of a process after settling [MB/h]: 24 MB a day."""
+"""Largest accepted growth of a process after settling [MB/h]: 24 MB a day."""
 TOPICS = (
     "joint_states",
     "mobile_base_controller/odom",
@@ -48,44 +48,45 @@ TOPICS = (
     "head_front_camera/depth/image_raw",
     "lidar/points",
 )
-"""What the listener of a robot subscribes to, below the robot's namespace."""
+"""Topics that the listener of a robot subscribes to, below the robot's namespace."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Cast:
-    """Who takes part beside the server."""
+    """Programs that take part in a run in addition to the server."""
 
     scene: str = "demo"
     robots: int = 4
     people: int = 2
     records: bool = True
     real_time_factor: float | None = None
-    """Of the world; as fast as all can follow unless given."""
+    """Rate of the world's time. None: as fast as all clients can follow."""
 
 
 @dataclasses.dataclass(frozen=True)
 class SoakResult:
-    """What a run has shown."""
+    """Result of a run."""
 
     histories: dict[tuple[str, int], ProcessHistory]
-    """Of each process after settling, by kind and process id."""
+    """History of each process after settling, by kind and process id."""
     counts: dict[str, int]
-    """Malformed messages, faults and restarts by name, of all processes together."""
+    """Numbers of malformed messages, faults and restarts, by name, of all processes together."""
     tick_hz: float
-    """Least mean rate of any client."""
+    """Mean tick rate of the slowest client [Hz]."""
 
     def of_kind(self, kind: str) -> list[ProcessHistory]:
-        """The processes of one kind."""
+        """Returns the histories of all processes of one kind."""
         return [history for (name, _), history in self.histories.items() if name == kind]
 
 
 def soak(minutes: float, real_time_factor: float | None, announce: Callable[[str], None]) -> Iterator[Measurement]:
-    """Run for ``minutes`` [min] and measure; ``announce`` takes a line now and then."""
+    """Run for ``minutes`` [min] and measure. ``announce`` is called with a line of text from time to time."""
     yield from measurements(run_soak(Cast(real_time_factor=real_time_factor), minutes, announce))
 
 
 def measurements(result: SoakResult) -> Iterator[Measurement]:
-    """Of each kind of process: memory, growth, and more threads or open files in the second half than in the first."""
+    """Yields for each kind of process its memory, its growth, and how many more threads or open files it has in the
+    second half of the run than in the first."""
     for kind in dict.fromkeys(name for name, _ in result.histories):
         histories = result.of_kind(kind)
         memory = float(np.mean([history.samples[-1].memory for history in histories]))
@@ -103,9 +104,9 @@ def measurements(result: SoakResult) -> Iterator[Measurement]:
 
 
 def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> SoakResult:
-    """Start all, wait until they are ready, sample them for ``minutes`` [min], end them.
+    """Start all programs, wait until they are ready, sample them for ``minutes`` [min], and end them.
 
-    Raises :class:`ProcessFailed` if a process ends before, :class:`ProcUnavailable` where there is no /proc.
+    Raises :class:`ProcessFailed` if a process ends too early, :class:`ProcUnavailable` on systems without /proc.
     """
     check_proc()
     with own_processes() as group, tempfile.TemporaryDirectory() as folder:
@@ -133,10 +134,11 @@ def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> Soa
 def settle(
     histories: dict[tuple[str, int], ProcessHistory], start: float, settled: float, end: float
 ) -> tuple[dict[tuple[str, int], ProcessHistory], dict[str, int]]:
-    """Histories from the time ``settled`` [s] on, and which processes had ended a minute before the ``end`` [s].
+    """Returns the histories after the processes have settled, and the processes that had ended a minute before ``end``
+    [s].
 
-    A process that was started later, as one that stands by for another, settles for as long from its own start. One
-    that has got another name meanwhile is there under both, and has not ended.
+    A process settles for ``settled`` - ``start`` [s] from its first sample. Some processes start late, such as those
+    that stand by for another. A process that was renamed has a history under each name, and does not count as ended.
     """
     last: dict[int, float] = {}
     for (_, pid), history in histories.items():
@@ -147,10 +149,10 @@ def settle(
 
 
 class _Run:
-    """The programs of one run."""
+    """Programs of one run."""
 
     def __init__(self, group: ProcessGroup, cast: Cast, folder: pathlib.Path) -> None:
-        """Start them; what they write goes below ``folder``."""
+        """Start the programs; their files go below ``folder``."""
         self._folder = folder
         self.server = group.start(
             "server",
@@ -182,13 +184,14 @@ class _Run:
         self.sampler = ProcessSampler([(kind, process.child.pid) for kind, process in self.processes])
 
     def _start_clients(self, group: ProcessGroup, cast: Cast) -> None:
-        """Robots one behind the other, the first of which pushes a bunch; people beside bunches of their own."""
+        """Start robots one behind the other, of which the first pushes a bunch, and people next to bunches of their
+        own."""
         scene = load_scene(cast.scene)
         model = generate(scene)
         first = start_poses.start_pose(scene, 0)
         pushed = start_poses.find_reachable_bunch(model, first)
         with_ros = middleware.unavailable_reason() is None
-        sensor_hz = SENSOR_HZ / (cast.real_time_factor or 1.0)  # of simulated time
+        sensor_hz = SENSOR_HZ / (cast.real_time_factor or 1.0)  # rate in simulated time
         for i in range(cast.robots):
             name = f"robot_{i + 1}"
             pose = start_poses.start_pose(scene, 0, queue=i)
@@ -200,7 +203,7 @@ class _Run:
                 self.processes.append(("ROS listener", group.processes[-1]))
             self._start_client(group, "robot", name, cast, [*options, *(["--push", str(pushed)] if i == 0 else [])])
         centres = start_poses.bunch_centres(model)[:, :2]
-        # a person's bunch lies apart from the robots
+        # bunches for people are far from the robots
         far = np.argsort(-np.linalg.norm(centres - first[:2], axis=1), kind="stable")
         for i in range(cast.people):
             bunch = int(far[i * len(far) // 4])
@@ -228,7 +231,7 @@ class _Run:
         self.processes.append(("robot client" if role == "robot" else "person's client", self.clients[name]))
 
     def read(self) -> None:
-        """Take what the processes have printed; :class:`ProcessFailed` if one has ended."""
+        """Read the processes' output. Raises :class:`ProcessFailed` if a process has ended."""
         for name, client in self.clients.items():
             for line in client.new_lines():
                 self._newest[name] = json.loads(line)
@@ -240,12 +243,12 @@ class _Run:
             self.recorder.new_lines()
 
     def forget_messages(self) -> None:
-        """Let the listeners drop the times of the messages so far, which they keep for statistics: 3 MB an hour."""
+        """Let the listeners drop the times of past messages, which they keep for statistics: 3 MB an hour."""
         for listener in self.listeners:
             listener.restart()
 
     def wait_until_ready(self) -> None:
-        """Return when every client steps, every sensor publishes and every listener has heard all its topics."""
+        """Return when every client steps, every sensor publishes and every listener has received all its topics."""
         deadline = time.monotonic() + START_TIMEOUT
         while True:
             self.read()
@@ -258,18 +261,19 @@ class _Run:
             time.sleep(POLL_PERIOD)
 
     def progress(self) -> str:
-        """One line: memory of all, rates of the clients, faults so far."""
+        """Returns one line: memory of all processes, tick rates of the clients, faults so far."""
         memory = self.sampler.memory()
         rates = " ".join(f"{values['tick_hz']:.0f}" for values in self._newest.values())
         faults = {name: values["faults"] for name, values in self._newest.items() if values["faults"]}
         return f"{memory:.0f} MB in all, ticks {rates} Hz, faults {faults or 'none'}"
 
     def least_rate(self) -> float:
-        """The least mean rate of a client's ticks so far [Hz]."""
+        """Returns the mean tick rate of the slowest client so far [Hz]."""
         return min((values["tick_hz"] for values in self._newest.values()), default=0.0)
 
     def end(self) -> dict[str, int]:
-        """End the clients in order; what they counted. One that fails now is counted: the run itself is over."""
+        """End the clients in order and return their counts. A client that fails now adds to the counts: the run itself
+        is over."""
         counts = {"malformed, server": self._figures["malformed"], "refused, server": self._figures["refused"]}
         for client in self.clients.values():
             client.interrupt()

@@ -1,12 +1,12 @@
-"""``python -m benchmarks sound``: how late an alarm is seen and heard, and how late voices are, in simulated time.
+"""``python -m benchmarks sound``: delay of an alarm until it is seen and heard, and of voices, in simulated time.
 
-A robot and a person 3 m from it, of two clients, over a network in memory. Again and again the robot switches its
-lights to alarm with their tone and plays an alarm as a waveform, too, and the person says a word.
+A robot and a person 3 m from it belong to two clients on a network in memory. Again and again the robot switches its
+lights to alarm with their tone, and also plays an alarm as a waveform; and the person says a word.
 
 The light is seen when the copy of the robot in the person's client is lit. The tone is heard when the person's page is
-told to make it, the waveform when the page has its first frame and has waited as long as it does. The word is heard
-when the robot's microphone has recorded a block of 20 ms with it, counted from its first sample. What a headset, a
-browser and a sound card need comes on top.
+told to make it; the waveform, when the page has received its first frame and has waited as long as a page does. The
+word is heard when the robot's microphone has recorded a block of 20 ms with the word; that delay counts from the word's
+first sample. The delays of a headset, a browser and a sound card are not included.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ from vinesim.scene.values import Measurement
 from vinesim.scene.values.signals import FREQUENCY, UNLIT, LightPattern, Lights
 
 DELAYS = (0.0002, 0.02, 0.05, 0.1)
-"""[s] One way, from client to client; with a fifth of it as jitter, and 1 % lost."""
+"""Delays one way, from client to client [s]. Jitter is a fifth of the delay; 1 % of the messages are lost."""
 ALARMS = 20
 STEP = 0.01
 LISTENING = 0.7
-"""[s] After each alarm."""
+"""Time after each alarm in which its signs are awaited [s]."""
 PAUSE = 0.5
-"""[s] Of silence between two alarms; the voices begin anew."""
+"""Silence between two alarms [s], after which voices begin as new ones."""
 WAVEFORM = 500.0
 WORD = 700.0
-"""[Hz] Of the alarm as a waveform, and of the word."""
+"""Frequency of the word [Hz]. ``ALARM`` is the frequency of the alarm that is played as a waveform."""
 PAGE_WAITS = 0.01
-"""From the first frame of a voice until a page plays it [s] (``vinesim/web/page/voice_worklet.js``)."""
+"""Time from the first frame of a voice until a page plays it [s] (``vinesim/web/page/voice_worklet.js``)."""
 HEARD = 0.01
-"""Amplitude of a tone from which a block contains it; 3 m away alarms have 0.16."""
+"""Amplitude from which a block counts as containing a tone; 3 m away, alarms have 0.16."""
 BUDGET = 500.0
-"""[ms] Of voices (CANOPIES D6.4, section 5.5)."""
+"""Budget of the delay of voices [ms] (CANOPIES D6.4, section 5.5)."""
 
 LIGHT = "the light is seen"
 TONE_OF_LIGHTS = "its tone is heard"
@@ -53,7 +53,7 @@ VOICE = "a word reaches a microphone"
 
 
 class _PageEars:
-    """Notes what a page gets."""
+    """Stands in for the page of a person: notes which frames and tones arrive."""
 
     is_open = True
     decodes_opus = True
@@ -68,7 +68,7 @@ class _PageEars:
 
 
 class _World:
-    """Two clients in simulated time."""
+    """Two clients in simulated time: a robot ``bot`` and a person ``anna``."""
 
     def __init__(self, delay: float) -> None:
         self.hub = MemoryHub(delay=delay, jitter=0.2 * delay, loss=0.01, seed=1)
@@ -104,22 +104,22 @@ class _World:
         self.now += STEP
 
     def world_time(self) -> float:
-        """Time of the world at the robot's client [s]."""
+        """Returns the time of the world at the robot's client [s]."""
         return self.bot.physics.time + self.bot.world_time.offset
 
     def is_lit(self) -> bool:
-        """Whether the person sees the alarm."""
+        """Returns whether the robot's copy in the person's client shows the alarm."""
         robot = self.anna.remote_actors["bot"]
         anna = self.anna
         assert isinstance(robot, RobotInstance)
         return robot.lights.shown(anna.physics.time + anna.world_time.offset) not in (None, UNLIT)
 
     def alarm(self) -> dict[str, float]:
-        """Time until each sign of one alarm arrives [s]."""
+        """Play one alarm; return the time until each sign of it arrives [s], by name."""
         self.bot.robot.lights = Lights()
         self.run(PAUSE)
         while not 0.0 <= self.world_time() * FREQUENCY[LightPattern.ALARM] % 1.0 < 0.04:
-            self.step()  # to the beginning of a flash
+            self.step()  # step to the beginning of a flash
         self.at_bot.blocks = []
         self.at_anna.frames = 0
         self.at_anna.has_tone = False
@@ -130,7 +130,7 @@ class _World:
         found: dict[str, float] = {}
         for step in range(round(LISTENING / STEP)):
             if step % 2 == 0 and step > 0 and (said := word[(step - 2) * FRAME_SAMPLES : step * FRAME_SAMPLES]):
-                self.anna.sound.speak("anna", Codec.PCM16, said)  # what was said since the last frame
+                self.anna.sound.speak("anna", Codec.PCM16, said)  # the samples since the last frame
             self.step()
             after = self.now - begin
             has_word = any(_level(block.samples, WORD) > HEARD for block in self.at_bot.blocks)
@@ -151,13 +151,13 @@ def _tone(frequency: float, seconds: float) -> np.ndarray:
 
 
 def _level(samples: np.ndarray, frequency: float) -> float:
-    """Amplitude of a tone in a block."""
+    """Returns the amplitude of a tone of ``frequency`` [Hz] in a block of ``samples`` [n]."""
     time = np.arange(len(samples)) / SAMPLE_RATE
     return 2.0 * abs(complex(np.mean(samples * np.exp(-2j * np.pi * frequency * time))))
 
 
 def sound(delays: tuple[float, ...] = DELAYS, alarms: int = ALARMS) -> Iterator[Measurement]:
-    """Median and largest delay of each sign of an alarm, and of a word."""
+    """Measure the median and the largest delay of each sign of an alarm, and of a word, for each network delay [s]."""
     for delay in delays:
         world = _World(delay)
         found = [world.alarm() for _ in range(alarms)]

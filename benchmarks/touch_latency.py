@@ -1,7 +1,8 @@
-"""``python -m benchmarks link``: a contact seen over an emulated link, by whole clients over Zenoh, in real time.
+"""``python -m benchmarks link``: delay of a contact over an emulated link, with whole clients over Zenoh, in real time.
 
-Server and clients are processes, each in a network namespace of its own. The picker pushes a bunch again and again, the
-visitor watches the same bunch in its own simulation; both trace it by the clock of the host.
+Server and clients are processes, each in a network namespace of its own. One client, the picker, pushes a bunch again
+and again; the other, the visitor, watches the same bunch in its own simulation. Both record its motion by the clock of
+the host.
 """
 
 from __future__ import annotations
@@ -30,32 +31,32 @@ LINES = {
     "20 +- 4 ms one way, 1 % lost": Link(LinkProfile(0.010, 0.002, 0.005)),
     "50 +- 10 ms one way, 1 % lost": Link(LinkProfile(0.025, 0.005, 0.005)),
 }
-"""Link of each client to the server; from client to client it is twice that."""
+"""Profiles of the link from each client to the server, by name; from client to client delay and loss are twice that."""
 
 BUDGETS = {LAN: 45.0}
-"""Time from a touch to motion as another client sees it, by link [ms]."""
+"""Largest accepted time from a touch until the bunch moves on another client, by link [ms]."""
 
 SECONDS = 26.0
-"""Running time of the clients [s]: some four pushes."""
+"""Running time of the clients [s], enough for about four pushes."""
 
 START = 150.0
 """Time limit for a client to start, and to write its trace [s]."""
 
 SEEN = 0.002
-"""Displacement from which a bunch has visibly moved [m]."""
+"""Displacement from which a bunch counts as visibly moved [m]."""
 
 TOUCHES = 40
-"""Contacts of fake clients."""
+"""Number of contacts that fake clients make."""
 
 STILL = 0.001
-"""Only contacts count of a bunch that moved by less than this in the 0.3 s before [m]."""
+"""A contact counts only if the bunch moved by less than this in the 0.3 s before [m]."""
 
 APART = 1.0
-"""A contact is new after so long without one [s]."""
+"""A contact counts as new after this time without contact [s]."""
 
 
 def touches(rows: Rows) -> list[int]:
-    """Rows in which a force begins after a pause, on a bunch that is still."""
+    """Returns the rows in which a force begins after a pause, on a bunch that is still."""
     pressed = np.flatnonzero(np.linalg.norm(rows.force, axis=1) > 0.0)
     if not len(pressed):
         return []
@@ -64,8 +65,8 @@ def touches(rows: Rows) -> list[int]:
 
 
 def moves(rows: Rows, since: float) -> float:
-    """Time from ``since`` [s, clock of the host] until the bunch visibly moves [s]; infinite if it does not within a
-    second."""
+    """Returns the time from ``since`` [s, clock of the host] until the bunch visibly moves [s]; infinite if it does not
+    within a second."""
     first = int(np.searchsorted(rows.clock, since))
     here = slice(first, int(np.searchsorted(rows.clock, since + 1.0)))
     if first == 0 or here.stop <= first:
@@ -75,7 +76,8 @@ def moves(rows: Rows, since: float) -> float:
 
 
 def run_clients(line: Link) -> tuple[Rows, Rows]:
-    """Traces of the picker and of the visitor, of the same bunch."""
+    """Run both clients over the link ``line``; return the traces of the picker and of the visitor, of the same
+    bunch."""
     scene = load_scene("demo")
     bunch = str(find_reachable_bunch(generate(scene), spawn_pose(scene, 0)))
     client = [sys.executable, "-m", "vinesim", "client", "--no-ros", "--status", "none", "--sensor-hz", "0.1"]
@@ -95,9 +97,10 @@ def run_clients(line: Link) -> tuple[Rows, Rows]:
 
 
 def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
-    """Time from the step of a contact to the step in which another client is informed [s]: fake clients.
+    """Returns times from the step of a contact to the step in which another client receives it [s], with fake clients.
 
-    Their steps are kept even on a busy machine, so this is the share of the network, and the wait for two steps.
+    Fake clients keep the pace of their steps even on a busy machine. So this time is the share of the network, and the
+    wait for two steps.
     """
     with NetworkEmulator({"ada": line, "bob": line}) as net:
         net.start_server("--insecure")
@@ -128,7 +131,7 @@ def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
 
 
 def link() -> Iterator[Measurement]:
-    """Rows for each link, and whether a poor one keeps its clients."""
+    """Measure each link with fake and whole clients, and whether a poor link keeps its clients."""
     for case, line in LINES.items():
         took = 1e3 * np.array(measure_notification(line))
         for share in (50, 95):
@@ -140,7 +143,8 @@ def link() -> Iterator[Measurement]:
 
 
 def line_measurements(case: str) -> Iterator[Measurement]:
-    """Rows of whole clients over one of :data:`LINES`; the time to visible motion beside its budget if it has one."""
+    """Measure whole clients over one of :data:`LINES`. The time to visible motion is compared with its budget if it has
+    one."""
     picker, visitor = run_clients(LINES[case])
     known = [picker.clock[row] for row in touches(picker) if visitor.is_remote.any()]
     both = [(moves(picker, start), moves(visitor, start)) for start in known]

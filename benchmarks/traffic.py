@@ -2,9 +2,9 @@
 
 Ten robots and five people work on a block of about ten thousand bunches. Each touches three trees with a bunch and two
 without, all of which swing. The replicators are real, the network is the bus in memory with the delay of a LAN, and
-what moves is scripted: no physics is needed to count bytes.
+motion is scripted: no physics is needed to count bytes.
 
-The broadcast is the cost of sending everything to all: the pose of every actor and a rigid record of 26 B for
+The broadcast is the cost of sending everything to all clients: the pose of every actor and a rigid record of 26 B for
 every bunch, at 60 Hz.
 """
 
@@ -28,37 +28,39 @@ ROBOTS = 10
 PEOPLE = 5
 BUNCHES = 3
 BRANCHES = 2
-"""Trees with and without a bunch that each actor touches."""
+"""Number of trees without a bunch that each actor touches; ``BUNCHES`` is the number of those with a bunch."""
 
 HZ = 60.0
 SECONDS = 6.0
 SETTLE = 2.0
-"""Time until all actors have met [s]."""
+"""Time for all actors to meet [s]."""
 
 LAN = 0.001
-"""Delay one way [s]."""
+"""Delay of the network one way [s]."""
 
 RIGID = 26
-"""Size of the record of a rigid object [B]."""
+"""Size of the state of a rigid object in the broadcast [B]."""
 
 RINGS = (0.0, 3.0, 6.0, 12.0, 100.0)
-"""Distances [m] between which the error of what is shown is given."""
+"""Bounds of the classes of distance [m] for which errors of shown robots are reported."""
 REACH = 1.0
-"""Of an arm [m]: a joint's error moves the hand by that times the error."""
+"""Length of an arm [m], by which a joint's error is multiplied to estimate the error of the hand."""
 
 OVERHEAD = 6
-"""Framing of a message that shares a packet with others [B]; alone it costs far more, see the load benchmark."""
+"""Framing of a message that shares a packet with others [B]. A message alone in its packet costs far more, see the
+benchmark ``load``."""
 
 
 def places(model: Model, share: float, seed: int = 3) -> np.ndarray:
-    """Positions of all actors [actor, 2] m: anywhere in a ``share`` of the edges of the block."""
+    """Returns random positions of all actors [actor, 2] m, in a part of the block with ``share`` of the length of its
+    edges."""
     low = model.tree_pose[:, :2].min(0)
     high = model.tree_pose[:, :2].max(0)
     return low + share * (high - low) * np.random.default_rng(seed).uniform(size=(ROBOTS + PEOPLE, 2))
 
 
 def place_actors(hub: MemoryHub, model: Model, where: np.ndarray) -> list[FakeClient]:
-    """Robots and people in contact with the nearest trees: those with bunches first."""
+    """Returns robots and people at the positions ``where`` [actor, 2] m, in contact with the nearest trees."""
     laden = np.zeros(len(model.tree_first), bool)
     laden[model.body_tree[model.bunch_body]] = True
     roots = model.tree_pose[:, :2]
@@ -80,13 +82,13 @@ def place_actors(hub: MemoryHub, model: Model, where: np.ndarray) -> list[FakeCl
 
 
 def broadcast(model: Model, fake_clients: list[FakeClient]) -> float:
-    """Bytes a second that a client receives if everything is sent to all at 60 Hz."""
+    """Returns the bytes a second that a client receives if everything is sent to all clients at 60 Hz."""
     poses = sum(len(encode_pose(fake_client.pose(0.0))) for fake_client in fake_clients[1:])
     return HZ * (poses + RIGID * len(model.bunch_body))
 
 
 def traffic() -> Iterator[Measurement]:
-    """Rows for actors anywhere, and for the same ones close together."""
+    """Measure actors anywhere in the block, then the same actors close together."""
     model = generate(load_scene("tendone"))
     for case, share in (("all over the block", 1.0), ("in a quarter of it", 0.5)):
         hub = MemoryHub(delay=LAN, seed=1)
@@ -101,7 +103,7 @@ def traffic() -> Iterator[Measurement]:
             _tick(hub, fake_clients)
             if tick % 7 == 0:
                 errors.append(shown_errors(fake_clients, hub.time))
-            if tick % 10 == 9:  # tenths of a second: what a link must carry, not what a packet holds
+            if tick % 10 == 9:  # sums over tenths of a second: the load of a link, not single packets
                 rows.append([(p.bus.bytes_in, p.bus.bytes_out, _messages(p)) for p in fake_clients])
         rates = 10.0 * np.diff(np.array(rows, float), axis=0)  # [tenth, actor, (in, out, messages in)]
         everything = broadcast(model, fake_clients)
@@ -139,7 +141,8 @@ def traffic() -> Iterator[Measurement]:
 
 
 def shown_errors(fake_clients: list[FakeClient], now: float) -> np.ndarray:
-    """[k, 2] Distance [m] and largest joint error [rad] of every robot as every other client shows it ``now``."""
+    """Returns [k, 2] the distance [m] and the largest joint error [rad] of every robot on every other client,
+    ``now``."""
     found = []
     for viewer in fake_clients:
         for other in fake_clients:

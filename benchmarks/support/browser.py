@@ -1,4 +1,4 @@
-"""A headless browser, driven by the DevTools protocol: scripts in its page, keys, and pictures of it."""
+"""A headless browser that is driven by the DevTools protocol: runs scripts in a page, presses keys, takes pictures."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ import numpy as np
 from vinesim.audio.frame import to_pcm
 
 TIMEOUT = 120.0
-"""Longest time in which the browser answers [s]."""
+"""Time limit for each answer of the browser [s]."""
 PROGRAMS = ("chromium", "google-chrome")
 OPTIONS = (
     "--headless",
@@ -43,18 +43,20 @@ IWER = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
 """The emulator of headsets; ``tools/build_page`` puts it there."""
 
 GUARD = '"$@" & read -r _; kill -9 $!'
-"""Script of a shell that runs a program until its own standard input ends: with this process, however that ends."""
+"""Shell script that runs a program until the script's standard input ends: it ends with this process, however that
+ends."""
 
 AS_RECORDED = """
   const media = navigator.mediaDevices, open = media.getUserMedia.bind(media);
   const raw = { echoCancellation: false, noiseSuppression: false, autoGainControl: false };
   media.getUserMedia = () => open({ audio: raw });
 """
-"""Runs before the page. A tone is noise to the filters of a browser, which remove it: tests need it as it is."""
+"""Script that runs before the page and switches the browser's sound filters off: they would remove test tones as
+noise."""
 
 
 def microphone(path: pathlib.Path) -> tuple[str, ...]:
-    """Options of a browser whose microphone hears a file, again and again."""
+    """Returns options of a browser whose microphone plays a sound file in a loop."""
     return (
         "--use-fake-ui-for-media-stream",
         "--use-fake-device-for-media-stream",
@@ -64,12 +66,12 @@ def microphone(path: pathlib.Path) -> tuple[str, ...]:
 
 
 def write_tone(path: pathlib.Path, frequency: float, level: float) -> pathlib.Path:
-    """Write a second of a tone at 48 kHz that may be repeated without a gap; returns the ``path``."""
+    """Write one second of a tone at 48 kHz that can be repeated without a gap; returns ``path``."""
     return write_sound(path, level * np.sin(2.0 * np.pi * frequency * np.arange(48_000) / 48_000))
 
 
 def write_sound(path: pathlib.Path, samples: np.ndarray) -> pathlib.Path:
-    """Write samples [n] of 48 kHz; returns the ``path``."""
+    """Write ``samples`` [n] at 48 kHz; returns ``path``."""
     with wave.open(str(path), "wb") as file:
         file.setnchannels(1)
         file.setsampwidth(2)
@@ -79,13 +81,13 @@ def write_sound(path: pathlib.Path, samples: np.ndarray) -> pathlib.Path:
 
 
 def emulated_headset() -> str:
-    """Script that runs before the page and gives the browser a Quest 3, ``device`` in further scripts."""
+    """Returns a script that runs before the page and emulates a Quest 3; further scripts find it as ``device``."""
     device = ";window.device = new IWER.XRDevice(IWER.metaQuest3); device.stereoEnabled = true;"
     return IWER.read_text() + device + "device.installRuntime({forceInstall: true});"
 
 
 def program() -> str | None:
-    """The browser of this machine, or None."""
+    """Returns the path of this machine's browser, or None."""
     return next((path for name in PROGRAMS if (path := shutil.which(name))), None)
 
 
@@ -96,19 +98,19 @@ class BrowserMissing(RuntimeError):
 
 
 class Page:
-    """One page of a browser. All calls wait until the browser has answered."""
+    """One page of a browser. Each method returns when the browser has answered."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop, socket: aiohttp.ClientWebSocketResponse) -> None:
         self._loop = loop
         self._socket = socket
         self._count = 0
         self._before: str | None = None
-        """Of the script that runs before the page."""
+        """Identifier of the script that runs before the page."""
         self.errors: list[str] = []
-        """What the page has thrown."""
+        """Errors that the page has thrown."""
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
-        """Result of a method of the DevTools protocol."""
+        """Call a method of the DevTools protocol and return its result."""
         return self._loop.run_until_complete(asyncio.wait_for(self._call(method, parameters), TIMEOUT))
 
     async def _call(self, method: str, parameters: dict[str, Any]) -> dict[str, Any]:
@@ -124,19 +126,21 @@ class Page:
                 return answer["result"]
 
     def resize(self, width: int, height: int, ratio: float = 1.0) -> None:
-        """Set the size of the page [px], each pixel of which has ``ratio`` pixels of the screen each way."""
+        """Set the size of the page [px]. ``ratio``: pixels of the screen for each pixel of the page, in each
+        direction."""
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=ratio, mobile=False
         )
 
     def look(self, eye: np.ndarray, target: np.ndarray) -> None:
-        """Put the eyes of vinesim's page to a place ``eye`` [3] m in the world, looking at a point ``target`` [3] m."""
+        """Move the eyes of vinesim's page to ``eye`` [3] m in the world, looking at the point ``target`` [3] m."""
         x, y, z = target - eye
         look = {"place": eye.tolist(), "yaw": float(np.arctan2(y, x)), "pitch": float(np.arctan2(z, np.hypot(x, y)))}
         self.run(f"Object.assign(vinesim.viewer.eyes, {json.dumps(look)}), 0")
 
     def open(self, address: str, *, before: str = "") -> None:
-        """Go to an address; the script ``before`` runs before those of the page. Errors are counted from here on."""
+        """Go to an address. The script ``before`` runs before the scripts of the page. The list of errors starts
+        empty."""
         self.call("Runtime.enable")
         self.call("Page.enable")
         if self._before is not None:
@@ -147,7 +151,7 @@ class Page:
         self.errors.clear()
 
     def run(self, script: str) -> Any:
-        """Value of an expression in the page."""
+        """Evaluate an expression in the page and return its value."""
         answer = self.call("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in answer, answer["exceptionDetails"]
         return answer["result"].get("value")
@@ -157,7 +161,7 @@ class Page:
         self.call("Input.dispatchKeyEvent", type="keyDown" if down else "keyUp", code=code)
 
     def picture(self) -> np.ndarray:
-        """What the page shows [row, column, 3] RGB."""
+        """Returns a picture of the page [row, column, 3] RGB."""
         png = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
         assert picture is not None
@@ -166,7 +170,8 @@ class Page:
 
 @contextlib.contextmanager
 def browser_page(*options: str, graphics: Sequence[str] = SOFTWARE) -> Iterator[Page]:
-    """A page of a browser, started with these further options and those for ``graphics``, that ends with the block."""
+    """Start a browser and yield a page of it; the browser ends with the context. ``options``: further options of the
+    browser; ``graphics``: options that choose how it draws."""
     path = program()
     if path is None:
         raise BrowserMissing(f"a browser is needed, one of {', '.join(PROGRAMS)}: install chromium")

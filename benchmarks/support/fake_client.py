@@ -1,11 +1,11 @@
 r"""Clients without physics: scripted poses and objects on a real replicator, to measure and test the network.
 
-python -m benchmarks.support.fake_client \ '{"connect": "tcp/127.0.0.1:7447", "fake_clients": [{"name": "ada",
-"place": [1, 0]}]}'
+    python -m benchmarks.support.fake_client \\
+        '{"connect": "tcp/127.0.0.1:7447", "fake_clients": [{"name": "ada", "place": [1, 0]}]}'
 
-Such a process answers each line of its input, a JSON object, with one line: ``{"who": "ada", "touch": [3]}`` is a
-command for one client (:meth:`FakeClient.apply`), and every answer is its :meth:`FakeClient.report`. It ends with its
-input.
+Such a process reads JSON objects from its standard input, one a line, and answers each with one line. ``{"who": "ada",
+"touch": [3]}`` is a command for one client (:meth:`FakeClient.apply`); the answer is the client's
+:meth:`FakeClient.report`. The process ends with its input.
 """
 
 from __future__ import annotations
@@ -38,16 +38,18 @@ STEP_PERIOD = 0.01
 """Time step of a client [s]."""
 
 ROBOT_JOINTS = 27
-"""Joints of a robot, as many as vinebot has."""
+"""Number of joints of a robot, the same as of vinebot."""
 
 SWAY = 0.12
 SWING = 1.3
-"""Amplitude [m] and frequency [Hz] of the tip of a touched tree: its owner must then publish 12 to 20 times a second,
-as for a cane that a robot pushes (measured: 13 messages in the 0.4 s of a push, then 14 in a second of holding)."""
+"""Amplitude [m] and frequency [Hz] with which the tip of a touched tree swings. Its owner must then publish 12 to 20
+times a second, as for a cane that a robot pushes (measured: 13 messages in the 0.4 s of a push, then 14 in a second of
+holding)."""
 
 
 def tree_row(count: int = 12, *, apart: float = 1.0) -> Model:
-    """Trees of six bodies with a bunch along x, the first at half their distance [m], and a box below each."""
+    """Returns a model with trees of six bodies and a bunch along x, ``apart`` [m] from each other, and a box below
+    each."""
     trees = []
     for number in range(count):
         tree = TreeBuilder(frames.pose(np.array([(number + 0.5) * apart, 0.0, 1.5])))
@@ -77,7 +79,7 @@ class FakeClient:
         near: float = interest.INTEREST_RADIUS,
         restless: bool = True,
     ) -> None:
-        """Stand at ``place`` [2] m; ``restless`` lets the joints swing, so that no two poses are equal."""
+        """Join at ``place`` [2] m. ``restless``: the joints swing, so that no two poses are equal."""
         joints = 0 if kind == "human" else joints
         hello = Hello(bus.name, kind=kind, scene="fake_clients", digest=digest, joints=joints)
         self.bus = bus
@@ -88,34 +90,35 @@ class FakeClient:
         self.joints = joints
         self.restless = restless
         self.touching: set[int] = set()
-        """Trees it is in contact with."""
+        """Trees that this client touches."""
         self.swinging: set[int] = set()
-        """Trees that move without contact."""
+        """Trees that this client moves without contact."""
         self.grabbing: set[int] = set()
-        """Objects it grabs in its next step."""
+        """Objects that this client grabs in its next step."""
         self.picking: set[int] = set()
-        """Bunches that it picks in its next step and then carries."""
+        """Bunches that this client picks in its next step and then carries."""
         self.carrying: set[int] = set()
-        """Boxes and free bunches that move in its hands; what is released rests at once where it is."""
+        """Boxes and free bunches that this client carries; an object that is released is at rest at once, where it
+        is."""
         self.parents: dict[int, str] = {}
-        """Frame in which a released object rests, if not the world."""
+        """Frame in which a released object rests, by object; the world if there is no entry."""
         self.sway = SWAY
         self.joined_at: dict[str, float] = {}
         self.left_at: dict[str, float] = {}
         self.heard: dict[int, float] = {}
-        """When each object was last updated [s, own clock]."""
+        """Time of the last update of each object [s, clock of this client]."""
         self.first: dict[int, float] = {}
-        """When updates of each tree began after a pause [s, own clock]."""
+        """Time at which updates of each tree began after a pause [s, clock of this client]."""
         self._rested: set[int] = set()
         self.moved: dict[int, np.ndarray] = {}
         """Last received poses [7] of boxes and free bunches."""
         self.facts: dict[int, dict[str, Any]] = {}
-        """Retained records that it received, by object."""
+        """Received retained records, by object."""
         self.released: list[int] = []
         self.reads = 0
         self.ticks = 0
         self.robots: dict[str, RobotUpdate | HumanUpdate] = {}
-        """The peers as last shown."""
+        """Remote actors as last shown, by name."""
         self._now = 0.0
 
     def tick(self, now: float) -> None:
@@ -162,7 +165,7 @@ class FakeClient:
         self.ticks += 1
 
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
-        """The own pose at ``now`` [s]."""
+        """Returns this client's pose at ``now`` [s]."""
         if self.replicator.hello.kind == "human":
             points = np.tile(frames.pose(self.place), (len(POINT_NAMES), 1))
             points[:, 2] = (0.0, 1.65, 1.1 + 0.2 * np.sin(2.0 * now), 1.1, 0.9, 0.1, 0.1)
@@ -174,7 +177,8 @@ class FakeClient:
         return RobotUpdate(self.name, now, frames.pose(self.place), np.zeros(6), 0.3 * np.sin(phase), speed)
 
     def carried_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] and velocity [6] of what it carries: to and fro above its place."""
+        """Returns the pose [7] and velocity [6] of a carried object, which moves to and fro above the client's
+        place."""
         phase = 2.0 * np.pi * SWING * (self._now + self.replicator.offset) + object_id
         pose = frames.pose(self.place + np.array([0.2 * np.sin(phase), 0.0, 1.0]))
         velocity = np.zeros(6)
@@ -182,18 +186,18 @@ class FakeClient:
         return pose, velocity
 
     def pose_on_support(self, object_id: int) -> tuple[str, np.ndarray]:
-        """Parent frame and pose [7] of a released object."""
+        """Returns the parent frame and the pose [7] of a released object."""
         return self.parents.get(object_id, ""), self.carried_state(object_id)[0]
 
     def read(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
-        """State of an object; a tree swings about one axis of every joint, equally on every clock."""
+        """Returns the state of an object. A tree swings about one axis of every joint, equally on every clock."""
         self.reads += 1
         if not is_tree(object_id):
             return self.carried_state(object_id)
         return swinging_state(self.model, object_id, self._now + self.replicator.offset, self.sway)
 
     def report(self) -> dict[str, Any]:
-        """Everything that a test may need."""
+        """Returns all state that a test may need, as JSON values."""
         replicator = self.replicator
         return {
             "name": self.name,
@@ -218,10 +222,10 @@ class FakeClient:
         }
 
     def apply(self, command: dict[str, Any]) -> None:
-        """``touch``, ``swing``, ``grab``, ``pick``, ``carry``: object ids; ``lay``: {object id: parent frame} of what
-        is released.
+        """Apply a command, a dictionary with any of these keys.
 
-        ``place``: [x, y] m; ``sway``: m.
+        ``touch``, ``swing``, ``grab``, ``pick``, ``carry``: object ids. ``lay``: {object id: parent frame}, objects to
+        release. ``place``: [x, y] m, where to stand. ``sway``: amplitude of touched trees [m].
         """
         for what, value in command.items():
             if what == "touch":
@@ -246,10 +250,10 @@ class FakeClient:
 
 
 def swinging_state(model: Model, tree: int, time: float, sway: float = SWAY) -> tuple[np.ndarray, np.ndarray]:
-    """Joint rotations [n, 4] and rates [n, 3] rad/s of a tree whose tip sways by ``sway`` [m] for ever."""
+    """Returns joint rotations [n, 4] and rates [n, 3] rad/s of a tree whose tip sways without end, by ``sway`` [m]."""
     bodies = model.bodies_of(tree)
     length = float(model.body_length[bodies].sum())
-    amplitude = 2.0 * sway / max(length * len(model.joint_settled[bodies]), 1e-3)  # every joint bears half of it
+    amplitude = 2.0 * sway / max(length * len(model.joint_settled[bodies]), 1e-3)  # shared equally by all joints
     phase = 2.0 * np.pi * SWING * time + tree
     turn = frames.exp(np.array([0.0, amplitude * np.sin(phase), 0.0]))
     settled = model.joint_settled[bodies]
@@ -262,7 +266,7 @@ def swinging_state(model: Model, tree: int, time: float, sway: float = SWAY) -> 
 
 
 class FakeClientProcess:
-    """Fake clients in a process of their own, seen from the process that started it. A context manager."""
+    """Fake clients in a process of their own, as the process that started them controls them. A context manager."""
 
     def __init__(
         self,
@@ -272,7 +276,8 @@ class FakeClientProcess:
         start: Callable[..., Any] = subprocess.Popen,
         **options: Any,
     ) -> None:
-        """``start(command, **options of Popen)`` may start it in a namespace; ``options`` as in :func:`run`."""
+        """Start the process. ``start(command, **options of Popen)`` may start it in a network namespace; ``options`` as
+        in :func:`run`."""
         wanted = json.dumps({"connect": connect, "fake_clients": list(fake_clients), **options})
         self.process = start(
             [sys.executable, "-m", "benchmarks.support.fake_client", wanted],
@@ -283,7 +288,7 @@ class FakeClientProcess:
         self._read_line()
 
     def command(self, who: str = "", **command: Any) -> dict[str, Any]:
-        """Send a command to one client; its report after the next step."""
+        """Send a command to the client ``who``; return the client's report after its next step."""
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps({"who": who, **command}) + "\n")
         self.process.stdin.flush()
@@ -325,8 +330,11 @@ def run(
     skew: float = 0.0,
     certificates: str = "",
 ) -> None:
-    """Step clients over Zenoh and apply commands from standard input until it ends. ``skew`` [s]: clock error;
-    ``certificates``: folder with those of all, for ``tls/`` and ``quic/``."""
+    """Step clients over Zenoh and apply commands from standard input until it ends.
+
+    ``trees``, ``apart``: arguments of :func:`tree_row`. ``tick``: period of steps [s]. ``skew``: error of the clock
+    [s]. ``certificates``: folder with the certificates of all clients, for ``tls/`` and ``quic/``.
+    """
     from vinesim.net.transport.zenoh_bus import ZenohBus
 
     model = tree_row(trees, apart=apart)
@@ -357,7 +365,7 @@ def run(
                     return
                 name = command.pop("who") or next(iter(by_name))
                 by_name[name].apply(command)
-                answering.append(name)  # after its next tick
+                answering.append(name)  # answered after the next tick of this client
             due += tick
             late += time.monotonic() - due > tick
             if time.monotonic() - due > 0.5:

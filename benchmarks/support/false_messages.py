@@ -1,7 +1,8 @@
-"""Well-formed false messages of every kind: the model forbids their content, or they contradict each other.
+"""Hypothesis strategies for well-formed false messages of every kind: the model forbids their content, or their parts
+contradict each other.
 
-Strategies of Hypothesis. A message that carries a time is encoded for time zero plus an error, and moved to the present
-when it is told.
+A message that carries a time is encoded for time zero plus an error; the time is shifted to the present when the
+message is sent.
 """
 
 from __future__ import annotations
@@ -49,7 +50,8 @@ Draw = Callable[[st.SearchStrategy], Any]
 
 @dataclasses.dataclass(frozen=True)
 class FalseMessage:
-    """A message under a key, or a greeting with which the attacker comes back, or an offered mesh."""
+    """A false message: one under a key, a greeting with which the attacker comes back, an offered mesh, or a request to
+    join."""
 
     kind: str
     """``put``, ``greet``, ``mesh`` or ``join``."""
@@ -57,7 +59,7 @@ class FalseMessage:
     key: str = ""
 
     def tell(self, world: FuzzWorld) -> None:
-        """Send it."""
+        """Send the message into a ``world``."""
         if self.kind == "put":
             world.put(self.key, shift_time(self.payload, world.now))
         elif self.kind == "greet":
@@ -69,8 +71,11 @@ class FalseMessage:
 
 
 class Liar:
-    """Sends false messages in a world that goes on from one example to the next. It starts again after a broken law,
-    so that Hypothesis can find the shortest list of messages that breaks it."""
+    """Sends false messages into one world that is kept from one Hypothesis example to the next.
+
+    After a broken law it starts a new world, so that Hypothesis can find the shortest list of messages that breaks the
+    law.
+    """
 
     def __init__(self, *, kind: str = "robot") -> None:
         self.kind = kind
@@ -78,7 +83,7 @@ class Liar:
         self.world: FuzzWorld | None = None
 
     def tell(self, messages: list[FalseMessage]) -> None:
-        """Send these messages, one a step, then let the world go on and check its laws."""
+        """Send these messages, one a step, and check the laws of the world after each step."""
         world = self.world or FuzzWorld(kind=self.kind)
         self.world = None
         try:
@@ -96,7 +101,8 @@ class Liar:
         self.world = world
 
     def close(self) -> None:
-        """Close the world, whose store must be what its journals say."""
+        """Close the world. Raises :class:`benchmarks.support.fuzz_world.LawBroken` unless its journals hold the state
+        of its store."""
         if self.world is not None:
             self.world.check_store()
             self.world.close()
@@ -112,9 +118,9 @@ _HEALTH_CHECKS = (
 
 
 def send_false_messages(examples: int, *, seed: int = 0, kind: str = "robot") -> int:
-    """Send that many series of up to eight messages, found by Hypothesis; the number of messages.
+    """Send ``examples`` series of up to eight messages, found by Hypothesis; return the number of messages.
 
-    Raises what the product raises, or :class:`benchmarks.support.fuzz_world.LawBroken`.
+    Passes on exceptions of the attacked code, and :class:`benchmarks.support.fuzz_world.LawBroken`.
     """
     liar = Liar(kind=kind)
 
@@ -138,7 +144,7 @@ def send_false_messages(examples: int, *, seed: int = 0, kind: str = "robot") ->
 
 
 def false_messages(model: Model) -> st.SearchStrategy[FalseMessage]:
-    """Lies about a model, of all kinds alike."""
+    """Returns a strategy for false messages about a model, of all kinds with equal probability."""
     return st.one_of(
         _composite(_about_trees, model),
         _composite(_about_objects, model),
@@ -159,7 +165,7 @@ def _composite(make: Callable[[Draw, Model], FalseMessage | None], model: Model)
     def strategy(draw: Draw) -> FalseMessage | None:
         try:
             return make(draw, model)
-        except MessageError:  # not well-formed
+        except MessageError:  # the message is not well-formed
             return None
 
     return strategy().filter(lambda one: one is not None)  # type: ignore[return-value]
@@ -176,7 +182,7 @@ UNIT = st.floats(-1.0, 1.0, width=32)
 
 
 def _vectors(draw: Draw, number: st.SearchStrategy[float], *shape: int, scale: float = 1.0) -> np.ndarray:
-    """An array [shape] of numbers; large ones come from a seed."""
+    """Draw an array [shape] of numbers, times ``scale``; large arrays come from a drawn seed."""
     count = int(np.prod(shape))
     if count <= 12:
         return scale * np.array([draw(number) for _ in range(count)], float).reshape(shape)
@@ -194,7 +200,7 @@ def _object(draw: Draw, model: Model, kinds: tuple[ObjectKind, ...]) -> int:
 
 
 def _about_trees(draw: Draw, model: Model) -> FalseMessage:
-    """Absurd states of trees, and bodies cut off that cannot be, far away."""
+    """Draw states of trees with absurd values, or with impossible bodies cut off, far away."""
     trees = sorted(draw(st.sets(st.integers(0, len(model.tree_first) - 1), min_size=1, max_size=2)))
     sizes = np.array([int(model.tree_size[tree]) + draw(st.sampled_from((0, 0, 0, 0, 1))) for tree in trees])
     roots = [sorted(draw(st.sets(st.integers(0, int(size) - 1), max_size=3))) for size in sizes]
@@ -221,7 +227,7 @@ def _about_trees(draw: Draw, model: Model) -> FalseMessage:
 
 
 def _about_objects(draw: Draw, model: Model) -> FalseMessage:
-    """Boxes and bunches that hang, of others or that there are not, at absurd places and speeds."""
+    """Draw states of boxes and bunches that hang, belong to others or do not exist, at absurd places and speeds."""
     numbers = sorted({_object(draw, model, (ObjectKind.BUNCH, ObjectKind.BOX)) for _ in range(draw(st.integers(1, 3)))})
     count = len(numbers)
     cell = (draw(CELL), draw(CELL))
@@ -241,7 +247,7 @@ def _about_objects(draw: Draw, model: Model) -> FalseMessage:
 
 
 def _about_owners(draw: Draw, model: Model) -> FalseMessage:
-    """Claims for others, for objects that there are not, and of all sequences."""
+    """Draw claims in the name of others, for objects that do not exist, and with any sequence numbers."""
     claims = []
     for _ in range(draw(st.integers(1, 4))):
         claim = Claim(draw(SEQUENCE), draw(SEQUENCE), draw(OWNERS))
@@ -275,7 +281,8 @@ PARENTS = st.sampled_from(
 
 
 def _records(draw: Draw, model: Model) -> FalseMessage:
-    """Records: cuts of bodies that cannot be cut, states of other trees, supports that lie in each other."""
+    """Draw records with cuts of bodies that cannot be cut, states of other trees, or supports that rest on each
+    other."""
     records = []
     for _ in range(draw(st.integers(1, 3))):
         number = _object(draw, model, tuple(ObjectKind))
@@ -308,7 +315,7 @@ def _pose_key(draw: Draw) -> str:
 
 
 def _robot_pose(draw: Draw, _: Model) -> FalseMessage:
-    """Robots with any number of joints, at any distance and speed, turned over."""
+    """Draw robots with any number of joints, at any distance and speed, turned over."""
     count = draw(st.sampled_from((27, 27, 27, 0, 1, 256)))
     near = draw(st.booleans())
     base = np.concatenate([_vectors(draw, NEAR if near else FARTHER, 3), _quaternions(draw, 1)[0]])
@@ -324,7 +331,7 @@ def _robot_pose(draw: Draw, _: Model) -> FalseMessage:
 
 
 def _human_pose(draw: Draw, _: Model) -> FalseMessage:
-    """People turned and stretched, far away, and near others at absurd speeds."""
+    """Draw people turned and stretched, far away, or near others at absurd speeds."""
     place = frames.pose(_vectors(draw, NEAR if draw(st.booleans()) else FAR, 3))
     points = human_at(place).points + np.pad(_vectors(draw, UNIT, 7, 3, scale=2.0), ((0, 0), (0, 4)))
     points[:, 3:] = _quaternions(draw, 7)
@@ -335,7 +342,7 @@ def _human_pose(draw: Draw, _: Model) -> FalseMessage:
 
 
 def _wrenches(draw: Draw, _: Model) -> FalseMessage:
-    """Forces beyond all limits, on links out of reach, of other robots, or that there are not."""
+    """Draw forces beyond all limits, on links that are out of reach, belong to other robots or do not exist."""
     links = draw(
         st.sets(st.sampled_from(("base_link", "arm_left_7_link", "torso_lift_link", "no link", "")), max_size=3)
     )
@@ -344,7 +351,7 @@ def _wrenches(draw: Draw, _: Model) -> FalseMessage:
 
 
 def _couplings(draw: Draw, model: Model) -> FalseMessage:
-    """Springs to bodies without an owner, that cannot be held, or that there are not, from far away."""
+    """Draw springs (ties) from far away to bodies that have no owner, cannot be held or do not exist."""
     bodies = sorted(draw(st.sets(st.integers(0, len(model.body_tree)), max_size=8)))
     couplings = tuple(
         Coupling(body, _vectors(draw, st.floats(-10.0, 10.0, width=32), 3), _vectors(draw, FAR, 3)) for body in bodies
@@ -383,13 +390,13 @@ URDFS = (
         "<joint name='k' type='fixed'><parent link='a'/><child link='b'/></joint>"
     ),
 )
-"""Robots that cannot be; None: one that can."""
+"""Robot descriptions that are impossible; None: a possible one."""
 
 SIDECARS = (None, "", "{}", "[]", "null", '{"groups": 3}', '{"base_limits": [1e999, -1]}', "\x00", '{"a": ' * 50)
 
 
 def _greeting(draw: Draw, model: Model) -> FalseMessage:
-    """Greetings whose parts contradict each other, of robots that cannot be."""
+    """Draw greetings whose parts contradict each other, with impossible robots."""
     robot = load_description("vinebot")
     urdf = draw(st.sampled_from(URDFS))
     sidecar = draw(st.sampled_from(SIDECARS))
@@ -411,7 +418,7 @@ def _greeting(draw: Draw, model: Model) -> FalseMessage:
 
 
 def _mesh(draw: Draw, _: Model) -> FalseMessage:
-    """Parts of meshes with lying digests and sizes."""
+    """Draw parts of meshes with false digests and sizes."""
     corners = _vectors(draw, UNIT, 4, 3, 3, scale=draw(st.sampled_from((1.0, 1e6, 1e38)))).astype("<f4").tobytes()
     data = draw(st.sampled_from((corners, corners[:-1], b"", b"\xff" * 36)))
     digest = draw(st.sampled_from((triangles.digest_of(data), "0" * 40)))
@@ -423,7 +430,7 @@ def _mesh(draw: Draw, _: Model) -> FalseMessage:
 
 
 def _control(draw: Draw, model: Model) -> FalseMessage:
-    """Answers that were not asked for, under keys of other kinds; clocks."""
+    """Draw answers that were not asked for, messages under keys of other kinds, and clocks."""
     number = draw(st.floats(allow_nan=False, allow_infinity=False))
     payload = draw(
         st.sampled_from(

@@ -1,9 +1,10 @@
-"""A small world under attack: a client with physics, a person of another client, a store of records; and its laws.
+"""A small world under attack: a client with physics, a person of another client, a store of records; and laws that must
+hold.
 
-The client ``ada`` controls a robot and has copies of all others. The person ``bob`` belongs to another client and does
-nothing but move its hands. The store is the server's, with journals on disk. The attacker sends what it wants, under
-any key, from a session with or without admission. After each step :meth:`FuzzWorld.check` holds client and store
-against the laws.
+The client ``ada`` controls a robot and has copies of all other actors. The person ``bob`` belongs to another client and
+only moves its hands. The store is the server's, with journals on disk. The attacker sends any message under any key,
+from a session with or without admission. After each step :meth:`FuzzWorld.check` checks client and store against the
+laws.
 """
 
 from __future__ import annotations
@@ -46,17 +47,18 @@ from vinesim.scene.values import HumanPose, HumanUpdate, RobotUpdate
 ATTACKER = "evil"
 WORLD = "vineyard"
 HEIGHT = 1.75
-"""Of people [m]."""
+"""Height of people [m]."""
 DT = 0.01
 CELLS = [(x, y) for x in range(-2, 2) for y in range(-2, 2)]
 """Cells around the origin."""
 BOB = frames.pose([-1.5, -1.0, 0.0])
 MAX_DRIFT = 0.1
-"""[m/s] At which an admitted actor's body may push a robot whose base holds still, beyond the first metre."""
+"""Speed at which the body of an admitted actor may push a robot with a locked base, beyond the first metre [m/s]."""
 HONEST_ERROR = 0.3
-"""Largest distance of the middle of the copy of ``bob`` from its hips [m]."""
+"""Largest accepted distance of the middle of the copy of ``bob`` from its true place [m]."""
 FARTHEST = 2.0 * MAX_COORDINATE
-"""No object moves farther [m]: none is believed beyond half of it, and none is fast."""
+"""Largest coordinate that an object may reach [m]: messages with coordinates beyond half of it are refused, and no
+object is fast."""
 
 
 class LawBroken(AssertionError):
@@ -76,11 +78,11 @@ def small_vineyard() -> Model:
 
 
 class FuzzWorld:
-    """See the module. A context manager."""
+    """World with one client, one person, a store and an attacker. A context manager; see the module."""
 
     def __init__(self, *, is_stranger: bool = False, kind: str = "robot", seed: int = 0) -> None:
-        """``is_stranger``: the attacker was never admitted, and no bus checks the names under which it sends; else it
-        is admitted as ``kind``."""
+        """Start the world. ``is_stranger``: the attacker was never admitted, and no bus checks the names under which it
+        sends; otherwise the attacker is admitted as ``kind``."""
         self.model = small_vineyard()
         self.now = 100.0
         self.is_stranger = is_stranger
@@ -118,7 +120,7 @@ class FuzzWorld:
         self._home = self._base()
 
     def _declare_server(self) -> None:
-        """The server's part: a store that takes every record, whoever sent it, a clock, and snapshots."""
+        """Start the server's part: a store that takes every record, whoever sent it, a clock, and snapshots."""
         self._server = self.hub.bus("server", live=False)
         self._server.subscribe("fact/**", KEEP_ALL)
         self._server.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], self.now))
@@ -131,7 +133,7 @@ class FuzzWorld:
     # ------------------------------------------------------------ the attacker
 
     def hello(self, kind: str = "robot", **values: object) -> Hello:
-        """A greeting that is true, but for ``values``."""
+        """Returns a true greeting of the attacker, with the fields ``values`` replaced."""
         hello = Hello(
             ATTACKER,
             kind=kind,
@@ -145,7 +147,7 @@ class FuzzWorld:
         return msgspec.structs.replace(hello, **values)
 
     def greet(self, hello: Hello | bytes) -> None:
-        """Leave, and come back with this greeting."""
+        """Leave the world as the attacker, and come back with this greeting."""
         if self.is_stranger:
             return
         self.greeting = hello if isinstance(hello, bytes) else encode_hello(hello)
@@ -157,12 +159,13 @@ class FuzzWorld:
         self.publishers.clear()
 
     def admit(self, kind: str) -> None:
-        """Come back with a true greeting and pose unless the attacker has a body as an actor of this ``kind``."""
+        """Come back with a true greeting and pose, unless the attacker has a body as an actor of this ``kind``
+        already."""
         if self.is_stranger or (ATTACKER in self.client.remote_actors and self._kind == kind):
             return
         self._kind = kind
         self.greet(self.hello(kind))
-        for _ in range(100):  # a client asks a name twice a second
+        for _ in range(100):  # a client asks the server about a name twice a second
             if ATTACKER in self.client.remote_actors:
                 break
             self.put(f"a/{ATTACKER}/far", encode_pose(self.pose(self.now)))
@@ -171,7 +174,7 @@ class FuzzWorld:
             raise LawBroken("an actor that greets and poses as it should gets no body")
 
     def put(self, key: str, payload: bytes) -> None:
-        """Send a message."""
+        """Send a message as the attacker."""
         if key not in self.publishers:
             if len(self.publishers) > 10_000:
                 self.publishers.clear()
@@ -179,7 +182,7 @@ class FuzzWorld:
         self.publishers[key].put(payload)
 
     def offer(self, payload: bytes) -> None:
-        """Offer the server a part of a mesh, or ask for one."""
+        """Offer the server a part of a mesh as the attacker, or ask the server for one."""
         if len(payload) < 4 or payload[3] not in (MESH_PART, MESH_REQUEST):
             return
         try:
@@ -198,7 +201,7 @@ class FuzzWorld:
         return ATTACKER
 
     def pose(self, now: float) -> RobotUpdate | HumanUpdate:
-        """A pose as the attacker, beside the robot, might send it if it were honest."""
+        """Returns a true pose of the attacker, who stands near the robot."""
         sway = 0.3 * np.sin(now)
         at = frames.pose([1.0 + sway, -0.5, 0.0])
         if self._kind == "human":
@@ -209,7 +212,7 @@ class FuzzWorld:
     # ------------------------------------------------------------ time
 
     def step(self) -> None:
-        """One step of all; an exception in it is one of the product's."""
+        """Step client, person, attacker and server once."""
         self.hub.advance(DT)
         self.now += DT
         self.client.tick()
@@ -218,7 +221,7 @@ class FuzzWorld:
             self.store.submit(f"{WORLD}/{key}", payload)
 
     def run(self, seconds: float) -> None:
-        """Steps for so long [s]."""
+        """Step for ``seconds`` [s] of simulated time."""
         for _ in range(round(seconds / DT)):
             self.step()
 
@@ -230,7 +233,7 @@ class FuzzWorld:
             raise LawBroken(law)
 
     def broken_laws(self) -> Iterator[str]:
-        """What is wrong now."""
+        """Yields a sentence for each law that does not hold now."""
         physics = self.client.physics
         client = self.client
         state = physics.state
@@ -263,7 +266,7 @@ class FuzzWorld:
         yield from self._faults_of_threads()
 
     def _harms(self) -> Iterator[str]:
-        """What an attacker must not do to others."""
+        """Yields a sentence for each harm that the attacker has done to other actors."""
         client = self.client
         if "bob" not in client.remote_actors:
             yield "the copy of another person has vanished"
@@ -276,11 +279,11 @@ class FuzzWorld:
         if abs(client.replicator.offset) > 0.1:
             yield f"the network clock was moved by {client.replicator.offset:.3g} s"
         moved = float(np.linalg.norm(self._base()[:3] - self._home[:3]))
-        if moved > 1.0 + MAX_DRIFT * client.physics.time:  # whoever is admitted may lean on a robot
+        if moved > 1.0 + MAX_DRIFT * client.physics.time:  # an admitted actor may lean on a robot
             yield f"the robot was moved by {moved:.3g} m"
 
     def _faults_of_threads(self) -> Iterator[str]:
-        """Threads that ended, and errors that they counted."""
+        """Yields a sentence for threads that have ended, and for errors that threads have counted."""
         store = self.store
         if dead := sorted(thread.name for thread in self.threads if not thread.is_alive()):
             yield f"threads have ended: {', '.join(dead)}"
@@ -288,7 +291,8 @@ class FuzzWorld:
             yield f"the store of the server: {store.status_message or 'an error in a message'}"
 
     def check_store(self) -> None:
-        """Close the store; :class:`LawBroken` unless a server that starts from its journals knows the same."""
+        """Close the store. Raises :class:`LawBroken` unless a server that starts from the store's journals has the same
+        records."""
         kept = {cell: self.store.snapshot(WORLD, [cell]) for cell in self.store.cells(WORLD)}
         self.store.close()
         self.check_closed_store()
@@ -300,7 +304,7 @@ class FuzzWorld:
                 raise LawBroken(f"the journal has other records of cell {cell} than the store had")
 
     def check_closed_store(self) -> None:
-        """As the laws about the store, of one that was closed."""
+        """Raise :class:`LawBroken` if a law about the store does not hold, for a store that was closed."""
         if self.store.status_message or self.store.counters.errors:
             raise LawBroken(f"the store of the server: {self.store.status_message or 'an error in a message'}")
 
@@ -340,5 +344,5 @@ class FuzzWorld:
 
 
 def human_at(place: np.ndarray) -> HumanPose:
-    """A person who stands at ``place`` [7] m, 1."""
+    """Returns the pose of a person who stands at ``place`` [7] m, 1."""
     return standing_pose(place, HEIGHT)

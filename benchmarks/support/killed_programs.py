@@ -25,47 +25,48 @@ from vinesim.scene.spec import load_scene
 
 SCENE = "demo"
 ROBOTS = ("left", "right")
-"""Names of the robots; left is linked to the server, right to the router."""
+"""Names of the robots: left is connected to the server, right to the router."""
 WITNESS = "witness"
 """Name of the person in this process, who picks bunches and is never killed."""
 WITNESS_PLACE = (2.5, 1.4)
 """Where the person stands, out of the robots' reach [m]."""
 REACH = (0.5, 11.5, -5.5, 5.5)
-"""x from, to, y from, to: bunches here are in cells that all clients subscribe to [m]."""
+"""Area with x from, x to, y from, y to [m]: bunches in it are in cells that all clients subscribe to."""
 SENSOR_HZ = "2"
-"""Pictures a second: enough to see that they go on."""
+"""Rate of pictures [Hz], enough to notice whether they go on."""
 CAMERA = "head_front_camera/rgb/image_raw"
 TOPICS = ("/clock", "/joint_states", f"/{CAMERA}", "/right/joint_states", f"/right/{CAMERA}")
-"""What the listener must go on to receive."""
+"""Topics that the listener must go on to receive."""
 SETTLING = 1.0
-"""A program that goes on does so for at least this long after a kill [s]."""
+"""A program counts as going on if it does so for at least this long after a kill [s]."""
 
 
 @dataclasses.dataclass
 class Program:
-    """A program as its user starts it, and starts it again after it was killed."""
+    """A program as its user starts it; it is started again after it was killed."""
 
     name: str
     arguments: tuple[str, ...]
     process: Process
     lines: list[tuple[float, dict[str, Any]]] = dataclasses.field(default_factory=list)
-    """When each line of JSON came [s, monotonic], since the last kill of any program; the newest of before is first."""
+    """Time of arrival [s, monotonic] and content of each JSON line since the last kill of any program, after the newest
+    line from before that kill."""
 
     def read(self) -> None:
-        """Take the lines that have come; :class:`ProcessFailed` if it has ended."""
+        """Read new lines of the program. Raises :class:`ProcessFailed` if it has ended."""
         now = time.monotonic()
         self.lines += [(now, json.loads(line)) for line in self.process.new_lines() if line.startswith("{")]
 
     def since(self, moment: float) -> list[dict[str, Any]]:
-        """What it has said since a ``moment`` [s, monotonic]."""
+        """Returns the lines of JSON since a ``moment`` [s, monotonic]."""
         return [values for came, values in self.lines if came > moment]
 
 
 class Vineyard:
-    """The programs, and the person. A context; leaving it ends all."""
+    """The programs and the person of one vineyard. A context manager that ends all at its exit."""
 
     def __init__(self, group: ProcessGroup, folder: pathlib.Path, *, ros: bool, seed: int) -> None:
-        """Start all; ``folder`` takes the server's state. ``ros``: with ROS processes and a listener."""
+        """Start all programs. ``folder``: for the server's state; ``ros``: start ROS processes and a listener, too."""
         self._group = group
         self._random = np.random.default_rng(seed)
         self.ros = ros and middleware.unavailable_reason() is None
@@ -113,7 +114,7 @@ class Vineyard:
         self.programs[name] = Program(name, arguments, self._group.start(name, *arguments))
 
     def _wait_for_endpoint(self, endpoint: str) -> None:
-        """Return when a server listens there."""
+        """Return when a server listens at ``endpoint``."""
         host, port = endpoint.removeprefix("tcp/").split(":")
         deadline = time.monotonic() + 60.0
         while time.monotonic() < deadline:
@@ -125,7 +126,8 @@ class Vineyard:
     # ------------------------------------------------------------------ while all goes on
 
     def step(self) -> None:
-        """Step the person when it is due, and take what the programs say; :class:`ProcessFailed` if one has ended."""
+        """Step the person if due, and read the programs' output. Raises :class:`ProcessFailed` if a program has
+        ended."""
         time.sleep(max(self._next_tick - time.monotonic(), 0.0))
         self._next_tick = max(self._next_tick + self.witness.physics.dt, time.monotonic())
         self.witness.tick()
@@ -135,7 +137,7 @@ class Vineyard:
             self.programs["ROS listener"].process.write_line("counts")
 
     def pick(self) -> None:
-        """Let the person pick a bunch, unless half of all are picked."""
+        """Let the person pick a bunch, unless half of all bunches are picked."""
         places = bunch_centres(self._model)[:, :2]
         x0, x1, y0, y1 = REACH
         near = np.logical_and((places > (x0, y0)).all(1), (places < (x1, y1)).all(1))
@@ -146,18 +148,19 @@ class Vineyard:
             self.picked.add(bunch)
 
     def workers(self, robot: str) -> dict[str, int]:
-        """Process ids of a robot's own processes, by what they do."""
+        """Returns the process ids of a robot client's workers, by their kind."""
         lines = self.programs[robot].lines
         return {what.removesuffix(f" of {robot}"): pid for what, pid in lines[-1][1]["processes"].items()}
 
     def sensor_restarts(self, robot: str) -> int:
-        """How often the sensor process of a robot was started again, as its client said last."""
+        """Returns how often the sensor process of a robot was restarted, by the client's newest line."""
         return int(self.programs[robot].lines[-1][1]["sensor_restarts"])
 
     # ------------------------------------------------------------------ a kill
 
     def kill(self, name: str, worker: str = "") -> float:
-        """Kill a program, which is then started again, or a ``worker`` of a robot; when [s, monotonic]."""
+        """Kill a program and start it again, or kill a ``worker`` of a robot client, which restarts it. Returns the
+        time of the kill [s, monotonic]."""
         program = self.programs[name]
         for other in self.programs.values():
             del other.lines[:-1]
@@ -171,7 +174,7 @@ class Vineyard:
         return now
 
     def missing(self, moment: float) -> list[str]:
-        """What does not go on after a kill at a ``moment`` [s, monotonic]."""
+        """Returns descriptions of what does not go on after a kill at a ``moment`` [s, monotonic]."""
         missing = []
         for name in ROBOTS:
             missing += [f"{name}: {what}" for what in self._missing_of_robot(name, moment)]
@@ -216,7 +219,7 @@ class Vineyard:
         return [f"ROS listener: {topic}" for topic in TOPICS if said[-1].get(topic, 0) <= said[0].get(topic, 0)]
 
     def close(self) -> None:
-        """Let the person leave; the programs end with their group."""
+        """Let the person leave. The programs end with their process group."""
         self._stack.close()
 
     def __enter__(self) -> Vineyard:

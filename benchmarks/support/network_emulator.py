@@ -1,14 +1,16 @@
-"""Emulated links of a wide network on one machine: delay, jitter, loss and cuts between network namespaces.
+"""Emulated links of a wide area network on one machine: delay, jitter, loss and cuts between network namespaces.
 
-with NetworkEmulator({"ada": Link(LinkProfile(0.05, 0.02, 0.01)), "bob": Link()}) as net: server = net.start("hub",
-["vinesim", "server", "--insecure"]) client = net.start("ada", ["vinesim", "client", "--connect",
-f"tcp/{net.hub('ada')}:7447"]) sent, received = net.counts("ada")
+    with NetworkEmulator({"ada": Link(LinkProfile(0.05, 0.02, 0.01)), "bob": Link()}) as net:
+        server = net.start("hub", ["vinesim", "server", "--insecure"])
+        client = net.start("ada", ["vinesim", "client", "--connect", f"tcp/{net.hub('ada')}:7447"])
+        sent, received = net.counts("ada")
 
-Each end of the star is a namespace of its own, joined to the hub's by a pair of TUN devices, and a process between them
-forwards the packets: not every kernel has tc-netem, all have TUN. It needs Linux and root, see :func:`unusable`.
+Each end of the star is a namespace of its own. A pair of TUN devices joins it to the namespace of the hub, and a
+process between them forwards the packets: not every kernel has tc-netem, but all have TUN. The emulator needs Linux and
+root, see :func:`unusable`.
 
-The namespaces carry the process id of the process that created them. If that process dies, the forwarding process
-removes them; if that is killed, too, the next emulator does.
+The names of the namespaces contain the process id of the process that created them. If that process dies, the
+forwarding process removes the namespaces; if the forwarding process is killed, too, the next emulator removes them.
 """
 
 from __future__ import annotations
@@ -41,9 +43,10 @@ _MAX_PACKET = 2048
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LinkProfile:
-    """How packets travel in one direction: uniformly between ``delay`` - ``jitter`` and ``delay`` + ``jitter`` [s].
+    """Delay, jitter and loss in one direction: packets take from ``delay`` - ``jitter`` to ``delay`` + ``jitter`` [s],
+    uniformly.
 
-    They stay in order, as in the queue of a router; ``loss`` is the probability that one is lost.
+    Packets stay in order, as in the queue of a router. ``loss`` is the probability that a packet is lost.
     """
 
     delay: float = 0.0
@@ -57,31 +60,31 @@ class LinkProfile:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Link:
-    """The link between one end and the hub; both directions are equal unless ``back`` is given."""
+    """Link between one end and the hub. Its directions are equal unless ``back`` is given for the way from the hub."""
 
     there: LinkProfile = LinkProfile()
     back: LinkProfile | None = None
 
     def ways(self) -> tuple[LinkProfile, LinkProfile]:
-        """From the end to the hub, and from the hub to the end."""
+        """Returns the profiles from the end to the hub, and from the hub to the end."""
         return self.there, self.there if self.back is None else self.back
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Count:
-    """Packets in one direction, with their IP headers."""
+    """Numbers of packets and bytes in one direction, IP headers included."""
 
     packets: int = 0
     bytes: int = 0
     lost: int = 0
-    """Packets that did not arrive."""
+    """Number of packets that did not arrive."""
 
     def __sub__(self, earlier: Count) -> Count:
         return Count(self.packets - earlier.packets, self.bytes - earlier.bytes, self.lost - earlier.lost)
 
 
 def unusable() -> str:
-    """Empty, or why links cannot be emulated here."""
+    """Returns the reason why links cannot be emulated here, or an empty string."""
     if not sys.platform.startswith("linux"):
         return "network namespaces are Linux's"
     if os.geteuid() != 0:
@@ -139,41 +142,41 @@ class NetworkEmulator:
         return json.loads(answer)
 
     def hub(self, end: str) -> str:
-        """The hub's address as ``end`` reaches it."""
+        """Returns the hub's address as ``end`` reaches it."""
         return _addresses(self._ends[end])[0]
 
     def address(self, end: str) -> str:
-        """The address of ``end`` as the hub reaches it."""
+        """Returns the address of ``end`` as the hub reaches it."""
         return _addresses(self._ends[end])[1]
 
     def start(self, end: str, command: list[str], **options: Any) -> subprocess.Popen:
-        """Run a command in the namespace of an end or of the hub; it ends with the emulator at the latest."""
+        """Run a command in the namespace of an end or of the hub. The process is ended when the emulator closes."""
         process = subprocess.Popen(["ip", "netns", "exec", self._namespace(end), *command], **options)
         self._started.append(process)
         return process
 
     def start_server(self, *options: str) -> None:
-        """Start ``vinesim server`` in the hub with some ``options``, and wait until it listens."""
+        """Start ``vinesim server`` in the hub with these ``options``, and wait until it listens."""
         command = [sys.executable, "-m", "vinesim", "server", "--status", "none", *options]
         server = self.start("hub", command, stdout=subprocess.PIPE, text=True)
         assert server.stdout is not None
         server.stdout.readline()
 
     def shape(self, end: str, line: Link) -> None:
-        """Change the link of ``end`` from now on."""
+        """Change the link of ``end`` immediately."""
         self._request({"shape": end, "line": _to_json(line)})
 
     def disconnect(self, end: str) -> None:
-        """Drop all packets of a link, until :meth:`shape`."""
+        """Drop all packets of the link of ``end`` until :meth:`shape` is called."""
         self.shape(end, Link(LinkProfile(loss=1.0)))
 
     def counts(self, end: str) -> tuple[Count, Count]:
-        """Packets that ``end`` has sent on its link, and that the hub has sent on it."""
+        """Returns counts of packets on the link of ``end``: sent by the end, and sent by the hub."""
         there, back = self._request({"counts": end})
         return Count(*there), Count(*back)
 
     def close(self) -> None:
-        """End all started processes and remove the namespaces. Idempotent."""
+        """End all started processes and remove the namespaces. Further calls do nothing."""
         for process in self._started:
             if process.poll() is None:
                 process.kill()
@@ -201,7 +204,7 @@ def _to_json(line: Link) -> list[tuple]:
 
 
 def _addresses(number: int) -> tuple[str, str]:
-    """Of the hub and of the end of line ``number``, in a private network of their own."""
+    """Returns the addresses of the hub and of the end on link ``number``, in a private network for this link."""
     return f"10.77.{number}.1", f"10.77.{number}.2"
 
 
@@ -228,7 +231,7 @@ def _remove_stale_namespaces() -> None:
 
 
 class _Direction:
-    """Packets on their way from one device to another."""
+    """Packets on their way from the device ``source`` to the device ``target``."""
 
     def __init__(self, source: int, target: int, way: LinkProfile) -> None:
         self.source = source
@@ -239,7 +242,8 @@ class _Direction:
 
 
 def _device(space: str, name: str, mine: str, other: str) -> int:
-    """A TUN device inside a namespace with address ``mine``, which leads to ``other``; ``%d`` in its name counts."""
+    """Create a TUN device in the namespace ``space`` with address ``mine``, which leads to address ``other``; return
+    its file descriptor. ``%d`` in ``name`` is replaced by a free number."""
     device = os.open("/dev/net/tun", os.O_RDWR | os.O_NONBLOCK)
     made = fcntl.ioctl(device, _TUNSETIFF, struct.pack("16sH22x", name.encode(), _TUN | _NO_PACKET_INFO))
     name = made[:16].rstrip(b"\0").decode()
@@ -250,9 +254,11 @@ def _device(space: str, name: str, mine: str, other: str) -> int:
 
 
 def _forward(answers: IO[str]) -> None:
-    """Make what the first request names, carry packets, answer requests; until standard input is closed."""
+    """Create the links that the first request on standard input names, then forward packets and answer requests until
+    standard input is closed."""
     request = b""
-    while not request.endswith(b"\n"):  # by the byte: input that select must report may not wait in a buffer
+    # read single bytes: input must not wait in a buffer, where select does not find it
+    while not request.endswith(b"\n"):
         if not (more := os.read(0, 1)):
             return
         request += more
@@ -303,7 +309,8 @@ def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], rng
                     packet = os.read(source, _MAX_PACKET)
                 except BlockingIOError:
                     break
-                if packet[0] >> 4 != 4:  # IPv6 looks for neighbours on every new device; unasked
+                # IPv6 sends neighbour discovery packets on every new device; they are not wanted
+                if packet[0] >> 4 != 4:
                     continue
                 direction.packets += 1
                 direction.bytes += len(packet)
@@ -317,7 +324,7 @@ def _loop(answers: IO[str], lines: dict[str, tuple[_Direction, _Direction]], rng
         now = time.monotonic()
         while pending and pending[0][0] <= now:
             _, _, target, packet = heapq.heappop(pending)
-            with contextlib.suppress(OSError):  # a full device drops packets, as any does
+            with contextlib.suppress(OSError):  # a full device drops packets, as any device does
                 os.write(target, packet)
 
 

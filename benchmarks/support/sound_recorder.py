@@ -1,4 +1,5 @@
-"""Records what an actor of a client hears, in the client's own process: as a robot's process does it, for tests."""
+"""Records for tests what an actor of a client hears. It runs in the client's own process and works like a robot's
+microphone."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from vinesim.client.sound.microphone_step import at_place
 
 
 class SoundRecorder:
-    """Listens for an actor of a client from now on."""
+    """Listens to sounds for an actor of a client."""
 
     is_open = True
 
@@ -21,11 +22,11 @@ class SoundRecorder:
         self.decodes_opus = decodes_opus
         self.microphone = Microphone()
         self.blocks: list[Block] = []
-        """What was recorded since the last :meth:`take`."""
+        """Blocks recorded since the last :meth:`take`."""
         client.sound.listen(name, self)
 
     def hear(self, step: SoundStep) -> None:
-        """Mix what has arrived."""
+        """Mix the sounds of one step into the recording."""
         here = at_place(step, self._client.sound.place_of(self._name))
         for frame in here.frames:
             self.microphone.hear(frame)
@@ -34,7 +35,7 @@ class SoundRecorder:
         self.blocks += self.microphone.blocks(here.now)
 
     def take(self) -> np.ndarray:
-        """Samples [n] since the last call."""
+        """Returns the samples [n] recorded since the last call."""
         blocks = self.blocks
         self.blocks = []
         return np.concatenate([block.samples for block in blocks])
