@@ -1,8 +1,8 @@
 """Two people on different machines pull at one bunch over a poor link: whole clients over Zenoh, in real time.
 
 Each client is a process in a network namespace of its own, joined to the server by the emulated link of
-:data:`benchmarks.poor_link.POOR`. Both people grasp the bunch and pull outwards with 10 N. Two authorities that do
-not agree would show the bunch 5 cm off to either side, or let it oscillate.
+:data:`benchmarks.poor_link.POOR`. Both people grasp the bunch and pull in opposite directions with 10 N. If the clients
+did not agree who owns the bunch, they would show it 5 cm off to either side, or it would oscillate.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ from vinesim.scene.spec import load_scene
 from vinesim.scene.values import HumanPose, Measurement
 
 SIDES = {"ada": -1.0, "bob": 1.0}
-"""Who stands on which side of the bunch along y."""
+"""Side of the bunch along y on which each person stands, by name."""
 
 PULL = 0.1
-"""Way of each hand outwards [m]; a hand pulls with 100 N/m."""
+"""Distance that each hand moves outwards [m]; a hand pulls with 100 N/m."""
 
 PULLS_AT = 6.0
 PULLS_UNTIL = 7.0
-"""When both pull [s after the start]."""
+"""End of the pull [s after the start]; ``PULLS_AT`` is its beginning."""
 
 SETTLE = 2.0
-"""The bunch rests so long after the pull [s]."""
+"""Time after the pull for which the bunch comes to rest [s]."""
 
 SECONDS = 27.0
 """Length of a run [s]."""
 
 START = 240.0
-"""Time limit for both to meet, and to write what they saw [s]."""
+"""Time limit for both clients to meet, and to write their records [s]."""
 
 _NEAR = 0.05 + HAND_HALF_THICKNESS
-"""Distance of a palm that grasps from the middle of the bunch [m]."""
+"""Distance of a grasping palm from the middle of the bunch [m]."""
 
 
 def hanging_bunch() -> tuple[Model, int]:
-    """A cane with a bunch that nothing tears off, and the bunch's body."""
+    """Returns a model of a cane with a bunch that no pull tears off, and the index of the bunch's body."""
     tree = TreeBuilder(frames.pose(np.array([0.0, 0.0, 2.0])))
     tip = tree.add_rod(-1, 1.0, (0.006, 0.006), RodMaterial(5e9, 800.0), 16)[-1]
     down = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
@@ -66,31 +66,35 @@ def hanging_bunch() -> tuple[Model, int]:
 
 
 def middle(pose: np.ndarray, length: float) -> np.ndarray:
-    """Middle [3] m of a bunch with its stalk at ``pose`` [7]."""
+    """Returns the middle [3] m of a bunch of ``length`` [m] whose upper end is at ``pose`` [7]."""
     return pose[:3] + frames.rotate(pose[3:].astype(float), np.array([0.5 * length, 0.0, 0.0]))
 
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What one client saw, a row for each step."""
+    """Record of one client, with a row for each step."""
 
     clock: np.ndarray
-    """[step] s, of the host."""
+    """Times of the steps by the host's clock [step] s."""
     way: np.ndarray
-    """[step] m, of the middle of the bunch along y."""
+    """Displacement of the middle of the bunch along y [step] m."""
     owner: np.ndarray
-    """[step] name, empty without an owner."""
+    """Name of the bunch's owner, empty without an owner [step]."""
     held: np.ndarray
-    """[step] whether its person holds the bunch."""
+    """Whether the client's person holds the bunch [step]."""
     alone: np.ndarray
-    """[step] whether it had lost the server, so that it simulated alone."""
+    """Whether the client had lost the server, so that it simulated alone [step]."""
 
 
 # ---------------------------------------------------------------- in a process of its own
 
 
 def run_client(connect: str, name: str, seconds: float, out: str) -> None:
-    """Be one of the two; ``out``: file for :class:`Seen`. Standard input says when it starts [s, clock of the host]."""
+    """Run the client of one of the two people for ``seconds`` [s] after the start.
+
+    The time of the start [s, clock of the host] is read from standard input. ``out``: file for the arrays of
+    :class:`Seen`.
+    """
     from vinesim.net.transport.zenoh_bus import ZenohBus
 
     side = SIDES[name]
@@ -103,7 +107,7 @@ def run_client(connect: str, name: str, seconds: float, out: str) -> None:
     palm = frames.multiply(frames.from_yaw(-side * 0.5 * np.pi), frames.exp(np.array([0.0, -0.5 * np.pi, 0.0])))
     begins = [0.0]
     rows = []
-    first = 2.0 + 2.0 * (side > 0.0)  # one grasps after the other
+    first = 2.0 + 2.0 * (side > 0.0)  # one person grasps after the other
     times = [first, first + 1.0, PULLS_AT, PULLS_UNTIL]
     ways = [_NEAR + 0.1, _NEAR, _NEAR, _NEAR + PULL]
 
@@ -149,7 +153,10 @@ def run_client(connect: str, name: str, seconds: float, out: str) -> None:
 
 
 def run_two_pullers(seconds: float = SECONDS, protocol: str = "tcp") -> tuple[float, dict[str, Seen]]:
-    """When both began [s, clock of the host], and what each saw; RuntimeError if one ends early."""
+    """Run both clients. Returns the start of the run [s, clock of the host], and the record of each client by name.
+
+    Raises RuntimeError if a client ends early.
+    """
     with tempfile.TemporaryDirectory() as folder, NetworkEmulator(dict.fromkeys(SIDES, POOR)) as net:
         net.start_server("--insecure")
         files = {name: pathlib.Path(folder) / f"{name}.npz" for name in SIDES}
@@ -183,29 +190,34 @@ def run_two_pullers(seconds: float = SECONDS, protocol: str = "tcp") -> tuple[fl
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """How far two clients agree about what both pull at."""
+    """How far two clients agree about the bunch that both people pull."""
 
     owners: tuple[str, ...]
-    """All that either client took for the owner in the last seconds."""
+    """All actors that either client considered the owner in the last seconds."""
     held: bool
-    """Whether both held the bunch to the end."""
+    """Whether both people held the bunch to the end."""
     moving: float
-    """[m] p95 of the difference of the ways of the bunch, while they pull and until it has settled."""
+    """95th percentile of the difference between the bunch's displacements on the two clients, from the start of the
+    pull until the bunch has settled [m]."""
     resting: float
-    """[m] The same in the last seconds."""
+    """95th percentile of the difference between the bunch's displacements on the two clients in the last seconds
+    [m]."""
     off: float
-    """[m] Largest distance of the bunch from the middle in the last seconds, on either client."""
+    """Largest displacement of the bunch in the last seconds, on either client [m]."""
     spans: tuple[float, float]
-    """[m] Largest span of the way on either client, in the seconds after it has settled and in the last ones."""
+    """Largest range of the displacement on either client: in the seconds after the bunch has settled, and in the last
+    seconds [m]."""
     rate: float
-    """[Hz] Steps a second of the slower client."""
+    """Steps a second of the slower client [Hz]."""
     alone: float
-    """Share of the steps since the beginning in which a client had lost the server, of the worse one: on a busy machine
-    the process that emulates the link may stand still for longer than the lease."""
+    """Share of the steps since the start in which a client had lost the server; the larger share of the two clients.
+
+    On a busy machine the process that emulates the link may stop for longer than the lease.
+    """
 
 
 def outcome(begin: float, seen: dict[str, Seen]) -> Outcome:
-    """Compare what both saw of a run that began at ``begin`` [s]."""
+    """Compare the records of both clients of a run that started at ``begin`` [s]."""
     end = min(one.clock[-1] for one in seen.values())
     settled = begin + PULLS_UNTIL + SETTLE
     part = 0.4 * (end - settled)
@@ -235,7 +247,7 @@ def outcome(begin: float, seen: dict[str, Seen]) -> Outcome:
 
 
 def two_pullers() -> Iterator[Measurement]:
-    """Rows of a run over tcp and one over udp."""
+    """Measure one run over tcp and one over udp."""
     for protocol in ("tcp", "udp"):
         found = outcome(*run_two_pullers(protocol=protocol))
         case = f"two people pull at one bunch, 50 +- 20 ms to the server, 2 % lost each way, {protocol}"

@@ -1,4 +1,5 @@
-"""Time of sleeping plants, and of a whole step of a vineyard of ten thousand bunches: twenty trees awake, one robot."""
+"""Time of sleeping plants, and of a whole step of a vineyard of ten thousand bunches with twenty awake trees and one
+robot."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ MEASURED_STEPS = 1000
 
 
 def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
-    """Twenty awake canes beside none, a thousand and ten thousand asleep; then the block of ten thousand bunches."""
+    """Measure twenty awake canes among no, a thousand and ten thousand sleeping bunches, then the scene ``tendone``."""
     worlds = []
     for sleepers in (0, *SLEEPING_TREES):
         physics = Physics(scenes.cane_row(AWAKE_TREES + sleepers))
@@ -44,7 +45,7 @@ def sleeping_measurements(robot: RobotSpec) -> Iterator[Measurement]:
 
 
 def _measure_tendone(robot: RobotSpec) -> Iterator[Measurement]:
-    """The shipped scene ``tendone`` with one ``robot``: median and 99th percentile of a step."""
+    """Measure the median and the 99th percentile of a step of the shipped scene ``tendone`` with one ``robot``."""
     model = generate(load_scene("tendone"))
     physics = Physics(model)
     physics.add_robot(robot)

@@ -1,10 +1,11 @@
-"""``python -m benchmarks voice``: from the microphone of one page to the sound of another, in real browsers.
+"""``python -m benchmarks voice``: delay from the microphone of one page to the sound of another, in real browsers.
 
-A server, two people 3 m apart on clients of their own as users start them, and a browser for each. The microphone of
-the first hears bursts of a tone. In each page a probe in the thread of sound notes when a burst begins: as the samples
-of the microphone come, and as they are played in the other page; both clocks are that of this machine. What the second
-browser says of the delay of its output is added; the delay of a microphone before its browser is not known. The pages
-draw two small pictures a second, as the browsers have no graphics card, and the browser's filters of sound are off.
+There are a server, two people 3 m apart on clients of their own, all started as users start them, and a browser for
+each person. The microphone of the first browser plays bursts of a tone. In the audio thread of each page a probe notes
+when a burst begins: in the samples of the microphone, and in the samples that the other page plays; both pages use the
+clock of this machine. The second browser reports the delay of its output, which is added; the delay of a microphone
+before its browser is not known. The pages draw only two small pictures a second, because the browsers have no graphics
+card, and the browser's sound filters are off.
 """
 
 from __future__ import annotations
@@ -24,29 +25,30 @@ from vinesim.client.processes.child_process import START_TIMEOUT, ProcessFailed,
 from vinesim.scene.values import Measurement
 
 _Frames = dict[str, list[tuple[float, str]]]
-"""By event, the times [ms] of frames and their data."""
+"""Times [ms] and data of frames, by event."""
 BURSTS = 60
-"""Measured bursts."""
+"""Number of measured bursts."""
 FREQUENCY = 600.0
 LENGTH = 0.12
 LEVEL = 0.5
-"""Of the tone of a burst [Hz, s, 1]."""
+"""Amplitude of the tone of a burst [1]; ``FREQUENCY`` [Hz] and ``LENGTH`` [s] are its other properties."""
 PERIOD = 0.7
 VARIATION = 0.1
-"""From one burst to the next, and at most so much more, so that they fall into all phases of the frames [s]."""
+"""Largest random time [s] that is added to ``PERIOD`` [s] between bursts, so that bursts fall into all phases of the
+frames."""
 HEARD_LEVEL = 0.05
 QUIET = 0.3
-"""Amplitude from which a burst has begun after silence of so long [1, s]."""
+"""Silence [s] after which an amplitude of ``HEARD_LEVEL`` [1] counts as the beginning of a burst."""
 LATEST = 0.6
-"""A burst that is heard later than this is lost [s]."""
+"""A burst that is played later than this after it was spoken counts as lost [s]."""
 FIRST = ("anna", "-6 -3.5 0")
 SECOND = ("ben", "-3 -3.5 3.1")
-"""Names, and places x y yaw beside the vines [m, rad]."""
+"""Names of the two people, and their places x, y, yaw next to the vines [m, rad]."""
 ADDRESS = "?triangles=100&rate=2&shadows=0"
 TIMEOUT = 300.0
 """Longest wait for a page or for bursts [s]."""
 BUDGET = 150.0
-"""From mouth to ear, percentile 95 [ms]."""
+"""Budget of the 95th percentile of the delay from mouth to ear [ms]."""
 
 PROBE = """(async () => {
   const { voice } = vinesim, { context } = voice, source = %s;
@@ -67,7 +69,7 @@ PROBE = """(async () => {
   source.connect(probe);
   return true;
 })()"""
-"""Notes the times at which bursts begin [ms]."""
+"""Script that notes the times at which bursts begin [ms]."""
 NOTE = """(() => {
   const { voice } = vinesim, now = () => performance.timeOrigin + performance.now();
   const note = (object, method, times, data = () => []) => {
@@ -81,20 +83,21 @@ NOTE = """(() => {
 SENDS = """note(voice, 'send', times.sent, (_, data) => data);
   if (voice.encoder) note(voice.encoder, 'encode', times.full); else times.full = times.sent;"""
 RECEIVES = "const one = %s; note(one, 'take', times.received, (_, __, data) => data); note(one, 'play', times.decoded);"
-"""Note when frames [ms, data] are full in the page's own thread, encoded and sent; received, decoded."""
+"""Part of the script ``NOTE`` for the page that hears: notes when frames are received and decoded [ms], with their
+data. ``SENDS`` notes in the page that speaks when frames are full, encoded and sent."""
 STAGES = ("the rest of its frame", "encoding", "network of two clients and a server", "decoding", "queue and output")
-"""Of the way of the first frame of a burst."""
+"""Stages on the way of the first frame of a burst."""
 
 
 def voice() -> Iterator[Measurement]:
-    """Delay from microphone to ear, and what of it is the output of the browser."""
+    """Measure the delay from microphone to ear, and the part of it that the browser's output causes."""
     with contextlib.ExitStack() as stack:
         folder = pathlib.Path(stack.enter_context(tempfile.TemporaryDirectory()))
         addresses = _start(stack.enter_context(own_processes()))
         speaks = microphone(write_sound(folder / "bursts.wav", _bursts()))
         pages = [stack.enter_context(browser_page(*options)) for options in (speaks, speaks[-1:])]
         for page, address in zip(pages, addresses, strict=True):
-            page.call("Page.setBypassCSP", enabled=True)  # the probe comes from outside of the page
+            page.call("Page.setBypassCSP", enabled=True)  # the probe comes from outside the page
             page.resize(160, 120)
             page.open(address + ADDRESS, before=AS_RECORDED)
             _wait(lambda page=page: page.run("window.vinesim?.drawn >= 2"), "a picture")
@@ -118,7 +121,7 @@ def voice() -> Iterator[Measurement]:
 
 
 def _bursts() -> np.ndarray:
-    """Bursts of a tone at 48 kHz."""
+    """Returns 40 bursts of a tone, each after silence of random length; samples at 48 kHz."""
     rng = np.random.default_rng(1)
     rate = 48_000
     burst = LEVEL * np.sin(2.0 * np.pi * FREQUENCY * np.arange(round(LENGTH * rate)) / rate)
@@ -127,7 +130,7 @@ def _bursts() -> np.ndarray:
 
 
 def _start(group: ProcessGroup) -> list[str]:
-    """Start a server and two people; addresses of their pages."""
+    """Start a server and two people; return the addresses of their pages."""
     server = group.start("server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json")
     endpoint = json.loads(server.next_line(START_TIMEOUT))["endpoints"][0]
     ports = []
@@ -161,8 +164,12 @@ def _start(group: ProcessGroup) -> list[str]:
 
 
 def _stages(said: np.ndarray, took: np.ndarray, times: _Frames) -> np.ndarray:
-    """How long each of :data:`STAGES` took [stage, burst] ms for the first frame that was full after a burst began and
-    was sent: nothing is sent for silence; NaN: not known. ``times`` [ms] of frames and their data."""
+    """Returns the duration of each of :data:`STAGES` [stage, burst] ms; NaN where it is unknown.
+
+    The followed frame is the first one that was full after the burst began and that was sent; silence is not sent.
+    ``said``: beginnings of bursts at the microphone [ms]; ``took``: delays of the bursts [ms]; ``times``: frames by
+    event.
+    """
     sent = times["sent"]
     received = times["received"]
     decoded = times["decoded"]
@@ -180,8 +187,8 @@ def _stages(said: np.ndarray, took: np.ndarray, times: _Frames) -> np.ndarray:
 
 
 def _measure(first: Page, second: Page) -> tuple[list[float], list[float], float, int, _Frames]:
-    """Times at which bursts began in both pages, delay of the second one's output [ms], its gaps, and times of frames
-    [ms] with their data."""
+    """Let the first page speak and the second hear. Returns times at which bursts began in the first and in the second
+    page [ms], delay of the second page's output [ms], number of its gaps, and frames by event."""
     second.run("vinesim.voice.hear()")
     first.run("vinesim.voice.toggleSpeaking()")
     speaker = f"vinesim.voice.speakers.get({FIRST[0]!r})"

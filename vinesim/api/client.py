@@ -94,12 +94,12 @@ class Client:
 
     @property
     def physics(self) -> Physics:
-        """This client's copy of the world."""
+        """Physics of this client's copy of the world."""
         return self._client.physics
 
     @property
     def state(self) -> State:
-        """State of the plants in this client's copy, at the current time."""
+        """State of the plants in this client's copy of the world, at the current time."""
         self._client.physics.update_kinematics()
         return self._client.physics.state
 
@@ -129,7 +129,8 @@ class Client:
         return self._client.physics.rigid.base_state(name)[0]
 
     def step(self, count: int = 1) -> None:
-        """Advance by ``count`` steps of 10 ms at once: receive, control, step, sense, send. It does not wait."""
+        """Advance by ``count`` steps of 10 ms: receive, control, step, sense, send. The steps follow each other without
+        waiting for real time."""
         for _ in range(count):
             self._client.tick()
 

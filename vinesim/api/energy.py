@@ -12,7 +12,7 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Energy:
-    """Energy of plants [J]."""
+    """Energies of plants [J]."""
 
     kinetic: float
     elastic: float
@@ -28,21 +28,22 @@ class Energy:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Momentum:
-    """Momentum of plants, world axes."""
+    """Momentum of plants in world axes."""
 
     linear: np.ndarray
-    """[3] kg m/s"""
+    """Linear momentum [3] kg m/s."""
     angular: np.ndarray
-    """[3] kg m^2/s about the origin of the world."""
+    """Angular momentum about the origin of the world [3] kg m^2/s."""
 
 
 def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None = None) -> Energy:
-    """Energy of ``trees`` [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to date.
+    """Returns the energy of ``trees`` [k] (all unless given); ``gravity`` [m/s^2]. Poses and velocities must be up to
+    date.
 
-    Kinetic energy is the sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic energy is the sum of
-    k theta^2 / 2 about each joint axis, with theta the rotation vector of the joint, and of k d^2 / 2 for each tie. A
-    tie that deflects a wire by u counts k d (d + u) / 2, which includes its share of the wire. For a root on an arm
-    that is twisted by u, k u (theta - theta as drawn) / 2 is subtracted.
+    Kinetic energy is the sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic energy is the sum of k theta^2 /
+    2 about each joint axis, with theta the rotation vector of the joint, and of k d^2 / 2 for each tie. A tie that
+    deflects a wire by u counts k d (d + u) / 2, which includes its share of the wire. For a root on an arm that is
+    twisted by u, k u (theta - theta as drawn) / 2 is subtracted.
     """
     model = plants.model
     state = plants.state
@@ -66,7 +67,8 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
 
 
 def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Momentum:
-    """Linear and angular momentum of ``trees`` [k] (all unless given). Poses and velocities must be up to date."""
+    """Returns the linear and angular momentum of ``trees`` [k] (all unless given). Poses and velocities must be up to
+    date."""
     mass, com, velocity, omega, inertia = _motion(plants, _moving_bodies(plants, trees))
     impulse = mass[:, None] * velocity
     spin = np.cross(com, impulse) + np.einsum("bij,bj->bi", inertia, omega)
@@ -74,7 +76,8 @@ def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Mom
 
 
 def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.ndarray:
-    """Bodies [k] that are simulated; fused berry clusters are part of the body of their bunch."""
+    """Returns the indices [k] of the simulated bodies of ``trees``; fused berry clusters are part of the body of their
+    bunch."""
     model = plants.model
     size = np.where(plants.state.tree_fine, model.tree_size, model.tree_core)
     number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]
@@ -85,9 +88,8 @@ def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.n
 
 
 def _motion(plants: ArticulationSolver, bodies: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Mass [k], position [k, 3] and velocity [k, 3] of the centre of mass, angular velocity [k, 3], inertia [k, 3, 3].
-
-    All are in world axes.
+    """Returns mass [k], position [k, 3] and velocity [k, 3] of the centre of mass, angular velocity [k, 3], inertia [k,
+    3, 3].
     """
     pose = plants.state.body_q[bodies].astype(float)
     speed = plants.state.body_qd[bodies].astype(float)

@@ -12,9 +12,9 @@ from vinesim.web.page_server import PageServer
 
 
 class Page:
-    """The live vineyard of a client. A notebook shows it in a cell that ends with this object.
+    """Live view of a client's vineyard in a browser. A notebook shows the view in a cell that ends with this object.
 
-    Pages need the extra ``web`` and a browser on the same machine. They change only while the client steps.
+    A page needs the extra ``web`` and a browser on the same machine. It changes only while the client steps.
     """
 
     height = 480

@@ -58,7 +58,8 @@ class PickAttempt:
 
 
 def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: float = 3.0) -> list[Grasp]:
-    """Grasps of bunches within ``reach`` [m] of the scene's start place ``spawn``, most room for the hand first.
+    """Returns grasps of bunches within ``reach`` [m] of the scene's start place ``spawn``, most room for the hand
+    first.
 
     The base may move. Bunches that a hand can reach are listed even if the hand has no room around them.
     """
@@ -76,7 +77,7 @@ def attempt_pick(scene: Scene | str | pathlib.Path | Model, grasp: Grasp) -> Pic
     physics = Physics(model)
     picker = Robot(physics.rigid, load_description(ROBOT), "picker", pose=grasp.base)
     picker.fit_cutters(physics)
-    # box and path of the plan belong to phases that are not reached
+    # dummy values: the phases that use the box and the path of the plan are not reached
     plan = PickPlan(grasp.bunch, grasp.side, grasp.base, 0, grasp.base[None, :2], 0.0)
     task = PickBunch(physics, picker, plan)
     while not task.is_done and task.phase != _END_PHASE:

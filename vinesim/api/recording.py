@@ -3,7 +3,7 @@
     for message in Recording("harvest.mcap"):
         print(message.time, message.actor, message.key, message.data)
 
-``vinesim record`` writes them.
+``vinesim record`` writes such recordings.
 """
 
 from __future__ import annotations
@@ -55,15 +55,16 @@ class Recording:
 
     @property
     def damage(self) -> str:
-        """One line that says why the file is truncated, or empty. All messages before the damage can be read."""
+        """One line that explains why the file is truncated, or an empty string. All messages before the damage can be
+        read."""
         return self._recording.damage
 
     def __len__(self) -> int:
-        """Number of messages."""
+        """Returns the number of messages."""
         return len(self._recording.messages)
 
     def __iter__(self) -> Iterator[RecordedMessage]:
-        """All messages in order of time."""
+        """Yields all messages in order of time."""
         for entry in self._recording.messages:
             data = describe_message(entry.key, entry.payload)
             yield RecordedMessage(entry.time - self._recording.start, sender_of(entry.key), entry.key, data)

@@ -124,7 +124,8 @@ class Lidar:
 
 
 def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Pose [7] of the optical frame of an upright camera at ``eye`` [3] m that looks at ``target`` [3] m."""
+    """Returns the pose [7] of the optical frame of an upright camera at ``eye`` [3] m that looks at ``target`` [3]
+    m."""
     start = np.asarray(eye, float)
     end = np.asarray(target, float)
     if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
@@ -133,13 +134,14 @@ def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndar
 
 
 def _first_frame(robot: Robot | None, kind: str) -> str | None:
-    """Where the first sensor of a kind sits on a robot; None if there is none."""
+    """Returns the name of the frame of the robot's first sensor of a kind; None if there is none."""
     mounts = () if robot is None else robot.description.sensors_of(kind)
     return mounts[0].frame if mounts else None
 
 
 def _sensor_pose(pose: Sequence[float] | np.ndarray | None, robot: Robot | None, frame: str | None) -> np.ndarray:
-    """Pose [7] of a sensor in the world; :class:`UsageError` unless either ``pose`` or ``robot`` is given."""
+    """Returns the pose [7] of a sensor in the world. Raises :class:`UsageError` unless either ``pose`` or ``robot`` is
+    given."""
     if (pose is None) == (robot is None):
         raise UsageError("the sensor has no place, or two; give either a pose [7] or a robot")
     if robot is None:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from vinesim.sensors.primitives.scene_primitives import Primitives
 
 Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]
-"""Things that can be simulated: a model, a scene, the name or path of a scene, one or more canes."""
+"""Types that :class:`Simulation` accepts: a model, a scene, the name or path of a scene, one or more canes."""
 
 
 class Simulation:
@@ -105,7 +105,7 @@ class Simulation:
         if not isinstance(count, int | np.integer) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._detachments = []
-        for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that removed themselves
+        for name in self.robots.keys() - set(self.physics.rigid.robots):  # robots that are no longer in the physics
             self._forget_robot(name)
         for _ in range(count):
             for robot in self.robots.values():
@@ -114,7 +114,7 @@ class Simulation:
             self._detachments += self.physics.detachments
         for body, before in self._loads.items():
             self.physics.plants.body_load[body] = before
-        if self._loads:  # a tree that fell asleep under its load moves again
+        if self._loads:  # a tree that fell asleep under its load must move again
             self.physics.wake(np.unique(self.model.body_tree[list(self._loads)]))
         self._loads.clear()
         for robot, link in self._pushed:
@@ -163,28 +163,30 @@ class Simulation:
         return tuple(self._detachments)
 
     def energy(self, tree: int | None = None) -> Energy:
-        """Kinetic, elastic and gravitational energy [J] of the plants, or of one tree."""
+        """Returns the kinetic, elastic and gravitational energy [J] of the plants, or of one tree."""
         self.physics.update_kinematics()
         return energy(self.physics.plants, self.parameters.gravity, self._one(tree))
 
     def momentum(self, tree: int | None = None) -> Momentum:
-        """Linear momentum [kg m/s] and angular momentum about the world's origin [kg m^2/s] of plants, or of a tree."""
+        """Returns the linear [kg m/s] and the angular momentum about the world's origin [kg m^2/s] of the plants, or of
+        one tree."""
         self.physics.update_kinematics()
         return momentum(self.physics.plants, self._one(tree))
 
     def body_pose(self, body: int) -> np.ndarray:
-        """Pose [7] (m, quaternion xyzw) of a plant's body in the world at the current time."""
+        """Returns the pose [7] (m, quaternion xyzw) of a plant's body in the world at the current time."""
         body = self._body(body)
         return self.state.body_q[body].astype(float)
 
     def tip(self, tree: int = 0) -> np.ndarray:
-        """Position [3] m of the tip of a tree's main axis in the world at the current time."""
+        """Returns the position [3] m of the tip of a tree's main axis in the world at the current time."""
         body = self.tip_body(tree)
         pose = self.body_pose(body)
         return pose[:3] + frames.rotate(pose[3:], np.array([float(self.model.body_length[body]), 0.0, 0.0]))
 
     def tip_body(self, tree: int = 0) -> int:
-        """Index of the last body of a tree's main axis, found by following the first child that is a piece of cane."""
+        """Returns the index of the last body of a tree's main axis, which follows the first child that is a piece of
+        cane."""
         bodies = self.model.bodies_of(self._tree(tree))
         body = bodies.start
         while True:
@@ -195,7 +197,7 @@ class Simulation:
             body = bodies.start + int(following[0])
 
     def snapshot(self) -> Snapshot:
-        """The whole world at the current time, for sensors. It does not change when the simulation steps."""
+        """Returns the whole world at the current time, for sensors. It does not change when the simulation steps."""
         return self.physics.snapshot()
 
     # ------------------------------------------------------------------ actions
@@ -305,7 +307,7 @@ class Simulation:
     # ------------------------------------------------------------------ sensors
 
     def primitives(self) -> Primitives:
-        """Visible primitives for cameras and lidars, at the current time. They are built in the first call."""
+        """Returns the visible primitives at the current time, for cameras and lidars. The first call builds them."""
         if self._primitives is None:
             from vinesim.sensors.primitives.scene_primitives import Primitives
 
@@ -326,7 +328,8 @@ class Simulation:
 
 
 def base_pose(pose: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]; :class:`UsageError` for others."""
+    """Returns the pose [7] of a robot's base from (x, y, yaw) in m and rad, or from a pose [7]. Raises
+    :class:`UsageError` for other values."""
     given = _numbers(pose)
     if given.shape not in ((3,), (7,)) or not np.isfinite(given).all():
         shown = given.tolist() if given.ndim else pose
@@ -350,7 +353,7 @@ def _model_of(source: Model | Scene | CaneBuilder | TreeBuilder | Iterable[CaneB
 
 
 def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.ndarray:
-    """Three finite numbers as an array; :class:`UsageError` otherwise."""
+    """Returns three finite numbers as an array. Raises :class:`UsageError` for other values."""
     vector = _numbers(value)
     if vector.shape != (3,) or not np.isfinite(vector).all():
         raise UsageError(f"{name} is {value}; give three finite numbers [{unit}]")
@@ -358,7 +361,7 @@ def _vector(name: str, value: Sequence[float] | np.ndarray, unit: str) -> np.nda
 
 
 def _numbers(value: Sequence[float] | np.ndarray) -> np.ndarray:
-    """``value`` as an array of numbers; an array of one NaN if it is not one."""
+    """Returns ``value`` as an array of numbers; an array of one NaN if it is not numeric."""
     try:
         return np.asarray(value, float)
     except (TypeError, ValueError):

@@ -24,7 +24,7 @@ from vinesim.core.errors import UsageError
 log = logging.getLogger(__name__)
 
 MAX_LOSSES = 3
-"""Number of times that the worker of one parameter may die until the parameter is taken to be the cause."""
+"""Number of deaths of workers with the same parameter after which the parameter is taken to be the cause."""
 
 P = TypeVar("P")
 R = TypeVar("R")
@@ -39,16 +39,16 @@ class WorkerLost(RuntimeError):
 def sweep(
     function: Callable[[P], R], parameters: Iterable[P], *, workers: int | None = None, executor: Any = None
 ) -> list[R]:
-    """The results of ``function`` for all parameters, in their order.
+    """Call ``function`` with each parameter, in several processes. Returns the results in the order of the parameters.
 
     Args:
         function: function of one parameter. It must be defined in a module, because processes import it by name. An
             exception from it ends the sweep.
         parameters: seeds, or other values that can be pickled.
         workers: number of processes on this machine; one for each core unless given.
-        executor: executor for the tasks instead of these processes: an object with the method ``submit`` of
-            :class:`concurrent.futures.Executor`, such as a cluster. Whether tasks of killed workers are repeated
-            depends on the executor; Dask repeats them.
+        executor: executor that runs the tasks instead of processes on this machine: an object with the method
+            ``submit`` of :class:`concurrent.futures.Executor`, such as a cluster. Whether tasks of killed workers are
+            repeated depends on the executor; Dask repeats them.
 
     Raises:
         WorkerLost: a worker died :data:`MAX_LOSSES` times with the same parameter.
@@ -59,7 +59,7 @@ def sweep(
         try:
             return [future.result() for future in futures]
         finally:
-            for future in futures:  # if one has raised, the others need not begin
+            for future in futures:  # if a task has raised an exception, later tasks need not begin
                 future.cancel()
     if workers is not None and workers < 1:
         raise UsageError(f"workers is {workers}; give 1 or more")
@@ -97,6 +97,6 @@ def _all_done(
                     results[index] = future.result()
             return False
         finally:
-            for future in futures:  # if one has raised, the others need not begin
+            for future in futures:  # if a task has raised an exception, later tasks need not begin
                 future.cancel()
     return True

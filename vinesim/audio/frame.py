@@ -34,7 +34,7 @@ class Codec(enum.IntEnum):
 
 
 def find_fault(codec: int, data: bytes) -> str:
-    """The reason why ``data`` is not a frame of this codec; empty if its length and first byte are valid."""
+    """Returns the reason why ``data`` is not a frame of this codec; empty if its length and first byte are valid."""
     if codec == Codec.PCM16:
         return "" if len(data) == 2 * FRAME_SAMPLES else f"PCM16 of {len(data)} B, not {2 * FRAME_SAMPLES}"
     if codec != Codec.OPUS:
@@ -50,10 +50,10 @@ def find_fault(codec: int, data: bytes) -> str:
 
 
 def to_pcm(samples: np.ndarray) -> bytes:
-    """Samples [n] as PCM16; values outside -1 to 1 are clipped."""
+    """Returns samples [n] encoded as PCM16; values outside -1 to 1 are clipped."""
     return np.round(np.clip(samples, -1.0, 1.0) * 32767.0).astype("<i2").tobytes()
 
 
 def from_pcm(data: bytes) -> np.ndarray:
-    """PCM16 as samples [n] float32 from -1 to 1; an odd last byte is left out."""
+    """Returns the samples [n] of PCM16 as float32 from -1 to 1; an odd last byte is left out."""
     return np.frombuffer(data, "<i2", len(data) // 2).astype(np.float32) / np.float32(32767.0)

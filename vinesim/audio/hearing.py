@@ -18,9 +18,9 @@ FADE = 5.0
 
 
 def gain(distance: float) -> float:
-    """Amplitude of a sound at a ``distance`` [m], relative to its amplitude within :data:`REFERENCE`.
+    """Returns the amplitude of a sound at a ``distance`` [m], relative to its amplitude within :data:`REFERENCE`.
 
-    It falls with 1/d and is 0 from :data:`REACH` on.
+    The amplitude falls with 1/d and is 0 from :data:`REACH` on.
     """
     if not distance < REACH:
         return 0.0
@@ -32,7 +32,7 @@ def gain(distance: float) -> float:
 
 
 class SpectatorsSpeakTo(enum.StrEnum):
-    """Who hears spectators."""
+    """Setting of the server: which actors hear spectators."""
 
     NOBODY = "nobody"
     PEOPLE = "people"
@@ -41,7 +41,10 @@ class SpectatorsSpeakTo(enum.StrEnum):
 
 
 def may_hear(speaker: str, hearer: str, setting: SpectatorsSpeakTo) -> bool:
-    """Whether an actor of the kind ``hearer`` hears one of the kind ``speaker``: robot, human or spectator."""
+    """Returns whether an actor of the kind ``hearer`` hears an actor of the kind ``speaker``.
+
+    Kinds are "robot", "human" and "spectator".
+    """
     if speaker != "spectator" or setting is SpectatorsSpeakTo.ALL:
         return True
     return setting is SpectatorsSpeakTo.PEOPLE and hearer != "robot"

@@ -33,7 +33,7 @@ class Loudspeaker:
         self._lock = threading.Lock()
 
     def play(self, pcm: bytes) -> None:
-        """Append PCM16 to the queue."""
+        """Append PCM16 to the queue. Sound that does not fit is refused and counted."""
         with self._lock:
             room = round(MAX_QUEUED / FRAME) * _FRAME_BYTES - len(self._waiting) * _FRAME_BYTES - len(self._rest)
             self.refused += max(len(pcm) - max(room, 0), 0)
@@ -43,7 +43,7 @@ class Loudspeaker:
             self._rest = data[whole:]
 
     def frames(self, now: float) -> Iterator[tuple[float, bytes]]:
-        """Frames played until ``now`` [s], each with the time at which it began.
+        """Yields the frames played until ``now`` [s], each with the time [s] at which it began.
 
         The first frame of a sound begins one frame before ``now``.
         """

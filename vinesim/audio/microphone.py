@@ -60,7 +60,7 @@ class Block:
 
 @dataclasses.dataclass(slots=True)
 class _Voice:
-    """State of one speaker."""
+    """State of the mixing of one speaker."""
 
     number: int
     end: int
@@ -98,7 +98,7 @@ class Microphone:
         """Mix a frame that has arrived."""
         voice = self._voices.pop(frame.speaker, None)
         step = 1 if voice is None else (frame.number - voice.number) % 65536
-        if voice is not None and not 0 < step < 32768:  # received twice or out of order
+        if voice is not None and not 0 < step < 32768:  # the frame was received twice or out of order
             self._voices[frame.speaker] = voice
             self.late += step != 0
             return
@@ -114,7 +114,8 @@ class Microphone:
             self.lost += step - 1
             if abs(start - voice.end) <= 2:
                 start = voice.end
-            if 0 < voice.end - start < SAMPLE_RATE:  # a voice does not add to itself
+            # the frame overlaps the speaker's last one: a voice is not added to itself
+            if 0 < voice.end - start < SAMPLE_RATE:
                 self.late += 1
                 self._voices[frame.speaker] = dataclasses.replace(voice, number=frame.number, decoder=decoder)
                 return
@@ -136,7 +137,7 @@ class Microphone:
         """
         end = round(now * SAMPLE_RATE)
         start, before, last = self._tones.pop(source, (end, 0.0, frequency))
-        if start < end - 2 * FRAME_SAMPLES:  # the tone was out of hearing for a while
+        if start < end - 2 * FRAME_SAMPLES:  # the tone was not heard for a while
             start = end - 2 * FRAME_SAMPLES
             before = 0.0
         frequency = frequency or last
@@ -149,10 +150,10 @@ class Microphone:
         self._tones[source] = end, gain, frequency
 
     def blocks(self, now: float) -> Iterator[Block]:
-        """Blocks that are complete at network time ``now`` [s]."""
+        """Yields the blocks that are complete at network time ``now`` [s]."""
         ready = int((now - self.delay) * SAMPLE_RATE)
         if self._next is None or not self._next - _RING < ready < self._next + _RING // 2:
-            self._mix[:] = 0.0  # the first, or the clock was set
+            self._mix[:] = 0.0  # this is the first block, or the clock was set
             self._voices.clear()
             self._next = ready - ready % FRAME_SAMPLES
         while self._next + FRAME_SAMPLES <= ready:
@@ -182,7 +183,8 @@ class Microphone:
     def _decode(
         self, frame: HeardFrame, decoder: opus.OpusDecoder | None
     ) -> tuple[np.ndarray | None, opus.OpusDecoder | None]:
-        """Samples of a frame (None if it cannot be decoded), and the speaker's decoder for its next frame."""
+        """Returns the samples of a frame (None if it cannot be decoded), and the speaker's decoder for its next
+        frame."""
         if frame.codec is Codec.PCM16:
             return from_pcm(frame.data), decoder
         if decoder is None:

@@ -21,7 +21,7 @@ _LOW_PASS /= _LOW_PASS.sum()
 
 
 def is_available() -> bool:
-    """Whether Opus can be decoded here."""
+    """Returns whether Opus can be decoded on this machine."""
     return importlib.util.find_spec("av") is not None
 
 
@@ -43,7 +43,8 @@ class OpusDecoder:
         return codec
 
     def decode(self, packet: bytes) -> np.ndarray | None:
-        """Samples [:data:`FRAME_SAMPLES`] float32 from -1 to 1; None if ``packet`` is not an Opus packet of 20 ms."""
+        """Returns samples [:data:`FRAME_SAMPLES`] float32 from -1 to 1; None if ``packet`` is not an Opus packet of 20
+        ms."""
         try:
             decoded = [frame.to_ndarray() for frame in self._codec.decode(self._av.Packet(packet))]
         except ValueError:

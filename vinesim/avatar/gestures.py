@@ -67,7 +67,8 @@ class Gestures:
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Gestures:
-        """The poses of :data:`GESTURES` and of a file; raises :class:`GestureError` if the file cannot be used."""
+        """Returns the poses of :data:`GESTURES` and of a file. Raises :class:`GestureError` if the file cannot be
+        used."""
         given = load_toml(path, _GestureFile, GestureError)
         poses = GESTURES | given.poses
         buttons = {button: name for button, name in msgspec.structs.asdict(given.buttons).items() if name}
@@ -77,17 +78,17 @@ class Gestures:
         return cls(poses, {button: poses[name] for button, name in buttons.items()})
 
     def name_of(self, fingers: tuple[float, ...]) -> str:
-        """Name of the pose closest to ``fingers``; empty if none is within :data:`MAX_DIFFERENCE`."""
+        """Returns the name of the pose closest to ``fingers``; empty if none is within :data:`MAX_DIFFERENCE`."""
         away = {name: max(abs(a - b) for a, b in zip(fingers, pose, strict=True)) for name, pose in self.poses.items()}
         nearest = min(away, key=lambda name: away[name])
         return nearest if away[nearest] <= MAX_DIFFERENCE else ""
 
 
 def finger_bend(*, closed: bool) -> FingerBend:
-    """Finger pose of a closed or open hand."""
+    """Returns the finger pose of a closed or open hand."""
     return FIST if closed else OPEN_HAND
 
 
 def shears_grip(*, closed: bool) -> FingerBend:
-    """Finger pose of a hand that holds closed or open shears. GUESSED."""
+    """Returns the finger pose of a hand that holds closed or open shears. GUESSED."""
     return (0.4, 0.8, 0.8, 0.8, 0.8) if closed else (0.2, 0.5, 0.5, 0.5, 0.5)

@@ -63,5 +63,5 @@ class LegEstimator:
 
 
 def _upright(head: np.ndarray) -> np.ndarray:
-    """The pose [7] of a head without its pitch and roll."""
+    """Returns the pose [7] of a head without its pitch and roll."""
     return frames.pose(head[:3], frames.from_yaw(frames.to_yaw(head[3:])))

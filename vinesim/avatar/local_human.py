@@ -1,4 +1,4 @@
-"""A person whom this client moves: pose from a source, shears, messages for other clients, haptic feedback."""
+"""A person whom this client controls: pose from a source, shears, messages for other clients, haptic feedback."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _HANDS = [POINT_NAMES.index(side) for side in SIDES]
 
 
 class LocalHuman:
-    """A person in the physics whose tracked points a source gives in every step."""
+    """A person in the physics whose head and hands follow a pose source in every step."""
 
     def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
         """``source(time)`` gives the pose at the end of the step that begins at simulation ``time`` [s]."""
@@ -32,7 +32,7 @@ class LocalHuman:
         self.haptics: tuple[Haptic, ...] = ()
         """Vibrations of the person's controllers after the last step."""
         self.closures: tuple[Closure, ...] = ()
-        """What shears did that closed in the last step."""
+        """Results of shears that closed in the last step."""
         self._feedback = HapticFeedback(physics, spec.name)
         self._shears = tuple(Shears(physics, spec.name, side) for side in SIDES)
         self._sent_points = spec.pose.points
@@ -55,7 +55,7 @@ class LocalHuman:
             shears.control(self.pose)
 
     def update(self, now: float) -> HumanUpdate:
-        """After a step: pose and velocity for other clients.
+        """After a step: return the person's pose and velocity for other clients.
 
         Busy hands are sent at their simulated poses, free hands at the poses of their controllers.
         """
@@ -71,7 +71,8 @@ class LocalHuman:
             if self._is_busy(i):
                 points[_HANDS[i]] = hand.pose
             if was_busy != self._is_busy(i):
-                before[_HANDS[i]] = points[_HANDS[i]]  # a switch between controller and simulated hand is no motion
+                # switching between controller and simulated hand must not count as motion
+                before[_HANDS[i]] = points[_HANDS[i]]
         way = points[:, :3] - before[:, :3]
         turn = frames.log(frames.multiply(points[:, 3:], frames.conjugate(before[:, 3:])))
         velocity = np.concatenate([way, turn], 1) / self.physics.dt
@@ -84,14 +85,16 @@ class LocalHuman:
         return HumanUpdate(self.name, now, pose, velocity, self.intention)
 
     def between_blades(self) -> tuple[str, ...]:
-        """What the shears in the left and right hand would cut now, as in :meth:`Shears.between`; "" without shears."""
+        """What the shears in the left and in the right hand would cut now, as in :meth:`Shears.between`; "" without
+        shears."""
         return tuple(
             shears.between() if getattr(self.pose, f"{side}_shears") else ""
             for shears, side in zip(self._shears, SIDES, strict=True)
         )
 
     def hand_wrenches_on(self, robots: Container[str]) -> dict[str, dict[str, np.ndarray]]:
-        """Wrenches [6] of the hands on ``robots`` in the last step, by robot and link. Call it after :meth:`update`."""
+        """Returns the wrenches [6] of the hands on ``robots`` in the last step, by robot and link. Call it after
+        :meth:`update`."""
         return {robot: links for robot, links in self._hand_wrenches.items() if robot in robots}
 
     def _is_busy(self, hand: int) -> bool:
@@ -110,10 +113,10 @@ class HapticFeedback:
         self.name = name
         self._period = physics.parameters.steps(physics.parameters.haptic_period)
         self._contact_steps: dict[str, int] = {}
-        """By side: number of steps since the contact began."""
+        """Number of steps since the contact of each hand began, by side."""
 
     def update(self) -> tuple[Haptic, ...]:
-        """The vibrations of the last step, left hand first; call it once after each step."""
+        """Returns the vibrations of the last step, left hand first; call it once after each step."""
         p = self.physics.parameters
         found = []
         for hand in self.physics.rigid.human(self.name).hands:
@@ -137,7 +140,7 @@ class HapticFeedback:
 
 CUT_PULSE = (1.0, 0.1)
 MISS_PULSE = (0.3, 0.03)
-"""Amplitude [1] and duration [s] of the vibration when shears have cut something, and when they have not. GUESSED."""
+"""Amplitude [1] and duration [s] of the vibration when shears have cut nothing; ``CUT_PULSE`` is for a cut. GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -175,12 +178,12 @@ class Closure:
         return f"{shears} missed: there was no wood between the blades."
 
     def haptic(self, actor: str) -> Haptic:
-        """The vibration that tells the person about the closing."""
+        """Returns the vibration that tells the person about the closing."""
         return Haptic(actor, self.side, True, *(CUT_PULSE if self.has_cut else MISS_PULSE))
 
 
 class Shears:
-    """The shears that one hand can take: a blade in the physics that closes only while the hand holds the shears."""
+    """Shears that one hand can hold: a blade in the physics that closes only while the hand holds the shears."""
 
     def __init__(self, physics: Physics, name: str, side: str) -> None:
         """``name``: name of a person in ``physics``; ``side``: side of the hand."""
@@ -200,7 +203,7 @@ class Shears:
         self._was_closed = is_closed
 
     def between(self) -> str:
-        """After a step: what the blades would cut if they closed now, "bunch" or "cane".
+        """After a step: return what the blades would cut if they closed now, "bunch" or "cane".
 
         "strong wood" if all wood between the blades is too strong for them; "" if nothing is between them.
         """
@@ -211,7 +214,7 @@ class Shears:
         return "bunch" if max(weak) >= 0 else "cane"
 
     def closure(self) -> Closure | None:
-        """After a step: the result if the blades closed in this step, otherwise None."""
+        """After a step: return the result if the blades closed in this step, otherwise None."""
         blade = self._blade
         if blade.closures == self._closures:
             return None

@@ -29,7 +29,10 @@ REACH_SPEED = 0.5
 
 
 class ScriptedHuman:
-    """A source for :class:`vinesim.avatar.local_human.LocalHuman`: called once a step, gives the pose at its end."""
+    """A pose source for :class:`vinesim.avatar.local_human.LocalHuman` that follows a script of actions.
+
+    It is called once a step and returns the pose at the end of the step.
+    """
 
     def __init__(self, root: np.ndarray, height: float = 1.75, dt: float = 0.01) -> None:
         self.dt = dt
@@ -100,7 +103,8 @@ class ScriptedHuman:
             yield
 
     def reach(self, side: str, point: Callable[[], np.ndarray], *, close: bool = True) -> Iterator[None]:
-        """Move a palm to the world position ``point()`` [3] m, which is read in every step; then close the hand."""
+        """Move a palm to the world position ``point()`` [3] m, which is read in every step; then close the hand if
+        ``close``."""
         while True:
             goal = np.asarray(point(), float)
             here = frames.compose(self._standing_frame(), self._hands[side])

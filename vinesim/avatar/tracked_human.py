@@ -25,10 +25,10 @@ _SMOOTHING = 0.2
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class TrackedPoints:
-    """One input: where the person's head and hands are."""
+    """One input from the tracking device: poses of the person's head and hands."""
 
     head: np.ndarray
-    """[7] m, 1, world: between the eyes, x forward, z up."""
+    """Pose [7] m, 1 in the world of the point between the eyes, x forward, z up."""
     left: np.ndarray | None = None
     """Pose [7] of the left palm as in :class:`HumanPose`; None: the hand hangs down."""
     right: np.ndarray | None = None
@@ -40,7 +40,7 @@ class TrackedPoints:
 
 
 class TrackedHuman:
-    """A source for :class:`vinesim.avatar.local_human.LocalHuman`.
+    """A pose source for :class:`vinesim.avatar.local_human.LocalHuman` that follows tracked head and hands.
 
     Inputs arrive at the rate of a display, 60 to 90 Hz, while steps run at 100 Hz. Between inputs the points move at
     constant velocity, so that they have the person's velocities. This delays them by one interval between inputs.
@@ -134,7 +134,7 @@ class TrackedHuman:
 
 
 def _between(start: np.ndarray, goal: np.ndarray, share: float) -> np.ndarray:
-    """Poses [k, 7] interpolated between ``start`` (``share`` 0) and ``goal`` (``share`` 1)."""
+    """Returns poses [k, 7] interpolated between ``start`` (``share`` 0) and ``goal`` (``share`` 1)."""
     way = frames.log(frames.multiply(frames.conjugate(start[:, 3:]), goal[:, 3:]))
     turn = frames.multiply(start[:, 3:], frames.exp(share * way))
     return np.concatenate([start[:, :3] + share * (goal[:, :3] - start[:, :3]), turn], 1)

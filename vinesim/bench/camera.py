@@ -1,7 +1,7 @@
 """``vinesim bench camera``: depth, labels and pictures compared with Open3D's ray caster (Embree), in one process.
 
-Both see the same vineyard; Open3D gets it meshed (berries as icospheres of 80 triangles, canes as prisms, leaves as
-quads), about 0.9 million triangles. Cases alternate. Medians of CPU time of the whole process are compared, so the
+Both render the same vineyard. Open3D needs a mesh of it (berries as icospheres of 80 triangles, canes as prisms, leaves
+as quads), about 0.9 million triangles. Cases alternate. Medians of CPU time of the whole process are compared, so the
 number of cores that each uses does not matter.
 """
 
@@ -36,7 +36,7 @@ _ROUNDS = 7
 
 
 def median_cpu_times(*cases: Callable[[], object]) -> list[float]:
-    """Median CPU milliseconds of each case, run in turn."""
+    """Returns the median processor time [ms] of each case; the cases run in turn."""
     spent: list[list[float]] = [[] for _ in cases]
     for case in cases:
         case()
@@ -49,7 +49,8 @@ def median_cpu_times(*cases: Callable[[], object]) -> list[float]:
 
 
 def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [n, 3] m and triangles [m, 3] of plants and posts, as finely as another simulator would draw them."""
+    """Returns vertices [n, 3] m and triangles [m, 3] of plants and posts, as finely as another simulator would draw
+    them."""
     kind = primitives.shapes.kind.numpy()
     a, b, c = (getattr(primitives.shapes, name).numpy() for name in "abc")
     vertices = []
@@ -57,7 +58,7 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     first = 0
 
     def add(points: np.ndarray, triangles: np.ndarray) -> None:
-        """Add ``points`` [thing, vertex, 3], with one list of triangles for every thing."""
+        """Add ``points`` [thing, vertex, 3]; ``triangles`` [k, 3] holds indices into the vertices of each thing."""
         nonlocal first
         count, each = points.shape[:2]
         vertices.append(points.reshape(-1, 3))
@@ -99,13 +100,13 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
 
 
 def demo_scene() -> tuple[Model, Primitives]:
-    """The vineyard of both benches, without grass."""
+    """Returns the vineyard of the benches ``camera`` and ``lidar``, without grass."""
     model = generate(load_scene("demo"))
     return model, Primitives(model, grass=0.0)
 
 
 def embree_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
-    """Open3D's ray caster over triangles."""
+    """Returns Open3D's ray caster over a triangle mesh."""
     import open3d as o3d
 
     rays = o3d.t.geometry.RaycastingScene()
@@ -114,7 +115,7 @@ def embree_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 
 def camera() -> Iterator[Measurement]:
-    """Rasteriser and pictures; the peer is Open3D where it is installed."""
+    """Measure the rasteriser and whole pictures; the peer is Open3D if it is installed."""
     _, primitives = demo_scene()
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")
@@ -147,7 +148,7 @@ def camera() -> Iterator[Measurement]:
 
 
 def live_camera() -> Iterator[Measurement]:
-    """Cost of one live D435 picture with depth, part by part, each with its budget."""
+    """Measure one live D435 picture with depth, stage by stage, each with its budget."""
     model = generate(load_scene("demo"))
     primitives = Primitives(model)
     spec = CameraSpec.load("d435")
@@ -202,7 +203,7 @@ def live_camera() -> Iterator[Measurement]:
 
 
 def _rays(info: CameraInfo, pose: np.ndarray) -> np.ndarray:
-    """Origins and directions [height, width, 6] of all pixels in the world."""
+    """Returns the origins and directions [height, width, 6] of the rays of all pixels, in the world."""
     u, v = np.meshgrid(np.arange(info.width), np.arange(info.height))
     local = np.stack([(u - info.cx) / info.fx, (v - info.cy) / info.fy, np.ones(u.shape)], -1)
     d = frames.rotate(pose[3:], local)

@@ -1,11 +1,12 @@
-"""``vinesim bench tick``: the whole tick of a robot client with the push job, paced as users have it and in a loop.
+"""``vinesim bench tick``: the whole tick of a robot client with the push task, paced in real time and back to back.
 
-A paced client sleeps until each step is due, 100 times a second. Its caches are cold then, and a step takes two to five
-times as long as back to back. So the paced figures count; the figures of a loop are given in addition.
+A paced client sleeps until each step is due, 100 times a second, as it does for users. Its caches are cold then, and a
+step takes two to five times as long as back to back. So the paced figures count; the figures of steps back to back are
+given in addition.
 
 The real client steps on a clock that advances by one step a tick, so that it sends as many messages a tick as in real
-time. Its bus is in memory. Where a case has subscribers, it writes the records, true poses and snapshots that its ROS
-process and its sensor process ask for while all their topics have subscribers. The processes themselves do not run.
+time. Its bus is in memory. Where a case has subscribers, the client writes all records, true poses and snapshots that
+its ROS process and its sensor process request when every topic has a subscriber. Those processes themselves do not run.
 
 Times are given in processor time, which other programs on the machine change less, and in wall time.
 """
@@ -47,7 +48,7 @@ MEASURED_TICKS = 1000
 PARTS = ("receive", "control", "step", "sense", "send")
 """Parts of a tick, in their order."""
 TRUTH_PERIOD = 0.1
-"""Simulated time between two true poses of all bunches [s]: the default with which the ROS process asks for them."""
+"""Simulated time between two true poses of all bunches [s], as the ROS process requests them by default."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,16 +58,17 @@ class Case:
     scene: str
     robots: int = 1
     has_visitor: bool = False
-    """Whether a second client with a robot is near: its copy is simulated here, and states are exchanged."""
+    """Whether a second client with a robot is near: this client then simulates a copy of that robot and exchanges
+    states."""
     has_subscribers: bool = False
     """Whether all topics of the first robot have subscribers."""
     tick_budget: float | None = None
     step_budget: float | None = None
-    """Budget of a step of the physics, back to back."""
+    """Budget of a step of the physics back to back [ms, median]."""
 
     @property
     def text(self) -> str:
-        """The case in words."""
+        """Description of the case."""
         text = f"{self.scene}, {self.robots} robot{'s' * (self.robots > 1)}, one pushes"
         return text + ", a visitor beside" * self.has_visitor + ", all topics subscribed" * self.has_subscribers
 
@@ -85,13 +87,13 @@ class TickTimes:
     """Times of ticks [s]."""
 
     cpu: np.ndarray
-    """[tick, part + 1] Processor time of the thread in each part, and in the whole tick."""
+    """Processor time of the thread in each part, and in the whole tick [tick, part + 1] s."""
     wall: np.ndarray
-    """[tick, part + 1] Wall time of each part, and of the whole tick."""
+    """Wall time of each part, and of the whole tick [tick, part + 1] s."""
 
 
 def client_measurements() -> Iterator[Measurement]:
-    """Whole ticks and their parts, paced and back to back, each with its budget if it has one."""
+    """Measure whole ticks and their parts, paced and back to back, each compared with its budget if it has one."""
     robot = load_description("vinebot")
     for case in CASES:
         scene = load_scene(case.scene)
@@ -99,7 +101,7 @@ def client_measurements() -> Iterator[Measurement]:
 
 
 class PushingClient:
-    """A client in whose world the first robot pushes a bunch again and again; a second client may watch beside it."""
+    """A client whose first robot pushes a bunch again and again. A second client may stand behind it."""
 
     def __init__(
         self,
@@ -126,7 +128,7 @@ class PushingClient:
             self._visitor = self._add_client(scene, model, robot, "visitor", behind, stack)
         self._drain: Callable[[], int] = lambda: 0
         self.taken_steps = 0
-        """Number of records of steps that the subscribers have taken."""
+        """Number of step records that the subscribers have taken."""
         if has_subscribers:
             self._drain = _subscribe_to_all(client, scene, model, robot, stack)
         rest = client.physics.state.body_q[model.bunch_body[bunch]].copy()
@@ -134,7 +136,7 @@ class PushingClient:
         self.push = PushBunch(client.robot, client.side_of(trace.centre()), trace.centre)
         client.pre_step += [self.push.control, LookAt(client.robot, trace.centre)]
         self._marks = np.zeros((2 * len(PARTS), 2))
-        """[begin and end of each part, 2] processor time of the thread and wall time [s]."""
+        """Processor time of the thread and wall time at the begin and end of each part [2 * part, 2] s."""
         for i, name in enumerate(PARTS):
             owner = client.physics if name == "step" else client
             setattr(owner, name, functools.partial(self._time, i, getattr(owner, name)))
@@ -158,8 +160,8 @@ class PushingClient:
         return Client(scene, model, robot, bus, name=name, pose=pose, clock=lambda: self._now)
 
     def tick(self) -> np.ndarray:
-        """One tick of both clients; [part + 1, 2] processor and wall time of the first one's parts, and of its whole
-        tick [s]."""
+        """Step both clients once. Returns processor and wall time of the first client's parts, and of its whole tick
+        [part + 1, 2] s."""
         client = self.client
         begin = time.thread_time(), time.perf_counter()
         client.tick()
@@ -172,7 +174,8 @@ class PushingClient:
         return np.concatenate([self._marks[1::2] - self._marks[::2], [whole]])
 
     def measure(self, ticks: int, *, is_paced: bool) -> TickTimes:
-        """Times of a number of ticks, which begin when they are due in real time, or back to back."""
+        """Run ``ticks`` ticks and return their times. ``is_paced``: each tick begins when it is due in real time,
+        otherwise the ticks follow each other."""
         loop = RateLoop(self.client.physics.dt)
         times = np.zeros((ticks, len(PARTS) + 1, 2))
         for row in times:
@@ -185,7 +188,7 @@ class PushingClient:
 
 
 class _Demand:
-    """Stands for a running process of the client whose topics all have subscribers. It takes the messages that are
+    """Stands in for a worker process of the client whose topics all have subscribers. It takes the messages that are
     written."""
 
     is_ready = True
@@ -209,28 +212,28 @@ class _Demand:
         self.process = types.SimpleNamespace(pid=os.getpid())
 
     def current(self) -> _Demand:
-        """The present run, as of a worker process."""
+        """This object, which takes the place of the current run of a worker process."""
         return self
 
     def send(self, kind: str, value: Any = None) -> None:
-        """Take a message."""
+        """Ignore a message to the worker process."""
 
     def wait_until_ready(self, timeout: float) -> None:
-        """A real process may not be ready; this one always is."""
+        """Return at once: a real process may not be ready yet, this object always is."""
 
     def raise_failure(self) -> None:
-        """There is none."""
+        """Do nothing: this object never fails."""
 
     def close(self) -> None:
-        """Release the memory."""
+        """Release the shared memory."""
         self.shared.close()
 
 
 def _subscribe_to_all(
     client: Client, scene: Scene, model: Model, robot: RobotDescription, stack: contextlib.ExitStack
 ) -> Callable[[], int]:
-    """Ask the client for all records that the topics of its first robot need. Returns a function that takes the records
-    of steps and returns their number."""
+    """Request from the client all records that the topics of its first robot need. Returns a function that takes the
+    waiting step records and returns their number."""
     with mock.patch.object(ros_process, "WorkerProcess", _Demand):
         ros = stack.enter_context(ros_process.RosProcess(client.name, model, robot))
     with mock.patch.object(sensor_process, "WorkerProcess", _Demand):
@@ -253,7 +256,7 @@ def _subscribe_to_all(
 
 
 def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) -> Iterator[Measurement]:
-    """The rows of one case."""
+    """Yields the rows of one case."""
     with contextlib.ExitStack() as stack:
         pushing = PushingClient(
             scene,
@@ -272,7 +275,7 @@ def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) ->
 
 
 def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: float | None) -> Iterator[Measurement]:
-    """Median and 99th percentile of the whole tick and its parts, in processor and wall time."""
+    """Yields the median and the 99th percentile of the whole tick and of its parts, in processor and wall time."""
     budgets = {"whole tick": tick_budget, "step": step_budget}
     for kind, values in (("CPU", times.cpu), ("wall", times.wall)):
         for name, column in zip((*PARTS, "whole tick"), 1e3 * values.T, strict=True):
@@ -282,7 +285,7 @@ def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: f
 
 
 def _row(case: str, value: float, budget: float | None = None) -> Measurement:
-    """One row, with its budget if it has one."""
+    """Returns one row, with its budget if it has one."""
     if budget is None:
         return Measurement("tick", case, value, "ms/tick")
     return Measurement("tick", case, value, "ms/tick", "budget", budget, budget / value)

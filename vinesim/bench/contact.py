@@ -1,7 +1,7 @@
 """Time of contacts, compared with MuJoCo: the same canes, grippers and bar in both, in one process, in turns.
 
-Also the time of a whole step of a vineyard with one robot and with ten, twenty trees awake and ten thousand bunches, by
-stages.
+The module also measures a whole step of a vineyard of ten thousand bunches, of which twenty trees are awake, with one
+robot and with ten, by stages.
 """
 
 from __future__ import annotations
@@ -27,26 +27,28 @@ from vinesim.world import Physics
 
 CANE_COUNTS = (64, 256)
 STEPS_PER_ROUND = (20, 5)
-"""Number of steps of a turn, for each number of canes: 50 ms of MuJoCo, since every turn begins with cold caches."""
+"""Number of steps of a turn, for each number of canes: about 50 ms of MuJoCo, since every turn begins with cold
+caches."""
 LIFTED_CANES = 12
 HELD_CANES = (14, 20, 26, 32)
-"""Numbers of the canes whose bunch a gripper holds."""
+"""Indices of the canes whose bunch a gripper holds."""
 COMBS = ((2, 10, 50), (4, 32, 12), (8, 64, 5))
-"""Bars of two combs, canes between them, steps of a turn. The number of contacts in the one island is bars times
-canes."""
+"""Cases of two combs: number of bars, number of canes between them, steps of a turn. All contacts form one island;
+their number is bars times canes."""
 SETTLE_STEPS = 150
 """Number of steps before the measurement, in which the grippers close, and bar and grippers lift."""
 SCENE = "tendone"
 ROBOT_COUNTS = (1, 10)
 ROBOT_POSITION = (15.5, 17.2)
-"""[m] x, y of the first robot in the block: its arms reach into the row behind it."""
+"""Position x, y of the first robot in the block [m]: its arms reach into the row behind it."""
 AWAKE_TREES = 20
 MEASURED_STEPS = 1000
 WARM_UP_STEPS = 100
 
 
 def contact_measurements() -> Iterator[Measurement]:
-    """Canes with their bunches, all awake: a bar lifts twelve, four grippers hold a bunch each."""
+    """Measure awake canes with bunches, of which a bar lifts twelve and four grippers hold one bunch each; then canes
+    between combs."""
     robots = [
         scenes.bar("bar", 0, LIFTED_CANES),
         *(scenes.gripper(f"hand{i}", scenes.bunch_center(i)) for i in HELD_CANES),
@@ -77,7 +79,7 @@ def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurem
 
 
 def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
-    """Times of single steps and of their stages, by the code that they belong to."""
+    """Yields the times of whole steps, and of their stages summed over MuJoCo, vinesim's own code and the rest."""
     physics = Physics(model)
     for i in range(count):
         position = [4.0 * i, -6.0, 0.0] if i else [*ROBOT_POSITION, 0.0]
@@ -116,7 +118,8 @@ def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count:
 
 
 def _stage_owner(stage: str) -> str:
-    """``MuJoCo`` for stages that do little but call it, ``ours`` for plants, wind and contacts, ``rest`` for others."""
+    """Returns ``MuJoCo`` for stages that mainly call MuJoCo, ``ours`` for plants, wind and contacts, ``rest`` for
+    others."""
     part = stage.split(":")[0]
     return {"rigid": "MuJoCo", "plants": "ours", "contacts": "ours", "wind": "ours"}.get(part, "rest")
 
@@ -130,7 +133,7 @@ def _swing_joints(physics: Physics, robot: RobotSpec, raised: np.ndarray, tick: 
 
 @contextlib.contextmanager
 def _one_core() -> Iterator[None]:
-    """Keep this process on one core, where the system permits it."""
+    """Keep this process on one core while the context lasts, where the system permits it."""
     if not hasattr(os, "sched_setaffinity"):
         yield
         return
@@ -145,9 +148,9 @@ def _one_core() -> Iterator[None]:
 def _compare_with_mujoco(
     case: str, bench: str, model: Model, robots: list[RobotSpec], steps: int
 ) -> Iterator[Measurement]:
-    """Step the same scene here and in MuJoCo, in turns of ``steps``, by processor time.
+    """Step the same scene here and in MuJoCo, in turns of ``steps`` steps, and compare processor times.
 
-    Contacts are counted after all turns: to count them takes longer than a step.
+    Contacts are counted after all turns: counting takes longer than a step.
     """
     reference = MujocoScene(model, robots)
     physics = Physics(model)
@@ -176,7 +179,7 @@ def _compare_with_mujoco(
 
 
 def _pressing(physics: Physics) -> int:
-    """Number of contacts with plants that press."""
+    """Returns the number of contacts with plants whose force is not zero."""
     solver = physics.contact_solver
     return int(np.count_nonzero(solver.impulses.rows.impulse[: 3 * solver.count : 3]))
 

@@ -1,8 +1,8 @@
-"""A stock node that sends trajectory goals to a robot: random ones, some cancelled, some preempted; and judges them.
+"""A stock ROS node that sends random trajectory goals to a robot, cancels some, preempts some, and checks the results.
 
 ``python -m vinesim.bench.goal_sender --goals 50 --cancels 10 --preempts 10`` waits for the controllers of vinebot,
-sends one goal after the other, and prints a JSON object for each and one at the end. It knows the robot by
-/robot_description and /joint_states alone.
+sends one goal after the other, and prints a JSON object for each goal and one at the end. All it knows about the robot
+comes from /robot_description and /joint_states.
 """
 
 from __future__ import annotations
@@ -29,32 +29,32 @@ from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
 TIMEOUT = 120.0
-"""Longest wait for anything [s]."""
+"""Time limit of each wait [s]."""
 CONTROLLERS = {
     "head_controller": "head_",
     "torso_controller": "torso_",
     "arm_left_controller": "arm_left_",
     "arm_right_controller": "arm_right_",
 }
-"""Trajectory controllers of vinebot, and the beginning of the names of their joints."""
+"""Trajectory controllers of vinebot, with the prefix of the names of their joints."""
 REACH = 0.3
-"""Largest distance of targets from where the joints were in the beginning [rad, m]."""
+"""Largest distance of a joint's targets from its position at the beginning [rad, m]."""
 SPEED_SHARE = 0.4
-"""Fastest motion as a share of the joints' limits."""
+"""Largest speed in a goal, as a share of the joints' limits."""
 TOLERANCE = 0.01
 """Tolerance of the goals for each joint [rad, m]."""
 DELAY = 0.8
 """Time from the sending of a goal to the start of its trajectory [s]."""
 FORGOTTEN = 60.0
-"""[s] A goal that a server still knows so long after its end is kept for good.
+"""Time after the end of a goal [s]. If a server still knows the goal then, it counts as never forgotten.
 
-A server keeps a result for 10 s and, like any of rcl_action, forgets it within 20: whenever a goal ends, the timer
-starts again with the period that it had before.
+An action server keeps a result for 10 s and, like every server of rcl_action, forgets it within 20 s: whenever a goal
+ends, the timer restarts with its previous period.
 """
 PLACE_STEP = 0.001
-"""Time between two points of the splines that are compared with a message [s]."""
+"""Time between two points of the splines to which a message is compared [s]."""
 MOMENT = 0.4
-"""Time after a trajectory's start at which it is cancelled or preempted [s]."""
+"""Time after the start of a trajectory at which it is cancelled or preempted [s]."""
 UNKNOWN = 0
 SUCCEEDED = 4
 CANCELED = 5
@@ -69,15 +69,17 @@ class Plan:
     controller: str
     joints: list[str]
     times: np.ndarray
-    """[point] s after the start"""
+    """Times of the waypoints [point] s after the start."""
     positions: np.ndarray
-    """[point, joint]"""
+    """Positions at the waypoints [point, joint] rad, m."""
     velocities: np.ndarray
-    """[point, joint]"""
+    """Velocities at the waypoints [point, joint] rad/s, m/s."""
 
     def at(self, begin: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [time, joint] of the cubic splines at ``times`` [time] s after the start, which is
-        at ``begin`` [joint]."""
+        """Returns positions and velocities [time, joint] of the cubic splines at ``times`` [time] s after the start.
+
+        ``begin``: positions at the start [joint].
+        """
         knots = np.r_[0.0, self.times]
         places = np.vstack([begin, self.positions])
         speeds = np.vstack([0.0 * begin, self.velocities])
@@ -94,9 +96,11 @@ class Plan:
         return position, velocity / h
 
     def velocity_off(self, begin: np.ndarray, position: np.ndarray, velocity: np.ndarray) -> float:
-        """How far a ``velocity`` [joint] is from that of the splines where they have a ``position`` [joint].
+        """Returns how far a ``velocity`` [joint] is from the velocity of the splines at the point where their position
+        is closest to ``position`` [joint].
 
-        By place, not by time: the time of a client that is slower than real time skips ahead, its physics does not.
+        Points are matched by position and not by time: the time of a client that is slower than real time skips ahead,
+        its physics does not.
         """
         places, velocities = self.at(begin, np.arange(0.0, self.times[-1] + 0.5 * PLACE_STEP, PLACE_STEP))
         away = np.abs(places - position).max(1)
@@ -105,7 +109,8 @@ class Plan:
 
 
 def plan(random: np.random.Generator, controller: str, joints: dict[str, Joint], start: np.ndarray) -> Plan:
-    """A random goal with one to three waypoints, from ``start`` [joint]; at its last waypoint it stands."""
+    """Returns a random goal with one to three waypoints, from ``start`` [joint]; its velocity is zero at the last
+    waypoint."""
     own = list(joints.values())
     count = int(random.integers(1, 4))
     lower, upper = (np.array([getattr(one, side) for one in own]) for side in ("lower", "upper"))
@@ -132,7 +137,7 @@ class Joint:
 
 
 class GoalSender:
-    """The node: it receives the robot's state and sends goals to its trajectory controllers."""
+    """Node that receives the robot's state and sends goals to its trajectory controllers."""
 
     def __init__(self) -> None:
         from control_msgs.action import FollowJointTrajectory
@@ -159,7 +164,8 @@ class GoalSender:
         self.feedback: list[Any] = []
 
     def _found_joints(self) -> bool:
-        """Whether each controller has joints; the description of another robot has none of them."""
+        """Returns whether each controller has joints. The description of another robot than vinebot has none of these
+        joints."""
         self.joints = {name: self._joints(start) for name, start in CONTROLLERS.items()}
         return all(self.joints.values())
 
@@ -185,11 +191,12 @@ class GoalSender:
         self.stamp = message.clock.sec + 1e-9 * message.clock.nanosec
 
     def positions(self, joints: list[str]) -> np.ndarray:
-        """[joint] The newest positions."""
+        """Returns the newest positions of ``joints`` [joint] rad, m."""
         return self.history[-1][1][[self.names.index(name) for name in joints]]
 
     def until(self, done: Callable[[], object], what: str) -> None:
-        """Take messages until ``done()``; RuntimeError after :data:`TIMEOUT`."""
+        """Process messages until ``done()`` is true. Raises RuntimeError after :data:`TIMEOUT`, with ``what`` was
+        awaited."""
         end = time.monotonic() + TIMEOUT
         while not done():
             rclpy.spin_once(self.node, timeout_sec=0.1)
@@ -197,13 +204,13 @@ class GoalSender:
                 raise RuntimeError(f"waited {TIMEOUT:.0f} s in vain for {what}")
 
     def wait(self, seconds: float) -> None:
-        """Wait in the robot's time [s], until its joint states have come so far as well."""
+        """Wait for ``seconds`` [s] of the robot's time, until its joint states have reached that time as well."""
         end = self.now() + seconds
         self.until(lambda: self.stamp >= end and self.history[-1][0] >= end, "the robot's time")
 
     def now(self) -> float:
-        """Time of the robot's world [s], from a message of /clock that arrives from now on."""
-        for _ in range(2):  # one may have waited
+        """Wait for a new message of /clock and return its time [s]."""
+        for _ in range(2):  # one message may have been waiting
             before = self.stamp
             self.until(lambda before=before: self.stamp != before, "the robot's time")
         return self.stamp
@@ -234,7 +241,7 @@ class GoalSender:
         return handle, begin
 
     def result(self, handle: Any) -> tuple[int, int, str]:
-        """Status, error code and text of a goal that has ended."""
+        """Wait for the result of a goal; return its status, error code and text."""
         future = handle.get_result_async()
         self.until(future.done, "a result")
         answer = future.result()
@@ -242,9 +249,9 @@ class GoalSender:
 
 
 def wait_until_forgotten(status: Callable[[Any], int], handles: list[Any], longest: float) -> tuple[int, float]:
-    """Ask for the ``status`` of goals that have ended until none is known, for ``longest`` [s] at most.
+    """Poll the ``status`` of ended goals until the server knows none of them, for at most ``longest`` [s].
 
-    The number that still are, and the time that it took [s].
+    Returns the number of goals that are still known, and the time that passed [s].
     """
     begin = time.monotonic()
     while handles := [handle for handle in handles if status(handle) != UNKNOWN]:
@@ -255,12 +262,13 @@ def wait_until_forgotten(status: Callable[[Any], int], handles: list[Any], longe
 
 
 def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, int, str]) -> dict[str, Any]:
-    """Whether a goal that ran to its end did what it says."""
+    """Check a goal that ran to its end: whether it succeeded, and how far positions and velocities are from it."""
     columns = [sender.names.index(name) for name in one.joints]
-    sender.wait(0.2)  # on a busy machine a result comes before the joint states of up to a second
+    sender.wait(0.2)  # on a busy machine a result comes up to a second before the joint states
     wanted = 0.0
     measured = 0.0
-    first = sender.history[0][1][columns]  # it stood there; the first feedback may be missing on a busy machine
+    # the robot stood at the start; the first feedback may be missing on a busy machine
+    first = sender.history[0][1][columns]
     for told in sender.feedback:
         desired = np.array(told.desired.positions)
         speed = np.array(told.desired.velocities)
@@ -285,7 +293,7 @@ def judge_goal(sender: GoalSender, one: Plan, begin: float, status: tuple[int, i
 
 
 def cancel(sender: GoalSender, one: Plan) -> tuple[dict[str, Any], list[Any]]:
-    """Cancel a goal on its way; the joints stop."""
+    """Send a goal and cancel it while it moves; check that the joints stop. Returns the row and the goal handles."""
     slow = dataclasses.replace(one, times=one.times * 3.0 / one.times[-1], velocities=0.0 * one.velocities)
     handle, _ = sender.send(slow)
     sender.wait(DELAY + MOMENT)
@@ -302,7 +310,8 @@ def cancel(sender: GoalSender, one: Plan) -> tuple[dict[str, Any], list[Any]]:
 
 
 def preempt(sender: GoalSender, one: Plan, newer: Plan) -> tuple[dict[str, Any], list[Any]]:
-    """Send a newer goal while one is on its way: the older is aborted, the newer reached."""
+    """Send a goal, and ``newer`` while the first one moves; check that the older is aborted and the newer succeeds.
+    Returns the row and the goal handles."""
     slow = dataclasses.replace(one, times=one.times * 3.0 / one.times[-1], velocities=0.0 * one.velocities)
     first, _ = sender.send(slow)
     sender.wait(DELAY + MOMENT)
@@ -318,7 +327,7 @@ def preempt(sender: GoalSender, one: Plan, newer: Plan) -> tuple[dict[str, Any],
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Send the goals; 0 if all could be sent."""
+    """Send the goals and print the results. Returns 0 if all goals could be sent."""
     parser = argparse.ArgumentParser(prog="python -m vinesim.bench.goal_sender", description="Send goals to a robot.")
     for kind, count in (("goals", 50), ("cancels", 10), ("preempts", 10), ("seed", 1)):
         parser.add_argument(f"--{kind}", type=int, default=count)

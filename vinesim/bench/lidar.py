@@ -1,7 +1,7 @@
-"""``vinesim bench lidar``: rays of a revolution compared with Open3D's ray caster (Embree), with plants at rest and
+"""``vinesim bench lidar``: rays of one revolution compared with Open3D's ray caster (Embree), with plants at rest and
 moving.
 
-The scene and the way of measuring are those of ``vinesim bench camera``.
+The scene and the method are the same as in ``vinesim bench camera``.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from vinesim.sensors.primitives.ray_caster import RayCaster
 from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 _STAND = np.array([3.7, 1.25, 1.0, 0.0, 0.0, 0.0, 1.0])
-"""Between two rows, level."""
+"""Pose [7] of the level lidar between two rows."""
 
 
 def _grid(spec: LidarSpec) -> LidarRasterizer:
-    """The rays of one revolution."""
+    """Returns a rasteriser for the rays of one revolution."""
     turn = -2.0 * np.pi * spec.rate.value
     lasers = np.arange(len(spec.elevation.value))
     columns = round(1.0 / (spec.rate.value * spec.firing_period.value))
@@ -38,7 +38,7 @@ def _grid(spec: LidarSpec) -> LidarRasterizer:
 
 
 def lidar() -> Iterator[Measurement]:
-    """Distances and primitives of all rays, the whole scan, and both while twenty trees move."""
+    """Measure distances and primitives of all rays, the whole scan, and rays while twenty trees move."""
     model, primitives = demo_scene()
     spec = LidarSpec.load("vlp16")
     head = _grid(spec)

@@ -1,6 +1,6 @@
-"""``vinesim bench live``: the programs as their users start them, each figure with its budget, in one run.
+"""``vinesim bench live``: measures programs started as users start them, in one run, each figure against its budget.
 
-Clients, demo and commands are real processes on this machine; a stock ROS node counts pictures and small topics.
+Clients, demo and commands are real processes on this machine; a stock ROS node counts pictures and small messages.
 """
 
 from __future__ import annotations
@@ -18,40 +18,40 @@ from vinesim.bench.live_client import CLOCK, DEPTH, LIDAR, RGB, LiveRun, own_pro
 from vinesim.scene.values import Measurement
 
 RUN_TIME = 20.0
-"""Measured time of a client or a demo [s]."""
+"""Duration of the measurement of a client or a demo [s]."""
 COMMAND_TIMEOUT = 600.0
-"""Longest time of a command that is waited for [s]."""
+"""Time limit for one command [s]."""
 SMALL_TOPICS = ("/clock", "/joint_states", "/tf")
 GENERATE = (
     "import sys, time; from vinesim.scene.generation.vineyard import generate; "
     "from vinesim.scene.spec import load_scene; scene = load_scene(sys.argv[1]); "
     "start = time.perf_counter(); generate(scene); print(time.perf_counter() - start)"
 )
-"""A program that prints how long a scene takes to generate [s]."""
+"""Python program that prints the time that the generation of a scene takes [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """One group of figures that one run of programs gives."""
+    """Figures that are measured together, in one run of programs."""
 
     about: str
     seconds: float
-    """Duration of the measurement on two cores [s]."""
+    """Typical duration of the row on two cores [s]."""
     measure: Callable[[], Iterator[Measurement]]
 
 
 def at_most(case: str, value: float, unit: str, budget: float) -> Measurement:
-    """A figure that is the better the smaller it is; its ratio is 1 or more if it keeps the budget."""
+    """Returns a measurement whose value should be at most ``budget``; its ratio is 1 or more if it is."""
     return Measurement("live", case, value, unit, "budget, at most", budget, budget / value if value > 0.0 else None)
 
 
 def at_least(case: str, value: float, unit: str, budget: float) -> Measurement:
-    """A figure that is the better the larger it is; its ratio is 1 or more if it keeps the budget."""
+    """Returns a measurement whose value should be at least ``budget``; its ratio is 1 or more if it is."""
     return Measurement("live", case, value, unit, "budget, at least", budget, value / budget)
 
 
 def measure_demo() -> Iterator[Measurement]:
-    """``vinesim demo``: server, two clients with their sensors, and a listener."""
+    """Measure ``vinesim demo``: a server, two clients with their sensors, and a listener."""
     with tempfile.TemporaryDirectory() as folder:
         run_command("demo", "--headless", "--seconds", str(RUN_TIME), "--out", folder)
         summary = json.loads((pathlib.Path(folder) / "summary.json").read_text())
@@ -72,14 +72,14 @@ def measure_demo() -> Iterator[Measurement]:
 
 
 def measure_camera() -> Iterator[Measurement]:
-    """A client alone, with a subscriber to its pictures; kernels and models are cached."""
+    """Measure a client alone whose pictures have a subscriber; kernels and models are cached."""
     run = run_client((), (CLOCK, RGB, DEPTH), RUN_TIME)
     yield at_most("client: from start to first picture, warm", max(run.first[RGB], run.first[DEPTH]), "s", 3.0)
     yield from _client_rows("client, camera", run, camera=15.0)
 
 
 def measure_lidar() -> Iterator[Measurement]:
-    """As :func:`measure_camera`, with the lidar."""
+    """Measure a client alone whose pictures and scans have subscribers; kernels and models are cached."""
     run = run_client((), (CLOCK, RGB, DEPTH, LIDAR), RUN_TIME)
     yield from _client_rows("client, camera and lidar", run, camera=10.0)
     yield at_least("client, camera and lidar: /lidar/points", _hz(run.topics, LIDAR), "Hz", 9.8)
@@ -87,14 +87,14 @@ def measure_lidar() -> Iterator[Measurement]:
 
 
 def measure_cold() -> Iterator[Measurement]:
-    """A client on a machine that has run none before: kernels are compiled, caches are empty."""
+    """Measure a client on a machine that has never run one: kernels are compiled, caches are empty."""
     with tempfile.TemporaryDirectory() as cache:
         run = run_client((), (RGB, DEPTH), 1.0, WARP_CACHE_PATH=cache, VINESIM_CACHE=cache)
     yield at_most("client: from start to first picture, cold", max(run.first[RGB], run.first[DEPTH]), "s", 30.0)
 
 
 def measure_tendone() -> Iterator[Measurement]:
-    """The largest vineyard that ships."""
+    """Measure a client alone in ``tendone``, the largest shipped vineyard."""
     run = run_client(("--scene", "tendone"), (CLOCK, RGB, DEPTH), RUN_TIME)
     yield at_most("tendone: from start to first picture", max(run.first[RGB], run.first[DEPTH]), "s", 10.0)
     yield at_most("tendone: tick, p50", run.loop["tick_p50_ms"], "ms", 2.0)
@@ -104,14 +104,14 @@ def measure_tendone() -> Iterator[Measurement]:
 
 
 def measure_start() -> Iterator[Measurement]:
-    """``vinesim render`` with and without ``--path``, and the parts of a start, warm."""
+    """Measure ``vinesim render`` with and without ``--path``, and the parts of a start, with warm caches."""
     from vinesim.bench.start import start_measurements
 
     return start_measurements()
 
 
 def measure_generation() -> Iterator[Measurement]:
-    """Scenes generated by a new process, then by another one."""
+    """Measure the generation of scenes in one process, and their loading from the cache in another."""
     for scene, fresh, cached in (("demo", 0.3, 0.1), ("tendone", 2.0, 0.5)):
         with tempfile.TemporaryDirectory() as cache:
             for case, budget in (("generate", fresh), ("generate, cached", cached)):
@@ -122,7 +122,7 @@ def measure_generation() -> Iterator[Measurement]:
 
 
 def measure_tick() -> Iterator[Measurement]:
-    """Whole ticks of clients, paced and back to back."""
+    """Measure whole ticks of clients, paced and back to back."""
     from vinesim.bench.client_tick import client_measurements
 
     return client_measurements()
@@ -142,9 +142,10 @@ ROWS = {
 
 
 def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measurement]:
-    """The named rows of :data:`ROWS`, all if none are named; ``announce`` takes a line for each as it begins.
+    """Measure the named rows of :data:`ROWS`, or all of them. ``announce`` is called with a line of text before each
+    row.
 
-    A row that fails raises :class:`ProcessFailed` or :class:`RosMissing`.
+    Raises :class:`ProcessFailed` or :class:`RosMissing` if a row fails.
     """
     chosen = [name for name in ROWS if not rows or name in rows]
     left = sum(ROWS[name].seconds for name in chosen)
@@ -156,7 +157,8 @@ def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measu
 
 
 def run_command(*arguments: str) -> float:
-    """How long ``vinesim ARGUMENTS`` takes [s]; :class:`ProcessFailed` unless it ends with 0."""
+    """Returns the time that ``vinesim ARGUMENTS`` takes [s]. Raises :class:`ProcessFailed` unless it ends with exit
+    code 0."""
     with own_processes() as group:
         process = group.start(f"vinesim {arguments[0]}", "-m", "vinesim", *arguments)
         start = time.perf_counter()
@@ -170,7 +172,8 @@ def run_command(*arguments: str) -> float:
 
 
 def _client_rows(case: str, run: LiveRun, camera: float) -> Iterator[Measurement]:
-    """Rates and ages of pictures, whose rate must be at least ``camera`` [Hz], and the tick at the same time."""
+    """Yields rates and ages of pictures, whose rate should be at least ``camera`` [Hz], and the tick of the same
+    client."""
     for topic in (RGB, DEPTH):
         yield at_least(f"{case}: {topic}", _hz(run.topics, topic), "Hz", camera)
         yield from _age_rows(f"{case}: {topic}", run.topics[topic])
@@ -180,7 +183,8 @@ def _client_rows(case: str, run: LiveRun, camera: float) -> Iterator[Measurement
 
 
 def _age_rows(case: str, topic: dict[str, Any], budget: float | None = 100.0) -> Iterator[Measurement]:
-    """Age at arrival: simulated time since the stamp, by /clock. A scan is stamped when its revolution begins."""
+    """Yields the age of messages at arrival: simulated time on /clock since their stamp. A scan is stamped when its
+    revolution begins."""
     age = topic["age_ms"]
     if age is not None:
         median = f"{case}, age at arrival, p50"

@@ -1,5 +1,5 @@
-"""One client as its users start it, and a stock ROS node that measures when, how often and how late its messages
-come."""
+"""One client as users start it, and a stock ROS node that measures when, how often and how late the client's messages
+arrive."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from vinesim.client.rate_loop import TickLog
 from vinesim.ros import middleware
 
 POLL_PERIOD = 0.02
-"""Wall time between two looks for first messages [s]."""
+"""Wall time between two checks for first messages [s]."""
 RGB = "/head_front_camera/rgb/image_raw"
 DEPTH = "/head_front_camera/depth/image_raw"
 LIDAR = "/lidar/points"
-"""Sensor topics of vinebot."""
+"""Topic of vinebot's lidar; ``RGB`` and ``DEPTH`` are topics of its front camera."""
 CLOCK = "/clock"
 
 
 class RosMissing(RuntimeError):
-    """The measurement needs ROS 2; the text says why it cannot be used."""
+    """The measurement needs ROS 2; the text explains why ROS 2 cannot be used."""
 
     exit_code = 3
 
@@ -38,28 +38,30 @@ class LiveRun:
     """Measurements of a client."""
 
     first: dict[str, float]
-    """Time from its start to the first message of each topic [s]."""
+    """Time from the client's start to the first message of each topic [s]."""
     topics: TopicReport
-    """Statistics of each topic, from the time at which all had a message."""
+    """Statistics of each topic, from the time at which all topics had a message."""
     loop: dict[str, float]
-    """Rate and work of its ticks in the same span of time: see :meth:`TickLog.between`."""
+    """Rate and work of the client's ticks in the same time as ``topics``: see :meth:`TickLog.between`."""
     status: dict[str, Any]
-    """Its last status line."""
+    """The client's last status line."""
 
 
 @contextlib.contextmanager
 def own_processes(**environ: str) -> Iterator[ProcessGroup]:
-    """Processes in a ROS domain of their own, unless the user has chosen one; each may end its own children first."""
+    """Yields a group for processes in a ROS domain of their own, unless the user has set one. When the context ends,
+    each process gets time to end its own children."""
     domain = {} if "ROS_DOMAIN_ID" in os.environ else {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
     with process_group(3.0 * EXIT_TIMEOUT, **domain, **environ) as group:
         yield group
 
 
 def run_client(options: Sequence[str], topics: Sequence[str], seconds: float, **environ: str) -> LiveRun:
-    """Start ``vinesim client OPTIONS``, subscribe to ``topics``, and measure for ``seconds`` once all have come.
+    """Start ``vinesim client OPTIONS``, subscribe to ``topics``, and measure for ``seconds`` once all topics have a
+    message.
 
-    ``environ`` is added to its environment. :class:`RosMissing`, or :class:`ProcessFailed` if the client ends or a
-    topic stays silent.
+    ``environ`` is added to the client's environment. Raises :class:`RosMissing`, or :class:`ProcessFailed` if the
+    client ends or a topic stays silent.
     """
     if (reason := middleware.unavailable_reason()) is not None:
         raise RosMissing(reason)

@@ -22,10 +22,10 @@ from vinesim.scene.values import RobotSpec
 
 
 def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None = None) -> mujoco.MjModel:
-    """All trees of ``model`` as ball-joint chains under ``integrator="discrete"``, contacts off.
+    """Returns all trees of ``model`` as chains of ball joints under ``integrator="discrete"``, without contacts.
 
-    ``damping`` [body] N m s/rad replaces the model's: our solver subtracts the damping that its scheme adds, MuJoCo
-    does not.
+    ``damping`` [body] N m s/rad replaces the model's: vinesim's solver subtracts the damping that its scheme adds,
+    MuJoCo does not.
     """
     spec = mujoco.MjSpec()
     spec.option.timestep = dt
@@ -40,7 +40,7 @@ def compile_plants(model: Model, *, dt: float = 0.01, damping: np.ndarray | None
 def _add_plants(spec: mujoco.MjSpec, model: Model, damping: np.ndarray) -> list[mujoco.MjsBody]:
     """Add all trees to a world; ``damping`` [body] N m s/rad. Returns MuJoCo's bodies, without geoms.
 
-    Berry clusters are bodies of their own, and the body of their bunch is its head.
+    Berry clusters are bodies of their own; the body of their bunch is the upper part of the bunch.
     """
     made: list[mujoco.MjsBody] = []
     mass = model.body_mass.copy()
@@ -80,13 +80,13 @@ PLANT_IMPEDANCE = (0.925, 0.97, 0.001, 0.5, 2)
 
 
 class MujocoScene:
-    """A scene of plants and robots wholly in MuJoCo: one world, ball joints, a capsule or spheres for every body.
+    """A scene of plants and robots entirely in MuJoCo: one world, ball joints, a capsule or spheres for every body.
 
     Bunches that have berry clusters are always fine: each cluster is a body with its own capsule.
 
-    Robots touch plants; plants do not touch each other (in ours they may, so MuJoCo has less to compute). Commands are
-    given to ``rigid``, as to that of a :class:`vinesim.world.Physics`. The scheme of ``discrete`` adds dt K of
-    damping, which is subtracted from the model's, down to zero.
+    Robots touch plants; plants do not touch each other (in vinesim they may, so MuJoCo has less to compute). Commands
+    go to ``rigid``, as in :class:`vinesim.world.Physics`. The scheme of ``discrete`` adds damping of dt K, which is
+    subtracted from the model's damping, down to zero.
 
     ``contact_time_constant`` [s] of every contact (solref); the default of MuJoCo, 0.02, is soft: at 3 m/s bodies
     overlap by centimetres.
@@ -141,19 +141,19 @@ class MujocoScene:
         self.data = data
 
     def step(self) -> None:
-        """One step of the whole scene."""
+        """Advance the whole scene by one step."""
         self.rigid.apply_controls()
         mujoco.mj_step(self.world, self.data)
         self.rigid.invalidate_kinematics()
 
     def body_pose(self, body: int) -> np.ndarray:
-        """Pose [7] of a plant's body after the last step."""
+        """Returns the pose [7] of a plant's body after the last step."""
         self.rigid.update_kinematics()
         there = self.data.body(f"plant/{body}")
         return np.concatenate([there.xpos, frames.from_wxyz(there.xquat)])
 
     def contact_force_on(self, link: str) -> np.ndarray:
-        """[3] N of all contacts on the robot link of this name in the last step."""
+        """Returns the force [3] N of all contacts on the robot link of this name in the last step."""
         total = np.zeros(3)
         wrench = np.zeros(6)
         for number in range(self.data.ncon):
@@ -167,13 +167,13 @@ class MujocoScene:
         return total
 
     def plant_contact_count(self) -> int:
-        """Contacts of the last step between plants and robots."""
+        """Returns the number of contacts between plants and robots in the last step."""
         bodies = self.world.geom_bodyid[self.data.contact.geom]
         is_plant = np.array([self.world.body(i).name.startswith("plant/") for i in range(self.world.nbody)])
         return int((is_plant[bodies].sum(1) == 1).sum())
 
 
 def copy_state_to_mujoco(state: State, data: mujoco.MjData) -> None:
-    """Copy our joints into MuJoCo, whose ball joint rates are in the axes of the moved body."""
+    """Copy joint rotations and rates into MuJoCo, whose ball joint rates are in the axes of the child body."""
     data.qpos[:] = frames.to_wxyz(state.joint_q).ravel()
     data.qvel[:] = frames.rotate(frames.conjugate(state.joint_q), state.joint_qd).ravel()

@@ -1,4 +1,4 @@
-"""Median time of plants without contacts, compared with MuJoCo on the same scene, in one process, in turns.
+"""Median time of a step of plants without contacts, compared with MuJoCo on the same scene, in one process, in turns.
 
 The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch of 0.5 kg on its tip.
 """
@@ -24,7 +24,7 @@ CANE_COUNT = 64
 
 
 def plain_cane(side: float) -> TreeBuilder:
-    """A horizontal cane with a bunch hanging from its tip."""
+    """Returns a horizontal cane at y = ``side`` [m] with a bunch hanging from its tip."""
     tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
     last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), 16)[-1]
     tree.add_body(
@@ -43,12 +43,12 @@ def plain_cane(side: float) -> TreeBuilder:
 
 
 def cane_scene(count: int) -> Model:
-    """Canes half a metre apart."""
+    """Returns a model of ``count`` canes, half a metre apart."""
     return assemble([plain_cane(0.5 * i) for i in range(count)])
 
 
 def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
-    """A solver with its first trees awake and every kernel loaded."""
+    """Returns a solver whose first ``awake`` trees are awake and whose kernels are loaded."""
     plants = ArticulationSolver(model, State.at_rest(model))
     plants.wake(np.arange(awake))
     run_steps(plants, 5)
@@ -56,14 +56,14 @@ def warmed_up_solver(model: Model, awake: int) -> ArticulationSolver:
 
 
 def run_steps(plants: ArticulationSolver, count: int) -> None:
-    """Whole steps without contacts."""
+    """Run ``count`` whole steps without contacts."""
     for _ in range(count):
         plants.predict()
         plants.integrate()
 
 
 def plant_measurements() -> Iterator[Measurement]:
-    """64 canes awake, without contacts, by processor time."""
+    """Measure 64 awake canes without contacts, by processor time."""
     steps = 40
     model = cane_scene(CANE_COUNT)
     plants = warmed_up_solver(model, CANE_COUNT)

@@ -11,12 +11,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 RESOURCE_TRACKER = "resource tracker"
-"""Name of the process by which Python's multiprocessing frees shared memory."""
+"""Name of the process with which Python's multiprocessing frees shared memory."""
 _PROC = pathlib.Path("/proc")
 
 
 class ProcUnavailable(RuntimeError):
-    """The measurement needs /proc of Linux; the text says so."""
+    """The measurement needs /proc of Linux; the text explains this."""
 
     exit_code = 3
 
@@ -28,8 +28,8 @@ class ProcessSample:
     memory: float
     """Proportional set size [MB]: resident memory, where pages that n processes share count 1/n."""
     own: float
-    """Part of the memory that is no copy of a file [MB]: heap, arrays and shared memory. Unlike the proportional set
-    size, it does not grow when another process that has loaded the same libraries ends."""
+    """Part of the memory that is not a copy of a file [MB]: heap, arrays and shared memory. Unlike the proportional set
+    size, this part does not grow when another process that has loaded the same libraries ends."""
     threads: int
     handles: int
     """Number of open file descriptors."""
@@ -44,7 +44,7 @@ class ProcessHistory:
     samples: list[ProcessSample]
 
     def since(self, time: float) -> ProcessHistory:
-        """The samples from ``time`` [s] on."""
+        """Returns the samples from ``time`` [s] on."""
         first = int(np.searchsorted(self.times, time))
         return ProcessHistory(self.times[first:], self.samples[first:])
 
@@ -56,7 +56,8 @@ class ProcessHistory:
         return float(np.polyfit(hours, [sample.own for sample in self.samples], 1)[0])
 
     def change(self, what: str) -> int:
-        """How many more ``threads`` or ``handles`` the second half of the samples holds at most than the first."""
+        """Returns by how much the largest number of ``threads`` or ``handles`` in the second half of the samples
+        exceeds the largest in the first half."""
         middle = len(self.samples) // 2
         halves = self.samples[: max(middle, 1)], self.samples[middle:]
         first, second = (max(getattr(sample, what) for sample in half) for half in halves)
@@ -64,13 +65,13 @@ class ProcessHistory:
 
 
 def check_proc() -> None:
-    """:class:`ProcUnavailable` unless this system counts what :func:`sample_process` reads."""
+    """Raise :class:`ProcUnavailable` unless this system has the files that :func:`sample_process` reads."""
     if not (_PROC / "self" / "smaps_rollup").exists():
         raise ProcUnavailable("memory of processes is read from /proc/PID/smaps_rollup, which only Linux has")
 
 
 def sample_process(pid: int) -> ProcessSample:
-    """A sample of the process; OSError if it has ended."""
+    """Returns a sample of a process. Raises OSError if the process has ended."""
     place = _PROC / str(pid)
     kilobytes: dict[str, int] = {}
     for line in (place / "smaps_rollup").read_text().splitlines()[1:]:
@@ -86,7 +87,7 @@ def sample_process(pid: int) -> ProcessSample:
 
 
 def process_tree(pid: int) -> Iterator[tuple[int, str]]:
-    """Id and name of each descendant of a process; names are those of ``ps -o comm``."""
+    """Yields id and name of each descendant of a process; names are those of ``ps -o comm``."""
     children: list[int] = []
     with contextlib.suppress(OSError):
         for thread in os.listdir(_PROC / str(pid) / "task"):
@@ -123,7 +124,7 @@ class ProcessSampler:
         self._sampled_at = time
         for kind, root in self._roots:
             for name, pid in ((kind, root), *((name, pid) for pid, name in process_tree(root))):
-                with contextlib.suppress(OSError):  # it has ended meanwhile
+                with contextlib.suppress(OSError):  # the process may have ended meanwhile
                     found = sample_process(pid)
                     history = self.histories.setdefault((name, pid), ProcessHistory([], []))
                     history.times.append(time)

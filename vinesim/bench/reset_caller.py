@@ -1,7 +1,8 @@
-"""A stock node that disturbs a robot's world and resets it by simulation_interfaces, again and again, and judges that.
+"""A stock ROS node that disturbs a robot's world and resets it by simulation_interfaces, again and again, and checks
+the result.
 
-``python -m vinesim.bench.reset_caller --resets 20`` prints a JSON object for each reset, and goes on when a line comes
-on its standard input: what it talks to can be measured meanwhile.
+``python -m vinesim.bench.reset_caller --resets 20`` prints a JSON object for each reset, then waits for a line on its
+standard input before it goes on. Meanwhile, the caller can measure the robot client.
 """
 
 from __future__ import annotations
@@ -27,16 +28,16 @@ from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
 TIMEOUT = 180.0
-"""Longest wait for anything [s]."""
+"""Time limit of each wait [s]."""
 SENSORS = {"/head_front_camera/rgb/image_raw": Image, "/lidar/points": PointCloud2}
-"""Topics of vinebot's sensors, which must come back."""
+"""Topics of vinebot's sensors, which must continue after a reset, with their types."""
 ABORTED = 6
 TRAVEL = 0.1
-"""Distance from its start to which the robot is driven before each reset [m]."""
+"""Distance from its start that the robot is driven before each reset [m]."""
 AT_START = 0.02
-"""Largest distance from its start after a reset [m]."""
+"""Largest accepted distance of the robot from its start after a reset [m]."""
 STANDS = 1e-3
-"""Farthest that a robot that has stopped moves between two looks [m]."""
+"""Largest distance that a standing robot moves between two checks [m]."""
 
 
 class ResetCaller:
@@ -48,9 +49,9 @@ class ResetCaller:
 
         self.node = rclpy.create_node("reset_caller")
         self.newest: dict[str, float] = {}
-        """Newest stamp by topic [s]."""
+        """Newest stamp of each topic [s]."""
         self.back = 0
-        """Number of messages whose stamp was older than that of the message before."""
+        """Number of messages whose stamp was older than the stamp of the previous message."""
         for topic, kind in ({"/clock": Clock, "/joint_states": JointState} | SENSORS).items():
             self.node.create_subscription(kind, topic, lambda m, topic=topic: self._take(topic, m), 10)
         self._drive = self.node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 1)
@@ -65,7 +66,8 @@ class ResetCaller:
         self.newest[topic] = seconds
 
     def until(self, done: Callable[[], object], what: str, meanwhile: Callable[[], object] = lambda: None) -> None:
-        """Take messages until ``done()``; RuntimeError after :data:`TIMEOUT`."""
+        """Process messages until ``done()`` is true, and call ``meanwhile()`` between them. Raises RuntimeError after
+        :data:`TIMEOUT`."""
         end = time.monotonic() + TIMEOUT
         while not done():
             rclpy.spin_once(self.node, timeout_sec=0.05)
@@ -74,7 +76,8 @@ class ResetCaller:
                 raise RuntimeError(f"waited {TIMEOUT:.0f} s in vain for {what}")
 
     def call(self, service: str, **fields: Any) -> Any:
-        """The response of a service, by its type and name; RuntimeError unless its result is ok."""
+        """Call a service, given by its type and name, and return its response. Raises RuntimeError unless the result is
+        OK."""
         name = service
         kind = getattr(self._services, "".join(word.capitalize() for word in service.split("_")))
         client = self._clients.get(name) or self._clients.setdefault(name, self.node.create_client(kind, name))
@@ -87,12 +90,12 @@ class ResetCaller:
         return response
 
     def place(self, robot: str) -> np.ndarray:
-        """Position of the robot [2] m."""
+        """Returns the position of the robot [2] m."""
         point = self.call("get_entity_state", entity=robot).state.pose.position
         return np.array([point.x, point.y])
 
     def graph(self) -> dict[str, int]:
-        """Number of nodes, publishers and services of others."""
+        """Returns the numbers of nodes, publishers and services that belong to other nodes."""
         node = self.node
         topics = [name for name, _ in node.get_topic_names_and_types()]
         names = [name for name, _ in node.get_node_names_and_namespaces() if name != node.get_name()]
@@ -104,7 +107,7 @@ class ResetCaller:
         return {"nodes": len(names), "publishers": sum(map(node.count_publishers, topics)), "services": services}
 
     def begin_goal(self) -> Any:
-        """A goal of the head that takes a minute; its handle."""
+        """Send a goal to the head that takes a minute; return its handle."""
         from control_msgs.action import FollowJointTrajectory
 
         point = JointTrajectoryPoint(positions=[0.2, 0.1], time_from_start=Duration(sec=60))
@@ -115,9 +118,10 @@ class ResetCaller:
         return future.result()
 
     def drive_away(self, robot: str, start: np.ndarray) -> None:
-        """Drive until the robot is :data:`TRAVEL` from its start, and stop.
+        """Drive the robot until it is :data:`TRAVEL` away from ``start`` [2] m, and stop it.
 
-        Velocities that still wait in a busy robot's queue would move it after the reset.
+        The stop is repeated until the robot stands: velocities that still wait in a busy robot's queue would move it
+        after the reset.
         """
         message = TwistStamped()
         message.twist.linear.x = 0.3
@@ -132,7 +136,8 @@ class ResetCaller:
 
 
 def disturb_and_reset(caller: ResetCaller, robot: str, start: np.ndarray, entities: list[str]) -> dict[str, Any]:
-    """One row: whether the world is as in the beginning, the goal aborted, the sensors back, and what others have."""
+    """Disturb the world and reset it. Returns one row: whether the world is as in the beginning, whether the goal was
+    aborted, when the sensors continued, and the numbers of other nodes' publishers and services."""
     place = PoseStamped(header=Header(frame_id="map"), pose=Pose(position=Point(x=9.0, y=-3.0)))
     caller.call("spawn_entity", name="crate", uri="vinesim:box", initial_pose=place)
     goal = caller.begin_goal()
@@ -162,7 +167,7 @@ def disturb_and_reset(caller: ResetCaller, robot: str, start: np.ndarray, entiti
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Reset the world a number of times; returns 0 if all resets could be done."""
+    """Reset the world a number of times. Returns 0 if all resets could be done."""
     parser = argparse.ArgumentParser(prog="python -m vinesim.bench.reset_caller", description="Reset a robot's world.")
     parser.add_argument("--resets", type=int, default=20)
     given = parser.parse_args(arguments)
@@ -175,7 +180,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     robots = EntityFilters(categories=[EntityCategory(category=EntityCategory.CATEGORY_ROBOT)])
     robot = caller.call("get_entities", filters=robots).entities[0]
-    caller.call("reset_simulation")  # wherever others have driven it
+    caller.call("reset_simulation")  # others may have driven the robot anywhere
     entities = sorted(caller.call("get_entities").entities)
     start = caller.place(robot)
     for _ in range(given.resets):

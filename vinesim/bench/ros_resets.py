@@ -1,4 +1,5 @@
-"""Resets of a real robot client by simulation_interfaces from another process: right, and nothing is left behind."""
+"""Resets of a real robot client by simulation_interfaces from another process: checks the world after each reset, and
+that no threads, files or memory accumulate."""
 
 from __future__ import annotations
 
@@ -14,14 +15,14 @@ from vinesim.scene.values import Measurement
 
 RESETS = 20
 RESET_TIMEOUT = 300.0
-"""Longest time of one reset with all before and after [s]."""
+"""Time limit of one reset, with all that happens before and after it [s]."""
 GROWTH = 0.5
-"""Greatest growth of a process by one reset [MB]; what a new physics replaces is 20 MB and more."""
+"""Largest accepted growth of a process by one reset [MB]. A leaked physics would be 20 MB or more."""
 GRAPH = ("nodes", "publishers", "services")
 
 
 def measure_resets(group: ProcessGroup, resets: int = RESETS, *options: str) -> Iterator[Measurement]:
-    """Rows of a number of resets of a client that is started with these further options."""
+    """Measure ``resets`` resets of a client that is started with ``options``."""
     client = group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
     caller = group.start("reset caller", "-m", "vinesim.bench.reset_caller", "--resets", str(resets))
     sampler = ProcessSampler([("client", client.child.pid)])
@@ -38,7 +39,8 @@ def measure_resets(group: ProcessGroup, resets: int = RESETS, *options: str) -> 
 
 
 def reset_rows(rows: Sequence[dict[str, Any]], histories: dict[str, ProcessHistory]) -> Iterator[Measurement]:
-    """Evaluation of what :mod:`vinesim.bench.reset_caller` printed, and of samples of processes after each reset."""
+    """Yields the rows for the output of :mod:`vinesim.bench.reset_caller`, and for samples of processes after each
+    reset."""
     count = len(rows)
     right = sum(row["right"] for row in rows)
     yield Measurement(
@@ -72,11 +74,13 @@ def reset_rows(rows: Sequence[dict[str, Any]], histories: dict[str, ProcessHisto
 
 
 def growth_by_reset(history: ProcessHistory) -> float:
-    """Slope of the own memory by least squares over all resets but the first quarter [MB]."""
+    """Returns the slope of the process's own memory by least squares, over all resets but the first quarter [MB a
+    reset]."""
     later = history.since(0.25 * len(history.times))
-    return 0.0 if len(later.times) < 2 else later.growth() / 3600.0  # its times are numbers of resets, not seconds
+    # the history's times are numbers of resets, not seconds
+    return 0.0 if len(later.times) < 2 else later.growth() / 3600.0
 
 
 def at_most_none(case: str, value: float, unit: str) -> Measurement:
-    """A row for a count that must be 0."""
+    """Returns a row for a count that must be 0."""
     return Measurement("ros", case, value, unit, "bar, at most", 0.0, None)

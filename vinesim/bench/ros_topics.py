@@ -1,7 +1,8 @@
-"""``vinesim bench ros``: topics of a real robot client as another process receives them, its actions and resets.
+"""``vinesim bench ros``: topics of a real robot client as another process receives them, its actions and its resets.
 
-A client as its users start it, physics and renderer included; a stock node in a second process that subscribes to the
-topics of every step; and a third that reads them too, pictures and clouds besides, until it is stopped with SIGSTOP.
+Three processes run: a client as users start it, with physics and renderer; a stock node that subscribes to the topics
+of every step; and a third one that subscribes to the same topics and to pictures and clouds, until it is stopped with
+SIGSTOP.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from vinesim.ros import middleware
 from vinesim.scene.values import Measurement
 
 PERIOD = 0.01
-"""Period of the measured topics, and the delay after which a message is late [s]."""
+"""Period of the measured topics; a message with a longer delay counts as late [s]."""
 TOPICS = (
     CLOCK,
     "/joint_states",
@@ -41,27 +42,28 @@ TOPICS = (
 )
 """Topics that vinebot publishes in every step."""
 JOINTS = 21
-"""Number of joints in a message of the stock publisher; vinebot has as many."""
+"""Number of joints in a message of the stock publisher, the same as of vinebot."""
 WINDOW = 20.0
-"""Measured time before and after the other subscriber is stopped [s]."""
+"""Duration of the measurement before the third process is stopped, and again afterwards [s]."""
 SETTLING = 3.0
-"""Time from the first messages to the measured time, and again after the stop [s]."""
+"""Time from the first messages to the measurement, and again after the stop [s]."""
 POLL_PERIOD = 0.05
 ON_TIME = 98.0
 LATENCY = 10.0
-"""Least share of messages on time [%] and greatest 99th percentile of the time from one process to the other [ms]."""
+"""Largest accepted 99th percentile of the time from publisher to subscriber [ms]. ``ON_TIME`` is the smallest accepted
+share of messages on time [%]."""
 GOALS = 50
 CANCELS = 10
 PREEMPTS = 10
 ACTION_TIMEOUT = 180.0
-"""Longest time of one goal [s]."""
+"""Time limit of one goal [s]."""
 GOAL_TOLERANCE = 0.01
-"""Tolerance of the goals [rad, m]."""
+"""Largest accepted distance of a joint from its goal [rad, m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Arrivals:
-    """The messages of one topic as a subscriber received them, each [message] int64."""
+    """Messages of one topic as a subscriber received them; each array is [message] int64."""
 
     arrival: np.ndarray
     """[ns] Time of arrival since the epoch."""
@@ -73,7 +75,7 @@ class Arrivals:
     """The publisher's count of its messages, from 1 on."""
 
     def between(self, since: float, until: float) -> Arrivals:
-        """The messages that arrived in a span of time [s since the epoch]."""
+        """Returns the messages that arrived in a span of time [s since the epoch]."""
         part = slice(*np.searchsorted(self.arrival, (round(since * 1e9), round(until * 1e9))))
         return Arrivals(self.arrival[part], self.sent[part], self.stamp[part], self.number[part])
 
@@ -84,15 +86,16 @@ class Arrivals:
 
 
 def load_arrivals(path: pathlib.Path) -> dict[str, Arrivals]:
-    """The arrivals that ``topic_monitor --arrivals`` wrote, by topic."""
+    """Returns the arrivals that ``topic_monitor --arrivals`` wrote, by topic."""
     with np.load(path) as archive:
         return {topic: Arrivals(*archive[topic].T) for topic in archive.files}
 
 
 def delay_ms(messages: Arrivals, clock: Arrivals, memory: int = 100) -> np.ndarray:
-    """[message] ms from when each was due until it arrived.
+    """Returns the delay of each message from the time at which it was due until it arrived [message] ms.
 
-    Due is its stamp, where the quickest of the last ``memory`` messages of ``clock`` counts as undelayed.
+    A message is due at its stamp. The offset between stamps and wall time is that of the fastest of the last ``memory``
+    messages of ``clock``, which counts as undelayed.
     """
     offsets = (clock.arrival - clock.stamp).astype(float)
     padded = np.r_[np.full(memory - 1, np.inf), offsets]
@@ -102,12 +105,13 @@ def delay_ms(messages: Arrivals, clock: Arrivals, memory: int = 100) -> np.ndarr
 
 
 def share_on_time(delays: np.ndarray, seconds: float) -> float:
-    """Percentage of the messages due in a time of ``seconds`` [s] that came within a period; at most 100."""
+    """Returns the percentage of the messages due in ``seconds`` [s] that arrived within one period of their stamp; at
+    most 100."""
     return min(100.0, 100.0 * np.count_nonzero(delays <= 1e3 * PERIOD) / round(seconds / PERIOD))
 
 
 def topic_rows(case: str, heard: Mapping[str, Arrivals], since: float, until: float) -> Iterator[Measurement]:
-    """Timeliness of every topic in a span of time [s since the epoch]."""
+    """Yields the timeliness of every topic in a span of time [s since the epoch]."""
     latencies = []
     lost = 0
     for topic in TOPICS:
@@ -140,7 +144,8 @@ def topic_rows(case: str, heard: Mapping[str, Arrivals], since: float, until: fl
 
 
 def loss_rows(heard: Mapping[str, Arrivals], published: Mapping[str, int], dropped: int) -> Iterator[Measurement]:
-    """Every message of the publisher's own count, over the whole run: received, missed, or sent before or after."""
+    """Yields rows that account for every message of the publisher's own count over the whole run: received, lost, or
+    sent before the subscription or after the last received message."""
     received = sum(len(heard[topic].number) for topic in TOPICS)
     lost = sum(heard[topic].lost for topic in TOPICS)
     before = sum(int(heard[topic].number[0]) - 1 for topic in TOPICS)
@@ -156,7 +161,7 @@ def loss_rows(heard: Mapping[str, Arrivals], published: Mapping[str, int], dropp
 
 
 def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
-    """Counts and greatest errors of what :mod:`vinesim.bench.goal_sender` printed."""
+    """Yields counts and largest errors of the results that :mod:`vinesim.bench.goal_sender` printed."""
     kinds = {kind: [row for row in rows if row["kind"] == kind] for kind in ("goal", "cancel", "preempt", "end")}
     for kind, name in (("goal", "goals"), ("cancel", "cancels"), ("preempt", "preempts")):
         right = sum(row["right"] for row in kinds[kind])
@@ -189,7 +194,8 @@ def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
 
 
 def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Measurement]:
-    """All rows; ``window`` [s] is measured twice. :class:`RosMissing` or :class:`ProcessFailed` if that fails."""
+    """Measure topics, actions and resets; topics are measured twice for ``window`` [s]. Raises :class:`RosMissing` or
+    :class:`ProcessFailed` if that fails."""
     if (reason := middleware.unavailable_reason()) is not None:
         raise RosMissing(reason)
     with own_processes() as group, tempfile.TemporaryDirectory() as name:
@@ -203,7 +209,7 @@ def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Mea
 
 
 def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
-    """Measure topics next to a subscriber that reads, then next to one that has stopped reading."""
+    """Measure topics while a third process reads them, then after that process has stopped reading."""
     arrivals = folder / "arrivals.npz"
     log = folder / "ticks.npz"
     listener = RosListener(group, (*TOPICS, stock_publisher.TOPIC), arrivals=arrivals)
@@ -226,7 +232,7 @@ def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) ->
         os.kill(other.pid, signal.SIGCONT)
     stock.finish()
     client.finish()
-    time.sleep(1.0)  # what was sent last is on its way
+    time.sleep(1.0)  # the newest messages are on their way
     listener.stop()
     listener.report()
     other.stop()
@@ -244,7 +250,7 @@ def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) ->
 
 
 def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
-    """Goals of a stock action client in a process of its own."""
+    """Measure goals of a stock action client that runs in a process of its own."""
     client = _start_client(group)
     sender = group.start(
         "goal sender",
@@ -270,7 +276,8 @@ def _start_client(group: ProcessGroup, *options: str) -> Process:
 
 
 def _rest(client: Process, settling: float, window: float) -> tuple[float, float, float]:
-    """Wait; wall times between which to measure [s since the epoch], and the monotonic time of the first [s]."""
+    """Wait for ``settling`` and ``window`` [s]. Returns begin and end of the window as wall times [s since the epoch],
+    and its begin on the monotonic clock [s]."""
     time.sleep(settling)
     since = time.time()
     begin = time.monotonic()
@@ -281,10 +288,10 @@ def _rest(client: Process, settling: float, window: float) -> tuple[float, float
 
 
 def at_most(case: str, value: float, unit: str, bar: float) -> Measurement:
-    """A figure that is the better the smaller it is; its ratio is 1 or more if it keeps the bar."""
+    """Returns a row whose value should be at most ``bar``; its ratio is 1 or more if it is."""
     return Measurement("ros", case, value, unit, "bar, at most", bar, bar / value if value > 0.0 else None)
 
 
 def at_least(case: str, value: float, unit: str, bar: float) -> Measurement:
-    """A figure that is the better the larger it is; its ratio is 1 or more if it keeps the bar."""
+    """Returns a row whose value should be at least ``bar``; its ratio is 1 or more if it is."""
     return Measurement("ros", case, value, unit, "bar, at least", bar, value / bar)

@@ -1,7 +1,8 @@
-"""Scenes of the physics benches: rows of canes with bunches, grippers that hold some, a bar that lifts others.
+"""Scenes of the physics benches: rows of canes with bunches, grippers that hold some bunches, a bar that lifts some
+canes.
 
-A cane is a metre of wood, 12 mm thick (5 GPa, 800 kg/m^3) in 16 bodies, level at rest, and on its tip hangs a bunch of
-0.5 kg on a peduncle of 8 cm in two bodies.
+A cane is a metre of wood, 12 mm thick (5 GPa, 800 kg/m^3) in 16 bodies, level at rest. A bunch of 0.5 kg hangs from its
+tip on a peduncle of 8 cm in two bodies.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ SPACING = 0.15
 HEIGHT = 2.0
 """[m] Height of the canes above ground."""
 BUNCH_CENTER = 0.085
-"""[m] Distance from the bunch's stalk to its middle."""
+"""Distance from the upper end of a bunch's stalk to its middle [m]."""
 
 
 def cane_with_bunch(side: float) -> TreeBuilder:
-    """A level cane along x with a bunch hanging from its tip."""
+    """Returns a level cane along x, at y = ``side`` [m], with a bunch hanging from its tip."""
     tree = TreeBuilder(frames.pose(np.array([0.0, side, HEIGHT])))
     last = tree.add_rod(-1, 1.0, (0.006, 0.006), RodMaterial(5e9, 800.0, 0.01, shear_modulus=2.5e9), 16)[-1]
     down = frames.from_x_axis(np.array([0.0, 0.0, -1.0]))
@@ -52,7 +53,8 @@ def cane_with_bunch(side: float) -> TreeBuilder:
 
 
 def cane_row(count: int) -> Model:
-    """Canes side by side, the first at y = 0. All are copies of one, so ten thousand are built in seconds."""
+    """Returns a model of ``count`` canes side by side, the first at y = 0. All are copies of one cane, so ten thousand
+    are built in seconds."""
     one = cane_with_bunch(0.0)
     trees = []
     for i in range(count):
@@ -64,7 +66,7 @@ def cane_row(count: int) -> Model:
 
 
 def bunch_center(cane: int) -> np.ndarray:
-    """Centre [3] m of the bunch of one cane at rest."""
+    """Returns the centre [3] m of the bunch of one cane at rest."""
     return np.array([1.0, SPACING * cane, HEIGHT - 0.08 - BUNCH_CENTER])
 
 
@@ -83,7 +85,7 @@ def _slide(name: str, parent: str, child: str, axis: str, origin: str = "0 0 0")
 
 
 def gripper(name: str, at: np.ndarray) -> RobotSpec:
-    """A gripper with two flat fingers, 17 cm apart about the point ``at`` [3] m.
+    """Returns a gripper with two flat fingers, 17 cm apart around the point ``at`` [3] m.
 
     Drives [m]: lift, and one for each finger (0.05 is a firm grasp).
     """
@@ -105,7 +107,8 @@ def gripper(name: str, at: np.ndarray) -> RobotSpec:
 
 
 def bar(name: str, first: int, count: int) -> RobotSpec:
-    """A bar across ``count`` canes, 3 cm below them and 0.6 m from their clamps; its drive lifts it [m]."""
+    """Returns a bar across ``count`` canes from the cane ``first`` on, 3 cm below them and 0.6 m from their clamps. Its
+    drive lifts the bar [m]."""
     length = SPACING * count
     urdf = (
         f'<robot name="bar"><link name="base_footprint">{_inertial(50.0)}</link><link name="bar">{_inertial(6.0)}'
@@ -118,9 +121,10 @@ def bar(name: str, first: int, count: int) -> RobotSpec:
 
 
 def combs(name: str, bars: int, canes: int) -> RobotSpec:
-    """Bars across the first ``canes``, 0.3 to 0.9 m from their clamps, in turns 2 mm below and 2 mm above them.
+    """Returns a robot of two combs: bars across the first ``canes``, 0.3 to 0.9 m from their clamps, in turns 2 mm
+    below and 2 mm above the canes.
 
-    Drives [m]: lift of the lower bars, and lowering of the upper ones; each cane touches every bar from 2 mm on.
+    Drives [m]: lift of the lower bars, and lowering of the upper bars; from 2 mm on each cane touches every bar.
     """
     cylinder = f'<geometry><cylinder radius="0.02" length="{SPACING * canes}"/></geometry>'
     height = 0.006 + 0.02 + 0.002
@@ -141,19 +145,23 @@ def combs(name: str, bars: int, canes: int) -> RobotSpec:
 
 
 def keep_awake(physics: Physics, trees: np.ndarray) -> Physics:
-    """Wake some trees [k] and let no tree fall asleep again."""
+    """Wake some trees [k] and let no tree fall asleep again; return the physics."""
     physics.sleep_monitor.rate = -1.0
     physics.plants.wake(trees)
     return physics
 
 
 def interleaved_medians(*works: Callable[[], object], rounds: int = 9) -> list[float]:
-    """Median time [s] of each of some works, run in turns, so that changes of the machine's load meet all alike."""
+    """Returns the median wall time [s] of each function in ``works``.
+
+    The functions run in turns, so that changes of the machine's load affect all of them equally.
+    """
     return interleaved_times(*works, rounds=rounds)[0].tolist()
 
 
 def interleaved_times(*works: Callable[[], object], rounds: int = 9) -> np.ndarray:
-    """Medians [2, work] s of some works, run in turns: of the time that passes, and of this thread's processor time."""
+    """Returns medians [2, work] s of each function in ``works``, which run in turns: wall time and this thread's
+    processor time."""
     seconds = np.zeros((rounds, 2, len(works)))
     for row in seconds:
         for i, work in enumerate(works):

@@ -1,7 +1,7 @@
-"""``vinesim bench start``: the time that a user waits for the first step and the first picture, caches warm.
+"""``vinesim bench start``: the time that a user waits for the first step and the first picture, with warm caches.
 
-Each case runs in fresh processes, three times after one that fills the caches; the median of the wall time counts.
-Compiling kernels on a machine that has none takes half a minute and is not measured here.
+Each case runs in fresh processes, three times after a run that fills the caches; the median of the wall time counts.
+Compiling all kernels on a machine without cached kernels takes half a minute and is not measured here.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ print(json.dumps(parts))
 
 
 def start_measurements() -> Iterator[Measurement]:
-    """All cases, each with its budget if it has one."""
+    """Measure all cases, each compared with its budget if it has one."""
     for scene in SCENES:
         runs = [json.loads(_run("-c", _PARTS, scene)[1]) for _ in range(RUNS + 1)][1:]
         for part in runs[0]:
@@ -86,12 +86,13 @@ def _render_rows(folder: pathlib.Path) -> Iterator[Measurement]:
 
 
 def _median_wall(*command: str) -> float:
-    """Median wall time [s] of a command of vinesim."""
+    """Returns the median wall time [s] of a command of vinesim."""
     return statistics.median([_run("-m", "vinesim", *command)[0] for _ in range(RUNS + 1)][1:])
 
 
 def _run(*arguments: str) -> tuple[float, str]:
-    """Wall time [s] and output of a Python process that may keep its compiled modules, as a user's does."""
+    """Run a Python process that may cache its compiled modules, as a user's does. Returns its wall time [s] and its
+    output."""
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     start = time.perf_counter()
     output = subprocess.run(

@@ -1,4 +1,5 @@
-"""A stock ROS node that publishes joint states from a timer, as a peer of vinesim's; it knows nothing of vinesim.
+"""A stock ROS node that publishes joint states from a timer, as a peer of vinesim's publishers. It imports nothing from
+vinesim.
 
 Each message is stamped with the time at which it was due [s since the start of the timer].
 """
@@ -18,7 +19,7 @@ TOPIC = "/stock/joint_states"
 
 
 def main(joints: int, period: float) -> int:
-    """Publish messages with a number of ``joints`` every ``period`` [s] until SIGINT."""
+    """Publish messages with ``joints`` joints every ``period`` [s] until SIGINT. Returns the exit code."""
     rclpy.init(args=[])
     node = rclpy.create_node("stock_publisher")
     publisher = node.create_publisher(JointState, TOPIC, QoSProfile(depth=100))

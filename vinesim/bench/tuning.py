@@ -1,8 +1,8 @@
-"""``vinesim bench tune``: how near fits of synthetic tracks come, how honest their intervals are, what they cost.
+"""``vinesim bench tune``: errors of fits to synthetic tracks, calibration of their intervals, and their cost.
 
-The truth is stepped at 1 ms by vinesim, or at 0.5 ms by MuJoCo, whose scheme then has less damping of its own than the
-canes have, or by PyElastica (:mod:`vinesim.bench.tuning_rods`); or the tracks come from pictures
-(:mod:`vinesim.bench.tuning_pictures`). Beside peers in :mod:`vinesim.bench.tuning_peers`.
+The true swing is stepped at 1 ms by vinesim, or at 0.5 ms by MuJoCo (its scheme then has less damping of its own than
+the canes have), or by PyElastica (:mod:`vinesim.bench.tuning_rods`); or the tracks come from pictures
+(:mod:`vinesim.bench.tuning_pictures`). The peers are in :mod:`vinesim.bench.tuning_peers`.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ class Recovery:
     """[seed] Relative error of the modulus."""
     damping_error: np.ndarray
     covered: np.ndarray
-    """[seed, 2] Whether the 90 % interval of modulus and damping holds the truth."""
+    """Whether the 90 % interval of modulus and of damping contains the true value [seed, 2]."""
     refused: np.ndarray
-    """[seed] Whether the fit says that it has failed."""
+    """Whether the fit reports that it has failed [seed]."""
     seconds: np.ndarray
     """[seed] Wall time of a fit."""
 
@@ -65,7 +65,8 @@ class Recovery:
 
 
 def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recovery:
-    """Fit the track of each case, by default its own measurement."""
+    """Fit one track for each case, and return the results. ``tracks``: tracks to fit, by default simulated measurements
+    of the cases."""
     rows = []
     for i, case in enumerate(cases):
         track = measure(case.truth, case.experiment) if tracks is None else tracks[i]
@@ -91,7 +92,8 @@ def _errors(fit: Fit, truth: Specimen) -> tuple[float, float, bool, bool]:
 
 
 def mujoco_track(case: Case, dt: float = 5e-4) -> Trajectory:
-    """The case's track from a MuJoCo chain of 32 ball joints, released from vinesim's equilibrium of the same chain."""
+    """Returns the case's track from a MuJoCo chain of 32 ball joints, released from vinesim's equilibrium of the same
+    chain."""
     specimen = msgspec.structs.replace(case.truth, segments=MUJOCO_SEGMENTS)
     e = case.experiment
     candidates = Candidates(specimen, dt=dt)
@@ -99,7 +101,8 @@ def mujoco_track(case: Case, dt: float = 5e-4) -> Trajectory:
     row[0, 5:] = pull_for(candidates, e.number("displacement"), math.radians(e.angle))
     pose = candidates.held_pose(row)[0]
     model = assemble([build_tree(specimen)])
-    # the ball joint takes the bending stiffness for all axes; the cane bends in one plane and does not twist
+    # a ball joint has the bending stiffness for all axes, which suffices: the cane bends in one plane and does not
+    # twist
     damping = (model.joint_damping - dt * model.joint_stiffness)[:, 1]  # MuJoCo's scheme adds the rest
     world = compile_plants(model, dt=dt, damping=damping)
     data = mujoco.MjData(world)
@@ -137,7 +140,7 @@ def recovery_rows(name: str, found: Recovery) -> Iterator[Measurement]:
 
 
 def picture_rows(cases: list[Case]) -> Iterator[Measurement]:
-    """Recovery from pictures, and how far the tracks are off."""
+    """Yields results of fits to pictures, and the errors of the tracks."""
     swings = [film(case) for case in cases]
     name = f"{len(cases)} swings filmed by a D435"
     off = np.concatenate([swing.error for swing in swings])
@@ -150,10 +153,10 @@ def picture_rows(cases: list[Case]) -> Iterator[Measurement]:
 
 
 def tuning(announce: Callable[[str], None], seeds: int = SEEDS) -> Iterator[Measurement]:
-    """Recovery over seeds from tracks of vinesim, of pictures, of MuJoCo and of PyElastica; CPU time and calibration
-    compared with peers.
+    """Measure fits over seeds to tracks from vinesim, from pictures, from MuJoCo and from PyElastica; compare processor
+    time and calibration with peers.
 
-    ``announce`` takes a line about what is left out.
+    ``announce`` is called with a line of text about each part that is skipped.
     """
     cases = [draw_case(seed) for seed in range(seeds)]
     tracks = [measure(case.truth, case.experiment) for case in cases]

@@ -1,4 +1,4 @@
-"""Synthetic laboratories of ``vinesim bench tune``: canes, start values, and when they are let go.
+"""Synthetic laboratories of ``vinesim bench tune``: canes, start values, and times of release.
 
 Canes of 1 m (9 to 6 mm, 900 kg/m^3), modulus 2 to 9 GPa, damping ratio 0.01 to 0.1, pulled by 10 cm; 30 pictures a
 second for 3 s with 2 mm of noise in each axis; start values up to five times off.
@@ -16,7 +16,7 @@ from vinesim.tune import Experiment
 
 MODULUS_BAR = 0.03
 DAMPING_BAR = 0.15
-"""Largest relative errors."""
+"""Largest accepted relative error of a fitted damping; ``MODULUS_BAR`` is for the modulus."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -25,12 +25,12 @@ class Case:
 
     truth: Specimen
     guess: Specimen
-    """Start values that the user gives."""
+    """Specimen with the start values that a user would give."""
     experiment: Experiment
 
 
 def bench_cane(modulus: float, damping: float, segments: int = 8) -> Specimen:
-    """The cane of this benchmark; ``damping`` [s]."""
+    """Returns the cane of this benchmark; ``modulus`` [Pa], ``damping`` [s], ``segments``: number of rigid bodies."""
 
     def number(value: float, unit: str) -> Number:
         return Number(value, unit, "GUESSED", "benchmark")
@@ -48,7 +48,7 @@ def bench_cane(modulus: float, damping: float, segments: int = 8) -> Specimen:
 
 
 def draw_case(seed: int) -> Case:
-    """Modulus, damping, start values and the moment of release of one seed."""
+    """Draw a case from a ``seed``: modulus, damping, start values and the time of release."""
     rng = np.random.default_rng(seed)
     modulus = 1e9 * math.exp(rng.uniform(math.log(2.0), math.log(9.0)))
     ratio = math.exp(rng.uniform(math.log(0.01), math.log(0.1)))

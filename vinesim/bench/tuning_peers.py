@@ -1,8 +1,8 @@
-"""Fits by other methods compared with ours, on the same data with the same simulator: scipy's least squares, CMA-ES,
-Stein particles.
+"""Fits by other methods, compared with vinesim's on the same data with the same simulator: scipy's least squares,
+CMA-ES, Stein particles.
 
-All begin where the user does, with modulus and damping up to five times off; release and pull are given to the peers,
-as ours finds them. Time is CPU time of the process.
+All begin at the user's start values, with modulus and damping up to five times off. The peers are given release and
+pull as vinesim's fit finds them. Time is processor time of the process.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from vinesim.tune.start import start_values
 from vinesim.tune.tuning import STEP_PHASE
 
 AS_GOOD = 1.0
-"""A peer is done when its loss, half a chi square, is less than this much above that of our minimum."""
+"""A peer has finished when its loss, half a chi square, exceeds the loss of vinesim's minimum by less than this."""
 MOST_SECONDS = 30.0
-"""[s] CPU time after which a peer that restarts gives up."""
+"""Processor time after which a peer with restarts gives up [s]."""
 STEIN_SEGMENTS = 3
-"""Rigid bodies of the spring abstraction."""
+"""Number of rigid bodies of the chain of springs on which Stein particles are computed."""
 STEIN_PARTICLES = 20
 STEIN_ITERATIONS = 120
 
 
 class PlainProblem:
-    """Our loss and simulator, for methods that know neither derivatives nor features."""
+    """Loss and simulator of vinesim's fit, for methods that use neither its derivatives nor its features."""
 
     def __init__(self, specimen: Specimen, track: Trajectory) -> None:
         features = extract_features(track)
@@ -45,27 +45,27 @@ class PlainProblem:
         self.problem = Problem(specimen, track, features, ("modulus", "damping"), physical_priors(specimen), dt)
         self.noise = features.noise
         self.good = start_values(self.problem)
-        """Our own start values."""
+        """Start values that vinesim's fit finds [8]."""
         self.plain = self.good.copy()
-        self.plain[:2] = 0.0  # the user's
+        self.plain[:2] = 0.0  # the user's modulus and damping
         self.scales = self.problem._scales()
-        self.losses(self.plain[None])  # loads every kernel
+        self.losses(self.plain[None])  # the first call loads every kernel
 
     def losses(self, thetas: np.ndarray) -> np.ndarray:
-        """[n] Losses of the parameters [n, 8], all computed in one launch."""
+        """Returns the losses [n] of the parameters [n, 8], all computed in one kernel launch."""
         problem = self.problem
         x, _ = problem.samples(thetas, np.array([problem.row(theta) for theta in thetas]))
         return np.array([problem.loss(theta, y, self.noise) for theta, y in zip(thetas, x, strict=True)])
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Residuals of one candidate, priors included, for scipy."""
+        """Returns the residuals of one candidate, priors included, for scipy."""
         problem = self.problem
         x, _ = problem.samples(theta[None], problem.row(theta)[None])
         off = (x[0] - problem.observed)[problem.seen] / self.noise
         return np.concatenate([off, problem._extra(theta)[0]])
 
     def log_gradients(self, thetas: np.ndarray) -> np.ndarray:
-        """Gradients [n, 8] of the log posterior by forward differences, all candidates of one launch."""
+        """Returns gradients [n, 8] of the log posterior by forward differences, all candidates in one launch."""
         size = thetas.shape[1]
         step = 1e-2 * self.scales
         moved = np.concatenate([thetas, *(thetas + step[i] * np.eye(size)[i] for i in range(size))])
@@ -74,7 +74,7 @@ class PlainProblem:
 
 
 def fit_by_scipy(plain: PlainProblem, start: np.ndarray) -> np.ndarray:
-    """scipy's least squares with its own finite differences, from one start."""
+    """Fit by scipy's least squares with its own finite differences, from one start; return the parameters [8]."""
     from scipy.optimize import least_squares
 
     return least_squares(
@@ -91,7 +91,7 @@ def fit_by_scipy(plain: PlainProblem, start: np.ndarray) -> np.ndarray:
 
 
 def fit_by_cma(plain: PlainProblem, start: np.ndarray, seed: int) -> np.ndarray:
-    """CMA-ES with its default population, each generation one launch."""
+    """Fit by CMA-ES with its default population, one launch for each generation; return the parameters [8]."""
     import cma
 
     spread = plain.scales.copy()
@@ -108,8 +108,11 @@ def fit_by_cma(plain: PlainProblem, start: np.ndarray, seed: int) -> np.ndarray:
 def until_as_good(
     plain: PlainProblem, fit: Callable[[np.ndarray, int], np.ndarray], target: float, seed: int
 ) -> tuple[np.ndarray, float]:
-    """What a method finds that begins where the user does, and again up to five times off until its loss is as good as
-    ours; and the CPU time [s]."""
+    """Repeat a ``fit`` until its loss is as good as ``target``, the loss of vinesim's fit.
+
+    The first start is the user's; further starts are up to five times off. Returns the best parameters and the
+    processor time [s].
+    """
     rng = np.random.default_rng(seed)
     begun = time.process_time()
     start = plain.plain
@@ -131,12 +134,12 @@ def until_as_good(
 
 
 def peer_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measurement]:
-    """CPU time of our fit, and of fits as good as ours by scipy and CMA-ES."""
+    """Yields the processor time of vinesim's fit, and of equally good fits by scipy and CMA-ES."""
     peers: dict[str, Callable[[PlainProblem], Any]] = {
         "scipy with finite differences": lambda p: lambda start, _: fit_by_scipy(p, start),
         "CMA-ES": lambda p: lambda start, seed: fit_by_cma(p, start, seed),
     }
-    tune(cases[0].guess, tracks[0])  # loads every kernel
+    tune(cases[0].guess, tracks[0])  # the first call loads every kernel
     ours = []
     seconds = {name: [] for name in peers}
     good = dict.fromkeys(peers, 0)
@@ -164,15 +167,16 @@ def peer_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measureme
 def stein_descent(
     log_gradients: Callable[[np.ndarray], np.ndarray], particles: np.ndarray, iterations: int, rate: float = 0.1
 ) -> np.ndarray:
-    """Particles [n, k] moved to a posterior by Stein variational gradient descent (Liu and Wang 2016).
+    """Move particles [n, k] to a posterior by Stein variational gradient descent (Liu and Wang 2016); return them.
 
-    A kernel exp(-d^2 / h), h the squared median distance over ln n, and AdaGrad's steps with momentum, as there.
+    The kernel is exp(-d^2 / h), with h the squared median distance over ln n. Steps are AdaGrad's with momentum, as in
+    that paper.
 
     Args:
-        log_gradients: of the log posterior at particles [n, k], [n, k].
-        particles: [n, k] to begin with, in units in which the posterior is about as wide in all directions.
-        iterations: how many.
-        rate: [1] length of a step, in those units.
+        log_gradients: function from particles [n, k] to gradients of the log posterior [n, k].
+        particles: initial particles [n, k], in units in which the posterior is about equally wide in all directions.
+        iterations: number of steps.
+        rate: length of a step in those units [1].
     """
     x = particles.astype(float).copy()
     history = np.zeros_like(particles)
@@ -189,7 +193,7 @@ def stein_descent(
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Sides:
-    """One method over several tracks."""
+    """Results of one method over several tracks."""
 
     error: np.ndarray
     """[track, 2] Relative errors of modulus and damping."""
@@ -199,8 +203,11 @@ class _Sides:
 
 
 def _stein(cases: list[Case], tracks: list[Trajectory], from_features: bool) -> _Sides:
-    """Posteriors by Stein particles on a chain of few springs; particles begin up to five times off the user's start,
-    or near our start values."""
+    """Compute posteriors by Stein particles on a chain of few springs.
+
+    ``from_features``: particles begin near the start values that vinesim's fit finds; otherwise up to five times off
+    the user's.
+    """
     error = []
     covered = []
     seconds = []
@@ -245,7 +252,7 @@ def _ours(cases: list[Case], tracks: list[Trajectory]) -> _Sides:
 
 
 def stein_rows(cases: list[Case], tracks: list[Trajectory]) -> Iterator[Measurement]:
-    """Time and calibration of the posterior, compared with Stein particles on spring abstractions (arXiv
+    """Yields time and calibration of vinesim's posterior, compared with Stein particles on chains of springs (arXiv
     2306.03410)."""
     ours = _ours(cases, tracks)
     for name, from_features in (("SVGD", False), ("SVGD from our start values", True)):

@@ -1,8 +1,9 @@
-"""Tracks of ``vinesim bench tune`` from pictures: the true swing as an RGB-D camera sees it, a marker found in each.
+"""Tracks of ``vinesim bench tune`` from pictures: an RGB-D camera films the simulated swing, and a marker is found in
+each picture.
 
-The camera is the D435 of ``data/cameras`` with its errors, 0.8 m beside the tip, and looks across the plane of the
-swing. The marker is a ball of 24 mm without mass. Pictures are sharp: no motion blur, no rolling shutter. Its colour is
-picked in the first picture.
+The camera is the D435 of ``data/cameras`` with its errors. It is 0.8 m from the tip and looks across the plane of the
+swing. The marker is a ball of 24 mm without mass. Pictures are sharp, without motion blur or rolling shutter. The
+colour of the marker is picked in the first picture.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from vinesim.tune.marker_track import track_marker
 from vinesim.tune.specimen import TIP, build_tree
 
 SEGMENTS = 192
-"""Number of segments of the chain that is filmed. A chain of 64 segments swings 0.01 % too slowly, which tracks as
-exact as these would show."""
+"""Number of segments of the filmed chain. A chain of 64 segments swings 0.01 % too slowly, and tracks as exact as these
+would show it."""
 STEP = 2.5e-4
-"""[s] Step of the simulated swing that is filmed. In steps of 1 ms the swing is slow by 0.007 to 0.02 % of the modulus,
-as much as a track from pictures tells."""
+"""Step of the filmed simulation [s]. Steps of 1 ms slow the swing as much as a modulus that is 0.007 to 0.02 % too
+small, which a track from pictures can resolve."""
 PIECES = 16
-"""Number of straight pieces with which the cane is drawn."""
+"""Number of straight pieces of the drawn cane."""
 HEIGHT = 1.2
 """[m] Height of the base above the ground."""
 AWAY = 0.8
@@ -47,7 +48,8 @@ PAINT = (0.85, 0.05, 0.35)
 
 
 def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ...]]:
-    """The specimen with markers at the ends of equal pieces, and the markers' names from the base to the tip."""
+    """Returns the specimen with markers at the ends of equal pieces, and the markers' names from the base to the
+    tip."""
     names = tuple(f"node {i}" for i in range(1, pieces))
     along = {name: specimen.length.value * (i + 1) / pieces for i, name in enumerate(names)}
     return msgspec.structs.replace(specimen, markers=along), (*names, TIP)
@@ -55,15 +57,16 @@ def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ..
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class FilmedSwing:
-    """A track from pictures, and its error."""
+    """A track from pictures, and its true error."""
 
     track: Trajectory
     error: np.ndarray
-    """[sample, 3] m: of the marker's place along the camera's axes, right, down, ahead; NaN where it was not found."""
+    """Error of the marker's position along the camera's axes right, down and forward [sample, 3] m; NaN where the
+    marker was not found."""
 
 
 def film(case: Case) -> FilmedSwing:
-    """The case's swing, filmed and tracked."""
+    """Film the case's swing and track the marker in the pictures."""
     specimen, names = with_nodes(case.truth, PIECES)
     fine = msgspec.structs.replace(specimen, segments=SEGMENTS)
     true = measure(fine, dataclasses.replace(case.experiment, markers=names), exact=True, step=STEP)
@@ -81,7 +84,7 @@ def film(case: Case) -> FilmedSwing:
 
 
 def _pick_colour(picture: CameraFrame, point: np.ndarray) -> tuple[int, int, int]:
-    """What a user would pick in the first picture: the colour where the marker is."""
+    """Returns the RGB colour that a user would pick in the first picture: the colour at the marker."""
     local = frames.rotate(frames.conjugate(picture.pose[3:]), point - picture.pose[:3])
     column, row = np.round(project_points(local, picture.info)).astype(int)
     red, green, blue = np.median(picture.rgb[row - 2 : row + 3, column - 2 : column + 3], (0, 1)).astype(int).tolist()
@@ -89,7 +92,7 @@ def _pick_colour(picture: CameraFrame, point: np.ndarray) -> tuple[int, int, int
 
 
 def _pictures(specimen: Specimen, true: Trajectory, pose: np.ndarray, seed: int) -> Iterator[CameraFrame]:
-    """The pictures that the camera takes at the track's times."""
+    """Yields the pictures that the camera takes at the times of the track."""
     model = assemble([build_tree(msgspec.structs.replace(specimen, segments=PIECES))])
     spec = CameraSpec.load("d435")
     camera = Camera(spec, spec.info("optical"), seed=seed)

@@ -1,12 +1,14 @@
-"""Tracks of ``vinesim bench tune`` from PyElastica: a Cosserat rod, let go from vinesim's equilibrium of the same cane.
+"""Tracks of ``vinesim bench tune`` from PyElastica: a Cosserat rod that is released from vinesim's equilibrium of the
+same cane.
 
-Its steps are explicit, so what damps wood, a moment by the rate of curvature, would ask for steps of nanoseconds.
-PyElastica's own damper takes the same share of every velocity instead. The first mode gets the case's damping ratio by
-it; the second one then decays no faster than the first, in vinesim's cane some thirty times faster. Shear modulus
-E / 16, as along the grain of wood; PyElastica's own E / 3 asks for steps half as long.
+The steps of PyElastica are explicit. Damping as in wood, a moment in proportion to the rate of curvature, would need
+steps of nanoseconds. PyElastica's own damper takes the same share of every velocity instead. That share is chosen for
+the case's damping ratio in the first mode. The second mode then decays no faster than the first; in vinesim's cane it
+decays some thirty times faster. The shear modulus is E / 16, as along the grain of wood; PyElastica's own E / 3 needs
+steps half as long.
 """
 
-# PyElastica names what it exports only at run time, and takes arrays where it asks for a float.
+# PyElastica names its exports only at run time, and accepts arrays where its types ask for a float.
 # pyright: reportPrivateImportUsage=false, reportArgumentType=false
 
 from __future__ import annotations
@@ -27,24 +29,25 @@ from vinesim.tune.candidates import COLUMNS, Candidates
 from vinesim.tune.experiment import pull_for
 
 ELEMENTS = 32
-"""Number of elements of the rod; the cane is half an element shorter."""
+"""Number of elements of the rod. The cane is half an element shorter than the rod."""
 FINE = 64
-"""Segments of vinesim's chain whose equilibrium is the rod's at the start, and whose first mode is damped."""
+"""Number of segments of vinesim's chain, whose equilibrium is the start of the rod and whose first mode sets the rod's
+damping."""
 SHEAR = 16.0
-"""[1] Young's modulus over the shear modulus."""
+"""Ratio of Young's modulus to the shear modulus [1]."""
 STEP_PHASE = 1.6
-"""[rad] Rotation of an element against its own shear in a step; PyElastica's scheme is unstable from 2 on."""
+"""Rotation of an element against its own shear in one step [rad]; PyElastica's scheme is unstable from 2 on."""
 PICTURE_STEP = 1e-3
-"""[s] Time between the positions that are kept."""
+"""Time between recorded positions [s]."""
 
 
 def is_installed() -> bool:
-    """Whether PyElastica is installed."""
+    """Returns whether PyElastica is installed."""
     return importlib.util.find_spec("elastica") is not None
 
 
 def rod_track(case: Case) -> Trajectory:
-    """The case's track from a Cosserat rod of PyElastica."""
+    """Returns the case's track from a Cosserat rod of PyElastica."""
     e = case.experiment
     path = _swing(case.truth, *_held_shape(case), damping_rate(case.truth), e.number("duration") + 2.0 * PICTURE_STEP)
     clock = np.arange(math.ceil((e.hold + e.number("duration")) * e.rate)) / e.rate
@@ -55,7 +58,8 @@ def rod_track(case: Case) -> Trajectory:
 
 
 def damping_rate(specimen: Specimen) -> float:
-    """[1/s] The share of every velocity that must be lost for the first mode's damping ratio to be the specimen's."""
+    """Returns the rate at which every velocity must decay so that the first mode has the specimen's damping ratio
+    [1/s]."""
     mode = CaneBuilder(
         length=specimen.length.value,
         radius=(0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value),
@@ -67,10 +71,10 @@ def damping_rate(specimen: Specimen) -> float:
 
 
 def _held_shape(case: Case) -> tuple[np.ndarray, np.ndarray]:
-    """Nodes [node, 3] m and tangents [element, 3] of the rod in vinesim's equilibrium under the pull.
+    """Returns nodes [node, 3] m and tangents [element, 3] of the rod in vinesim's equilibrium under the pull.
 
-    The clamp holds the first element, and bending is between the middles of elements: so the first element ends half an
-    element beyond the clamp, straight, and its middle lies in the clamp.
+    The clamp holds the first element, and joints are between the middles of elements. So the middle of the first
+    element is at the clamp, and the element ends, straight, half an element beyond it.
     """
     specimen, names = with_nodes(msgspec.structs.replace(case.truth, segments=FINE), FINE)
     candidates = Candidates(specimen, names, dt=1e-3)
@@ -78,7 +82,7 @@ def _held_shape(case: Case) -> tuple[np.ndarray, np.ndarray]:
     row[0, 5:] = pull_for(candidates, case.experiment.number("displacement"), math.radians(case.experiment.angle))
     nodes = np.concatenate([np.zeros((1, 3)), candidates.shape(row)[0]])
     chords = np.diff(nodes, axis=0)
-    # the tangent of a chain of segments at their middles, at the clamp that of the clamp
+    # tangents of the chain at the middles of its segments; at the clamp, the direction of the clamp
     piece = specimen.length.value / FINE
     along = np.concatenate([[0.0], piece * (np.arange(FINE) + 0.5)])
     known = np.concatenate([[[1.0, 0.0, 0.0]], chords / np.linalg.norm(chords, axis=1, keepdims=True)])
@@ -90,14 +94,14 @@ def _held_shape(case: Case) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _swing(specimen: Specimen, nodes: np.ndarray, tangents: np.ndarray, rate: float, seconds: float) -> np.ndarray:
-    """Positions [sample, 3] m of the tip, :data:`PICTURE_STEP` apart, of a rod that is let go at rest.
+    """Returns the positions [sample, 3] m of the tip, :data:`PICTURE_STEP` apart, of a rod that is released at rest.
 
     Args:
         specimen: diameters, modulus, density.
         nodes: [node, 3] m at the start.
         tangents: [element, 3] at the start.
-        rate: [1/s] of the damping.
-        seconds: how long.
+        rate: rate of the damping [1/s].
+        seconds: duration [s].
     """
     import elastica
 
@@ -125,7 +129,7 @@ def _swing(specimen: Specimen, nodes: np.ndarray, tangents: np.ndarray, rate: fl
         position=nodes.T.copy(),
         directors=directors.copy(),
     )
-    # an element turns against its shear at 2 / r sqrt(G / rho), whatever its length
+    # an element oscillates against its shear with the angular frequency 2 / r sqrt(G / rho), whatever its length
     every = math.ceil(PICTURE_STEP * 2.0 / radius.min() * math.sqrt(modulus / SHEAR / density) / STEP_PHASE)
     dt = PICTURE_STEP / every
     world = World()

@@ -1,12 +1,11 @@
-"""The command line: ``vinesim``.
+"""The command line ``vinesim``.
 
-``commands`` holds the options of all commands and nothing else; a command imports its implementation when it runs, so
-that ``vinesim --help`` opens at once.
+``commands`` contains the options of all commands and nothing else. A command imports its implementation when it runs,
+so that ``vinesim --help`` is fast.
 
 Exit codes: 0 done; 1 ``doctor`` has found an error, or a defect of vinesim; 2 wrong use or bad input; 3 a part is
-missing on this machine; 4 the network or the server;
-5 a job was not done, or its files could not be written; 130 stopped by Ctrl-C or SIGTERM where stopping is not the
-ordinary end.
+missing on this machine; 4 an error of the network or the server; 5 a task was not done, or its files could not be
+written; 130 stopped by Ctrl-C or SIGTERM where stopping is not the normal end.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ app = typer.Typer(
     help="Soft vines and grapes with robots and people: simulated at 100 Hz by every client, no GPU needed.",
     epilog="Start with: vinesim demo",
 )
-scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Vineyards: the content of a scene file.")
+scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Vineyards: contents of a scene file.")
 ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
 certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certificates for secured links.")
 app.add_typer(scene_app, name="scene")
@@ -56,27 +55,27 @@ certs_app.command("new")(certs_new)
 
 @app.callback()
 def configure_logging(
-    verbose: Annotated[int, typer.Option("--verbose", "-v", count=True, help="Log more; twice for everything.")] = 0,
+    verbose: Annotated[int, typer.Option("--verbose", "-v", count=True, help="Log more; -vv logs everything.")] = 0,
 ) -> None:
-    """Log level for every command."""
+    """Set the log level for every command."""
     level = (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, stream=sys.stderr, format="%(asctime)s %(levelname)s %(name)s: %(message)s")
     progress.show_on(sys.stderr)
 
 
 def main() -> None:
-    """Entry point of the command line.
+    """Run the command line, and end the process with its exit code.
 
-    Leaves without taking the interpreter down in order: all is closed by then, and Python 3.11 would end threads of
-    foreign runtimes (Zenoh's are Rust) in a way that makes them abort the process.
+    The process ends without the interpreter's own shutdown: everything is closed by then, and Python 3.11 would stop
+    threads of foreign runtimes (Zenoh's are Rust) in a way that makes them abort the process.
     """
-    # Small matrices gain nothing from BLAS threads, and those would take the other core from the sensors.
+    # BLAS threads do not speed up small matrices, and would take processor time from the sensors.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # MuJoCo draws nothing here, and looking for a window system takes 0.1 s.
+    # MuJoCo draws nothing in vinesim, and its search for a window system takes 0.1 s.
     os.environ.setdefault("MUJOCO_GL", "disable")
     allocator.keep_large_blocks_apart()
     allocator.trim_regularly()
-    # A shell lets processes in the background ignore SIGINT; a sender means it to end them, and so with SIGTERM.
+    # A shell lets processes in the background ignore SIGINT. Whoever sends SIGINT or SIGTERM means to end the process.
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.default_int_handler)
     code = _run()
@@ -88,7 +87,8 @@ def main() -> None:
 
 
 def _run() -> int:
-    """The exit code. An error of vinesim's own is one line in words; any other is a defect with a traceback."""
+    """Run the command and return its exit code. Errors of vinesim's own are printed in one line; any other exception is
+    a defect and is printed with a traceback."""
     try:
         app()
     except SystemExit as end:

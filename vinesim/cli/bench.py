@@ -1,4 +1,4 @@
-"""``vinesim bench``: measurements compared with a peer, one JSON object a line."""
+"""``vinesim bench``: measurements compared with a peer, printed as text or as one JSON object a line."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ RAISED = {
     "torso_lift_joint": 0.45,
     **{f"arm_{side}_{i}_joint": q for side in ("left", "right") for i, q in ((1, 0.6), (2, 0.1), (4, 1.8))},
 }
-"""Joint positions that put vinebot's hands among the vines [m, rad]."""
+"""Joint positions with which vinebot's hands are among the vines [m, rad], by joint."""
 
 BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
     "plants": _plants,
@@ -97,7 +97,7 @@ BENCHES: dict[str, Callable[[], Iterator[Measurement]]] = {
 
 
 class NoSuchBench(ValueError):
-    """There is no benchmark of that name; the text lists all."""
+    """No benchmark has the given name; the text lists all names."""
 
 
 def print_measurement(one: Measurement, as_json: bool) -> None:
@@ -110,9 +110,9 @@ def print_measurement(one: Measurement, as_json: bool) -> None:
 
 
 def run(names: list[str], as_json: bool, rows: Sequence[str] = ()) -> int:
-    """Run the named benchmarks in order and print their measurements as they come; the exit code.
+    """Run the named benchmarks in order and print their measurements as they come. Returns the exit code.
 
-    ``rows`` of live: all if there are none.
+    ``rows``: rows of the benchmark ``live``; all of them if empty.
     """
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")

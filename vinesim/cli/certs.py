@@ -10,7 +10,7 @@ from vinesim.net.transport.certificates import create as new_certificate
 
 
 def new(actor: str, folder: pathlib.Path, role: str, hosts: list[str], authority: pathlib.Path | None) -> int:
-    """Make certificates and print the names of their files; the exit code."""
+    """Make certificates and print the names of their files. Returns the exit code."""
     possible = [each.value for each in Role if each != Role.SERVER]
     if role not in possible:
         raise UsageError(f"--role {role!r}: give {', '.join(possible)}")

@@ -1,5 +1,6 @@
-"""Options of ``vinesim client``: each is declared once, with its help, its default and the roles that have it; and the
-checks that need no scene.
+"""Options of ``vinesim client``, and the checks that need no scene.
+
+Each option is declared once, with its help, its default and the roles that have it.
 """
 
 from __future__ import annotations
@@ -36,15 +37,21 @@ OF_CAMERAS = OnlyFor(("robot", "spectator"))
 
 @dataclasses.dataclass(frozen=True)
 class ClientOptions:
-    """The options of one client on the command line; fields have the names of the options and the order of the help."""
+    """Options of one client. Fields have the names of the command line's options and the order of the help."""
 
     role: Annotated[str, typer.Option(help="robot, human or spectator.")] = "robot"
-    name: Annotated[str | None, typer.Option(help="The actor's unique name; ROLE-PID unless given, alone ROLE.")] = None
-    connect: Annotated[str | None, typer.Option(help="Server, e.g. tcp/192.168.1.5:7447. Alone if not given.")] = None
-    """None: no network."""
+    name: Annotated[
+        str | None, typer.Option(help="The actor's unique name; by default ROLE-PID, or ROLE without a server.")
+    ] = None
+    connect: Annotated[
+        str | None, typer.Option(help="Server, such as tcp/192.168.1.5:7447; by default none: the client is alone.")
+    ] = None
+    """None: the client is alone and has no network."""
     tls: Annotated[
         pathlib.Path | None,
-        typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key; the server is then tls/HOST:7447."),
+        typer.Option(
+            help="Folder with ca.pem, NAME.pem and NAME.key, for a server with certificates at tls/HOST:7447."
+        ),
     ] = None
     scene: Scene = "demo"
     seed: Seed = None
@@ -52,71 +59,75 @@ class ClientOptions:
         list[str] | None,
         OF_ROBOT,
         typer.Option(
-            help="Of a robot: a URDF file, or the name of one that ships: vinebot, logistic. Given several times, so "
-            "many robots NAME_1, NAME_2, each under its namespace."
+            help="Robots: a URDF file, or the name of a shipped robot: vinebot, logistic. Given several times, the "
+            "robots are NAME_1, NAME_2, ..., each in a namespace of its own."
         ),
     ] = None
-    """None: one vinebot."""
+    """None: one robot of the kind vinebot."""
     spawn: Annotated[int, typer.Option(min=0, help="Index of one of the scene's start poses.")] = 0
-    pose: Annotated[Pose | None, typer.Option(help="Start at X Y [m] with YAW [rad] instead.")] = None
+    pose: Annotated[
+        Pose | None, typer.Option(help="Start at X Y [m] with YAW [rad] instead of a start pose of the scene.")
+    ] = None
     approach: Annotated[
         float,
         OF_ROBOT,
         typer.Option(
-            help="Of a robot: start this far behind the start pose and drive to it [m]; on a server once others are "
-            "there."
+            help="Robots: start this far behind the start pose and drive to it [m]; with a server, when another actor "
+            "has joined."
         ),
     ] = 0.0
-    namespace: Annotated[str, OF_ROBOT, typer.Option(help="Of a robot: prefix of all ROS topics.")] = ""
+    namespace: Annotated[str, OF_ROBOT, typer.Option(help="Robots: prefix of all ROS topics.")] = ""
     params_file: Annotated[
         pathlib.Path | None,
         OF_ROBOT,
-        typer.Option(help="Of a robot: a ROS 2 parameter file for its nodes (YAML)."),
+        typer.Option(help="Robots: a ROS 2 parameter file for the robot's nodes (YAML)."),
     ] = None
-    ros: Annotated[bool, OF_ROBOT, typer.Option(help="Of a robot: run a ROS 2 node, if ROS 2 is installed.")] = True
+    ros: Annotated[bool, OF_ROBOT, typer.Option(help="Robots: run a ROS 2 node, if ROS 2 is installed.")] = True
     push: Annotated[
         int | None,
         OF_ROBOT,
-        typer.Option(hidden=True, help="Of a robot: reach for this bunch and push it repeatedly."),
+        typer.Option(hidden=True, help="Robots: reach for this bunch and push it repeatedly."),
     ] = None
-    """Hidden, like all options with which a demo or a benchmark directs its clients."""
-    job: Annotated[
-        str | None, OF_ROBOT, typer.Option(help="Of a robot: do a job and stop: pick, exchange or meet.")
-    ] = None
+    """The option is hidden, like all options with which a demo or a benchmark controls its clients."""
+    job: Annotated[str | None, OF_ROBOT, typer.Option(help="Robots: do a task and stop: pick, exchange or meet.")] = (
+        None
+    )
     walk: Annotated[
         tuple[float, float] | None,
         OF_HUMAN,
-        typer.Option(hidden=True, help="Of a human: walk to this point, x y [m]."),
+        typer.Option(hidden=True, help="People: walk to this point, x y [m]."),
     ] = None
     reach: Annotated[
         int | None,
         OF_HUMAN,
-        typer.Option(hidden=True, help="Of a human: walk to this bunch, hold it, pull, let go, repeatedly."),
+        typer.Option(hidden=True, help="People: walk to this bunch, hold it, pull, let go, repeatedly."),
     ] = None
     into: Annotated[
         int | None,
         OF_HUMAN,
-        typer.Option(hidden=True, help="Of a human: pick the bunch of --reach, and lay it into this box."),
+        typer.Option(hidden=True, help="People: pick the bunch of --reach, and lay it into this box."),
     ] = None
-    height: Annotated[float, OF_HUMAN, typer.Option(min=1.0, max=2.5, help="Of a human [m].")] = 1.75
+    height: Annotated[float, OF_HUMAN, typer.Option(min=1.0, max=2.5, help="People: height [m].")] = 1.75
     watch: Annotated[
         int | None,
         OF_ROBOT,
-        typer.Option(hidden=True, help="Of a robot: record force and displacement of this bunch."),
+        typer.Option(hidden=True, help="Robots: record force and displacement of this bunch."),
     ] = None
     interest_radius: Annotated[
-        float, typer.Option(min=0.1, max=5.0, help="Actors nearer than this to an object receive its motion [m].")
+        float, typer.Option(min=0.1, max=5.0, help="Actors within this distance of an object receive its motion [m].")
     ] = 5.0
     jitter_buffer: Annotated[
         float,
         OF_PEERS,
-        typer.Option(min=0.0, max=500.0, help="Show other actors this much later, without the network's jitter [ms]."),
+        typer.Option(
+            min=0.0, max=500.0, help="Show remote actors with this delay, which hides the network's jitter [ms]."
+        ),
     ] = 0.0
     device: Annotated[
         str,
         typer.Option(
-            help="Where plants are simulated, cameras and lidars compute: cpu, cuda or cuda:N. For plants alone a GPU "
-            "pays from 200 awake trees."
+            help="Device of plants, cameras and lidars: cpu, cuda or cuda:N. For plants alone, a GPU is faster from "
+            "200 awake trees on."
         ),
     ] = "cpu"
     seconds: Seconds = None
@@ -125,74 +136,73 @@ class ClientOptions:
     sensor_hz: Annotated[
         float | None,
         OF_CAMERAS,
-        typer.Option(min=0.1, help="Pictures and scans a second; each sensor's own rate unless given."),
+        typer.Option(min=0.1, help="Pictures and scans a second; by default each sensor's own rate."),
     ] = None
     sensors: Annotated[
         str | None,
         OF_ROBOT,
         typer.Option(
-            help="Of a robot: live: cameras and lidars give what they can, but time waits below --least-sensor-hz. "
-            "paced: every frame at its rate in simulated time. lockstep: time waits for every frame, and two runs are "
-            "equal to the bit. As the robot's file says unless given, else live."
+            help="Robots: pace of cameras and lidars. live: as fast as the machine can, but simulated time waits if a "
+            "sensor is slower than --least-sensor-hz. paced: every frame at its rate in simulated time. lockstep: time "
+            "waits for every frame, and two runs are equal to the bit. By default as in the robot's file, or live."
         ),
     ] = None
-    """A :class:`vinesim.scene.values.SensorMode`."""
+    """A value of :class:`vinesim.scene.values.SensorMode`; None: the mode that the robot's file gives."""
     least_sensor_hz: Annotated[
         float | None,
         OF_ROBOT,
-        typer.Option(min=0.01, max=1000.0, help="Of live sensors: least rate in simulated time [Hz]; 5 unless given."),
+        typer.Option(min=0.01, max=1000.0, help="Least rate of live sensors in simulated time [Hz]; by default 5."),
     ] = None
-    """None: as the robot's file says."""
+    """None: the rate that the robot's file gives."""
     renderer: Annotated[Renderer, OF_CAMERAS] = "warp"
     tick_log: Annotated[
-        pathlib.Path | None, typer.Option(hidden=True, help="Write when each tick began and its work (.npz).")
+        pathlib.Path | None, typer.Option(hidden=True, help="Write the start and the duration of each tick (.npz).")
     ] = None
     page: Annotated[
         int | None,
         typer.Option(
             min=0,
             max=65535,
-            help="Show the vineyard in a browser, on this port; people and spectators: on a free one.",
+            help="Show the vineyard in a browser, on this port. By default, people and spectators use a free port.",
         ),
     ] = None
-    """0: any port that is free; None: a free one if this client exists for its page, else no page."""
+    """0: any free port. None: a free port if the client is used through its page only, otherwise no page."""
     page_lan: Annotated[
         bool,
-        typer.Option("--page-lan", help="Let other machines of the network open the page, by https with a token."),
+        typer.Option("--page-lan", help="Let other machines on the network open the page, by https with a token."),
     ] = False
     gestures: Annotated[
         pathlib.Path | None,
         OF_HUMAN,
-        typer.Option("--gestures", help="Of a human: TOML file of finger poses for the buttons."),
+        typer.Option("--gestures", help="People: TOML file of finger poses for the buttons."),
     ] = None
     outfit: Annotated[
         str | None,
         OF_HUMAN,
-        typer.Option(help="Of a human: what it wears: orange, yellow, green, ...; follows from its name unless given."),
+        typer.Option(help="People: colours of the clothes: orange, yellow, green, ...; by default chosen by name."),
     ] = None
     real_time_factor: RealTimeFactor = None
-    """Real-time factor of a client without a server; None: as fast as the client can follow."""
+    """Real-time factor of a client without a server; None: as fast as the client can follow, at most 1."""
     world: World = DEFAULT_WORLD
     standby: Annotated[
         bool,
         OF_ROBOT,
         typer.Option(
             "--standby",
-            help="Of a robot: keep a process ready that takes the place of the one that renders its sensors if that "
-            "fails; 0.11 GB.",
+            help="Robots: keep a second sensor process ready, which takes over if the first fails; needs 0.11 GB.",
         ),
     ] = False
 
     @property
     def is_for_page(self) -> bool:
-        """Whether the client is used through its page only: a person without a script, or a spectator that writes no
-        pictures."""
+        """Whether the client is used through its page only: as a person without a script, or as a spectator that writes
+        no pictures."""
         is_person = self.role == "human" and self.walk is None and self.reach is None
         return is_person or (self.role == "spectator" and self.out is None)
 
 
 def check_role(role: str, given: Collection[str]) -> None:
-    """:class:`UsageError` unless the role exists and has all the options ``given`` on the command line."""
+    """Raise :class:`UsageError` unless the role exists and has all the options ``given`` on the command line."""
     if role not in ROLES:
         raise UsageError(f"role {role!r} is none of {', '.join(ROLES)}; give one of them")
     hints = get_type_hints(ClientOptions, include_extras=True)
@@ -205,13 +215,13 @@ def check_role(role: str, given: Collection[str]) -> None:
 
 
 def check_status(status: str) -> None:
-    """:class:`UsageError` unless this format of status lines exists."""
+    """Raise :class:`UsageError` unless ``status`` is a format of status lines."""
     if status not in STATUS_FORMATS:
         raise UsageError(f"--status {status!r}: give text, json or none")
 
 
 def check_options(options: ClientOptions) -> None:
-    """Refuse wrong options before anything is built: :class:`UsageError`, or DeviceError for a missing device."""
+    """Check options before anything is built. Raises :class:`UsageError`, or DeviceError for a missing device."""
     from vinesim.scene.values import SensorMode
 
     check_status(options.status)

@@ -35,7 +35,7 @@ from vinesim.scene.spec import load_scene, with_seed
 from vinesim.web import page_files
 
 SWITCH_INTERVAL = 2e-4
-"""Longest time for which another thread may hold the interpreter lock when the loop needs it [s]; Python's own is 5
+"""Longest time for which another thread may hold the interpreter lock when the loop needs it [s]. Python's default is 5
 ms."""
 STATUS_PERIOD = 1.0
 """Wall time between two status lines [s]."""
@@ -44,22 +44,21 @@ FIRST_STATUS = 0.1
 CLOCK_TIMEOUT = 2.0
 """Longest time for which the first step waits for the server's clock [s]."""
 TRACE_CAPACITY = 1 << 17
-"""Steps that a trace of one bunch can hold: 22 minutes."""
+"""Number of steps that a trace of one bunch can hold: 22 minutes."""
 
 T = TypeVar("T")
 
 
 class ClientSession:
-    """One client process: its scene, its buses and its loop. It is a context manager; leaving it closes everything in
-    order."""
+    """One client process: its scene, its buses and its loop. A context manager that closes all of them in order."""
 
     def __init__(self, options: ClientOptions) -> None:
-        """Check the options and generate the vineyard; errors of the scene and :class:`UsageError` come from here."""
+        """Check the options and generate the vineyard. Raises errors of the scene and :class:`UsageError`."""
         check_options(options)
         # The loop releases the interpreter lock at every kernel launch and needs it back within a fraction of a step.
         sys.setswitchinterval(SWITCH_INTERVAL)
         self.options = options
-        # alone it has the same name in every run: names seed the noise of sensors
+        # a client without a server has the same name in every run, because names seed the noise of sensors
         self.name = options.name or (options.role if options.connect is None else f"{options.role}-{os.getpid()}")
         self.scene = with_seed(load_scene(options.scene), options.seed)
         self.spawn = options.spawn
@@ -67,7 +66,7 @@ class ClientSession:
         if options.pose is not None:
             self.scene = with_start_pose(self.scene, *options.pose)
             self.spawn = 0
-        # those of cameras and lidars are compiled while the loop runs already; the sensor processes wait for them
+        # the loop starts before the kernels of cameras and lidars are compiled; sensor processes wait for those kernels
         sensors = SENSOR_PACKAGES if options.role == "robot" else ()
         compile_kernels(PHYSICS_PACKAGES, options.device, then=sensors)
         self.model = generate(self.scene)
@@ -82,11 +81,11 @@ class ClientSession:
         self._stack.__exit__(*exception)
 
     def enter(self, context: contextlib.AbstractContextManager[T]) -> T:
-        """Enter a context manager that is left together with the session."""
+        """Enter a context manager that is left at the end of the session."""
         return self._stack.enter_context(context)
 
     def bus(self, name: str) -> Bus:
-        """A member of the world on the server, or of a network in memory if there is no server."""
+        """Returns a member of the world on the server, or of a network in memory if there is no server."""
         options = self.options
         if options.connect is None:
             return self.enter(self._hub.bus(name))
@@ -95,7 +94,7 @@ class ClientSession:
         return self.enter(ZenohBus(name, connect=options.connect, world=options.world, certificates=options.tls))
 
     def client_options(self, name: str | None = None) -> dict[str, Any]:
-        """Keyword arguments of :class:`Client` for every role; ``name`` replaces the session's name."""
+        """Returns the keyword arguments of :class:`Client` for every role; ``name`` replaces the session's name."""
         options = self.options
         return {
             "name": name or self.name,
@@ -106,7 +105,7 @@ class ClientSession:
         }
 
     def leave_at_end(self, client: Client) -> None:
-        """Let a client announce that it leaves, before its buses close."""
+        """At the end of the session, let a client announce that it leaves, before its buses close."""
         self._stack.callback(client.leave)
 
     def trace(self, client: Client, bunch: int) -> Trace:
@@ -115,8 +114,11 @@ class ClientSession:
         return client.trace
 
     def show_page(self, client: Client, person: TrackedHuman | None = None) -> None:
-        """Show the vineyard in browsers until the session ends, if ``--page`` is given or the client exists for its
-        page. The first page moves a spectator's eyes, or the ``person``."""
+        """Show the vineyard in browsers until the session ends, if ``--page`` is given or the client is used through
+        its page only.
+
+        The first page controls a spectator's eyes, or the ``person``.
+        """
         port = self.options.page
         if port is None:
             if not self.options.is_for_page:
@@ -153,11 +155,10 @@ class ClientSession:
         sensors: Callable[[], dict[str, Any]] = dict,
         publish: Callable[[dict[str, Any]], Any] = lambda _: None,
     ) -> Status:
-        """Step as the world's clock says until a signal, the time limit or the end of the ``task``; returns the final
-        status.
+        """Step by the world's clock until a signal, the time limit or the end of the ``task``; return the final status.
 
-        ``sent`` counts the ROS messages by topic, ``sensors`` gives the status of sensors, ``publish`` takes every
-        status for /diagnostics.
+        ``sent``: returns the numbers of ROS messages by topic. ``sensors``: returns the status of sensors. ``publish``:
+        is called with every status, for /diagnostics.
         """
         is_shared = self.options.connect is not None
         if is_shared:
@@ -188,7 +189,7 @@ class ClientSession:
 
 
 def start_trace(client: Client, model: Model, bunch: int) -> Trace:
-    """An empty trace of a bunch that hangs at rest."""
+    """Returns an empty trace of a bunch that hangs at rest."""
     body = int(model.bunch_body[bunch])
     return Trace(model, bunch, client.physics.state.body_q[body].copy(), TRACE_CAPACITY)
 
@@ -201,13 +202,13 @@ def run_loop(
     dt: float,
     is_done: Callable[[], bool] = lambda: False,
 ) -> None:
-    """Step at the loop's rate until ``stop`` (set by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until
-    done.
+    """Step at the loop's rate until ``stop`` is set (by SIGINT, SIGTERM), for ``seconds`` of simulated time, or until
+    ``is_done()``. ``dt``: duration of a step [s].
     """
     allocator.release_free_memory()
-    gc.freeze()  # all that exists now lives to the end; the collector need not visit it in a step
+    gc.freeze()  # all objects that exist now live to the end; the collector need not visit them during a step
     gc.enable()
-    # until here Ctrl-C simply interrupts; from now on it ends the run in order
+    # before this line Ctrl-C interrupts the process; after it, Ctrl-C ends the run in order
     stop_at_signals(stop)
     limit = None if seconds is None else round(seconds / dt)
     while not (stop.is_set() or loop.ticks == limit or is_done()):
@@ -217,7 +218,7 @@ def run_loop(
 
 
 def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
-    """Write ``report.json``, whole or not at all."""
+    """Write ``report.json`` atomically."""
     with writing(out / "report.json"):
         partial = out / "report.json.part"
         partial.write_text(json.dumps(report, indent=2) + "\n")
@@ -225,7 +226,7 @@ def save_report(out: pathlib.Path, report: dict[str, Any]) -> None:
 
 
 def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form: str, stop: threading.Event) -> None:
-    """Every second, give the status to ``publish`` and print it as text or JSON. Runs until ``stop`` is set."""
+    """Every second, pass the status to ``publish`` and print it as text or JSON. Returns when ``stop`` is set."""
     period = FIRST_STATUS
     try:
         while not stop.wait(period):
@@ -236,12 +237,12 @@ def report_status(status: Status, publish: Callable[[dict[str, Any]], Any], form
                 print(json.dumps(values), flush=True)
             elif form == "text":
                 print(status_line(values), flush=True)
-    except BrokenPipeError:  # the reader of standard output is gone: that ends the run, not the log
+    except BrokenPipeError:  # the reader of standard output has closed it: the run ends without an error
         stop.set()
 
 
 def status_line(values: dict[str, Any]) -> str:
-    """One line of text for a status."""
+    """Returns a status as one line of text."""
     counts = {
         "pictures and scans": values["frames_dropped"],
         "messages": values["messages_dropped"],

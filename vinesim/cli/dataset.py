@@ -28,7 +28,7 @@ from vinesim.sensors.export.files import remove_partial_files
 from vinesim.sensors.raster import renderer_selection
 
 CONNECT_TIMEOUT = 10.0
-"""[s] Longest time to reach a scheduler."""
+"""Time limit for connecting to a scheduler [s]."""
 _RENDERING = threading.Lock()
 
 
@@ -39,13 +39,13 @@ class DaskMissing(RuntimeError):
 
 
 class WorkerDied(RuntimeError):
-    """A worker was killed or crashed before its images were written; the text says what to do."""
+    """A worker was killed or crashed before all its images were written; the text says how to continue."""
 
     exit_code = 5
 
 
 Worker = tuple[BaseProcess, Any]
-"""A process and the end of the pipe on which it reports."""
+"""A worker process, and the end of the pipe on which it reports."""
 
 
 def run(
@@ -63,7 +63,7 @@ def run(
     scheduler: str | None = None,
     sensor: Sequence[str] | None = None,
 ) -> int:
-    """Render the missing images, then gather the annotations of all images; the exit code."""
+    """Render the missing images, then gather the annotations of all images. Returns the exit code."""
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
     if scheduler is not None and workers is not None:
@@ -94,7 +94,7 @@ def run(
                 task = progress.add_task("images", total=images, completed=images - len(wanted))
                 _render_on_cluster(scheduler, plan, out, wanted, lambda done: progress.advance(task, done))
             return _finish(out, images, len(wanted))
-        # Of an image on a GPU the cores only generate, write and compute the truth; they share the GPU.
+        # With a GPU, the cores only generate vineyards, write files and compute the truth; all workers share the GPU.
         cores = os.cpu_count() or 2
         shares = _shares(wanted, workers or max(cores // 2 if device == "cpu" else cores, 1))
         running += [_start_worker(plan, out, share) for share in shares]
@@ -112,7 +112,7 @@ def run(
 
 
 def _finish(out: pathlib.Path, images: int, new: int) -> int:
-    """Gather the annotations and say what there is; the exit code."""
+    """Gather the annotations and print a summary. Returns the exit code."""
     splits = collections.Counter(map(dataset.split_of, range(images)))
     parts = ", ".join(f"{splits[split]} {split}" for split in dataset.SPLITS)
     print(f"{dataset.finish(out, images)}: {images} images ({parts}), {new} of them new")
@@ -120,7 +120,7 @@ def _finish(out: pathlib.Path, images: int, new: int) -> int:
 
 
 def _by_vineyard(wanted: list[int]) -> list[list[int]]:
-    """Images grouped by vineyard."""
+    """Returns the numbers of images, grouped by vineyard."""
     vineyards: dict[int, list[int]] = {}
     for image in wanted:
         vineyards.setdefault(image // dataset.IMAGES_PER_VINEYARD, []).append(image)
@@ -128,8 +128,8 @@ def _by_vineyard(wanted: list[int]) -> list[list[int]]:
 
 
 def _shares(wanted: list[int], workers: int) -> list[list[int]]:
-    """The images of each worker, in whole vineyards where possible: generating a vineyard costs more than rendering an
-    image."""
+    """Returns the images of each worker, in whole vineyards where possible: generating a vineyard costs more than
+    rendering an image."""
     shares: list[list[int]] = [[] for _ in range(workers)]
     for group in _by_vineyard(wanted):
         min(shares, key=len).extend(group)
@@ -139,9 +139,10 @@ def _shares(wanted: list[int], workers: int) -> list[list[int]]:
 def _render_on_cluster(
     scheduler: str, plan: DatasetPlan, out: pathlib.Path, wanted: list[int], advance: Callable[[int], None]
 ) -> None:
-    """Render images by the workers of a Dask scheduler, a vineyard a task; ``advance`` takes the images of each.
+    """Render images on the workers of a Dask scheduler, one vineyard in each task. ``advance`` is called with the
+    number of new images after each task.
 
-    The images of a killed worker go to another worker. All machines must see ``out`` at the same path.
+    The images of a killed worker go to another worker. All machines must have the folder ``out`` at the same path.
     """
     if importlib.util.find_spec("distributed") is None:
         raise DaskMissing("Dask is not installed; run: pip install 'vinesim[dask]'")
@@ -169,7 +170,7 @@ def _render_on_cluster(
 
 
 def _render_share(plan: DatasetPlan, out: pathlib.Path, share: list[int]) -> int:
-    """Task of a worker of a cluster: render images and return their number. A process renders one share at a time,
+    """Task of a cluster's worker: render images and return their number. A process renders one share at a time,
     whatever its number of threads."""
     with _RENDERING:
         return sum(1 for _ in dataset.render_images(plan, out, share))
@@ -198,7 +199,7 @@ def _run_worker(plan: DatasetPlan, out: pathlib.Path, share: list[int], pipe: Co
 
 
 def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
-    """Call ``advance`` for each image until all workers are done. Raises the error that stopped a worker."""
+    """Call ``advance`` after each image until all workers are done. Raises the exception that stopped a worker."""
     working = {pipe: process for process, pipe in workers}
     while working:
         for pipe in wait(list(working)):

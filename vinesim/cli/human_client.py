@@ -1,4 +1,5 @@
-"""``vinesim client --role human``: join a vineyard as a human who is moved by a page in a browser, or by a script."""
+"""``vinesim client --role human``: join a vineyard as a person who is controlled by a page in a browser, or by a
+script."""
 
 from __future__ import annotations
 
@@ -19,16 +20,20 @@ from vinesim.core.errors import writing
 from vinesim.world import Physics
 
 GIVING_HEIGHT = 0.70
-"""Height of the hand above the bottom of a box when it lets a bunch go [m]. GUESSED."""
+"""Height of the hand above the bottom of a box when the hand releases a bunch [m]. GUESSED."""
 LIFTED = 0.08
 STILL_SPEED = 0.03
 HOLDS_STILL = 1.0
-"""A box is held out if it is raised by this height [m], and slower than this speed [m/s] for this time [s]. GUESSED."""
+"""Time for which a box must move slower than ``STILL_SPEED`` [m/s], raised by at least ``LIFTED`` [m], to count as held
+out [s]. GUESSED."""
 
 
 def run(options: ClientOptions) -> int:
-    """Act as the person in front of the page; or by a script walk, reach for a bunch, hold it, pull at it and let go.
-    At a signal write report.json. Returns the exit code."""
+    """Run the client of a person who follows the input of a page, or a script: walk, reach for a bunch, hold it, pull,
+    let go.
+
+    At a signal the client writes report.json. Returns the exit code.
+    """
     gestures = None if options.gestures is None else Gestures.load(options.gestures)
     with ClientSession(options) as session:
         validate_bunch(session.model, options.reach)
@@ -75,9 +80,9 @@ def run(options: ClientOptions) -> int:
 def pull_repeatedly(
     human: ScriptedHuman, point: Callable[[], np.ndarray], indicate: Callable[[str], None] = lambda _: None
 ) -> Iterator[None]:
-    """Hold what is at a point [3] in the world, pull at it, let it go; without end.
+    """Script for a person: hold the thing at a point [3] m in the world, pull at it, let it go; without end.
 
-    ``indicate`` is told what the person intends.
+    ``indicate`` is called with what the person is about to do.
     """
     while True:
         indicate("pick")
@@ -94,9 +99,10 @@ def pull_repeatedly(
 def pick_and_give(
     human: ScriptedHuman, physics: Physics, bunch: int, box: int, indicate: Callable[[str], None] = lambda _: None
 ) -> Iterator[None]:
-    """Pick a bunch in reach, lower it, wait until a box was lifted and holds still, lay the bunch into it, step back.
+    """Script for a person: pick a bunch in reach, lower it, wait until a box was lifted and is held still, lay the
+    bunch into the box, step back.
 
-    ``indicate`` is told what the person intends.
+    ``indicate`` is called with what the person is about to do.
     """
     body = int(physics.model.bunch_body[bunch])
     middle = 0.5 * float(physics.model.bunch_length[bunch])
@@ -114,7 +120,7 @@ def pick_and_give(
     yield from human.wait(0.5)
     yield from human.back(lambda: not physics.state.bunch_attached[bunch])
     yield from human.back(lambda: False, 0.3)
-    yield from human.withdraw("right")  # else it hits the bunches that hang on the way, and tears them off
+    yield from human.withdraw("right")  # otherwise the hand hits the bunches that hang on its way, and tears them off
     indicate("hand over")
     low = box_place()[2]
     before = box_place()
@@ -137,7 +143,7 @@ def pick_and_give(
 
 
 def standing_place(goal: np.ndarray, start: np.ndarray) -> tuple[float, float]:
-    """A point (x, y) [m] within reach of a ``goal`` [3] m, on the side of the place ``start`` [2 or 7]."""
+    """Returns a point (x, y) [m] within reach of a ``goal`` [3] m, on the side of the place ``start`` [2 or 7]."""
     way = goal[:2] - start[:2]
     length = float(np.linalg.norm(way))
     x, y = goal[:2] - way * min(1.0, REACH / max(length, 1e-9))

@@ -1,4 +1,4 @@
-"""``vinesim record``: write down what is sent in a world."""
+"""``vinesim record``: write the messages of a world to a file."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def run(
     only: str | None,
     seconds: float | None,
 ) -> int:
-    """Record until asked to stop; 0 if the file is complete."""
+    """Record until a signal or the time limit. Returns 0 if the file is complete."""
     families = CHOICES if only is None else tuple(filter(None, only.split(",")))
     if unknown := [family for family in families if family not in CHOICES] or ([] if families else [only]):
         raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(CHOICES)}")
@@ -77,7 +77,7 @@ def run(
 
 
 def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
-    """Scene name, seed and digest of the only vineyard that is to be recorded, from a scene file."""
+    """Returns scene name, seed and digest of the only vineyard that may be recorded, from a scene file."""
     if scene is None:
         if seed is not None:
             raise UsageError(f"--seed {seed}: a seed is of a scene, give --scene too")
@@ -90,7 +90,7 @@ def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
 
 
 def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
-    """One line that is overwritten on a terminal; nothing is written to a file."""
+    """Show progress in one line that is overwritten on a terminal. Nothing is written if the output is a file."""
     if not sys.stderr.isatty():
         return
     trouble = recorder.bus.status_message

@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Viewpoint:
-    """Where a camera stands and what it looks at."""
+    """Position of a camera, and the point that it looks at."""
 
     eye: np.ndarray
-    """[3] m"""
+    """Position of the camera [3] m."""
     target: np.ndarray
-    """[3] m"""
+    """Point that the camera looks at [3] m."""
     place: str
-    """Place in the user's input where the viewpoint was given, for messages."""
+    """Place in the user's input where the viewpoint was given, for error messages."""
 
     def __post_init__(self) -> None:
         for name, point in (("position", self.eye), ("target", self.target)):
@@ -67,11 +67,12 @@ def run(
 ) -> int:
     """Render and write ``rgb``, ``depth``, ``measured``, ``labels``, ``overlay`` PNGs, ``camera``, ``truth`` JSON.
 
-    Each of ``sensors`` looks from there as well, into ``<sensor>_<image>.png`` and ``<sensor>.json``. The viewpoint is
-    ``at`` and ``look``; those of a ``path`` file go to the folders ``0000``, ``0001``, ... of ``out``.
+    Each of ``sensors`` measures from the viewpoint as well and writes ``<sensor>_<image>.png`` and ``<sensor>.json``.
+    The viewpoint is ``at`` and ``look``. Viewpoints of a ``path`` file go to the folders ``0000``, ``0001``, ... of
+    ``out``.
     """
     viewpoints = _viewpoints(at, look, path)
-    if device != "cpu":  # these imports cost half a second
+    if device != "cpu":  # the imports for a GPU cost half a second
         from vinesim.plants.device_buffers import find_device
 
         find_device(device)
@@ -97,7 +98,7 @@ def run(
     model = generate(plan)
     view = staged.compose(model, plan.physics)
     if (wind := wind_of(plan)) is not None:
-        from vinesim.wind.sway import windblown  # the kernels of plants: half a second
+        from vinesim.wind.sway import windblown  # loading the kernels of plants takes half a second
 
         view = windblown(model, view, wind, time)
     primitives = Primitives(model, renderer=renderer, device=device)
@@ -112,7 +113,7 @@ def run(
                 folder = out if path is None else out / f"{number:04d}"
                 folder.mkdir(parents=True, exist_ok=True)
                 picture, sight = stage.render(viewpoint)
-                written.append(writer.submit(picture.write, folder))  # while the next picture is rendered
+                written.append(writer.submit(picture.write, folder))  # written while the next picture is rendered
                 if number:
                     written[number - 1].result()
                 print(f"{folder}: {sight}")
@@ -127,13 +128,13 @@ def run(
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Picture:
-    """A picture with its truth, ready to be written."""
+    """A rendered picture with its ground truth, ready to be written."""
 
     images: dict[str, np.ndarray]
     records: dict[str, Any]
 
     def write(self, folder: pathlib.Path) -> None:
-        """Write PNG and JSON files, all or none; OSError if that fails."""
+        """Write all PNG and JSON files, or none. Raises OSError if that fails."""
         from vinesim.sensors.export import annotations as formats
         from vinesim.sensors.export import images as picture
         from vinesim.sensors.export.files import write_files
@@ -145,7 +146,7 @@ class _Picture:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Stage:
-    """A composed scene, ready to be looked at."""
+    """A composed scene, ready to be rendered."""
 
     plan: Scene
     model: Model
@@ -158,10 +159,11 @@ class _Stage:
     time: float
     """[s] Simulated time; it sets the sun."""
     sensors: tuple[RenderedMount, ...]
-    """Further sensors that look from the camera's place."""
+    """Further sensors that measure from the camera's place."""
 
     def render(self, viewpoint: Viewpoint) -> tuple[_Picture, str]:
-        """Returns the picture from a viewpoint, and a text that counts the visible bunches, berries and cut points."""
+        """Returns the picture from a viewpoint, and a text with the numbers of visible bunches, berries and cut
+        points."""
         from vinesim.scene.camera_geometry import depth_millimetres
         from vinesim.sensors import ground_truth
         from vinesim.sensors.camera.camera import Camera
@@ -172,7 +174,7 @@ class _Stage:
         pose = picture.look_at(viewpoint.eye, viewpoint.target)
         seen = ground_truth.render_buffers(self.primitives, self.info, pose)
         truths = ground_truth.bunch_truths(self.primitives, self.view, seen, self.caster)
-        # a camera for each picture: none depends on those before it
+        # each picture has a new camera, so that no picture depends on the one before
         camera = Camera(
             self.spec,
             self.info,
@@ -214,7 +216,7 @@ class _Stage:
 
 
 def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:
-    """:class:`UsageError` if a camera stands inside something."""
+    """Raise :class:`UsageError` if the camera is inside an object."""
     from vinesim.scene.ids import unlabel
     from vinesim.sensors.primitives.ray_caster import enclosing_primitive
 
@@ -225,7 +227,7 @@ def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:
 
 
 def _viewpoints(at: str | None, look: str | None, path: pathlib.Path | None) -> list[Viewpoint]:
-    """The viewpoints of the command line; :class:`UsageError` if one is wrong or none is given."""
+    """Returns the viewpoints of the command line. Raises :class:`UsageError` if one is wrong or none is given."""
     if path is not None:
         if at is not None or look is not None:
             raise UsageError("--path has the viewpoints; leave out --at and --look")
@@ -239,8 +241,8 @@ _COLUMNS = ("x", "y", "z", "look_x", "look_y", "look_z")
 
 
 def _read_path(path: pathlib.Path) -> list[Viewpoint]:
-    """Viewpoints from a CSV file with the columns x, y, z, look_x, look_y, look_z [m], or from a JSON list of objects
-    with those keys. :class:`UsageError` if there are none or one is wrong."""
+    """Returns the viewpoints of a CSV file with the columns x, y, z, look_x, look_y, look_z [m], or of a JSON list of
+    objects with those keys. Raises :class:`UsageError` if there are none or one is wrong."""
     try:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as bad:
@@ -259,7 +261,8 @@ def _read_path(path: pathlib.Path) -> list[Viewpoint]:
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:
-    """The actors and crates of ``--robot``, ``--person`` and ``--crate``; :class:`UsageError` if one is wrong."""
+    """Returns the actors and crates of ``--robot``, ``--person`` and ``--crate``. Raises :class:`UsageError` if one is
+    wrong."""
     from vinesim.client.composition.scene_composer import CratePlacement, PersonPlacement, RobotPlacement, SceneComposer
     from vinesim.robot.description.loader import load_description
     from vinesim.scene import appearance
@@ -290,7 +293,7 @@ def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequ
 
 
 def _parse_place(option: str, text: str, most: int) -> list[float]:
-    """``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
+    """Returns ``X,Y[,YAW[,...]]`` as two to ``most`` numbers."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -302,7 +305,7 @@ def _parse_place(option: str, text: str, most: int) -> list[float]:
 
 
 def parse_point(option: str, text: str) -> np.ndarray:
-    """``X,Y,Z`` as a point [3] m."""
+    """Returns ``X,Y,Z`` as a point [3] m."""
     try:
         value = np.array([float(part) for part in text.split(",")])
     except ValueError:
@@ -313,7 +316,8 @@ def parse_point(option: str, text: str) -> np.ndarray:
 
 
 def parse_sensors(texts: Sequence[str], size: tuple[int, int] | None) -> tuple[RenderedMount, ...]:
-    """The sensors of ``--sensor``, pictures of the given ``size`` [px]; :class:`UsageError` if one is wrong."""
+    """Returns the sensors of ``--sensor``, with pictures of the given ``size`` [px]. Raises :class:`UsageError` if one
+    is wrong."""
     from vinesim.scene.values import SENSOR_KINDS, PictureMount
     from vinesim.sensors.sensor import maker
 
@@ -334,7 +338,7 @@ def parse_sensors(texts: Sequence[str], size: tuple[int, int] | None) -> tuple[R
 
 
 def parse_size(text: str) -> tuple[int, int]:
-    """``WxH`` as width and height [px]."""
+    """Returns ``WxH`` as width and height [px]."""
     match = re.fullmatch(r"(\d{1,6})x(\d{1,6})", text)
     if match is None:
         raise UsageError(f"--size is {text!r}; give WxH in pixels, such as 640x480")

@@ -48,7 +48,7 @@ def run(
     scene: str | None,
     seed: int | None,
 ) -> int:
-    """Play a file; 0 when its end is reached, or on Ctrl-C."""
+    """Play a recording. Returns 0 when its end is reached, or after Ctrl-C."""
     if sum(way is not None for way in (connect, listen, out, page)) + ros != 1:
         raise UsageError(
             "give one of --connect (play to a server), --listen (be one), --page (look at it in a browser), --out (as "
@@ -85,7 +85,7 @@ def _tell(
     start: float,
     end: float | None,
 ) -> int:
-    """Play to a network."""
+    """Play to the clients of a server, or as a server. Returns the exit code."""
     from vinesim.client.recording.replay import Replay
     from vinesim.net.server.server import Server
     from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -123,7 +123,8 @@ def _look(
     start: float,
     end: float | None,
 ) -> int:
-    """Play to a spectator in this process, as fast as it can take pictures. The pictures are the same every time."""
+    """Play to a spectator in this process, as fast as it can render pictures, and save them. The pictures are the same
+    every time."""
     from vinesim.client.spectator import PictureWriter
 
     spectator, bus = _spectator(tape, pose, scene, seed, start, end)
@@ -146,7 +147,7 @@ def make_page_replay(
     start: float = 0.0,
     end: float | None = None,
 ) -> PageReplay:
-    """A recording that pages can play; arguments as for :func:`run`."""
+    """Returns a recording that pages can play; arguments as for :func:`run`."""
     from vinesim.client.page.page_replay import PageReplay
 
     plan, model = _vineyard(tape, scene, seed)
@@ -168,7 +169,8 @@ def _show(
     start: float,
     end: float | None,
 ) -> int:
-    """Play to a spectator in this process and show it in browsers, which can pause it and go to other times."""
+    """Play to a spectator in this process and show its view in browsers, which can pause the recording and go to other
+    times."""
     from vinesim.web import page_files
 
     page_files.check()
@@ -231,13 +233,14 @@ def _spectator(
     start: float,
     end: float | None,
 ) -> tuple[Spectator, ReplayBus]:
-    """A spectator of a recording, and its bus. It stands at a ``pose``, or unless given behind the first robot."""
+    """Returns a spectator of a recording, and its bus. The spectator stands at ``pose``, by default behind the first
+    robot."""
     plan, model = _vineyard(tape, scene, seed)
     return _spectator_in(tape, plan, model, _eyes(tape, model, pose), start, end)
 
 
 def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Scene, Model]:
-    """The scene of a recording, and its model."""
+    """Returns the scene of a recording, and its model."""
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import SceneError, load_scene, with_seed
 
@@ -260,7 +263,7 @@ def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Sce
 
 
 def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None) -> np.ndarray:
-    """Pose [7] of eyes that stand at a ``pose``, unless given behind the first robot."""
+    """Returns the pose [7] of a spectator's eyes at ``pose``, by default behind the first robot."""
     from vinesim.client.page.first_view import first_view
     from vinesim.client.spectator import standing_view
 
@@ -272,7 +275,7 @@ def _eyes(tape: Recording, model: Model, pose: tuple[float, float, float] | None
 def _spectator_in(
     tape: Recording, plan: Scene, model: Model, eyes: np.ndarray, start: float, end: float | None
 ) -> tuple[Spectator, ReplayBus]:
-    """A spectator at some time of a recording, and its bus."""
+    """Returns a spectator at the time ``start`` [s] of a recording, and its bus."""
     from vinesim.client.recording.replay import ReplayBus
     from vinesim.client.spectator import Spectator
 
@@ -281,7 +284,7 @@ def _spectator_in(
 
 
 def _step(spectator: Spectator, bus: ReplayBus, speed: float, *, follow: bool) -> None:
-    """One tick of a spectator; ``follow``: its eyes stay behind the first robot."""
+    """Step a spectator once; ``follow``: its eyes stay behind the first robot."""
     from vinesim.client.spectator import follow_view
 
     bus.play(spectator.physics.dt * speed)
@@ -292,7 +295,8 @@ def _step(spectator: Spectator, bus: ReplayBus, speed: float, *, follow: bool) -
 
 
 def _first_pose(tape: Recording) -> np.ndarray:
-    """Pose [7] at which the first robot appears in the recording; without robots, that of the first person."""
+    """Returns the pose [7] at which the first robot appears in the recording; without robots, the pose of the first
+    person."""
     for kind in ("robot", "human"):
         such = {
             sender_of(entry.key)

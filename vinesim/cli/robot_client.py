@@ -26,7 +26,7 @@ from vinesim.scene.values import SensorMode, SensorPacing
 
 
 def run(options: ClientOptions) -> int:
-    """Build the client from its options, step until asked to stop, then write what was asked for; the exit code."""
+    """Build the client from its options, step until the end, then write the requested files. Returns the exit code."""
     validate_task_name(options.job)
     descriptions = [load_description(robot) for robot in options.robot or ["vinebot"]]
     with ClientSession(options) as session:
@@ -47,7 +47,7 @@ def run(options: ClientOptions) -> int:
         sensors = _start_sensors(session, names, descriptions)
         client = _build_client(session, names, descriptions, start, approach)
         for name, process in zip(names, sensors, strict=True):
-            # a run of given length is seen from its beginning; others begin at once, and their sensors join them
+            # a run of given length waits for its sensors, so that they record its beginning; other runs begin at once
             process.attach(client, client.robots[name], wait_for_sensors=options.seconds is not None)
         task = None if begin is None else begin(client.physics, client.robot)
         _add_behaviour(session, client, task, approach)
@@ -109,8 +109,8 @@ def _start_sensors(
 
 
 def _pacing(options: ClientOptions, description: RobotDescription) -> SensorPacing:
-    """Settings of sensors and simulated time from the command line; the robot's file gives those that are missing
-    there."""
+    """Returns the settings of sensors and simulated time: from the command line, and from the robot's file where the
+    command line has none."""
     pacing = description.sensor_pacing
     if options.sensors is not None:
         pacing = dataclasses.replace(pacing, mode=SensorMode(options.sensors))
@@ -120,8 +120,8 @@ def _pacing(options: ClientOptions, description: RobotDescription) -> SensorPaci
 
 
 def complete_report(report: dict[str, Any], processes: Mapping[str, RobotProcesses]) -> dict[str, Any]:
-    """A client's report with that of the first robot's processes. If there are several robots, the reports of
-    all their processes are listed by robot name too."""
+    """Returns a client's report together with the report of the first robot's processes. If there are several robots,
+    the reports of all their processes are listed by robot name too."""
     reports = {name: one.report() for name, one in processes.items()}
     complete = report | next(iter(reports.values()))
     if len(reports) > 1:
@@ -132,7 +132,7 @@ def complete_report(report: dict[str, Any], processes: Mapping[str, RobotProcess
 
 
 def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
-    """The status of the processes of all robots together."""
+    """Returns the status of the processes of all robots together."""
     statuses = [one.status() for one in processes]
     awaited = [part for status in statuses for part in status["sensors_awaited"]]
     counts = {
@@ -151,7 +151,7 @@ def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
 def _build_client(
     session: ClientSession, names: list[str], descriptions: list[RobotDescription], start: np.ndarray, approach: float
 ) -> Client:
-    """A client that simulates all robots, the first at ``start`` [7], the others at the next start poses."""
+    """Returns a client that simulates all robots, the first at ``start`` [7], the others at the next start poses."""
     client = Client(
         session.scene,
         session.model,
@@ -168,7 +168,8 @@ def _build_client(
 
 
 def _add_behaviour(session: ClientSession, client: Client, task: Task | None, approach: float) -> None:
-    """Let the robots drive to their start poses, push the bunch of ``--push``, do the ``task``, and look at it."""
+    """Let the robots drive to their start poses, push the bunch of ``--push``, do the ``task``, and look at their
+    work."""
     options = session.options
     given = {"--job": options.job, "--push": options.push, "--watch": options.watch, "--approach": approach or None}
     client.script = next((name for name, value in given.items() if value is not None), "")

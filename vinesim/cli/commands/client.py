@@ -25,7 +25,7 @@ def client(ctx: typer.Context, **values: Any) -> None:
       vinesim client --role spectator --connect tcp/127.0.0.1:7447
       vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva --outfit green
     """
-    gc.disable()  # a sixth of the time of the start; the loop enables it
+    gc.disable()  # the collector takes a sixth of the start time; the loop enables it again
     options = ClientOptions(**values)
     check_role(options.role, {option for option in values if _is_given(ctx, option)})
     if options.role == "robot":
@@ -41,7 +41,8 @@ def client(ctx: typer.Context, **values: Any) -> None:
 
 
 def _signature() -> inspect.Signature:
-    """The context, and a parameter for each field of :class:`ClientOptions`: what typer reads options from."""
+    """Returns the signature that typer reads options from: the context, and a parameter for each field of
+    :class:`ClientOptions`."""
     hints = get_type_hints(ClientOptions, include_extras=True)
     context = inspect.Parameter("ctx", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
     options = [
@@ -55,6 +56,6 @@ client.__signature__ = _signature()  # pyright: ignore[reportFunctionMemberAcces
 
 
 def _is_given(ctx: typer.Context, option: str) -> bool:
-    """Whether an option stands on the command line, rather than having its default."""
+    """Returns whether an option was given on the command line, rather than having its default."""
     source = ctx.get_parameter_source(option)
     return source is not None and source.name == "COMMANDLINE"

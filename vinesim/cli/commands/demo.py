@@ -14,19 +14,24 @@ def demo(
     job: Annotated[
         str,
         typer.Option(
-            help="push: on and on. pick: a bunch into a box. exchange: a full box for an empty one. meet: a person "
-            "picks into a box that a robot holds."
+            help="push: push a bunch again and again. pick: put a bunch into a box. exchange: a full box for an "
+            "empty one. meet: a person picks into a box that a robot holds."
         ),
     ] = "push",
     seconds: Annotated[
-        float | None, typer.Option(min=6.0, help="How long the robots push, 20; or how long a job may take, 120 [s].")
+        float | None,
+        typer.Option(
+            min=6.0, help="Time that the robots push [s], by default 20; or time limit of a task, by default 120."
+        ),
     ] = None,
     seed: Seed = None,
     scene: Annotated[
-        str | None, typer.Option(help="A scene file, or the name of one that ships; demo, or harvest for the jobs.")
+        str | None,
+        typer.Option(help="A scene file, or the name of a shipped scene; by default demo, or harvest for tasks."),
     ] = None,
     robot: Annotated[
-        str | None, typer.Option(help="A URDF file, or the name of one that ships; vinebot, or logistic to exchange.")
+        str | None,
+        typer.Option(help="A URDF file, or the name of a shipped robot; by default vinebot, or logistic to exchange."),
     ] = None,
     device: Device = "cpu",
     real_time_factor: RealTimeFactor = None,
@@ -35,12 +40,12 @@ def demo(
         "out"
     ),
 ) -> None:
-    """A robot pushes a bunch, another client sees it move, ROS topics carry it; or a robot does a job.
+    """Let a robot push a bunch, show its motion on another client and in ROS topics; or let a robot do a task.
 
-    Starts a server, two robot clients (one for a job) and a plain rclpy subscriber, each a process of its own, on free
+    Starts a server, two robot clients (one for a task) and a plain rclpy subscriber, each in its own process, on free
     ports. The seconds of a push begin when server, clients, sensors and subscriber are all ready. summary.json holds
-    the measurements; of a job whether it was done ("picked", "exchanged", "handed_over") and if not, why.
-    To meet, a carrier brings a box to a person of another client, who picks a bunch and lays it in.
+    the measurements; for a task also whether it was done ("picked", "exchanged", "handed_over") and if not, why.
+    In the task meet, a carrier brings a box to a person of another client, who picks a bunch and lays it into the box.
 
     \b
     Examples:

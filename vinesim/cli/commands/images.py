@@ -13,9 +13,9 @@ from vinesim.cli.commands.options import Camera, Device, ImageSize, Renderer, Sc
 def scene_show(
     file: Annotated[str, typer.Argument(help="A scene file, or demo, harvest, tendone, vsp.")],
     seed: Seed = None,
-    out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; NAME.png unless given.")] = None,
+    out: Annotated[pathlib.Path | None, typer.Option(help="Picture to write; by default NAME.png.")] = None,
 ) -> None:
-    """Print what a scene holds, and draw it.
+    """Print the contents of a scene, and draw it.
 
     \b
     Examples:
@@ -31,19 +31,21 @@ def scene_import_plant(
     file: Annotated[
         pathlib.Path, typer.Argument(help="MTG (.mtg), PLY skeleton (.ply), cylinders (.txt) or Helios XML (.xml).")
     ],
-    out: Annotated[pathlib.Path | None, typer.Option(help="TOML file to write; NAME.toml unless given.")] = None,
-    unit: Annotated[str, typer.Option(help="Of coordinates: m, cm or mm.")] = "m",
-    diameter_unit: Annotated[str | None, typer.Option(help="Of diameters and radii; as --unit unless given.")] = None,
-    plants: Annotated[str, typer.Option(help="Plant parameters from which missing numbers are filled.")] = "vine",
+    out: Annotated[pathlib.Path | None, typer.Option(help="TOML file to write; by default NAME.toml.")] = None,
+    unit: Annotated[str, typer.Option(help="Unit of coordinates: m, cm or mm.")] = "m",
+    diameter_unit: Annotated[
+        str | None, typer.Option(help="Unit of diameters and radii; by default as --unit.")
+    ] = None,
+    plants: Annotated[str, typer.Option(help="Plant parameters that replace missing numbers.")] = "vine",
     slack: Annotated[
         bool, typer.Option("--slack", help="The file shows the plant without its weight: it will sag.")
     ] = False,
-    piece: Annotated[float, typer.Option(help="Length of the rigid bodies that wood is cut into [m].")] = 0.06,
+    piece: Annotated[float, typer.Option(help="Length of the rigid bodies into which wood is divided [m].")] = 0.06,
     old_wood: Annotated[
-        float | None, typer.Option(help="Wood thicker than this [m] stands still; 0.01575 with vine's parameters.")
+        float | None, typer.Option(help="Wood thicker than this [m] is rigid; 0.01575 with the parameters vine.")
     ] = None,
 ) -> None:
-    """Make a plant that another program has grown one that scenes load, with wood; fill what is missing, and mark it.
+    """Convert a plant of another program to a file that scenes load. Missing numbers are filled in and marked.
 
     \b
     Examples:
@@ -71,7 +73,7 @@ def render(
     look: Annotated[str | None, typer.Option(help="The point it looks at, X,Y,Z [m].")] = None,
     path: Annotated[
         pathlib.Path | None,
-        typer.Option(help="Many viewpoints: CSV or JSON with x, y, z, look_x, look_y, look_z [m] of each."),
+        typer.Option(help="Several viewpoints: CSV or JSON with x, y, z, look_x, look_y, look_z [m]."),
     ] = None,
     camera: Camera = "d435",
     size: ImageSize = None,
@@ -79,9 +81,13 @@ def render(
     hour: Annotated[
         float | None, typer.Option(min=0.0, max=24.0, help="Solar time [h], instead of the scene's own sun.")
     ] = None,
-    time: Annotated[float, typer.Option(min=0.0, help="Simulated time [s]: wind and sun.")] = 0.0,
-    out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its truth.")] = pathlib.Path("render"),
-    robot: Annotated[list[str] | None, typer.Option(help="NAME@X,Y[,YAW]: a robot there [m, rad]; may repeat.")] = None,
+    time: Annotated[float, typer.Option(min=0.0, help="Simulated time [s]; determines wind and sun.")] = 0.0,
+    out: Annotated[pathlib.Path, typer.Option(help="Folder for the picture and its ground truth.")] = pathlib.Path(
+        "render"
+    ),
+    robot: Annotated[
+        list[str] | None, typer.Option(help="NAME@X,Y[,YAW]: a robot at this place [m, rad]; may be repeated.")
+    ] = None,
     person: Annotated[
         list[str] | None,
         typer.Option(help="X,Y[,YAW][,POSTURE]: a person who stands, picks, reaches, points, waves, carries or walks."),
@@ -106,7 +112,7 @@ def render(
       vinesim render vsp --camera pinhole --at 1,-1.2,1.1 --look 1,0,1 --size 1280x960 --seed 4 --out shot
       vinesim render harvest --at 0,0.15,1.35 --look 2.6,0.35,1 --robot vinebot@2.9,1,-2.5 --person 2.2,-0.28,2.3,pick
       --crate 1.8,0.75,0,0.4
-    """  # a command line that can be copied
+    """  # keep a long command line whole, so that it can be copied
     from vinesim.cli.render import run
 
     code = run(
@@ -131,8 +137,10 @@ def render(
 
 
 def dataset(
-    images: Annotated[int, typer.Option(min=1, max=999_999, help="How many; never fewer than OUT holds.")],
-    out: Annotated[pathlib.Path, typer.Option(help="Folder of the data set; an unfinished one is continued.")],
+    images: Annotated[
+        int, typer.Option(min=1, max=999_999, help="Number of images, at least as many as OUT contains.")
+    ],
+    out: Annotated[pathlib.Path, typer.Option(help="Folder of the data set; an unfinished data set is continued.")],
     scene: Scene = "demo",
     seed: Annotated[int, typer.Option(help="The same seed gives the same images.")] = 0,
     camera: Camera = "d435",
@@ -140,23 +148,28 @@ def dataset(
     size: ImageSize = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=1, max=256, help="Processes; half as many as cores unless given, as many with a GPU."),
+        typer.Option(
+            min=1, max=256, help="Number of processes; by default half the number of cores, or one per core with a GPU."
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(help="Address of a Dask scheduler whose workers render; they must see OUT. Needs vinesim[dask]."),
+        typer.Option(
+            help="Address of a Dask scheduler whose workers render; they must have access to OUT. Needs vinesim[dask]."
+        ),
     ] = None,
     renderer: Renderer = "warp",
     device: Device = "cpu",
     actors: Annotated[
-        float, typer.Option(help="Share of the images with people, robots, crates and wind; 0 leaves the vines alone.")
+        float, typer.Option(help="Share of the images with people, robots, crates and wind; 0: vines only.")
     ] = 0.4,
 ) -> None:
-    """Render random pictures of random vineyards with their truth: COCO with masks, YOLO, depth, ids, poses.
+    """Render random pictures of random vineyards with their ground truth: COCO with masks, YOLO, depth, ids, poses.
 
     Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
-    Killed or stopped, the same command continues, and renders again what was deleted or truncated; more images may be
-    asked for later, fewer are refused. The five images of a vineyard are in one split: train, val or test (8 : 1 : 1).
+    After an interruption the same command continues, and renders deleted or truncated images again. A later run may
+    ask for more images; fewer are refused. The five images of a vineyard are in one split: train, val or test
+    (8 : 1 : 1).
 
     \b
     Examples:

@@ -8,27 +8,27 @@ from typing import Annotated
 import typer
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
-Scene = Annotated[str, typer.Option(help="A scene file, or the name of one that ships: demo, harvest, tendone, vsp.")]
+Scene = Annotated[str, typer.Option(help="A scene file, or the name of a shipped scene: demo, harvest, tendone, vsp.")]
 Renderer = Annotated[
     str, typer.Option(help="Rasterizer: warp, taichi (all cores) or taichi-gpu (Vulkan, Metal); needs vinesim[taichi].")
 ]
 Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:N (an NVIDIA GPU).")]
 Camera = Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")]
 ImageSize = Annotated[
-    str | None, typer.Option(help="WxH [px] at the same horizontal field of view; the camera's own unless given.")
+    str | None, typer.Option(help="WxH [px] at the same horizontal field of view; by default the camera's own size.")
 ]
 Sensors = Annotated[
     list[str] | None,
     typer.Option(
-        help="KIND:FILE: looks from the camera's place as well, such as multispectral:rededge_mx; may repeat."
+        help="KIND:FILE: a further sensor at the camera's place, such as multispectral:rededge_mx; may be repeated."
     ),
 ]
-Seconds = Annotated[float | None, typer.Option(help="Stop after so long [s]; until Ctrl-C unless given.")]
-StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: an object a second. none.")]
+Seconds = Annotated[float | None, typer.Option(help="Stop after this time [s]; by default at Ctrl-C.")]
+StatusFormat = Annotated[str, typer.Option(help="text: a line a second. json: a JSON object a second. none: nothing.")]
 
 
 def _parse_factor(text: str) -> float | None:
-    """A real-time factor, or None for ``auto``."""
+    """Returns a real-time factor, or None for ``auto``."""
     if text == "auto":
         return None
     with contextlib.suppress(ValueError):
@@ -42,8 +42,8 @@ RealTimeFactor = Annotated[
     typer.Option(
         parser=_parse_factor,
         metavar="auto|NUMBER",
-        help="Simulated time passes so many times as fast as real time. auto, unless given: as fast as every client "
-        "can follow, at most 1, so that no step is skipped on a slow machine. In a world with a server, the server's.",
+        help="Ratio of simulated time to real time. auto (the default): as fast as every client can follow, at most 1, "
+        "so that no step is skipped on a slow machine. In a world with a server, the server's value counts.",
     ),
 ]
 Insecure = Annotated[
@@ -52,6 +52,6 @@ Insecure = Annotated[
         help="Listen on a network without certificates: any program that reaches it may publish under any name."
     ),
 ]
-World = Annotated[str, typer.Option(help="Which of the server's worlds; those in different ones do not meet.")]
+World = Annotated[str, typer.Option(help="World on the server; actors in different worlds do not meet.")]
 Pose = tuple[float, float, float]
-"""X Y [m] and YAW [rad]."""
+"""Type of the option ``--pose``: X Y [m] and YAW [rad]."""

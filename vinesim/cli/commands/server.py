@@ -21,28 +21,33 @@ def server(
     ] = None,
     connect: Annotated[
         list[str] | None,
-        typer.Option(help="Only route, for the server at this endpoint, which admits actors and keeps the state."),
+        typer.Option(
+            help="Work as a router only, for the server at this endpoint, which admits actors and keeps the state."
+        ),
     ] = None,
     state_dir: Annotated[
         pathlib.Path | None,
-        typer.Option(help="Folder in which picked bunches, boxes and cuts are kept; in memory unless given."),
+        typer.Option(
+            help="Folder in which picked bunches, boxes and cuts are stored; by default they are in memory only."
+        ),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option(help="Admit this scene only; unless given, the first actor decides.")
+        str | None, typer.Option(help="Admit this scene only; by default the scene of the first actor.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of that scene, instead of its own.")] = None,
     max_clients: Annotated[
-        int | None, typer.Option(min=1, help="Largest number of actors at a time; no bound unless given.")
+        int | None, typer.Option(min=1, help="Largest number of actors at a time; by default unlimited.")
     ] = None,
     quota: Annotated[
         tuple[float, float],
         typer.Option(help="MESSAGES/s and BYTES/s of retained records (cuts, resting objects) for each actor."),
     ] = (200.0, 200_000.0),
     spectators_speak_to: Annotated[
-        str, typer.Option(help="Who hears spectators: nobody, people (robots are deaf to them) or all.")
+        str, typer.Option(help="Who hears spectators: nobody, people (and no robots) or all.")
     ] = "people",
     tls: Annotated[
-        pathlib.Path | None, typer.Option(help="Folder of certificates (vinesim certs new): all others are refused.")
+        pathlib.Path | None,
+        typer.Option(help="Folder of certificates (vinesim certs new); actors without one are refused."),
     ] = None,
     insecure: Insecure = False,
     real_time_factor: RealTimeFactor = None,
@@ -50,7 +55,7 @@ def server(
 ) -> None:
     """Route messages between clients, and keep the retained state. The server simulates nothing.
 
-    The state is kept in memory unless --state-dir is given: a demonstration begins with an unpicked vineyard each time.
+    Without --state-dir the state is in memory only: each start begins with an unpicked vineyard.
 
     \b
     Examples:

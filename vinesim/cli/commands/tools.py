@@ -9,19 +9,21 @@ import typer
 
 
 def bench(
-    names: Annotated[list[str], typer.Argument(help="plants, camera, live; several are run one after the other.")],
+    names: Annotated[
+        list[str], typer.Argument(help="Benchmarks to run one after the other, such as plants, camera, live.")
+    ],
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
     row: Annotated[
         list[str] | None,
-        typer.Option(help="Of live: demo, camera, lidar, tendone, start, generate, tick, cold; may repeat."),
+        typer.Option(help="Row of live: demo, camera, lidar, tendone, start, generate, tick, cold; may be repeated."),
     ] = None,
 ) -> None:
-    """Measure vinesim on this machine, and a peer in the same process on the same scene.
+    """Measure vinesim on this machine, compared with a peer in the same process on the same scene.
 
-    Physics: plants, contact, tick (whole steps of a client). Sensors: camera, lidar. What a user waits for: start. The
-    whole: live (demo, clients and commands as users start them, with budgets). ROS: ros (topics of every step in
-    another process, one subscriber stopped; actions; resets). Fits: tune (recovery over 50 seeds, MuJoCo as the truth,
-    compared with scipy, CMA-ES and Stein particles; needs scipy and cma).
+    Physics: plants, contact, tick (whole steps of a client). Sensors: camera, lidar. Time until a user can begin:
+    start. Whole programs: live (demo, clients and commands as users start them, with budgets). ROS: ros (topics of
+    every step in another process, one subscriber stopped; actions; resets). Fits: tune (recovery over 50 seeds,
+    MuJoCo as the truth, compared with scipy, CMA-ES and Stein particles; needs scipy and cma).
 
     \b
     Examples:
@@ -39,7 +41,7 @@ def bench(
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="All findings as one JSON object.")] = False,
 ) -> None:
-    """Check what vinesim needs of this machine: one line each, ok, warning or error, with the remedy.
+    """Check this machine for the requirements of vinesim: one line each, ok, warning or error, with a remedy.
 
     Python, packages, processor, GPU, ROS 2, page, certificates, ports, shared memory, clock, caches. The exit code is 0
     if a client can run, and 1 if it lacks something.
@@ -60,9 +62,10 @@ def ros_build_interfaces(
         pathlib.Path | None, typer.Option(help="Write wheels into this folder; installs nothing.", show_default=False)
     ] = None,
 ) -> None:
-    """Make ROS message packages that have no official wheel importable here (built once; cached). Needs g++.
+    """Build the ROS message packages that have no official wheel, and make them importable. Needs g++.
 
-    They are installed by pip into this environment, for every node that runs in it. What is official stays as it is.
+    The packages are built once, cached, and installed by pip into this environment, for every node that runs in it.
+    Official packages are not replaced.
 
     \b
     Examples:
@@ -77,9 +80,12 @@ def ros_build_interfaces(
 def ros_record(
     path: Annotated[pathlib.Path, typer.Argument(help="The MCAP file to write; an existing one is kept.")],
     topic: Annotated[
-        list[str] | None, typer.Option(help="A topic, or a regular expression for whole names; may repeat. All else.")
+        list[str] | None,
+        typer.Option(help="A topic, or a regular expression for whole names; may be repeated. By default all."),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="Stop after so many seconds; else at Ctrl-C.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after this time [s]; by default at Ctrl-C.")
+    ] = None,
 ) -> None:
     """Record ROS topics into one MCAP file with their definitions, as rosbag2 does, without rosbag2.
 
@@ -95,7 +101,7 @@ def ros_record(
 
 def ros_play(
     path: Annotated[pathlib.Path, typer.Argument(help="An MCAP file of ROS topics, of vinesim or rosbag2.")],
-    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Times as fast as recorded.")] = 1.0,
+    rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed as a multiple of the recorded one.")] = 1.0,
 ) -> None:
     """Publish the topics of a recording again, /clock included.
 
@@ -112,21 +118,21 @@ def ros_play(
 def certs_new(
     actor: Annotated[str, typer.Argument(help="The actor's name, or server.")],
     dir: Annotated[
-        pathlib.Path, typer.Option(help="Folder of certificates, for --tls of a server; made at first use.")
+        pathlib.Path, typer.Option(help="Folder of certificates, for --tls of a server; created at first use.")
     ] = pathlib.Path("certs"),
     authority: Annotated[
         pathlib.Path | None,
-        typer.Option(help="Folder of the authority's key ca.key; made at first use; default DIR-authority."),
+        typer.Option(help="Folder of the authority's key ca.key, created at first use; by default DIR-authority."),
     ] = None,
-    role: Annotated[str, typer.Option(help="robot, human or spectator, who only reads.")] = "robot",
+    role: Annotated[str, typer.Option(help="robot, human or spectator; spectators may only read.")] = "robot",
     host: Annotated[
-        list[str] | None, typer.Option(help="For server: name or address by which clients reach it; repeatable.")
+        list[str] | None, typer.Option(help="Name or address by which clients reach the server; may be repeated.")
     ] = None,
 ) -> None:
-    """Make the certificate and key of an actor; at first use the authority's and the server's as well.
+    """Make the certificate and key of an actor; at first use also those of the authority and the server.
 
-    An actor needs ca.pem, NAME.pem and NAME.key. The authority's key signs, stays where it is made, and belongs to no
-    server or client. A running server notices within seconds what is added to, replaced in or removed from its folder.
+    An actor needs ca.pem, NAME.pem and NAME.key. The authority's key signs certificates; keep it on the machine
+    that made it, away from servers and clients. A running server notices changes of its folder within seconds.
 
     \b
     Examples:

@@ -25,7 +25,10 @@ def tune(
     ],
     model: Model,
     fit: Annotated[
-        str, typer.Option(help="What is fitted, with commas: modulus, damping, mass (needs a force), rest (the shape).")
+        str,
+        typer.Option(
+            help="Quantities to fit, separated by commas: modulus, damping, mass (needs a force), rest (the shape)."
+        ),
     ] = "modulus,damping",
     out: Annotated[
         pathlib.Path | None, typer.Option(help="Write plant parameters that scenes load, with the fitted numbers.")
@@ -38,18 +41,22 @@ def tune(
         pathlib.Path | None,
         typer.Option(help="Points of the cane as it hangs at rest, base at the origin [m]: PLY, or lines of x y z."),
     ] = None,
-    release: Annotated[float | None, typer.Option(help="When it was let go [s]; found unless given.")] = None,
+    release: Annotated[
+        float | None, typer.Option(help="Time of the release [s]; by default found in the track.")
+    ] = None,
     push: Annotated[bool, typer.Option("--push", help="The track is of a push: a steady force begins.")] = False,
     samples: Annotated[
-        int, typer.Option(min=0, max=100_000, help="Draw so many candidates of the posterior, all simulated.")
+        int,
+        typer.Option(min=0, max=100_000, help="Number of candidates to draw from the posterior; all are simulated."),
     ] = 0,
-    seed: Annotated[int, typer.Option(min=0, help="Of these draws.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of these draws.")] = 0,
     device: Device = "cpu",
 ) -> None:
     """Fit a cane, or a bunch on its peduncle, to the track of a pull and release, a push, or a shaken base.
 
-    Prints modulus, damping and what else is fitted with 90 % intervals, what the data do not decide, and what speaks
-    against the fit; with such a fault the exit code is 5, and --out is not written. Needs scipy (extra: tune).
+    Prints modulus, damping and the other fitted quantities with 90 % intervals, directions that the data do not
+    determine, and faults of the fit. With a fault the exit code is 5, and --out is not written. Needs scipy (extra:
+    tune).
 
     \b
     Examples:
@@ -65,30 +72,31 @@ def tune(
 def track(
     recording: Annotated[
         pathlib.Path,
-        typer.Argument(
-            help="MCAP file of ROS topics, rosbag2 folder of such, or a data set as vinesim dataset writes."
-        ),
+        typer.Argument(help="MCAP file of ROS topics, rosbag2 folder of MCAP files, or data set of vinesim dataset."),
     ],
     marker: Annotated[
         list[str],
-        typer.Option(help="Colour R,G,B in a picture of the ball at the tip; NAME=R,G,B of another. May repeat."),
+        typer.Option(
+            help="Colour R,G,B of the ball at the tip in a picture; NAME=R,G,B for another ball. May be repeated."
+        ),
     ],
-    radius: Annotated[float, typer.Option(help="Of the balls [m].")],
+    radius: Annotated[float, typer.Option(help="Radius of the balls [m].")],
     out: Annotated[pathlib.Path, typer.Option(help="The CSV to write, for vinesim tune.")] = pathlib.Path("track.csv"),
     image: Annotated[
-        str | None, typer.Option(help="Topic of the colours; the one with rgb or color in its name unless given.")
+        str | None,
+        typer.Option(help="Topic of the colour pictures; by default the topic with rgb or color in its name."),
     ] = None,
     depth: Annotated[
-        str | None, typer.Option(help="Topic of the aligned depth; the one with depth in its name unless given.")
+        str | None, typer.Option(help="Topic of the aligned depth; by default the topic with depth in its name.")
     ] = None,
     pose: Annotated[
         tuple[float, float, float, float, float, float, float] | None,
         typer.Option(
-            help="Of the optical frame in the world, X Y Z QX QY QZ QW; level and looking along y unless given."
+            help="Pose of the optical frame in the world, X Y Z QX QY QZ QW; by default level, looking along y."
         ),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option(help="Pictures a second, of a data set whose records have no time.")
+        float | None, typer.Option(help="Pictures a second, for a data set whose records have no time.")
     ] = None,
 ) -> None:
     """Track balls of one colour each through recorded RGB-D pictures, into a CSV for vinesim tune.
@@ -115,38 +123,43 @@ def experiment(
         ),
     ],
     model: Model,
-    out: Annotated[pathlib.Path | None, typer.Option(help="Write the track as CSV; KIND.csv unless given.")] = None,
+    out: Annotated[pathlib.Path | None, typer.Option(help="CSV file for the track; by default KIND.csv.")] = None,
     displacement: Annotated[
-        float | None, typer.Option(help="Of the tip, by the pull or the push [m]; 0.1 unless given.")
+        float | None, typer.Option(help="Displacement of the tip by the pull or the push [m]; by default 0.1.")
     ] = None,
     angle: Annotated[
-        float, typer.Option(help="Of force or shaking about the base's x axis, from its y axis [deg].")
+        float, typer.Option(help="Direction of force or shaking: angle about the base's x axis, from its y axis [deg].")
     ] = 90.0,
-    amplitude: Annotated[float | None, typer.Option(help="Of the base that is shaken [m]; 0.005 unless given.")] = None,
+    amplitude: Annotated[float | None, typer.Option(help="Amplitude of a shaken base [m]; by default 0.005.")] = None,
     from_frequency: Annotated[
-        float | None, typer.Option("--from", help="Of the sweep, at its start [Hz]; 1 unless given.")
+        float | None, typer.Option("--from", help="Frequency at the start of the sweep [Hz]; by default 1.")
     ] = None,
     to_frequency: Annotated[
-        float | None, typer.Option("--to", help="Of the sweep, at its end [Hz]; 8 unless given.")
+        float | None, typer.Option("--to", help="Frequency at the end of the sweep [Hz]; by default 8.")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(help="Of the track after the release, or of the sweep [s]; 3, or 10 of a sweep.")
+        float | None,
+        typer.Option(help="Duration of the track after the release [s], by default 3; or of the sweep, by default 10."),
     ] = None,
-    hold: Annotated[float, typer.Option(help="Before it [s].")] = 0.2,
+    hold: Annotated[float, typer.Option(help="Duration of the track before the release or the sweep [s].")] = 0.2,
     rate: Annotated[float, typer.Option(help="Pictures a second.")] = 30.0,
     noise: Annotated[float, typer.Option(help="Standard deviation of a tracked position [m].")] = 0.002,
     force_noise: Annotated[
-        float | None, typer.Option(help="A force gauge of this relative standard deviation, 0.01; none unless given.")
+        float | None,
+        typer.Option(
+            help="Relative standard deviation of a force gauge, such as 0.01; by default no force is measured."
+        ),
     ] = None,
-    marker: Annotated[list[str] | None, typer.Option(help="tip, or one of specimen.markers; may repeat.")] = None,
+    marker: Annotated[list[str] | None, typer.Option(help="tip, or one of specimen.markers; may be repeated.")] = None,
     axes: Annotated[str, typer.Option(help="Axes of the world that are tracked.")] = "xyz",
-    seed: Annotated[int, typer.Option(min=0, help="Of the noise.")] = 0,
-    fit: Annotated[str, typer.Option(help="What will be fitted; see vinesim tune.")] = "modulus,damping",
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
+    fit: Annotated[str, typer.Option(help="Quantities to fit; see vinesim tune.")] = "modulus,damping",
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout, nothing else.")] = False,
 ) -> None:
-    """Simulate what a laboratory would measure, with noise, and say what a fit of it would know.
+    """Simulate a measurement in a laboratory, with noise, and print how well a fit to it would do.
 
-    To plan a campaign: how long to film, how fast, with or without a force gauge. Needs scipy (extra: tune).
+    For the planning of experiments: how long to film, how fast, with or without a force gauge. Needs scipy (extra:
+    tune).
 
     \b
     Examples:

@@ -11,13 +11,17 @@ from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 
 APPROACH_DISTANCE = 14
-"""Distance from which the visitor drives up [m], beyond the interest radius."""
+"""Distance from which the visitor approaches [m], beyond the interest radius."""
 VISITOR_DISTANCE = 3.0
-"""Distance from which a visitor watches a job [m]."""
+"""Distance from which a visitor watches a task [m]."""
 
 
 def choose_poses(scene: Scene, model: Model) -> tuple[int, tuple[list[str], list[str]]]:
-    """The bunch to push, and the start poses of picker and visitor: the scene's own if a bunch is in reach there."""
+    """Returns the bunch to push, and the options for the start poses of picker and visitor.
+
+    If a bunch is within reach of the scene's first start pose, the poses are the scene's first two start poses.
+    Otherwise the picker is placed at a bunch, and the visitor at a distance from the picker.
+    """
     start = start_poses.spawn_pose(scene, 0)
     try:
         return start_poses.find_reachable_bunch(model, start), (["--spawn", "0"], ["--spawn", "1"])
@@ -28,7 +32,8 @@ def choose_poses(scene: Scene, model: Model) -> tuple[int, tuple[list[str], list
 
 
 def visitor_pose(scene: Scene) -> list[str] | None:
-    """Pose of a visitor that watches a job, beside the picker towards the second start place; None without that."""
+    """Returns the pose of a visitor that watches a task, next to the picker, towards the second start place. None if
+    the scene has no second start place."""
     if len(scene.spawns) < 2:
         return None
     here, there = (start_poses.spawn_pose(scene, i)[:2] for i in (0, 1))
@@ -45,7 +50,7 @@ def _pose_option(pose: np.ndarray) -> list[str]:
 
 
 def check_device(device: str) -> None:
-    """Raise DeviceUnavailable for a missing device. For the CPU it skips the imports, which take a second."""
+    """Raise DeviceUnavailable for a missing device. For the CPU the function skips the imports, which take a second."""
     if device != "cpu":
         from vinesim.plants.device_buffers import find_device
 

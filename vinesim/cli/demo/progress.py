@@ -17,9 +17,9 @@ from vinesim.client.processes.child_process import REPORT_TIMEOUT, Process
 from vinesim.net.pace import describe
 
 PICKER = "picker"
-"""Name of the robot that touches a bunch or works."""
+"""Name of the robot that pushes a bunch or does a task."""
 VISITOR = "visitor"
-"""Name of the robot that comes near and watches."""
+"""Name of the robot that approaches and watches."""
 
 Statuses = dict[str, dict[str, Any]]
 """The newest status of each client, by name."""
@@ -34,9 +34,9 @@ def show_progress(
     headless: bool,
     is_over: Callable[[Statuses], bool] = lambda _: False,
 ) -> None:
-    """Show the status of both clients until the picker ends, or until ``is_over``, which interrupts the picker.
+    """Show the status of both clients until the picker ends. If ``is_over(newest)`` is true, the picker is interrupted.
 
-    :class:`ProcessFailed` if any process ends too early or the picker fails.
+    Raises :class:`ProcessFailed` if any process ends too early or the picker fails.
     """
     live = contextlib.nullcontext() if headless or not console.is_terminal else Live(console=console, transient=True)
     with live as view:
@@ -68,7 +68,7 @@ def show_progress(
 
 
 def status_line(status: dict[str, Any]) -> str:
-    """The picker's status in one line."""
+    """Returns the picker's status as one line."""
     common = (
         f"{status['time']:6.1f} s  {status['tick_hz']:6.2f} Hz  p99 {status['tick_p99_ms']:5.2f} ms  "
         f"awake {status['awake']:3d}  force {status['force']:6.2f} N  {pace(status)}"
@@ -82,13 +82,13 @@ def status_line(status: dict[str, Any]) -> str:
 
 
 def pace(status: dict[str, Any]) -> str:
-    """Text about how fast time passes and what limits it, followed by two blanks; empty in real time."""
+    """Returns a text about the real-time factor and its cause, followed by two blanks; empty in real time."""
     text = describe(status["target_real_time_factor"], status["pace_cause"])
     return f"{text}  " if text else ""
 
 
 def status_table(newest: Statuses) -> Table:
-    """The newest status of all clients, side by side."""
+    """Returns a table with the newest status of all clients, side by side."""
     table = Table(title="vinesim demo", title_justify="left")
     table.add_column("")
     for name in newest:

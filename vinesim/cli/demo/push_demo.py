@@ -1,4 +1,4 @@
-"""``vinesim demo``: one robot pushes a bunch, another drives up and sees it move, a stock ROS node counts messages."""
+"""``vinesim demo``: one robot pushes a bunch, another approaches and sees it move, a stock ROS node counts messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from vinesim.scene.values import SENSOR_KINDS
 from vinesim.web import page_files
 
 VISITOR_SENSOR_HZ = "1"
-"""Rate of the visitor's sensors [Hz]. It is low, because the demo only needs them to exist."""
+"""Rate of the visitor's sensors [Hz], low because the demo only needs them to exist."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,7 +41,7 @@ class ListenedTopics:
     """By topic: the sensor that publishes it, in words."""
 
     def describe(self, topic: str) -> str:
-        """Text for what is missing while a topic has had no message."""
+        """Returns a text for the progress display: what is missing while a topic has had no message."""
         return self.owners.get(topic, topic)
 
 
@@ -61,7 +61,7 @@ def run_push(
     begin = time.time()
     check_device(device)
     plan = with_seed(load_scene(scene), seed)
-    description = load_description(robot)  # raises errors before any process starts
+    description = load_description(robot)  # raise errors before any process starts
     for folder in (out, out / PICKER, out / VISITOR):
         with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
@@ -111,7 +111,7 @@ def run_push(
 
 
 class _RunTimer:
-    """Measures from now until the picker's simulated time ``end`` [s], which ends the demo."""
+    """Measures a run from its creation until the picker's simulated time ``end`` [s], at which the demo ends."""
 
     def __init__(self, end: float, listener: RosListener | None) -> None:
         self._end = end
@@ -121,7 +121,8 @@ class _RunTimer:
             listener.restart()
 
     def is_over(self, newest: Statuses) -> bool:
-        """Whether the run has reached its end according to the newest statuses; then the measurement ends too."""
+        """Returns whether the run has reached its end, according to the newest statuses. If so, the measurement ends
+        too."""
         if newest[PICKER]["time"] < self._end:
             return False
         if self.window.is_open:
@@ -165,7 +166,8 @@ def _start_clients(
 
 
 def listened_topics(robot: RobotDescription) -> ListenedTopics:
-    """All topics of the picker; of the visitor its joints, and the first frame of each sensor."""
+    """Returns the topics that the listener subscribes to: all topics of the picker, and of the visitor the joints and
+    the first frame of each sensor."""
     always = [
         "/clock",
         "/robot_description",

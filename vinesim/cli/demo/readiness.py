@@ -30,10 +30,10 @@ def wait_until_ready(
     console: Console,
     timeout: float,
 ) -> dict[str, float]:
-    """Wait until every client steps and every topic of the listener had a message.
+    """Wait until every client steps and every topic of the listener has had a message.
 
-    Returns the wall time of each first event [s since the epoch] by name of the client or topic. ``describe`` gives a
-    text for a missing topic. :class:`ProcessFailed` if a process ends, or after ``timeout`` [s].
+    Returns the wall time of each first event [s since the epoch] by name of the client or topic. ``describe`` returns a
+    text for a missing topic. Raises :class:`ProcessFailed` if a process ends, or after ``timeout`` [s].
     """
     ready: dict[str, float] = {}
     with _waiting_line(console) as show:
@@ -48,7 +48,7 @@ def wait_until_ready(
                     raise process.failure()
             topics = [] if listener is None else listener.missing()
             missing = [name for name in clients if name not in ready]
-            # while a client does not step yet, its sensors are not listed
+            # sensors are listed only after all clients step
             missing += [] if missing else dict.fromkeys(describe(topic) for topic in topics)
             if not missing:
                 return ready | ({} if listener is None else listener.first)
@@ -61,12 +61,12 @@ def wait_until_ready(
 
 
 def progress_of(clients: Mapping[str, Process], newest: Statuses) -> str:
-    """Progress text of the first client that waits for something, such as the number of compiled kernels.
+    """Returns the progress text of the first client that waits for something, such as the number of compiled kernels.
 
     All clients wait for the same kernels. Other output of clients, such as warnings, is left out.
     """
     for name, process in clients.items():
-        if name in newest:  # it steps, but its sensors are not ready yet
+        if name in newest:  # this client steps, but its sensors are not ready yet
             awaited = newest[name].get("sensors_awaited", [])
             lines = [text for text in awaited if "compiling" in text]
         else:
@@ -78,7 +78,8 @@ def progress_of(clients: Mapping[str, Process], newest: Statuses) -> str:
 
 @contextlib.contextmanager
 def _waiting_line(console: Console) -> Iterator[Callable[[str], None]]:
-    """Context with a function that shows a text: in one updated line on a terminal, otherwise every few seconds."""
+    """Yields a function that shows a text: in one updated line on a terminal, otherwise as a new line every few
+    seconds."""
     if console.is_terminal:
         with console.status("") as status:
             yield status.update

@@ -42,11 +42,11 @@ class Window:
 
     @classmethod
     def begin(cls) -> Self:
-        """A window that begins now."""
+        """Returns a window that begins now."""
         return cls(time.monotonic())
 
     def end(self) -> Window:
-        """The window with its end at the present time."""
+        """Returns this window with its end at the present time."""
         return dataclasses.replace(self, until=time.monotonic())
 
 
@@ -61,7 +61,7 @@ def write_summary(out: pathlib.Path, summary: dict[str, Any]) -> None:
 
 
 def report_of(out: pathlib.Path, name: str) -> dict[str, Any]:
-    """The report that a client has written."""
+    """Returns the report that a client has written."""
     return json.loads((out / name / "report.json").read_text())
 
 
@@ -77,9 +77,9 @@ def push_summary(
     window: Window,
     starts: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Measurements of a push. It also draws ``touch.png``.
+    """Returns the measurements of a push, and draws ``touch.png``.
 
-    ``received``: statistics of the listener, by topic; ``starts``: times from the demo's start to the first event of
+    ``received``: statistics of the listener, by topic. ``starts``: times from the demo's start to the first event of
     each client and topic [s].
     """
     reports = {name: report_of(out, name) for name in (PICKER, VISITOR)}
@@ -121,7 +121,8 @@ def push_summary(
 
 
 def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str, Any]) -> dict[str, Any]:
-    """Lost messages of :data:`SMALL_TOPICS`: lost on the way according to the listener, and lost before sending.
+    """Returns how many messages of :data:`SMALL_TOPICS` were lost on the way, according to the listener, and before
+    sending.
 
     Messages lost before sending are counted over the whole run of the robot with this ``report``. ``share`` is the
     fraction of lost messages among all expected messages.
@@ -141,7 +142,8 @@ def lost_messages(received: Mapping[str, Mapping[str, Any]], report: Mapping[str
 
 
 def least_rate(received: Mapping[str, Mapping[str, Any]], pattern: str, simulated: float) -> float | None:
-    """Lowest message rate among the topics that match ``pattern`` [Hz of simulated time]; None without such topics.
+    """Returns the lowest message rate among the topics that match ``pattern`` [Hz of simulated time]; None without such
+    topics.
 
     ``simulated``: duration of the run in simulated time [s].
     """
@@ -150,7 +152,7 @@ def least_rate(received: Mapping[str, Mapping[str, Any]], pattern: str, simulate
 
 
 def push_table(summary: dict[str, Any]) -> Table:
-    """The most important values of :func:`push_summary` as a table to print."""
+    """Returns a table with the most important values of :func:`push_summary`."""
     error = summary["remote_displacement_error_mm"]
     lost = summary["ros_lost"]["share"]
     pictures, scans = (summary[f"{kind}_per_simulated_second"] for kind in ("pictures", "scans"))
@@ -179,7 +181,7 @@ def push_table(summary: dict[str, Any]) -> Table:
         ("largest force", f"{summary['force_peak_n']:.1f} N"),
         (
             "error of the remote copy",
-            # the visitor starts beyond the interest radius and comes near after about ten seconds
+            # the visitor starts beyond the interest radius and reaches it after about ten seconds
             f"the visitor was not near in {summary['seconds']:.0f} s, give more --seconds"
             if error is None
             else f"{error['p50']:.1f} mm median, {error['p95']:.1f} p95",
@@ -203,7 +205,7 @@ def job_summary(
     no_ros: str | None,
     with_visitor: bool,
 ) -> dict[str, Any]:
-    """Measurements of a job; ``done_key``: name of the boolean that says whether the job was done."""
+    """Returns the measurements of a task. ``done_key``: name of the boolean that tells whether the task was done."""
     report = report_of(out, PICKER)
     done = bool(report["job"]["succeeded"])
     reason = report["job"]["reason"] or ("" if done else f"stopped at {report['job']['phase']!r} before the end")

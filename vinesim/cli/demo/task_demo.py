@@ -1,4 +1,4 @@
-"""``vinesim demo --job``: one robot does a job, and a visitor watches or a person takes part."""
+"""``vinesim demo --job``: one robot does a task, and a visitor watches or a person takes part."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ JOBS = {
     "exchange": ("logistic", "exchanged"),
     "meet": ("logistic", "handed_over"),
 }
-"""By job: the default robot, and the key in ``summary.json`` that says whether the job was done."""
+"""Default robot, and the key in ``summary.json`` that tells whether the task was done, by task."""
 TIME_LIMIT = 120.0
-"""Default limit of the simulated time of a job [s]."""
+"""Default limit of the simulated time of a task [s]."""
 
 
 def run_job(
@@ -42,7 +42,7 @@ def run_job(
     headless: bool,
     out: pathlib.Path,
 ) -> int:
-    """Let one robot do a job, and write results into ``out``. Returns 0 if the job was done, 5 otherwise."""
+    """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
     console = Console(stderr=True)
@@ -51,7 +51,7 @@ def run_job(
     robot = robot or default_robot
     scene = scene or "harvest"
     plan = with_seed(load_scene(scene), seed)
-    load_description(robot)  # raises errors before any process starts
+    load_description(robot)  # raise errors before any process starts
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
@@ -124,7 +124,8 @@ def run_job(
 
 
 def _person_options(scene: Scene) -> list[str]:
-    """Options of a meeting's person: its start, the bunch that it picks, and the box into which it puts the bunch."""
+    """Returns the options of the person in a meeting: its start, the bunch that it picks, and the box into which it
+    puts the bunch."""
     model = generate(scene)
     meeting = plan_meeting(model, start_pose(scene, 0))
     bunch = bunch_centres(model)[meeting.bunch]

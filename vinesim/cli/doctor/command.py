@@ -27,7 +27,8 @@ CHECKS: tuple[Callable[[], Finding], ...] = (
 
 
 def diagnose(checks: Sequence[Callable[[], Finding]] = CHECKS) -> list[Finding]:
-    """The findings of all checks. A check that raises an exception gives an error, and the other checks still run."""
+    """Returns the findings of all checks. A check that raises an exception yields an error, and the other checks still
+    run."""
     found = []
     for check in checks:
         try:

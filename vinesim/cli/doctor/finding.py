@@ -30,20 +30,20 @@ class Finding:
 
     @property
     def line(self) -> str:
-        """The finding as one line of text."""
+        """Returns the finding as one line of text."""
         return f"{self.state:<9}{self.check:<15}{self.found}" + (f"; {self.remedy}" if self.remedy else "")
 
 
 def size_of(folder: pathlib.Path) -> int:
-    """Size [B] of all files below a folder; 0 if it does not exist."""
+    """Returns the size [B] of all files below a folder; 0 if it does not exist."""
     total = 0
     for parent, _, names in os.walk(folder):
         for name in names:
-            with contextlib.suppress(OSError):  # removed meanwhile
+            with contextlib.suppress(OSError):  # a file may be removed meanwhile
                 total += os.lstat(os.path.join(parent, name)).st_size
     return total
 
 
 def amount(size: float) -> str:
-    """A number of bytes as text with a unit."""
+    """Returns a number of bytes as text with a unit."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"

@@ -57,7 +57,7 @@ def cpu(description: pathlib.Path = pathlib.Path("/proc/cpuinfo"), cgroup: pathl
 
 
 def _cpu_flags(description: pathlib.Path) -> set[str]:
-    """Features of the first processor in Linux' names; empty on other systems."""
+    """Returns the features of the first processor in Linux' names; an empty set on other systems."""
     with contextlib.suppress(OSError):
         for line in description.read_text(errors="replace").splitlines():
             key, _, value = line.partition(":")
@@ -67,7 +67,7 @@ def _cpu_flags(description: pathlib.Path) -> set[str]:
 
 
 def _quota(cgroup: pathlib.Path) -> float | None:
-    """CPU limit of a control group as a number of cores; None without a limit."""
+    """Returns the CPU limit of a control group as a number of cores; None without a limit."""
     with contextlib.suppress(OSError, ValueError):
         quota, period = (cgroup / "cpu.max").read_text().split()
         return float(quota) / float(period)
@@ -194,7 +194,7 @@ def clock() -> Finding:
 
 
 def _clock_status() -> int | None:
-    """Status bits of the kernel's clock (adjtimex(2)); None if they cannot be read."""
+    """Returns the status bits of the kernel's clock (adjtimex(2)); None if they cannot be read."""
     if sys.platform != "linux":
         return None
     # struct timex: modes (int), offset, freq, maxerror, esterror (long), status (int), and others; 208 bytes

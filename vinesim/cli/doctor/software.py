@@ -26,7 +26,7 @@ EXTRAS = {
     "perception": "point clouds from depth",
     "voice": "voices",
 }
-"""Extras of the package for users, with their purpose."""
+"""Extras of the package that users may install, with their purpose."""
 
 
 def python(version: tuple[int, ...] = sys.version_info[:3]) -> Finding:
@@ -65,8 +65,8 @@ def packages(requirements: Iterable[str] | None = None) -> Finding:
     return Finding("packages", OK, found, f"if wanted: pip install 'vinesim[{states[0].split()[0]}]'" if states else "")
 
 
-def _fault(wanted) -> str:  # a packaging.requirements.Requirement
-    """Reason why an installed package does not fit; empty if it does."""
+def _fault(wanted) -> str:  # the type is packaging.requirements.Requirement
+    """Returns the reason why an installed package does not fulfil a requirement; empty if it does."""
     try:
         version = importlib.metadata.version(wanted.name)
     except importlib.metadata.PackageNotFoundError:
@@ -165,13 +165,14 @@ def caches() -> Finding:
 
 
 def kernel_folder() -> pathlib.Path:
-    """Folder in which Warp stores compiled kernels of all its versions. This function does not create it."""
+    """Returns the folder in which Warp stores compiled kernels of all its versions. The folder is not created."""
     chosen = os.environ.get("WARP_CACHE_PATH")
     return pathlib.Path(chosen) if chosen else disk_cache.user_folder() / "warp"
 
 
 def _write_fault(folder: pathlib.Path) -> str | None:
-    """Reason why a file cannot be written in a folder, which need not exist yet; None if it can be written."""
+    """Returns the reason why no file can be written in a folder, which need not exist yet; None if files can be
+    written."""
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     try:
