@@ -1,4 +1,4 @@
-"""``vinesim ros``."""
+"""``vinesim ros``: builds message packages, records topics and plays them."""
 
 from __future__ import annotations
 
@@ -16,9 +16,11 @@ PROGRESS_PERIOD = 2.0
 
 
 def build(quiet: bool, wheel: pathlib.Path | None) -> int:
-    """Make the message packages without an official wheel importable, or write wheels of them; the exit code.
+    """Build the message packages without an official wheel and install them, or write their wheels. Returns the exit
+    code.
 
-    ``quiet``: print nothing, and no error if ROS is not installed. ``wheel``: folder for wheels; None installs.
+    ``quiet``: print nothing, and no error if ROS is not installed. ``wheel``: folder for wheels; None: install the
+    packages.
     """
     reason = middleware.unavailable_reason()
     if reason is not None:
@@ -69,7 +71,7 @@ def record(path: pathlib.Path, topics: list[str], seconds: float | None) -> int:
 
 
 def play(path: pathlib.Path, rate: float) -> int:
-    """Publish a recording's topics again; the exit code."""
+    """Publish a recording's topics again. Returns the exit code."""
     if (reason := middleware.unavailable_reason()) is not None:
         print(f"ROS 2 is not usable here: {reason}")
         return 3

@@ -1,4 +1,4 @@
-"""``vinesim scene``."""
+"""``vinesim scene``: shows scenes and imports plants of other programs."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 
 def write_imported_plant(file: pathlib.Path, out: pathlib.Path | None, **options: Any) -> int:
-    """Read another program's plant, write it as TOML, and print what it has and what was filled; the exit code."""
+    """Read another program's plant, write it as TOML, and print its contents and the filled numbers. Returns the exit
+    code."""
     plant = import_plant(file, **options)
     target = out or pathlib.Path(f"{file.stem}.toml")
     plant.write(target)
@@ -42,7 +43,7 @@ def write_imported_plant(file: pathlib.Path, out: pathlib.Path | None, **options
 
 
 def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
-    """Print a table of the scene and write its picture; the exit code."""
+    """Print a table of the scene and write its picture. Returns the exit code."""
     scene = with_seed(load_scene(file), seed)
     model = generate(scene)
     console = Console()

@@ -1,4 +1,4 @@
-"""``vinesim server``."""
+"""``vinesim server``: carries the messages of a world."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def run(
     spectators_speak_to: str = "people",
     real_time_factor: float | None = None,
 ) -> int:
-    """Carry messages until SIGINT or SIGTERM."""
+    """Carry messages until SIGINT or SIGTERM. Returns the exit code."""
     if status not in ("text", "json", "none"):
         raise UsageError(f"--status {status!r}: give text, json or none")
     if spectators_speak_to not in tuple(SpectatorsSpeakTo):
@@ -65,7 +65,7 @@ def run(
             while not stop.wait(STATUS_PERIOD if status != "none" else None):
                 figures = server.figures()
                 print(json.dumps(figures) if status == "json" else _line(figures), flush=True)
-        except BrokenPipeError:  # the reader is gone: that ends the run, not the log
+        except BrokenPipeError:  # the reader of standard output has closed it: the run ends without an error
             pass
     return 0
 

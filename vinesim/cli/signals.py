@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM as a request to end in order."""
+"""Handles SIGINT and SIGTERM as a request to end in order."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import threading
 
 
 def stop_at_signals(stop: threading.Event) -> threading.Event:
-    """Let Ctrl-C and SIGTERM set ``stop`` from now on, instead of raising; returns it."""
+    """Let Ctrl-C and SIGTERM set ``stop`` from this call on, instead of raising an exception. Returns ``stop``."""
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     return stop

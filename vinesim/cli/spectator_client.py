@@ -12,7 +12,7 @@ from vinesim.core.errors import writing
 
 
 def run(options: ClientOptions) -> int:
-    """Watch until asked to stop; pictures go to ``--out``; the exit code."""
+    """Watch until a signal or the time limit; pictures go to ``--out``. Returns the exit code."""
     with ClientSession(options) as session:
         pose = options.pose
         if pose is None:

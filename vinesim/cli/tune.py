@@ -1,4 +1,4 @@
-"""``vinesim tune`` and ``vinesim experiment``."""
+"""``vinesim tune``, ``vinesim track`` and ``vinesim experiment``."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 
 
 LEAST_CHROMA = 0.2
-"""[1] Least chroma of a marker's colour: largest minus least of red, green and blue, over the largest."""
+"""Smallest accepted chroma of a marker's colour [1]: largest minus smallest of red, green and blue, divided by the
+largest."""
 
 
 class ScipyMissing(RuntimeError):
@@ -26,7 +27,7 @@ class ScipyMissing(RuntimeError):
 
 
 def require_scipy() -> None:
-    """:class:`ScipyMissing` with the remedy unless scipy is installed."""
+    """Raise :class:`ScipyMissing`, with a remedy, unless scipy is installed."""
     if importlib.util.find_spec("scipy") is None:
         raise ScipyMissing("scipy is not installed; run: pip install 'vinesim[tune]'")
 
@@ -45,7 +46,7 @@ def run(
     device: str,
     cloud: pathlib.Path | None = None,
 ) -> int:
-    """Fit and print; the exit code: 0, or 5 if something speaks against the fit."""
+    """Fit and print the result. Returns the exit code: 0, or 5 if the fit has a fault."""
     require_scipy()
     from vinesim.tune import load_specimen, read_trajectory, tune, with_cloud
 
@@ -79,7 +80,7 @@ def track(
     pose: tuple[float, ...] | None,
     rate: float | None,
 ) -> int:
-    """Write the track of markers in recorded pictures and say how many were found; the exit code."""
+    """Write the track of markers in recorded pictures and print how often each was found. Returns the exit code."""
     require_scipy()
     import numpy as np
 
@@ -113,7 +114,7 @@ def track(
 
 
 def _read_marker(text: str) -> tuple[str, tuple[int, int, int]]:
-    """Name and colour of ``R,G,B`` (the tip's) or ``NAME=R,G,B``."""
+    """Returns name and colour of ``R,G,B`` (the marker at the tip) or ``NAME=R,G,B``."""
     name, _, colour = text.rpartition("=")
     parts = colour.split(",")
     if len(parts) != 3 or not all(part.strip().isdigit() and int(part) < 256 for part in parts):
@@ -125,7 +126,7 @@ def _read_marker(text: str) -> tuple[str, tuple[int, int, int]]:
 
 
 def plan(experiment: Experiment, model: pathlib.Path, out: pathlib.Path | None, fit: str, as_json: bool) -> int:
-    """Write the track of an experiment and print what a fit of it would know; the exit code."""
+    """Write the track of an experiment and print how exact a fit to it would be. Returns the exit code."""
     require_scipy()
     from vinesim.tune import load_specimen, measure
     from vinesim.tune.experiment import expected_deviations

@@ -60,7 +60,8 @@ log = logging.getLogger(__name__)
 
 
 def label_index(name: str) -> int:
-    """Index of an actor's label in images. It follows from the name alone, so it is the same on every client.
+    """Returns the index of an actor's label in images. It follows from the name alone, so it is the same on every
+    client.
 
     With 64 actors the chance that two of them have the same index is 0.2 %.
     """
@@ -75,7 +76,7 @@ class Exchange(NamedTuple):
     """Functions of a client that make and apply one kind of the messages that actors send each other directly."""
 
     say: Callable[[str], Any]
-    """Returns the message of the named local actor to others in this step: the value for
+    """Returns the message of the named local actor to other actors in this step: the value for
     :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`."""
     apply: Callable[[Mapping[str, Any]], None]
     """Applies, before a step, the messages from other actors that are valid now: for each local actor, by name, the
@@ -83,12 +84,13 @@ class Exchange(NamedTuple):
 
 
 class Client:
-    """One simulation of the world with its local actors. ``clock``: any monotonic clock [s]; tests pass their own."""
+    """One simulation of the world with its local actors. ``clock``: any monotonic clock [s]; tests pass a simulated
+    one."""
 
     picking = True
     """Whether bunches and branches detach in this client's physics when they are pulled too hard."""
     slows_the_world = True
-    """Whether the clock of the world slows down if this client's machine cannot follow it."""
+    """Whether the clock of the world slows down if this client's machine cannot keep up with it."""
 
     def __init__(
         self,
@@ -108,13 +110,15 @@ class Client:
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
     ) -> None:
-        """The client's own actor is a robot of this ``description`` at ``pose`` [7] m, 1. If ``description`` is None,
-        it is a human of ``height`` [m] in an ``outfit`` (:func:`vinesim.scene.appearance.outfit_names`; if empty, the
-        outfit follows from the human's name).
+        """Create the simulation and the client's own actor.
 
-        ``source(time)`` gives the human's pose; without one it stands still. ``interest_radius`` [m]: actors nearer
-        than this to an object receive its motion. ``jitter_buffer`` [s]: delay of remote actors. ``executor`` compiles
-        the bodies of actors that join; without an executor the loop compiles them.
+        The actor is a robot of this ``description`` at ``pose`` [7] m, 1. If ``description`` is None, the actor is a
+        human of ``height`` [m] in an ``outfit`` (:func:`vinesim.scene.appearance.outfit_names`; if empty, the outfit
+        follows from the human's name).
+
+        ``source(time)`` returns the human's pose; without a source the human stands still. ``interest_radius`` [m]:
+        actors nearer than this to an object receive its motion. ``jitter_buffer`` [s]: delay of remote actors.
+        ``executor`` compiles the bodies of actors that join; without an executor the loop compiles them.
         """
         self.name = name
         self.model = model
@@ -163,7 +167,7 @@ class Client:
         that is woken may get this core at once."""
         self.script = ""
         """Command line option that lets the robots act by themselves, or "". Services do not reset a client that has
-        one."""
+        such an option."""
         self.after_reset: list[Callable[[], None]] = []
         """Called after :meth:`reset`, so that parts that hold references to the physics or a robot take the new
         objects."""
@@ -195,10 +199,10 @@ class Client:
         return not (self.world_time.is_shared or self.remote_actors)
 
     def reset(self) -> None:
-        """Restore the scene as it was generated: plants, boxes and robots are where they started, at rest.
+        """Restore the scene as it was generated: plants, boxes and robots return to their start, at rest.
 
         Call it between steps. Human actors who are present stay. Simulated time continues, and so do all counters of
-        the network. It takes as long as the start of the physics. Raises :class:`ValueError` unless the client
+        the network. A reset takes as long as the start of the physics. Raises :class:`ValueError` unless the client
         :attr:`is_alone`.
         """
         if not self.is_alone:
@@ -267,7 +271,8 @@ class Client:
         return robot
 
     def add_human(self, spec: HumanSpec, source: Callable[[float], HumanPose] | None, bus: Bus) -> LocalHuman:
-        """Add a local human with the poses of ``source(time)`` (None: still); ``bus`` must have its name."""
+        """Add a local human that follows the poses of ``source(time)`` (None: stands still); ``bus`` must have the
+        human's name."""
         hello = Hello(
             name=spec.name,
             kind="human",
@@ -284,7 +289,8 @@ class Client:
         return human
 
     def remove_human(self, name: str) -> None:
-        """Remove a local human who is not this client's own actor. Call it between steps, and close its bus after."""
+        """Remove a local human who is not this client's own actor. Call it between steps, and close the human's bus
+        afterwards."""
         self.physics.remove_human(name)
         del self.humans[name], self.replicators[name]
         self._share_client()
@@ -301,8 +307,8 @@ class Client:
         )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
-        """Set the time with which the results of a step are stamped, sent and shown: ``step_time()`` [s], the world's
-        time of that step. None: the moment at which the step is made."""
+        """Set the function ``step_time`` that returns the world's time of a step [s], with which results of the step
+        are stamped, sent and shown. None: the results get the time at which the step is computed."""
         self.step_time = step_time
         for replicator in self.replicators.values():
             replicator.step_time = step_time
@@ -468,7 +474,7 @@ class Client:
                 )
 
     def side_of(self, point: np.ndarray) -> str:
-        """The arm, "left" or "right", on the side of a point [3] m in the world."""
+        """Returns the arm, "left" or "right", on the side of a point [3] m in the world."""
         base, _ = self.physics.rigid.base_state(self.name)
         local = frames.rotate(frames.conjugate(base[3:]), point - base[:3])
         return "left" if local[1] >= 0.0 else "right"
@@ -476,8 +482,8 @@ class Client:
     # ------------------------------------------------------------------ remote actors
 
     def _receive_all(self, now: float) -> Inbox:
-        """Merge the inboxes of all local actors. If several received an update of the same remote actor, the update
-        that the nearest of them received counts."""
+        """Merge the inboxes of all local actors. If several actors received updates of the same remote actor, the
+        update that the nearest local actor received counts."""
         inboxes = {name: replicator.receive(now) for name, replicator in self.replicators.items()}
         for kind, exchange in self.exchanges.items():
             exchange.apply({name: one.messages[kind] for name, one in inboxes.items()})
@@ -506,23 +512,24 @@ class Client:
         return inbox
 
     def _is_present(self, name: str) -> bool:
-        """Whether an actor of another client is in the world now."""
+        """Returns whether an actor of another client is in the world now."""
         return any(replicator.is_present(name) for replicator in self.replicators.values())
 
     def _is_owned_remotely(self, number: int) -> bool:
-        """Whether an actor of another client owns an object or tree."""
+        """Returns whether an actor of another client owns an object or tree."""
         owners = {replicator.owner(number) for replicator in self.replicators.values()} - {None}
         return bool(owners) and not owners & self.replicators.keys()
 
     def _link_centre(self, name: str, link: str) -> np.ndarray | None:
-        """Centre of mass [3] m of a link of a local robot. None if ``name`` is no robot or it has no such link."""
+        """Returns the centre of mass [3] m of a link of a local robot. None if ``name`` is no robot or the robot has no
+        such link."""
         try:
             return self.physics.rigid.link_centre(name, link) if name in self.robots else None
         except ValueError:
             return None
 
     def _say_wrenches(self, name: str) -> dict[str, dict[str, np.ndarray]] | None:
-        """Wrenches [6] N, N m of a local human's hands on remote robots."""
+        """Returns the wrenches [6] N, N m of a local human's hands on remote robots."""
         return self.humans[name].hand_wrenches_on(self.remote_actors) if name in self.humans else None
 
     def _apply_wrenches(self, received: Mapping[str, dict[str, np.ndarray]]) -> None:
@@ -534,7 +541,7 @@ class Client:
                 log.debug("a wrench on an unknown link: %s", error)
 
     def _say_couplings(self, name: str) -> list[Coupling]:
-        """Couplings for the contacts of a local actor with trees that other clients also move or touch."""
+        """Returns couplings for the contacts of a local actor with trees that other clients also move or touch."""
         return self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees)
 
     def _apply_couplings(self, received: Mapping[str, dict[str, tuple[Coupling, ...]]]) -> None:
@@ -560,8 +567,8 @@ class InterestAudit:
         self._seen = 0
 
     def update(self, client: Client, touching: bool) -> None:
-        """Count one tick. Remote actors are where their messages say: copies appear later, and spectators have no
-        copy."""
+        """Count one tick. Remote actors count at the positions in their messages: their copies appear later, and
+        spectators have no copy."""
         replicators = client.replicators.values()
         sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
         if touching or sent != self._seen:

@@ -1,4 +1,5 @@
-"""Which clock the steps of a client follow, and how fast this client could follow it at most."""
+"""Clocks that determine when a client's steps are due, and a meter of the largest real-time factor that the client can
+keep up with."""
 
 from __future__ import annotations
 
@@ -10,17 +11,17 @@ from vinesim.net.pace import PaceReport, WorldClock
 from vinesim.net.replication.replicator import Replicator
 
 HEADROOM = 0.9
-"""Share of a core's time that steps may take. The rest is for work that occurs seldom."""
+"""Share of a core's time that steps may take. The rest is for work that occurs rarely."""
 WINDOW = 0.5
-"""Real time over which work is measured [s]; the last two such spans count."""
+"""Length of a span of real time over which work is measured [s]; the last two spans count."""
 HELD_SHARE = 0.1
-"""If steps are held for more than this share of the time, the client reports its present speed as its limit."""
+"""Share of the time. If steps are held back for more than it, the client reports its present speed as its limit."""
 REPORT_PERIOD = 0.05
 """Real time between two reports to the clock of a client without a server, :class:`OwnPace` [s]."""
 
 
 class StepClock(Protocol):
-    """A clock whose time says when a step is due. ``now`` is ``time.monotonic()`` [s]."""
+    """A clock that determines when steps are due. ``now`` is ``time.monotonic()`` [s]."""
 
     @property
     def factor(self) -> float:
@@ -33,11 +34,11 @@ class StepClock(Protocol):
         ...
 
     def time(self, now: float) -> float:
-        """Time of this clock at ``now`` [s]."""
+        """Returns the time of this clock at ``now`` [s]."""
         ...
 
     def is_current(self, now: float) -> bool:
-        """Whether the time at ``now`` [s] is known, rather than extrapolated from an old value."""
+        """Returns whether the time at ``now`` [s] is known, rather than extrapolated from an old value."""
         ...
 
     def keep(self, now: float) -> None:
@@ -63,7 +64,8 @@ class RealTime:
 
 
 class OwnPace:
-    """The clock of a client without a server. Its time passes as fast as this client can follow."""
+    """The clock of a client without a server. Its time passes as fast as this client can compute, at most in real
+    time."""
 
     def __init__(self, name: str, now: float, report: Callable[[], PaceReport]) -> None:
         self._name = name
@@ -93,7 +95,7 @@ class OwnPace:
 
 
 class WorldPace:
-    """The clock of the world that a client shares, as its replicator knows it."""
+    """The clock of the world that this client shares with others, as its replicator knows it."""
 
     def __init__(self, replicator: Replicator) -> None:
         self._replicator = replicator
@@ -117,29 +119,29 @@ class WorldPace:
 
 
 class Limit(NamedTuple):
-    """The largest real-time factor that a part of a client can follow, and the name of the part."""
+    """The largest real-time factor that a part of a client can keep up with, and the name of the part."""
 
     factor: float
     cause: str
 
 
 class _Span:
-    """How a loop spent a span of real time."""
+    """How a loop spent one span of real time."""
 
     def __init__(self, begun: float) -> None:
         self.begun = begun
         self.ended = begun
         self.steps = 0
         self.idle = 0.0
-        """Time for which nothing was due [s]."""
+        """Time for which no step was due [s]."""
         self.held: dict[str, float] = {}
         """Time for which a due step was held, by cause [s]."""
 
 
 class PaceMeter:
-    """Measures from a loop's idle time how fast it could make steps of ``dt`` [s].
+    """Computes from a loop's idle time how fast the loop could make steps of ``dt`` [s].
 
-    Time in which work waits for a core counts as work.
+    Time in which a step waits for a processor core counts as work.
     """
 
     def __init__(self, dt: float) -> None:
@@ -190,5 +192,5 @@ class PaceMeter:
             self._measured = min(self._measured, Limit(simulated / elapsed, longest))
 
     def limit(self) -> Limit:
-        """Returns the largest real-time factor that the client can follow, and the part that limits it."""
+        """Returns the largest real-time factor that the client can keep up with, and the part that limits it."""
         return min([self._measured, *(limit() for limit in self.limits)])

@@ -1,4 +1,5 @@
-"""A loop whose steps follow a clock: each step begins when it is due. The loop records begin and work of the steps."""
+"""A loop with steps that follow a clock: each step begins when it is due. The loop records begin and duration of the
+steps."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ class TickLog:
     """[step] Real time from one deadline to the next [s]: longer than ``dt`` if the world is slower than real time."""
 
     def between(self, since: float, until: float) -> dict[str, float]:
-        """Rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of time [s].
+        """Returns rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of
+        time [s].
 
         Raises :class:`ValueError` if fewer than two steps began in it.
         """
@@ -69,45 +71,47 @@ class TickLog:
 
 
 class RateLoop:
-    """Waits until a step of ``dt`` [s] is due by a clock and nothing holds it, and measures its work.
+    """Waits until a step of ``dt`` [s] is due by a clock and nothing holds the step back, and measures its work.
 
-    Steps are due at the clock's times ``next_time``, ``dt`` apart, so a late step does not delay the ones after it. A
-    loop that is late makes at most 200 steps a second, so that it does not flood the subscribers of its messages. One
+    Steps are due at the clock's times ``next_time``, ``dt`` apart, so a late step does not delay later steps. A loop
+    that is late makes at most 200 steps a second, so that it does not flood the subscribers of its messages. A loop
     that is more than ``max_lag`` late (it was stopped, or the machine slept) skips the steps that it has missed.
     """
 
     MAX_LAG = 0.25
-    """Largest lag that is caught up, unless given [s]."""
+    """Default of the largest lag that is caught up [s]."""
     LEAST_SPACING = 0.5
     """Real time between the begins of two steps, as a share of ``dt``."""
     MAX_LEAD = 5.0
-    """If the clock is further behind the loop than this [s], it is a different clock, and the loop takes its time at
+    """If the clock is behind the loop by more than this [s], it is a different clock, and the loop jumps to its time at
     once."""
     MAX_SKIP = 3600.0
-    """If the clock is further ahead of the loop than this [s], the loop also takes its time at once. The first time
+    """If the clock is ahead of the loop by more than this [s], the loop also jumps to its time at once. The first time
     that a server reports is that far ahead."""
     FREE_LEAD = 0.015
-    """If the clock is further behind the loop than this [s], it was set back. Steps continue at :data:`LEAD_RATE` until
-    the clock has caught up."""
+    """If the clock is behind the loop by more than this [s], the clock was set back. Steps continue at
+    :data:`LEAD_RATE` until the clock has caught up."""
     LEAD_RATE = 0.9
     LONGEST_SLEEP = 0.05
     """Longest single sleep [s]. The loop keeps the clock up to date between two sleeps."""
     SHORTEST_SLEEP = 1e-6
     """A step that is due within this time begins now [s]."""
     HOLD_POLL = 0.001
-    """Time between two checks whether a step is still held [s]."""
+    """Time between two checks whether a step is still held back [s]."""
     CLOCK_PATIENCE = 3.0
-    """Longest wait for a clock that has to be asked, before steps are skipped [s]."""
+    """Longest wait for a clock whose time must be requested from a server, before steps are skipped [s]."""
 
     def __init__(
         self, dt: float, clock: StepClock | None = None, *, max_lag: float = MAX_LAG, capacity: int = 1 << 16
     ) -> None:
-        """``clock``: real time unless given. ``capacity``: steps whose times are kept."""
+        """``clock``: the clock that steps follow; by default real time. ``capacity``: number of steps whose times are
+        stored."""
         self.dt = dt
         self.clock = clock or RealTime()
         self.max_lag = max_lag
         self.next_time = 0.0
-        """Time of the clock at which the next step is due [s]; from :meth:`begin` to :meth:`end`, the present step."""
+        """Time of the clock at which the next step is due [s]; between :meth:`begin` and :meth:`end`, the time of the
+        present step."""
         self.hold: Callable[[], str] = lambda: ""
         """Returns the reason why the step that is due has to wait, such as "sensors", or "" if it may begin."""
         self.is_stopping: Callable[[], bool] = lambda: False
@@ -139,7 +143,7 @@ class RateLoop:
         return PaceReport(self.next_time, *self.meter.limit())
 
     def begin(self) -> None:
-        """Wait until the next step is due and nothing holds it, then start measuring its work."""
+        """Wait until the next step is due and nothing holds it back, then start measuring its work."""
         now = time.monotonic()
         self.clock.keep(now)
         if self.ticks == 0:
@@ -180,7 +184,8 @@ class RateLoop:
         return max(wait, self.LEAST_SPACING * self.dt - since)
 
     def _wait_for_clock(self, now: float) -> float:
-        """If steps are to be skipped, wait until the clock knows its time again. Returns the real time after that [s].
+        """If steps would be skipped, wait until the clock knows its time again. Returns the real time after the wait
+        [s].
 
         A client that was stopped knows only the world's time from before the stop, and would skip too many steps.
         """
@@ -237,22 +242,22 @@ class RateLoop:
         return self.ticks * self.dt / span if span > 0.0 else 0.0
 
     def log(self) -> TickLog:
-        """The begin and the duration of the last steps; at most ``capacity`` of them."""
+        """Returns the begin and the duration of the last steps; at most ``capacity`` of them."""
         order = np.arange(max(self.ticks - len(self._work), 0), self.ticks) % len(self._work)
         return TickLog(
             self._begins[order], self._work[order].astype(float), self.dt, self._periods[order].astype(float)
         )
 
     def work_ms(self, *percentiles: float) -> list[float]:
-        """Percentiles (0 to 100) of the work of a step [ms]."""
+        """Returns percentiles (0 to 100) of the work of a step [ms]."""
         done = self._work[: min(self.ticks, len(self._work))]
         return [float(v) * 1e3 for v in np.percentile(done, percentiles)] if len(done) else [0.0] * len(percentiles)
 
 
 def paced_loop(client: Client, *, is_shared: bool, factor: float | None = None) -> RateLoop:
-    """A loop for the steps of a client. It follows the clock of the server if the world ``is_shared``. Otherwise it
-    follows a clock of its own, which runs at a fixed real-time ``factor`` or, if that is None, as fast as this client
-    can follow."""
+    """Returns a loop for the steps of a client. The loop follows the clock of the server if the world ``is_shared``.
+    Otherwise it follows a clock of its own, which runs at a fixed real-time ``factor`` or, if that is None, as fast as
+    this client can compute."""
     if is_shared:
         loop = RateLoop(client.physics.dt, WorldPace(client.replicator), max_lag=WAITING_MAX_LAG)
         client.follow_steps(lambda: loop.next_time)

@@ -1,5 +1,7 @@
-"""Signals of robots and people: indicator lights, which flash by the time of the world and so are equal on all
-clients, intentions of people, and gestures of their hands."""
+"""Signals of robots and people: indicator lights, intentions, and gestures of hands.
+
+Lights flash by the time of the world, and so are equal on all clients.
+"""
 
 from __future__ import annotations
 
@@ -31,7 +33,7 @@ class IntentionLog:
         return tuple(self._known[name] for name in sorted(self._known))
 
     def update(self, present: Mapping[str, str], time: float) -> bool:
-        """Take the intentions of all ``present`` people, by name, at ``time`` of the world [s].
+        """Record the intentions of all ``present`` people, by name, at ``time`` of the world [s].
 
         Returns whether any has changed. If a person leaves, the person's intention ends.
         """
@@ -59,7 +61,8 @@ class GestureLog:
         """Gestures of the hands of each person, sorted by the person's name."""
 
     def update(self, people: Mapping[str, HumanPose]) -> bool:
-        """Take the poses of all people, by name. Returns whether the gesture of any hand has changed."""
+        """Record the gestures in the poses of all people, by name. Returns whether the gesture of any hand has
+        changed."""
         fingers = [(name, people[name].left_fingers, people[name].right_fingers) for name in sorted(people)]
         if fingers == self._fingers:
             return False

@@ -33,12 +33,13 @@ FOLLOW_YAW = 0.7
 
 
 def standing_view(x: float, y: float, heading: float) -> np.ndarray:
-    """Pose [7] m, 1 of the eyes of a person who stands at (x, y) [m] and looks along ``heading`` [rad]."""
+    """Returns the pose [7] m, 1 of the eyes of a person who stands at (x, y) [m] and looks along ``heading`` [rad]."""
     return frames.pose(np.array([x, y, EYE_HEIGHT]), frames.from_yaw(heading))
 
 
 def follow_view(base: np.ndarray) -> np.ndarray:
-    """Pose [7] m, 1 of the eyes of a person who looks over the shoulder of a robot with its base at ``base`` [7]."""
+    """Returns the pose [7] m, 1 of the eyes of a person who looks over the shoulder of a robot with its base at
+    ``base`` [7]."""
     ahead = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
     heading = float(np.arctan2(ahead[1], ahead[0])) + FOLLOW_YAW
     eye = base[:2] - FOLLOW_DISTANCE * np.array([np.cos(heading), np.sin(heading)])
@@ -48,7 +49,7 @@ def follow_view(base: np.ndarray) -> np.ndarray:
 class Spectator(Client):
     """A client that only watches. :attr:`pose` [7] is the pose of its eyes: x forward, z up. Assign it to move them."""
 
-    picking = False  # the owners of plants report what detaches
+    picking = False  # owners of plants report detachments
     slows_the_world = False
 
     def _add_own_actor(
@@ -95,7 +96,7 @@ class PictureWriter:
     WIDTH = 960
     HEIGHT = 640
     ANGLE = 1.2
-    """Size [px] and horizontal field of view [rad]."""
+    """Horizontal field of view [rad]; ``SIZE`` is the size of a picture [px]."""
 
     def __init__(
         self,
@@ -105,7 +106,7 @@ class PictureWriter:
         renderer: str = "warp",
         device: str = "cpu",
     ) -> None:
-        """One picture every ``period`` [s] of simulated time, into a ``folder`` that exists."""
+        """Write one picture every ``period`` [s] of simulated time into ``folder``, which must exist."""
         if device == "cpu":
             load_kernels(CameraMount.kind)
         focal = 0.5 * self.WIDTH / np.tan(0.5 * self.ANGLE)

@@ -52,7 +52,7 @@ class Status:
         self._before_ticks = 0
 
     def current(self) -> dict[str, Any]:
-        """The present values, for JSON. Rates of topics and recent values cover the time since the last call.
+        """Returns the present values, for JSON. Rates of topics and recent values cover the time since the last call.
 
         Recent faults are the kinds that occurred within the last minute.
         """
@@ -105,7 +105,7 @@ class Status:
         }
 
     def report(self) -> dict[str, Any]:
-        """The values at the end of a run, with counts of messages and the evaluation of the trace."""
+        """Returns the values at the end of a run, with counts of messages and the evaluation of the trace."""
         client = self.client
         values = self.current()
         values["topics"] = dict(self._sent())
@@ -124,7 +124,8 @@ class Status:
 
 
 def network_trouble(client: Client) -> str:
-    """Returns why an actor of the client has no network now (the first such actor), or "" if all have it."""
+    """Returns the reason why an actor of the client has no network now (for the first such actor), or "" if all have
+    it."""
     return next((text for one in client.replicators.values() if (text := one.bus.status_message)), "")
 
 
@@ -156,7 +157,7 @@ DESCRIPTIONS = {
 
 
 def count_faults(client: Client, steps_skipped: int = 0) -> dict[str, int]:
-    """How often each fault of :data:`DESCRIPTIONS` occurred. Faults that did not occur are left out."""
+    """Returns how often each fault of :data:`DESCRIPTIONS` occurred. Faults that did not occur are left out."""
     counters = [replicator.counters for replicator in client.replicators.values()]
     physics = client.physics.faults | {"couplings_refused": client.couplings.refused}
     counts = client.earlier_faults + collections.Counter(physics)

@@ -1,4 +1,5 @@
-"""Time of the world: the server's clock as one client sees it at its steps. It stamps all messages of the client.
+"""Time of the world: the server's clock as one client knows it at its steps. All messages of the client are stamped
+with it.
 
 Simulated time counts a client's own steps from 0. Clients start at different moments, and a client that is slow or was
 stopped falls behind. Stamps are therefore simulated time plus an offset that follows the server's clock. Without a
@@ -15,9 +16,9 @@ import numpy as np
 log = logging.getLogger(__name__)
 
 GAIN = 0.01
-"""Share of the offset's error that one step corrects. It smooths jitter of single steps over a second."""
+"""Share of the offset's error that one step corrects: jitter of single steps is smoothed over a second."""
 MAX_RATE = 0.1
-"""[s/s] Largest rate at which the offset follows: a step of 10 ms is stamped as 9 to 11 ms."""
+"""Largest rate of change of the offset [s/s]: the stamps of two successive steps of 10 ms differ by 9 to 11 ms."""
 MAX_LAG = 0.05
 """[s] Stamps are never further behind the server's clock than this: the stamps of a slow client skip ahead. If stamps
 are further ahead than this while steps follow each other faster than ``dt`` (a loop catches up), the stamps advance no
@@ -25,8 +26,8 @@ faster than the server's clock."""
 MIN_RATE = 0.1
 """[s/s] Stamps rise in every step, by at least this share of ``dt``."""
 MAX_LEAD = 5.0
-"""[s] A server's clock that is further behind than this belongs to another run of the world. The offset takes its time
-at once."""
+"""A server's clock that is further behind than this [s] belongs to another run of the world. The offset then jumps to
+it at once."""
 
 
 class WorldTime:
@@ -39,7 +40,7 @@ class WorldTime:
         self.is_shared = False
         """Whether a server's clock is followed."""
         self._dt = dt
-        self._clock = 0.0  # at the last step
+        self._clock = 0.0  # server's time at the last step
 
     def follow(self, simulated: float, clock: float) -> None:
         """Follow the server's ``clock`` [s] at the step that starts at ``simulated`` time [s]; call it every step."""
@@ -84,9 +85,10 @@ class OffsetHistory:
         self._offsets.append(offset)
 
     def world_time(self, simulated: float) -> float:
-        """World's time [s] at ``simulated`` time [s]. Outside the known range the nearest known offset holds.
+        """Returns the world's time [s] at ``simulated`` time [s]. Outside the known range the nearest known offset
+        holds.
 
-        The result rises with ``simulated`` if the stamps of the steps rise, however late it is asked for. Raises
+        The result rises with ``simulated`` if the stamps of the steps rise, no matter how late it is requested. Raises
         :class:`ValueError` before the first offset.
         """
         return simulated + float(np.interp(simulated, self._times, self._offsets))

@@ -22,26 +22,26 @@ class Sweep:
     direction: np.ndarray
     """[3] Unit vector in the world."""
     amplitude: float
-    """[m]"""
+    """Amplitude [m]."""
     frequencies: tuple[float, float]
     """[Hz] Frequencies at the start and at the end."""
     start: float
-    """[s]"""
+    """Time at which the sweep starts [s]."""
     duration: float
-    """[s]"""
+    """Duration of the sweep [s]."""
 
     def position(self, time: np.ndarray) -> np.ndarray:
-        """Position [k, 3] m in the world at times [k] s."""
+        """Returns the position [k, 3] m in the world at times [k] s."""
         size, _, phase, _ = self._terms(time)
         return (size * np.sin(phase))[:, None] * self.direction
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Velocity [k, 3] m/s in the world at times [k] s."""
+        """Returns the velocity [k, 3] m/s in the world at times [k] s."""
         size, growth, phase, rate = self._terms(time)
         return (growth * np.sin(phase) + size * rate * np.cos(phase))[:, None] * self.direction
 
     def _terms(self, time: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Amplitude [k] m and its derivative [m/s], phase [k] rad and its derivative [rad/s]."""
+        """Returns amplitude [k] m and its derivative [m/s], phase [k] rad and its derivative [rad/s]."""
         t = np.clip(np.asarray(time, float) - self.start, 0.0, self.duration)
         fade = FADE * self.duration
         edge = np.minimum(np.minimum(t, self.duration - t) / fade, 1.0)
@@ -67,9 +67,11 @@ class SampledMotion:
         self._bend = curve.derivative(2)
 
     def velocity(self, time: np.ndarray) -> np.ndarray:
-        """Velocity [k] or [k, 3] m/s at times [k] s; outside the samples it is the velocity of the nearest one."""
+        """Returns the velocity [k] or [k, 3] m/s at times [k] s; outside the samples, the velocity at the nearest
+        sample."""
         return self._slope(np.clip(time, *self._ends))
 
     def acceleration(self, time: np.ndarray) -> np.ndarray:
-        """Acceleration [k] or [k, 3] m/s^2 at times [k] s, as :meth:`velocity`."""
+        """Returns the acceleration [k] or [k, 3] m/s^2 at times [k] s; outside the samples, the acceleration at the
+        nearest sample."""
         return self._bend(np.clip(time, *self._ends))

@@ -23,8 +23,11 @@ from vinesim.scene.state import State
 from vinesim.tune.specimen import TIP, base_pose, build_tree, hanging_bends, place_markers, rest_bends
 
 COLUMNS = ("modulus", "damping", "mass", "bow_y", "bow_z", "pull_y", "pull_z")
-"""Columns of a candidate: natural logarithms of the ratios of modulus, damping and mass to the specimen's, bow [rad],
-and pull at the tip along the base's y and z [N at the specimen's modulus; it is scaled with the modulus]."""
+"""Columns of a candidate.
+
+They are natural logarithms of the ratios of modulus, damping and mass to the specimen's, the bow [rad], and the pull at
+the tip along the base's y and z [N at the specimen's modulus; it is scaled with the modulus].
+"""
 STATIC_STEP = 1.0
 """[s] Step in which inertia is negligible, so that the implicit solve is a Newton step towards equilibrium."""
 STATIC_STEPS = 8
@@ -43,7 +46,7 @@ class Motion:
     """[candidate, tick, marker, 3] m/s^2"""
 
     def at(self, index: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [candidate, sample, marker, 3] between ticks.
+        """Interpolate positions and velocities [candidate, sample, marker, 3] between ticks.
 
         The times are ``after`` [candidate or 1, sample] s after the ticks ``index`` [sample].
         """
@@ -60,7 +63,7 @@ class Candidates:
         markers: names of the points whose motion is returned.
         dt: step [s].
         device: ``cpu``, ``cuda`` or ``cuda:N``.
-        least: smallest number of candidates for which solvers are made.
+        least: smallest number of candidates for which solvers are created.
     """
 
     def __init__(
@@ -79,7 +82,8 @@ class Candidates:
         self._own: dict[int, tuple[np.ndarray, ...]] = {}
         self._least = least
         self._sag = np.array([frames.log(body["settled"]) for body in self._tree.bodies]) if specimen.axis else None
-        """[body, 3] rad, rotation of each joint from its slack shape by the weight of a specimen with an axis."""
+        """For a specimen with an axis: rotation of each joint from its slack shape by the specimen's weight [body, 3]
+        rad."""
         self.runs = 0
         """Number of candidates run so far."""
 
@@ -132,13 +136,13 @@ class Candidates:
         return Motion(position, velocity, (later - velocity) / np.float32(self.dt))
 
     def held_pose(self, candidates: np.ndarray) -> np.ndarray:
-        """Joint rotations [n, body, 4] of candidates [n, 7] in equilibrium under their pull."""
+        """Returns the joint rotations [n, body, 4] of candidates [n, 7] in equilibrium under their pull."""
         self.shape(candidates)
         still, _ = self._solvers[len(self._padded(candidates))]
         return still.state.joint_q.reshape(-1, self.size, 4)[: len(candidates)].astype(float)
 
     def shape(self, candidates: np.ndarray) -> np.ndarray:
-        """Markers [n, marker, 3] m of candidates [n, 7] in equilibrium under their pull."""
+        """Returns the markers [n, marker, 3] m of candidates [n, 7] in equilibrium under their pull."""
         count = len(candidates)
         candidates = self._padded(candidates)
         still, _ = self._solvers[len(candidates)]
@@ -150,7 +154,7 @@ class Candidates:
     # ------------------------------------------------------------------
 
     def _padded(self, candidates: np.ndarray) -> np.ndarray:
-        """Candidates [n, 7], padded with copies of the last one to a number for which solvers exist."""
+        """Returns candidates [n, 7], padded with copies of the last one to a number for which solvers exist."""
         count = len(candidates)
         sizes = [size for size in self._solvers if count <= size <= 2 * count + 8]
         size = min(sizes, default=max(count, self._least))
@@ -164,7 +168,7 @@ class Candidates:
         plants.wake(np.arange(count))
 
     def _bodies(self, count: int) -> np.ndarray:
-        """Bodies [n, marker] that carry the markers."""
+        """Returns the bodies [n, marker] that carry the markers."""
         return np.arange(count)[:, None] * self.size + self._body
 
     def _new_solvers(self, count: int) -> None:
@@ -194,13 +198,15 @@ class Candidates:
         rest = plants.kernel_arrays()[wp.quat]["body_rest"].reshape(count, self.size, 4)
         if self._sag is None:
             rest[:, : self.specimen.segments] = frames.exp(rest_bends(self.specimen, candidates[:, 3:5]))
-        else:  # it hangs along its axis for any modulus; the stiffer it is, the less the slack shape differs
+        # a specimen with an axis hangs along it for any modulus; the stiffer it is, the less its slack shape differs
+        else:
             hanging = frames.exp(hanging_bends(self.specimen))
             rest[:] = frames.multiply(hanging[None], frames.conjugate(frames.exp(self._sags(candidates))))
         plants.launches.changed = True
 
     def _sags(self, candidates: np.ndarray) -> np.ndarray:
-        """[n, body, 3] rad, rotation of joints by weight, for candidates [n, 7] of a specimen with an axis."""
+        """Returns the rotation of joints by weight [n, body, 3] rad, for candidates [n, 7] of a specimen with an
+        axis."""
         assert self._sag is not None
         return self._sag * np.exp(candidates[:, 2] - candidates[:, 0])[:, None, None]
 
@@ -231,7 +237,8 @@ class Candidates:
     def _load(
         self, plants: ArticulationSolver, candidates: np.ndarray, pushed: bool, base_velocity: np.ndarray | None
     ) -> Callable[[int], None] | None:
-        """A function of a tick that loads the bodies for the step after it; None if the load does not change."""
+        """Returns a function of a tick that loads the bodies for the step after it; None if the load does not
+        change."""
         plants.body_load[:] = 0.0
         plants.tree_air[:] = 0.0
         if base_velocity is None and not pushed:
@@ -243,7 +250,7 @@ class Candidates:
 
 
 def _advance(plants: ArticulationSolver, first: int, end: int, load: Callable[[int], None] | None) -> None:
-    """Take the steps from tick ``first`` to tick ``end``."""
+    """Simulate from tick ``first`` to tick ``end``."""
     if load is None:
         plants.upload()
         plants.advance(end - first)
@@ -270,7 +277,8 @@ def _shake(plants: ArticulationSolver, base_velocity: np.ndarray, tick: int) -> 
 def _marker_motion(
     plants: ArticulationSolver, bodies: np.ndarray, point: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions [n, marker, 3] of markers after a prediction, their velocities, and velocities at the step's end."""
+    """Returns positions [n, marker, 3] of markers after a prediction, their velocities, and velocities at the step's
+    end."""
     pose, now, later = (rows[bodies] for rows in (plants.state.body_q, plants.state.body_qd, plants.velocity_free))
     arm = frames.rotate(pose[..., 3:], point)
     velocity = now[..., :3] + frames.cross(now[..., 3:], arm)

@@ -51,7 +51,7 @@ class Experiment:
     duration: float | None = None
     """[s] Duration of the recording after the force begins or ends, or of the sweep."""
     hold: float = 0.2
-    """[s] Duration of the recording before that."""
+    """Duration of the recording before the force begins or ends, or before the sweep [s]."""
     rate: float = 30.0
     """[1/s] Picture rate."""
     noise: float = 0.002
@@ -64,7 +64,7 @@ class Experiment:
     seed: int = 0
 
     def number(self, name: str) -> float:
-        """The number ``name`` of this kind of experiment, given or default."""
+        """Returns the number ``name`` of this experiment: the given one, or the default of its kind."""
         given = getattr(self, name)
         return KINDS[self.kind][name] if given is None else given
 
@@ -102,7 +102,7 @@ class Experiment:
 def measure(
     specimen: Specimen, experiment: Experiment = Experiment(), *, exact: bool = False, step: float = TRUTH_STEP
 ) -> Trajectory:
-    """The track of an experiment on a specimen, simulated in steps of ``step`` [s]; ``exact``: without noise."""
+    """Simulate an experiment on a specimen in steps of ``step`` [s] and return its track; ``exact``: without noise."""
     experiment.check()
     e = experiment
     rng = np.random.default_rng(experiment.seed)
@@ -128,7 +128,7 @@ def measure(
     if e.force_noise is not None:
         size = float(np.linalg.norm(row[0, 5:]))
         force = np.where(held if e.kind == "pull-release" else ~held, size, 0.0)
-        force = force * (1.0 + (0.0 if exact else e.force_noise) * rng.normal())  # a gauge has an error of scale
+        force = force * (1.0 + (0.0 if exact else e.force_noise) * rng.normal())  # the error of a gauge is one of scale
     if not exact:
         position += rng.normal(0.0, e.noise, position.shape)
     for axis in range(3):
@@ -138,7 +138,7 @@ def measure(
 
 
 def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
-    """The motion of the shaken base."""
+    """Returns the motion of the shaken base."""
     e = experiment
     angle = math.radians(experiment.angle)
     direction = np.array([math.cos(angle), math.sin(angle)]) @ candidates.pull_axes()
@@ -148,9 +148,9 @@ def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:
 
 
 def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.ndarray:
-    """The pull [2] N along the base's y and z that moves the tip by ``displacement`` [m] at ``angle`` [rad].
+    """Returns the pull [2] N along the base's y and z that moves the tip by ``displacement`` [m] at ``angle`` [rad].
 
-    :class:`UsageError` if there is no such pull.
+    Raises :class:`UsageError` if there is no such pull.
     """
     specimen = candidates.specimen
     tip = Candidates(specimen, (TIP,), dt=candidates.dt)
@@ -173,7 +173,8 @@ def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.nd
 def expected_deviations(
     specimen: Specimen, track: Trajectory, parameters: Sequence[str] = ("modulus", "damping"), *, pushed: bool = False
 ) -> dict[str, float]:
-    """Standard deviation of each parameter's posterior after a fit to ``track``: relative, or in rad for bows."""
+    """Returns the standard deviation of each parameter's posterior after a fit to ``track``: relative, or in rad for
+    bows."""
     fit = tune(specimen, track, parameters, pushed=pushed)
     if not fit.ok:
         raise UsageError(f"this experiment cannot be fitted: {fit.faults[0]}")

@@ -24,10 +24,14 @@ RELATIVE_STEP = 0.03
 SUBSTEPS = 8
 """Number of parts of a sample interval in each of which the acceleration of a base is taken as constant."""
 STANDS_OUT = 0.1
-"""[1] A sample counts as motion, not noise, if it differs from the first samples by this fraction of the whole range. A
-late onset does no harm, because the turning point is known to a quarter of a period. An onset in the hold does."""
+"""A sample counts as motion, not noise, if it differs from the first samples by this fraction of the whole range [1].
+
+Detection of the onset after its true time does no harm, because the turning point is known to a quarter of a period.
+Detection during the hold does.
+"""
 CLEARLY = 5.0
-"""[1] Reduction of the loss, in squared standard deviations, by which another release must be better."""
+"""Reduction of the loss, in squared standard deviations, by which another release time must be better to replace the
+first [1]."""
 DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 """Trial damping ratios."""
 
@@ -37,9 +41,9 @@ class Features:
     """A damped sinusoid, or the response of a damped oscillator, fitted to a track."""
 
     frequency: float
-    """[Hz]"""
+    """Frequency [Hz]."""
     damping_ratio: float
-    """[1]"""
+    """Damping ratio [1]."""
     release: float
     """[s] Time of the release on the track's clock: the turning point at or before the onset of motion. For a shaken
     base it is the start of the track."""
@@ -59,7 +63,7 @@ class Features:
 
 
 def columns_of(track: Trajectory) -> np.ndarray:
-    """The tracked columns [sample, column] m, with gross outliers replaced by NaN."""
+    """Returns the tracked columns [sample, column] m, with gross outliers replaced by NaN."""
     values = track.position[:, track.tracked].copy()
     for column in values.T:
         column[_gross_outliers(column)] = np.nan
@@ -67,13 +71,14 @@ def columns_of(track: Trajectory) -> np.ndarray:
 
 
 def robust_deviation(values: np.ndarray) -> float:
-    """Standard deviation from the median of absolute deviations."""
+    """Returns the standard deviation, estimated from the median of absolute deviations."""
     values = values[np.isfinite(values)]
     return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else math.nan
 
 
 def _gross_outliers(column: np.ndarray) -> np.ndarray:
-    """Samples far from the median of five neighbours [sample] bool, such as swapped markers and wrong digits."""
+    """Returns which samples are far from the median of five neighbours [sample] bool, such as swapped markers and wrong
+    digits."""
     seen = np.flatnonzero(np.isfinite(column))
     if len(seen) < 5:
         return np.zeros(len(column), bool)
@@ -87,7 +92,7 @@ def _gross_outliers(column: np.ndarray) -> np.ndarray:
 
 
 def find_onset(track: Trajectory) -> float:
-    """Last time [s] before the motion, which is the first sample unless the track begins with a hold."""
+    """Returns the last time [s] before the motion, which is the first sample unless the track begins with a hold."""
     values = columns_of(track)
     time = track.time
     noise = max(_hold_noise(values), 1e-9)
@@ -99,23 +104,25 @@ def find_onset(track: Trajectory) -> float:
 
 
 def _hold_noise(values: np.ndarray) -> float:
-    """Noise [m] of the first samples if they hold still."""
+    """Returns the noise [m] of the first samples if they hold still."""
     first = values[: max(4, len(values) // 20)]
     return float(np.nanmax([robust_deviation(column) for column in np.diff(first, axis=0).T])) / math.sqrt(2.0)
 
 
 def _basis(time: np.ndarray, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Basis curves [trial, sample, 3]: constant one, damped cosine and damped sine."""
+    """Returns basis curves [trial, sample, 3]: constant one, damped cosine and damped sine."""
     omega = 2.0 * np.pi * frequency[:, None]
     decay = np.exp(-ratio[:, None] / np.sqrt(1.0 - ratio[:, None] ** 2) * omega * time)
     return np.stack([np.ones_like(decay), decay * np.cos(omega * time), decay * np.sin(omega * time)], -1)
 
 
 def _response_basis(time: np.ndarray, motion: SampledMotion, frequency: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Basis curves [trial, sample, 3]: constant one, response of a damped oscillator, and acceleration of the base.
+    """Returns basis curves [trial, sample, 3]: constant one, response of a damped oscillator, and acceleration of the
+    base.
 
-    Higher modes follow the acceleration without delay. The last two curves are scaled to a mean square of one. The
-    response is exact for an acceleration that is constant over each of :data:`SUBSTEPS` parts of a sample interval.
+    The acceleration represents higher modes, which follow it without delay. The last two curves are scaled to a mean
+    square of one. The response is exact for an acceleration that is constant over each of :data:`SUBSTEPS` parts of a
+    sample interval.
     """
     omega = 2.0 * np.pi * frequency
     pole = omega * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
@@ -135,7 +142,8 @@ def _response_basis(time: np.ndarray, motion: SampledMotion, frequency: np.ndarr
 
 
 def _misfit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted squared residuals [trial] and coefficients [trial, 3, column] for ``basis`` [trial, sample, 3]."""
+    """Returns weighted squared residuals [trial] and coefficients [trial, 3, column] for ``basis`` [trial, sample,
+    3]."""
     clean = np.where(weight > 0.0, values, 0.0)
     normal = np.einsum("tsi,sc,tsj->tcij", basis, weight, basis) + 1e-9 * np.eye(3)
     right = np.einsum("tsi,sc->tci", basis, weight * clean)
@@ -145,7 +153,7 @@ def _misfit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[
 
 
 def extract_features(track: Trajectory, onset: float | None = None) -> Features:
-    """Features of the motion after ``onset`` [s], which is detected unless given.
+    """Returns the features of the motion after ``onset`` [s], which is detected unless given.
 
     A track with a shaken base is used from its first sample on, at which the plant must be at rest.
     """
@@ -161,7 +169,7 @@ def extract_features(track: Trajectory, onset: float | None = None) -> Features:
 
 
 def _free_features(track: Trajectory, onset: float) -> Features:
-    """Features of the damped sinusoid that fits the track best after ``onset`` [s]."""
+    """Returns the features of the damped sinusoid that fits the track best after ``onset`` [s]."""
     here = track.time >= onset
     time = track.time[here] - onset
     values = columns_of(track)[here]
@@ -173,7 +181,7 @@ def _free_features(track: Trajectory, onset: float) -> Features:
 
 
 def _find_release(track: Trajectory, features: Features) -> float:
-    """Time of the release [s]: the turning point of the sinusoid before which the track is still.
+    """Returns the time of the release [s]: the turning point of the sinusoid before which the track is still.
 
     It is the release in ``features`` unless a turning point some half periods away fits clearly better.
     """
@@ -195,7 +203,7 @@ def _find_release(track: Trajectory, features: Features) -> float:
 
 
 def _shaken_features(track: Trajectory) -> Features:
-    """Features of the oscillator whose response to the base's motion fits the track best."""
+    """Returns the features of the oscillator whose response to the base's motion fits the track best."""
     assert track.base is not None
     along = _direction(track.base)
     motion = SampledMotion(track.time, track.base @ along)
@@ -217,7 +225,7 @@ def _shaken_features(track: Trajectory) -> Features:
 
 
 def _direction(base: np.ndarray) -> np.ndarray:
-    """Unit vector [3] of the largest motion of a base [sample, 3]."""
+    """Returns the unit vector [3] of the largest motion of a base [sample, 3]."""
     return np.linalg.svd(base, full_matrices=False)[2][0]
 
 
@@ -259,7 +267,8 @@ def _search(
 
 
 def _explained(off: np.ndarray, values: np.ndarray) -> float:
-    """Fraction [1] of the variance of ``values`` [sample, column] that is missing in the residuals ``off``."""
+    """Returns the explained fraction [1] of the variance of ``values`` [sample, column]: the part that is not in the
+    residuals ``off``."""
     moved = np.nanvar(values, axis=0).sum()
     return float(1.0 - np.nanvar(off, axis=0).sum() / max(moved, 1e-18))
 

@@ -1,4 +1,4 @@
-"""The result of a fit: in words, as JSON, and as a file of plant parameters for scenes."""
+"""The result of a fit: as text, as JSON, and as a file of plant parameters for scenes."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Minimum:
     """Another minimum of the loss."""
 
     modulus: float
-    """[Pa]"""
+    """Modulus at this minimum [Pa]."""
     loss_ratio: float
-    """[1] Ratio of its loss to the loss of the best minimum."""
+    """Ratio of this minimum's loss to the loss of the best minimum [1]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -87,7 +87,7 @@ class Fit:
 
     @property
     def ok(self) -> bool:
-        """Whether there is no reason to distrust the fit."""
+        """Whether the fit has no faults."""
         return not self.faults
 
     @property
@@ -97,7 +97,7 @@ class Fit:
         return tuple(self._estimate(name, name not in weak) for name in self.posterior.names[: self.posterior.physical])
 
     def estimate(self, name: str) -> Estimate:
-        """The fitted number of this name."""
+        """Returns the fitted number of this name."""
         return next(estimate for estimate in self.estimates if estimate.name == name)
 
     def _estimate(self, name: str, known: bool) -> Estimate:
@@ -115,7 +115,7 @@ class Fit:
 
     @property
     def outliers(self) -> int:
-        """Number of samples with less than half of the full weight, or left out as gross errors."""
+        """Number of samples that have less than half of the full weight, or that are left out as gross errors."""
         data = self.track.position[:, self.track.tracked]
         off = np.abs(self.model - data) / self.column_noise
         gross = np.isfinite(data) & ~np.isfinite(self.model)
@@ -129,7 +129,7 @@ class Fit:
     # ------------------------------------------------------------------ words
 
     def lines(self) -> list[str]:
-        """The fit in words, one fact in each line."""
+        """Returns the fit as text, one fact in each line."""
         f = self.features
         lines = []
         lines.append(f"{'fitted' if self.ok else 'FAILED'}: {self.track.source}, {len(self.track.time)} samples")
@@ -154,7 +154,7 @@ class Fit:
         return lines + [f"fault    {fault}" for fault in self.faults]
 
     def _noise_words(self) -> str:
-        """The noise of each column, once if all are alike."""
+        """Returns a text about the noise of each column, with a single value if all are alike."""
         low = float(self.column_noise.min())
         high = float(self.column_noise.max())
         if high < 2.0 * low:
@@ -173,7 +173,7 @@ class Fit:
         return "what is given there is the prior; fix one of them, or measure it otherwise"
 
     def as_json(self) -> dict[str, Any]:
-        """The fit as plain values."""
+        """Returns the fit as plain values for JSON."""
         return {
             "ok": self.ok,
             "source": self.track.source,
@@ -198,7 +198,7 @@ class Fit:
     # ------------------------------------------------------------------ file
 
     def fitted_specimen(self) -> Specimen:
-        """The specimen with the fitted numbers, of grade FITTED."""
+        """Returns the specimen with the fitted numbers, of grade FITTED."""
         text = f"{datetime.date.today().isoformat()}, vinesim tune of {self.track.source}"
         changes: dict[str, Any] = {}
         bow = list(self.specimen.bow)
@@ -219,8 +219,8 @@ class Fit:
     def write_plant(self, path: str | pathlib.Path, plant: str = "vine") -> None:
         """Write a file of plant parameters for scenes (``plants = "FILE"``).
 
-        It contains the parameters of ``plant`` with the fitted numbers, and the table ``[specimen]``. A cane's modulus
-        becomes ``woody_modulus``, and ``green_modulus`` keeps its ratio to it.
+        The file contains the parameters of ``plant`` with the fitted numbers, and the table ``[specimen]``. A cane's
+        modulus becomes ``woody_modulus``; ``green_modulus`` is scaled by the same factor.
         """
         text = find_data_file("plants", plant, ".toml").read_text("utf-8")
         text = text.split("\n[specimen]")[0].rstrip() + "\n"
@@ -240,7 +240,7 @@ class Fit:
 
 
 def specimen_toml(specimen: Specimen) -> str:
-    """The table ``[specimen]`` as TOML text."""
+    """Returns the table ``[specimen]`` as TOML text."""
     lines = ["[specimen]", f'organ = "{specimen.organ}"']
     for name in ("length", "base_diameter", "tip_diameter", "modulus", "density", "damping", "tip_mass"):
         number = getattr(specimen, name)
@@ -270,14 +270,15 @@ def _replaced(number: Any, value: float, source: str) -> Any:
 
 
 def _replace_line(text: str, table: str, key: str, number: Any) -> str:
-    """The text of a TOML file with the line of the number ``key`` in ``table`` replaced."""
+    """Returns the text of a TOML file with the line of the number ``key`` in ``table`` replaced."""
     before, head, after = re.split(rf"(^\[{table}\][^\n]*\n)", text, maxsplit=1, flags=re.MULTILINE)
     after = re.sub(rf"^{key} = [^\n]*", lambda _: f"{key} = {_number(number)}", after, count=1, flags=re.MULTILINE)
     return before + head + after
 
 
 def _scale_green(text: str, woody: Any) -> str:
-    """Scale a shoot's green modulus so that its ratio to the woody modulus stays the same."""
+    """Returns the text of a TOML file with a shoot's green modulus scaled, so that its ratio to the woody modulus is
+    unchanged."""
     values = [
         float(re.search(rf"^{key} = {{ value = ([^,]+),", text, re.MULTILINE)[1])  # pyright: ignore[reportOptionalSubscript]
         for key in ("woody_modulus", "green_modulus")

@@ -14,16 +14,21 @@ from vinesim.tune.specimen import TIP
 from vinesim.tune.trajectory import MIN_SAMPLES, Trajectory, TrajectoryError
 
 MAX_TURN = np.radians(30.0)
-"""[rad] Largest difference in hue between a pixel and the colour of its marker, as the angle between their
-chromaticities seen from grey. The shaded side of a ball differs from the sunny side by 20 degrees."""
+"""Largest difference in hue between a pixel and the colour of its marker [rad].
+
+It is the angle between their chromaticities, measured around grey. The shaded side of a ball differs from the sunny
+side by 20 degrees.
+"""
 LEAST_SATURATION = 0.5
-"""[1] Smallest ratio of a pixel's distance from grey to the colour's distance; a pixel half covered has 0.5."""
+"""Smallest accepted distance of a pixel's chromaticity from grey, as a share of the marker colour's distance [1]. A
+pixel half covered by the marker has 0.5."""
 DARKEST = 60
-"""[1] Smallest sum of red, green and blue (of 765) with which a pixel has a usable colour."""
+"""Smallest sum of red, green and blue (of 765) with which a pixel has a usable colour [1]."""
 MIN_PIXELS = 12
-"""Smallest number of pixels that show where the middle of a ball is."""
+"""Smallest number of pixels with which the middle of a ball can be located."""
 MIDDLE_DEPTH = 0.707
-"""[1] Median over a ball's disc of the distance by which the surface is nearer than the centre, in radii."""
+"""Distance by which a ball's visible surface is nearer than its centre, in radii [1]: the median over the ball's
+disc."""
 
 
 Colour = tuple[int, int, int]
@@ -33,7 +38,7 @@ Colour = tuple[int, int, int]
 def track_marker(
     pictures: Iterable[CameraFrame], colour: Colour | Mapping[str, Colour], *, radius: float, source: str = "pictures"
 ) -> Trajectory:
-    """The track of a coloured ball at the tip, or of several balls with different colours.
+    """Track a coloured ball at the tip, or several balls with different colours.
 
     In each picture the largest patch of the colour is the ball. The ball's direction is the centroid of the patch, its
     distance the median depth of the patch plus 0.7 radii. A picture is a gap if the patch is too small, touches the
@@ -46,7 +51,7 @@ def track_marker(
         radius: radius of the balls [m].
         source: name for messages.
 
-    :class:`~vinesim.tune.trajectory.TrajectoryError` for too few pictures, or if no picture shows the ball.
+    Raises :class:`~vinesim.tune.trajectory.TrajectoryError` for too few pictures, or if no picture shows the ball.
     """
     colours = dict(colour) if isinstance(colour, Mapping) else {TIP: colour}
     time = []
@@ -70,7 +75,8 @@ def track_marker(
 
 
 def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
-    """Pixels [height, width] bool of the largest patch of a colour in ``rgb`` [height, width, 3], with holes filled.
+    """Returns the pixels [height, width] bool of the largest patch of a colour in ``rgb`` [height, width, 3], with
+    holes filled.
 
     None if the patch is too small or touches the edge.
     """
@@ -94,12 +100,14 @@ def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
 
 
 def _off_grey(rgb: np.ndarray) -> np.ndarray:
-    """Distance of the chromaticity from grey: shares [..., 3] of red, green and blue in their sum, minus 1/3."""
+    """Returns the offset of each chromaticity from grey: shares [..., 3] of red, green and blue in their sum, minus
+    1/3."""
     return rgb / np.maximum(rgb.sum(-1, dtype=np.int32), 1)[..., None] - 1.0 / 3.0
 
 
 def _centre(picture: CameraFrame, patch: np.ndarray | None, radius: float) -> np.ndarray:
-    """Centre [3] m in the world of the ball seen as ``patch`` [height, width]; NaN if there is no patch."""
+    """Returns the centre [3] m in the world of the ball whose pixels are ``patch`` [height, width]; NaN if there is no
+    patch."""
     depth = np.zeros(0) if patch is None else picture.depth[patch]
     depth = depth[np.isfinite(depth)]
     if patch is None or len(depth) < MIN_PIXELS:

@@ -37,7 +37,7 @@ def draw_fit(fit: Fit, figure: Figure) -> None:
 
 
 def strongest_column(fit: Fit) -> int:
-    """Index of the tracked column with the largest swing."""
+    """Returns the index of the tracked column with the largest swing."""
     return int(np.argmax(np.nanstd(fit.model, axis=0)))
 
 
@@ -72,7 +72,8 @@ def draw_residuals(fit: Fit, axes: Axes) -> None:
 
 
 def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
-    """Draw the posterior of each pair of the plant's numbers into ``grid`` [k, k], with the prior where it fits."""
+    """Draw the posterior of each pair of the plant's numbers into the axes ``grid`` [k, k], with the prior where it
+    fits."""
     posterior = fit.posterior
     count = fit.posterior.physical
     names = posterior.names[:count]

@@ -31,14 +31,14 @@ MISSED = 0.05
 
 
 def with_cloud(specimen: Specimen, cloud: str | pathlib.Path | np.ndarray) -> Specimen:
-    """The specimen with its axis from a point cloud of the hanging cane.
+    """Returns the specimen with its axis from a point cloud of the hanging cane.
 
     Args:
         specimen: a cane; the cloud replaces its ``direction`` and ``bow``.
         cloud: points [n, 3] m, world axes (z up), of this cane alone, with the clamped end nearest to the origin; or a
             file of points: PLY, or text with x, y and z in each line.
 
-    :class:`~vinesim.core.errors.UsageError` if the points are not one cane of the specimen's length.
+    Raises :class:`~vinesim.core.errors.UsageError` if the points are not one cane of the specimen's length.
     """
     if specimen.organ != "cane":
         raise UsageError(f"the specimen is a {specimen.organ}; only a cane takes its shape from a point cloud")
@@ -57,9 +57,10 @@ def with_cloud(specimen: Specimen, cloud: str | pathlib.Path | np.ndarray) -> Sp
 
 
 def trace_axis(points: np.ndarray, source: str = "the point cloud") -> np.ndarray:
-    """The axis [k, 3] m of one cane from points [n, 3] m on or near it; the axis begins at the origin.
+    """Returns the axis [k, 3] m of one cane from points [n, 3] m on or near it; the axis begins at the origin.
 
-    The base is the end nearest to the origin. :class:`~vinesim.core.errors.UsageError` if the points are not one cane.
+    The base is the end nearest to the origin. Raises :class:`~vinesim.core.errors.UsageError` if the points are not one
+    cane.
     """
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise UsageError(f"{source}: points have the shape {points.shape}; give [n, 3] finite numbers")
@@ -93,7 +94,7 @@ def trace_axis(points: np.ndarray, source: str = "the point cloud") -> np.ndarra
 
 
 def _ways(graph: Any, start: int) -> np.ndarray:
-    """Length [point] m of the shortest path along the cloud from the point ``start`` to each point."""
+    """Returns the length [point] m of the shortest path along the cloud from the point ``start`` to each point."""
     return dijkstra(graph, directed=False, indices=start)
 
 

@@ -1,4 +1,5 @@
-"""Laplace's approximation of the posterior, the directions that the data do not decide, and importance resampling."""
+"""Laplace's approximation of the posterior, the directions that the data do not determine, and importance
+resampling."""
 
 from __future__ import annotations
 
@@ -12,7 +13,7 @@ from vinesim.tune.problem import SOFT, Evaluation, Problem
 Z90 = 1.6448536269514722
 """Number of standard deviations from the mean of a normal distribution to either end of its 90 % interval."""
 DECIDED = 3.0
-"""[1] The data decide a direction if their information (1 / variance) is at least this multiple of the prior's."""
+"""The data determine a direction if their information (1 / variance) is at least this multiple of the prior's [1]."""
 _CORRELATED = 3.0
 
 
@@ -45,17 +46,17 @@ class Posterior:
         return np.sqrt(np.diag(self.covariance))
 
     def interval(self, name: str) -> tuple[float, float]:
-        """The 90 % interval of one parameter."""
+        """Returns the 90 % interval of one parameter."""
         i = self.names.index(name)
         half = Z90 * float(self.deviation[i])
         return float(self.mean[i]) - half, float(self.mean[i]) + half
 
 
 def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.ndarray) -> Posterior:
-    """The posterior around a minimum ``theta`` with the evaluation ``found``, for a ``noise`` [column] m.
+    """Returns the posterior around a minimum ``theta`` with the evaluation ``found``, for a ``noise`` [column] m.
 
     The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so outliers and heavy tails widen it.
-    Correlated residuals count as fewer independent ones.
+    Correlated residuals count as a smaller number of independent residuals.
     """
     table = problem.residuals(found.model) / noise
     residual = table[problem.seen]
@@ -67,7 +68,7 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
     correlation_time = _correlation_time(table)
     data = slope**2 / (spread * correlation_time) * weighted.T @ weighted
     readings = sum(math.isfinite(prior.deviation) for prior in problem.priors)
-    data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # force reading
+    data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # rows of the force reading
     prior = np.array([1.0 / p.deviation**2 for p in problem.priors])  # 0 without prior knowledge
     size = 1.0 / np.sqrt(np.maximum(np.diag(data) + prior, 1e-12))
     scaled = (data + np.diag(prior)) * size * size[:, None]
@@ -78,7 +79,7 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
 
 
 def _correlation_time(residuals: np.ndarray) -> float:
-    """Number of correlated samples that carry as much information as one independent sample.
+    """Returns the number of correlated samples that carry as much information as one independent sample.
 
     ``residuals`` [sample, column] are in standard deviations. The result is 1 unless neighbours are clearly correlated.
     """
@@ -92,7 +93,7 @@ def _correlation_time(residuals: np.ndarray) -> float:
 
 
 def _ridges(problem: Problem, data: np.ndarray, prior: np.ndarray) -> tuple[Ridge, ...]:
-    """Directions of the plant's parameters, in units of their priors, that the data do not decide."""
+    """Returns the directions of the plant's parameters, in units of their priors, that the data do not determine."""
     k = len(problem.fitted)
     if k == 0:
         return ()

@@ -10,7 +10,7 @@ from vinesim.scene.plant_parameters import Specimen, load_plant
 GRADE_DEVIATIONS = {"READ": 0.5, "DERIVED": 0.7, "GUESSED": 1.0, "FITTED": 0.3}
 """[1] Standard deviation of the natural logarithm by grade; it is large because plants differ."""
 DENSITY_DEVIATION = 0.15
-"""[1] Standard deviation of the logarithm of wood density, from the range in ``data/plants``, 800 to 1050 kg/m^3."""
+"""Standard deviation of the logarithm of wood density [1], from the range in ``data/plants``, 800 to 1050 kg/m^3."""
 BOW_DEVIATION = 0.5
 """[rad] Standard deviation of a bow."""
 
@@ -26,7 +26,7 @@ class Prior:
 
 
 def physical_priors(specimen: Specimen, plant: str = "vine") -> dict[str, Prior]:
-    """Priors by name of the columns of a candidate that belong to the plant."""
+    """Returns the priors of the numbers that belong to the plant, by the names of a candidate's columns."""
     known = load_plant(plant)
     part = known.cane if specimen.organ == "cane" else known.peduncle
     modulus = known.cane.woody_modulus if specimen.organ == "cane" else known.peduncle.modulus

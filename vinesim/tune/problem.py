@@ -1,4 +1,5 @@
-"""The least-squares problem: parameters of a plant and of the experiment, residuals of a track, their derivatives.
+"""The least-squares problem of a fit: parameters of a plant and of the experiment, residuals of a track, their
+derivatives.
 
 The Jacobian is computed by central differences of candidates that run in parallel in one launch. So a residual vector
 and its Jacobian cost one simulation of about nine trees (docs/decisions/tuning.md).
@@ -25,16 +26,16 @@ PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
 """[standard deviations] Residuals larger than this have reduced weight (soft L1)."""
 FINER = 3
-"""Factor of the numbers of steps and segments in the finer run that determines the discretisation bias."""
+"""Factor by which the finer run that determines the discretisation bias has more steps and segments."""
 Noise = float | np.ndarray
 """[m] Standard deviation of all columns together, or of each column [column]."""
 PHASE_STEP = 0.05
-"""[rad] Change of phase at the end of the track in the finite differences by modulus and mass."""
+"""Change of phase at the end of the track that the finite differences by modulus and mass cause [rad]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Model and derivatives at one point."""
+    """Model and derivatives for one set of parameters."""
 
     model: np.ndarray
     """[observation] m, positions of the model."""
@@ -88,7 +89,7 @@ class Problem:
         pulls = tuple(name for name, way in zip(COLUMNS[5:], tips, strict=True) if np.linalg.norm(way) > 0.3)
         self.pulls = pulls if self.shaking is None else ()
         self.begins = ("release",) if self.shaking is None else ()
-        """Name of the parameter for the time at which the motion begins, if there is one."""
+        """Name of the parameter for the time at which the motion begins; empty if the base is shaken."""
         free = "bow_y" not in fitted and "bow_z" not in fitted
         self.origins = tuple(f"origin_{'xyz'[axis]}" for axis in self.axes) if free else ()
         self.names = (*fitted, *self.pulls, *self.begins, *self.origins)
@@ -113,7 +114,7 @@ class Problem:
     # ------------------------------------------------------------------ parameters
 
     def row(self, theta: np.ndarray) -> np.ndarray:
-        """The candidate [7] for the parameters ``theta`` [parameter]."""
+        """Returns the candidate [7] for the parameters ``theta`` [parameter]."""
         theta = theta + self.shift
         candidate = np.zeros(len(COLUMNS))
         candidate[3:5] = self.specimen.bow
@@ -122,7 +123,7 @@ class Problem:
         return candidate
 
     def step(self, name: str) -> float:
-        """Step of the central difference by the parameter ``name``."""
+        """Returns the step of the central difference by the parameter ``name``."""
         if name in ("modulus", "mass"):
             swing = math.pi * self.features.frequency * max(self.track.time[-1] - self.features.release, 0.2)
             by_weight = 4.0 if self.specimen.organ == "bunch" else 1.0  # a bunch's modulus changes the frequency less
@@ -134,9 +135,10 @@ class Problem:
     def samples(
         self, thetas: np.ndarray, candidates: np.ndarray, end: float = math.inf
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [n, sample, column] of ``candidates`` [n, 7] at the samples up to ``end`` [s].
+        """Returns positions and velocities [n, sample, column] of ``candidates`` [n, 7] at the samples up to ``end``
+        [s].
 
-        ``thetas`` [n, parameter] give the release and the origin of each candidate.
+        ``thetas`` [n, parameter] contain the release and the origin of each candidate.
         """
         thetas = thetas + self.shift
         time = self.track.time[self.track.time <= end]
@@ -155,23 +157,25 @@ class Problem:
         return x + self._origin(thetas)[:, None], v
 
     def _release(self, thetas: np.ndarray) -> np.ndarray:
-        """[n] s, time at which the motion of each candidate begins."""
+        """Returns the time at which the motion of each candidate begins [n] s."""
         if not self.begins:
             return np.full(len(thetas), self.track.time[0])
         return thetas[:, self.names.index("release")]
 
     def _base_velocity(self, last: int) -> np.ndarray | None:
-        """[tick, 3] m/s, velocity of the base up to the tick after the ``last`` one; None if the base rests."""
+        """Returns the velocity of the base up to the tick after the ``last`` one [tick, 3] m/s; None if the base
+        rests."""
         if self.shaking is None:
             return None
         return self.shaking.velocity(self.track.time[0] + self.candidates.dt * np.arange(last + 2))
 
     def correct_discretisation(self, theta: np.ndarray, noise: Noise) -> np.ndarray:
-        """Determine the bias of a fit near ``theta`` by coarse segments and steps. Returns ``theta`` without the bias.
+        """Determine the bias that coarse segments and steps cause in a fit near ``theta``. Returns ``theta`` without
+        the bias.
 
         Coarse candidates are fitted to the track of one candidate with finer segments and steps at ``theta``. The
-        difference between the result and ``theta`` is the bias, of second order in segment length and step. From now on
-        :meth:`row` and :meth:`samples` add the bias to their parameters.
+        difference between the result and ``theta`` is the bias, of second order in segment length and step. After this
+        call :meth:`row` and :meth:`samples` add the bias to their parameters.
         """
         coarse = self.candidates
         observed = self.observed
@@ -197,7 +201,7 @@ class Problem:
         return theta - self.shift
 
     def _origin(self, thetas: np.ndarray) -> np.ndarray:
-        """[n, column] m, origin of the markers for each of the ``thetas``."""
+        """Returns the origin of the markers for each of the ``thetas`` [n, column] m."""
         axis = np.nonzero(self.track.tracked)[1]
         if not self.origins:
             return np.zeros((len(thetas), len(axis)))
@@ -205,7 +209,7 @@ class Problem:
         return thetas[:, first + np.searchsorted(self.axes, axis)]
 
     def evaluate(self, theta: np.ndarray, end: float = math.inf) -> Evaluation:
-        """Model, Jacobian and extra rows at the parameters ``theta``, for the samples up to ``end`` [s]."""
+        """Returns model, Jacobian and extra rows at the parameters ``theta``, for the samples up to ``end`` [s]."""
         self.evaluations += 1
         base = self.row(theta)
         steps = [self.step(name) for name in self.simulated]
@@ -228,7 +232,7 @@ class Problem:
         return Evaluation(x[0][seen], jacobian, *self._extra(theta))
 
     def _extra(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Extra rows of the force reading and the priors, and their derivatives."""
+        """Returns the extra rows of the force reading and the priors, and their derivatives."""
         values = []
         rows = []
         for i, prior in enumerate(self.priors):
@@ -299,25 +303,30 @@ class Problem:
         return found.x, at(found.x)
 
     def residuals(self, model: np.ndarray) -> np.ndarray:
-        """Residuals [sample, column] m of a model [observation] m; NaN where there are no data."""
+        """Returns the residuals [sample, column] m of a model [observation] m; NaN where there are no data."""
         table = np.full(self.observed.shape, np.nan)
         table[self.seen] = model - self.observed[self.seen]
         return table
 
     def loss(self, theta: np.ndarray, positions: np.ndarray, noise: Noise) -> float:
-        """Loss that :meth:`minimise` minimises, for positions [sample, column], including priors and force."""
+        """Returns the loss that :meth:`minimise` minimises, for positions [sample, column], including priors and
+        force."""
         z = ((positions - self.observed) / noise / SOFT)[self.seen] ** 2
         return float(SOFT**2 * (np.sqrt(1.0 + z) - 1.0).sum() + 0.5 * (self._extra(theta)[0] ** 2).sum())
 
     def _scales(self) -> np.ndarray:
-        """Typical changes of the parameters."""
+        """Returns typical changes of the parameters [parameter], which scale the minimisation."""
         sizes = {"release": 0.5 / self.track.rate, "modulus": 0.1, "damping": 0.3, "mass": 0.1}
         sizes |= dict.fromkeys(("bow_y", "bow_z"), 0.1) | dict.fromkeys(self.pulls, 0.2 * self.pull_scale)
         return np.array([sizes.get(name, 0.02) for name in self.names])
 
 
 def _force_reading(track: Trajectory, release: float, pushed: bool) -> tuple[float, float] | None:
-    """Mean [N] of the pull before the release, or of the push after it, and its standard deviation, at least 1 %."""
+    """Returns the mean [N] of the pull before the release, or of the push after it, and its standard deviation, at
+    least 1 %.
+
+    None if the track has no force.
+    """
     if track.force is None:
         return None
     held = track.force[((track.time <= release) ^ pushed) & np.isfinite(track.force)]

@@ -15,18 +15,20 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.plant_parameters import Specimen
 
 TIP = "tip"
-"""The marker that every specimen has."""
+"""Name of the marker at the tip, which every specimen has."""
 _DIRECTIONS = {"cane": (1.0, 0.0, 0.0), "bunch": (0.0, 0.0, -1.0)}
 
 
 def with_values(specimen: Specimen, **values: float) -> Specimen:
-    """A copy of the specimen with other values of some numbers, in their units: ``with_values(cane, modulus=4e9)``."""
+    """Returns a copy of the specimen with other values of some numbers, in their units: ``with_values(cane,
+    modulus=4e9)``."""
     changed = {name: msgspec.structs.replace(getattr(specimen, name), value=value) for name, value in values.items()}
     return msgspec.structs.replace(specimen, **changed)
 
 
 def base_pose(specimen: Specimen) -> np.ndarray:
-    """Pose [7] of the base at the origin; x is the direction of growth, or of the first segment of an axis."""
+    """Returns the pose [7] of the base at the origin; x is the direction of growth, or of the first segment of an
+    axis."""
     if specimen.axis:
         return frames.pose(np.zeros(3), _axis_turns(specimen)[0])
     along = np.array(specimen.direction or _DIRECTIONS[specimen.organ], float)
@@ -34,9 +36,10 @@ def base_pose(specimen: Specimen) -> np.ndarray:
 
 
 def rest_bends(specimen: Specimen, bow: np.ndarray) -> np.ndarray:
-    """Rotation vectors [..., segments, 3] rad of each segment relative to the one before, for bows [..., 2] rad.
+    """Returns rotation vectors [..., segments, 3] rad of each segment relative to the one before, for bows [..., 2]
+    rad.
 
-    The first segment is clamped in the direction of growth. The bow is distributed equally over the others.
+    The first segment is clamped in the direction of growth. The bow is distributed equally over the other segments.
     """
     bends = np.zeros((*np.shape(bow)[:-1], specimen.segments, 3))
     bends[..., 1:, 1:] = np.asarray(bow, float)[..., None, :] / (specimen.segments - 1)
@@ -44,7 +47,8 @@ def rest_bends(specimen: Specimen, bow: np.ndarray) -> np.ndarray:
 
 
 def _axis_turns(specimen: Specimen) -> np.ndarray:
-    """Orientation [segments, 4] in the world of each segment along a specimen's axis, without twist between them."""
+    """Returns the orientation [segments, 4] in the world of each segment along a specimen's axis, without twist between
+    segments."""
     points = np.array(specimen.axis)
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     at = np.linspace(0.0, way[-1], specimen.segments + 1)
@@ -60,14 +64,15 @@ def _axis_turns(specimen: Specimen) -> np.ndarray:
 
 
 def hanging_bends(specimen: Specimen) -> np.ndarray:
-    """Rotation vectors [segments, 3] rad of each segment relative to the one before, along the axis of a specimen."""
+    """Returns rotation vectors [segments, 3] rad of each segment relative to the one before, along the axis of a
+    specimen."""
     turns = _axis_turns(specimen)
     bends = frames.log(frames.multiply(frames.conjugate(turns[:-1]), turns[1:]))
     return np.concatenate([np.zeros((1, 3)), bends])
 
 
 def build_tree(specimen: Specimen) -> TreeBuilder:
-    """A specimen as a tree: the segments of the rod, then the bunch if there is one."""
+    """Returns a specimen as a tree: the segments of the rod, then the bunch if there is one."""
     radius = (0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value)
     bends = hanging_bends(specimen) if specimen.axis else rest_bends(specimen, np.array(specimen.bow))
     if specimen.organ == "cane":
@@ -88,16 +93,17 @@ def build_tree(specimen: Specimen) -> TreeBuilder:
     last = tree.add_rod(
         -1, specimen.length.value, radius, material, specimen.segments, organ=Organ.PEDUNCLE, bends=frames.exp(bends)
     )[-1]
-    assert specimen.tip_mass is not None  # checked when it was loaded
+    assert specimen.tip_mass is not None  # checked when the specimen was loaded
     far = tree.bodies[last]["far"]  # spring of the last segment beyond its middle; the bunch is rigid
     tree.add_bunch(last, specimen.tip_mass.value, clusters=False, stiffness=far, damping=specimen.damping.value * far)
     return tree
 
 
 def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Body [k] of each marker in the specimen's tree, and the marker's position [k, 3] m in that body's frame.
+    """Returns the body [k] of each marker in the specimen's tree, and the marker's position [k, 3] m in that body's
+    frame.
 
-    :class:`UsageError` for a marker that the specimen does not have.
+    Raises :class:`UsageError` for a marker that the specimen does not have.
     """
     segment = specimen.length.value / specimen.segments
     bodies = []

@@ -1,7 +1,7 @@
-"""Start values for least squares: the modulus that gives the track's frequency, and the damping.
+"""Start values for least squares: the modulus with which a candidate has the track's frequency, and the damping.
 
-Least squares on a long track has many minima, in which the candidate is whole cycles off. Comparing frequencies has
-only one minimum.
+Least squares on a long track has many minima, in which the candidate is whole cycles off. A comparison of frequencies
+has only one minimum.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from vinesim.tune.features import Features
 from vinesim.tune.problem import Problem
 
 RATIOS = np.exp(np.linspace(-math.log(40.0), math.log(40.0), 8))
-"""Ratios of the moduli that are tried to the specimen's own modulus."""
+"""Ratios of the tried moduli to the specimen's own modulus."""
 SCAN_DAMPING_RATIO = 0.04
 
 
 def start_values(problem: Problem) -> np.ndarray:
-    """Parameters from which least squares converges, whatever the specimen's own modulus and damping are."""
+    """Returns parameters from which least squares converges, whatever the specimen's own modulus and damping are."""
     features = problem.features
     theta = np.zeros(len(problem.names))
     at = {name: i for i, name in enumerate(problem.names)}
@@ -50,7 +50,7 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
         rows[1 + i, COLUMNS.index(name)] = unit
     shape = problem.candidates.shape(rows)[:, problem.track.tracked]
     response = (shape[1:] - shape[0]) / unit  # [pull, column]
-    way = -1.0 if problem.pushed else 1.0  # a pushed plant starts displaced against the force
+    way = -1.0 if problem.pushed else 1.0  # at the start, a pushed plant is displaced against the force
     pull = np.zeros(0)
     if problem.pulls:
         pull = np.linalg.lstsq(response.T, way * problem.features.displacement, rcond=None)[0]
@@ -64,14 +64,15 @@ def _start_pull(problem: Problem, theta: np.ndarray, at: dict[str, int]) -> None
 
 
 def _unit_pull(problem: Problem) -> float:
-    """Force [N] that moves the tip of a cane without taper by a tenth of its length."""
+    """Returns the force [N] that moves the tip of a cane without taper by a tenth of its length."""
     specimen = problem.specimen
     radius = 0.5 * specimen.base_diameter.value
     return 0.1 * 3.0 * specimen.modulus.value * math.pi * radius**4 / 4.0 / specimen.length.value**2
 
 
 def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[float, float]:
-    """Logarithms of the ratios of modulus and damping to the specimen's that give the track's frequency and decay.
+    """Returns the logarithms of the ratios of modulus and damping to the specimen's with which a candidate has the
+    track's frequency and decay.
 
     They are found from free swings after the pull of ``theta``, or after any pull if the base was shaken.
     """
@@ -103,7 +104,7 @@ def _scan(problem: Problem, theta: np.ndarray, features: Features) -> tuple[floa
 
 
 def _peak_frequency(swing: np.ndarray, step: float) -> np.ndarray:
-    """Frequency [row] Hz of the strongest line of signals [row, sample]."""
+    """Returns the frequency [row] Hz of the strongest spectral line of signals [row, sample]."""
     count = swing.shape[1]
     padded = 8 * count
     power = np.abs(np.fft.rfft(swing * np.hanning(count), padded, axis=1))
@@ -115,7 +116,7 @@ def _peak_frequency(swing: np.ndarray, step: float) -> np.ndarray:
 
 
 def _decay(swing: np.ndarray, step: float) -> float:
-    """Decay rate [1/s] of the amplitude of a signal [sample], from the energies of its two halves."""
+    """Returns the decay rate [1/s] of the amplitude of a signal [sample], from the energies of its two halves."""
     half = len(swing) // 2
     first, second = (float((part**2).sum()) for part in (swing[:half], swing[half : 2 * half]))
     return max(math.log(max(first, 1e-18) / max(second, 1e-18)), 1e-3) / (2.0 * half * step)

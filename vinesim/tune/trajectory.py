@@ -20,19 +20,19 @@ MAX_MISSING = 0.6
 _SCALE = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "N": 1.0}
 _UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm"), "base": ("m", "cm", "mm")}
 BASE = "base"
-"""Name of the columns with the motion of the base; no marker may have this name."""
+"""Name of the columns for the motion of the base; no marker may have this name."""
 _HEADER = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
 
 
 class TrajectoryError(ValueError):
-    """A track that cannot be used; one line with file, line, column, value and remedy."""
+    """A track cannot be used. The message is one line with file, line, column, value and remedy."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Trajectory:
     """Positions of markers while a plant was pulled, released and swinging, or shaken at its base.
 
-    :class:`TrajectoryError` if shapes or numbers contradict each other.
+    Raises :class:`TrajectoryError` if shapes or numbers contradict each other.
     """
 
     time: np.ndarray
@@ -73,7 +73,7 @@ class Trajectory:
 
     @property
     def tracked(self) -> np.ndarray:
-        """[marker, 3] bool, whether each axis was tracked."""
+        """Whether each axis of each marker was tracked [marker, 3] bool."""
         return np.any(np.isfinite(self.position), axis=0)
 
     @property
@@ -83,11 +83,11 @@ class Trajectory:
 
     @property
     def rate(self) -> float:
-        """[1/s] Sample rate, from the median interval."""
+        """Sample rate from the median interval [1/s]."""
         return float(1.0 / np.median(np.diff(self.time)))
 
     def between(self, start: float, end: float) -> Trajectory:
-        """The samples from time ``start`` to ``end`` [s]."""
+        """Returns the samples from time ``start`` to ``end`` [s]."""
         here = (self.time >= start) & (self.time <= end)
         force = None if self.force is None else self.force[here]
         base = None if self.base is None else self.base[here]
@@ -112,7 +112,7 @@ class Trajectory:
 
 
 def _moved_axes(base: np.ndarray) -> list[int]:
-    """Axes along which a base [sample, 3] moved; the first axis if it stood still."""
+    """Returns the axes along which a base [sample, 3] moved; the first axis if it stood still."""
     return np.flatnonzero(np.any(base != 0.0, axis=0)).tolist() or [0]
 
 
@@ -125,14 +125,14 @@ class _Column:
 
 
 def read_trajectory(path: str | pathlib.Path) -> Trajectory:
-    """A track from a CSV file.
+    """Read a track from a CSV file.
 
-    The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker,
-    ``base x [mm]`` for the displacement of the base, ``force [N]``. Axes are x, y and z of the world, z up. Units are s
-    or ms, and m, cm or mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which are not allowed in time and
-    base. Lines that begin with ``#`` are skipped.
+    The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker, ``base
+    x [mm]`` for the displacement of the base, ``force [N]``. Axes are x, y and z of the world, z up. Units are s or ms,
+    and m, cm or mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which are not allowed in time and base.
+    Lines that begin with ``#`` are skipped.
 
-    :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
+    Raises :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
     """
     path = pathlib.Path(path)
     try:

@@ -1,4 +1,5 @@
-"""``tune``: fits a plant to a track; returns fitted numbers, their uncertainty, and reasons to distrust them."""
+"""Fits a plant to a track, with the function :func:`tune`. Returns fitted numbers, their uncertainty, and reasons to
+distrust them."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",
 CONTRADICTS = 4.0
 """[standard deviations] A fitted mass further than this from its prior cannot be a mass of wood."""
 WIDE = 0.5
-"""[1] A swing larger than this fraction of the plant's length suggests a wrong unit."""
+"""Width of the swing as a fraction of the plant's length [1]. A larger swing suggests a wrong unit."""
 UNEXPLAINED = 1.3
 """[1] A fit has failed if its residuals exceed those of a damped sinusoid by this factor."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
@@ -62,7 +63,7 @@ def tune(
         device: ``cpu``, ``cuda`` or ``cuda:N``.
         pushed: the track shows a push: from rest, a steady force begins to act at ``release``.
 
-    :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen,
+    Raises :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen, and
     :class:`~vinesim.core.errors.UsageError` for invalid parameters. A failed fit is returned, with the reasons in
     :attr:`Fit.faults`.
     """
@@ -154,7 +155,8 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
 
 
 def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluation, np.ndarray]:
-    """The minimum near ``theta``, its evaluation and noise. Uses growing horizons if the whole track at once fails."""
+    """Returns the minimum near ``theta``, its evaluation and noise. If fitting the whole track at once fails, growing
+    parts of it are fitted."""
     features = problem.features
     best = _settle(problem, theta, features.noise)
     if _left(problem, best[1]) <= UNEXPLAINED * features.noise:
@@ -169,7 +171,10 @@ def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluati
 
 
 def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarray, Evaluation, np.ndarray]:
-    """Minimise, estimate the noise [column] m from the residuals, and repeat if the weights change."""
+    """Minimise, estimate the noise [column] m from the residuals, and repeat if the weights change.
+
+    Returns parameters, evaluation and noise.
+    """
     for _ in range(2):
         theta, found = problem.minimise(theta, noise)
         left = np.array([max(robust_deviation(column), 1e-7) for column in problem.residuals(found.model).T])
@@ -180,14 +185,17 @@ def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarr
 
 
 def _left(problem: Problem, found: Evaluation) -> float:
-    """Robust standard deviation [m] of the residuals of all columns together."""
+    """Returns the robust standard deviation [m] of the residuals of all columns together."""
     return max(robust_deviation(found.model - problem.observed[problem.seen]), 1e-7)
 
 
 def _look_for_minima(
     problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.ndarray
 ) -> tuple[np.ndarray, Evaluation, np.ndarray, tuple[Minimum, ...]]:
-    """Scan the modulus for other minima of the loss, and move to a better one if there is one."""
+    """Scan the modulus for other minima of the loss, and move to a better one if there is one.
+
+    Returns parameters, evaluation and noise at the best minimum, and the other minima.
+    """
     at = problem.names.index("modulus")
     thetas = np.repeat(theta[None], len(MINIMA) + 1, 0)
     thetas[1:, at] += np.log(MINIMA)
@@ -208,7 +216,7 @@ def _look_for_minima(
 
 
 def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> Features:
-    """Features of the fitted candidate without noise, at the times of the track."""
+    """Returns the features of the fitted candidate without noise, at the times of the track."""
     position = np.full(problem.track.position.shape, np.nan)
     position[:, problem.track.tracked] = model
     release = float(theta[problem.names.index("release")]) if problem.begins else None
@@ -216,7 +224,7 @@ def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> 
 
 
 def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, ...]:
-    """Reasons not to trust the fit; empty if there are none."""
+    """Returns reasons not to trust the fit; empty if there are none."""
     faults = []
     features = problem.features
     curve = "sinusoid" if problem.shaking is None else "oscillator"
@@ -238,7 +246,7 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
 
 
 def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> list[str]:
-    """Numbers given by the user, other than the track, that contradict the fit, in words."""
+    """Returns sentences about numbers given by the user, other than the track, that contradict the fit."""
     faults = []
     features = problem.features
     specimen = problem.specimen

@@ -1,4 +1,4 @@
-"""A listener for https that answers plain http on its port with a sentence instead of dropping the connection."""
+"""A listener for https. It answers plain http on the same port with a sentence, instead of dropping the connection."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class HttpsSite:
         while True:
             try:
                 connection, _ = await loop.sock_accept(listener)
-            except OSError as failure:  # the peer is gone already, or there are too many open files
+            except OSError as failure:  # the peer has closed the connection already, or too many files are open
                 if failure.errno in (errno.EMFILE, errno.ENFILE):
                     log.warning("a page cannot connect: %s", os.strerror(failure.errno))
                 await asyncio.sleep(0.1)
@@ -104,7 +104,7 @@ class HttpsSite:
 
 
 async def _peek(connection: socket.socket) -> bytes:
-    """Wait for the first byte without consuming it; empty if the peer has closed."""
+    """Wait for the first byte without consuming it. Returns an empty string if the peer has closed."""
     while True:  # polling, because not every event loop can wait for this
         with contextlib.suppress(BlockingIOError):
             return connection.recv(1, socket.MSG_PEEK)

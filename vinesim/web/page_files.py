@@ -9,11 +9,11 @@ from vinesim.core.errors import UsageError
 
 PAGE = pathlib.Path(__file__).parent / "page"
 THREE = PAGE / "vendor" / "three.module.js"
-"""Copied from the npm packages by ``tools/build_page``."""
+"""Path of three.js, which ``tools/build_page`` copies from the npm packages."""
 
 
 def missing() -> str | None:
-    """Missing files of the page and the remedy in one line; None if nothing is missing."""
+    """Returns the missing files of the page and the remedy in one line; None if nothing is missing."""
     if importlib.util.find_spec("aiohttp") is None:
         return "the page needs aiohttp: pip install 'vinesim[web]'"
     if not THREE.is_file():

@@ -1,4 +1,4 @@
-"""Messages of a page: the state that it has drawn, its viewpoint, and poses of its person's head and hands."""
+"""Messages of a page: the last state that it has drawn, its viewpoint, and poses of its person's head and hands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _Component = Annotated[float, msgspec.Meta(ge=-1.01, le=1.01)]
 _Share = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 Pose = tuple[_Coordinate, _Coordinate, _Coordinate, _Component, _Component, _Component, _Component]
-"""[7] m, 1 in the world: x forward, z up."""
+"""Pose [7] m, 1 in the world: x forward, z up."""
 
 
 class TrackedHand(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -70,7 +70,8 @@ _decoder = msgspec.json.Decoder(PageInput)
 
 
 def decode_input(text: str) -> PageInput | None:
-    """Decode a page's message; None if it is invalid, or a quaternion in it is not of unit length within 1 %."""
+    """Decode a page's message. Returns None if the message is invalid, or if a quaternion is not of unit length within
+    1 %."""
     try:
         found = _decoder.decode(text)
     except (msgspec.MsgspecError, RecursionError, UnicodeError):
@@ -86,7 +87,7 @@ class _Place(msgspec.Struct, frozen=True):
 
 
 def decode_place(query: Mapping[str, str]) -> np.ndarray | None:
-    """The position [3] m in x, y and z of a URL's query; None if they are missing or invalid."""
+    """Returns the position [3] m in x, y and z of a URL's query; None if they are missing or invalid."""
     try:
         found = msgspec.convert(dict(query), _Place, strict=False)
     except msgspec.ValidationError:

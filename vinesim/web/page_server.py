@@ -1,7 +1,8 @@
-"""Serves the page and, on a socket, the world: an HTTP server with an event loop in its own thread.
+"""Serves the page and, on a web socket, the world: an HTTP server with an event loop in its own thread.
 
 At most :data:`WINDOW` states that the page has not drawn yet are on their way to it. Then the server waits, and the
-next state is the newest one. So after a stall of any duration a page is at most :data:`WINDOW` states late.
+next state that it sends is the newest one. So after a stall of any duration a page is at most :data:`WINDOW` states
+late.
 """
 
 from __future__ import annotations
@@ -55,19 +56,21 @@ class World(Protocol):
     """
 
     def scene(self) -> bytes:
-        """Message with everything that does not change."""
+        """Returns a message with everything that does not change."""
         ...
 
     def plants(self, place: np.ndarray) -> bytes:
-        """Message with the plants around ``place`` [3] m, for a vineyard that is too large to be loaded as a whole."""
+        """Returns a message with the plants around ``place`` [3] m, for a vineyard that is too large to be loaded as a
+        whole."""
         ...
 
     def rigid(self) -> bytes:
-        """Message with the shapes of the present rigid bodies."""
+        """Returns a message with the shapes of the present rigid bodies."""
         ...
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Tick and message of the newest state, with everything moved after tick ``since``; None without changes."""
+        """Returns tick and message of the newest state, with everything moved after tick ``since``; None without
+        changes."""
         ...
 
     def take(self, page: int, said: PageInput) -> None:
@@ -111,7 +114,7 @@ class PageServer:
         self._tls = tls
         self._token = token
         self.voice = None if sound is None else VoiceSocket(sound)
-        """The socket of sound."""
+        """The web socket for sound."""
         self.port = 0
         self._pages = 0
         self.states_sent = 0
@@ -211,8 +214,9 @@ class PageServer:
     async def _refuse_strangers(self, request: web.Request, handler: Callable[..., Any]) -> web.StreamResponse:
         """Refuse requests without permission.
 
-        With a token, a request must have it in the address, or in the cookie that is set then. Without a token, the
-        request must use a host name of this machine, because any site can make its own name point to this address.
+        If the server has a token, a request must have the token in the address, or in the cookie that the server then
+        sets. Without a token, the request must use a host name of this machine, because any site can make its own name
+        point to this address.
         """
         given = request.query.get("token", request.cookies.get("token", ""))
         if self._token is not None and not hmac.compare_digest(given.encode(), self._token.encode()):
@@ -273,7 +277,7 @@ class PageServer:
     async def _read(
         self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
     ) -> None:
-        """Handle the messages of a page; ``flight`` has the ticks of the states that it has not drawn yet."""
+        """Handle the messages of a page. ``flight``: ticks of the states that the page has not drawn yet."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 if self.refused == 0:

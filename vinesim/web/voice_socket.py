@@ -1,9 +1,10 @@
-"""The second socket of a page, for sound in both directions, so that pictures and voices do not wait for each other.
+"""The second web socket of a page, for sound in both directions, so that pictures and voices do not wait for each
+other.
 
 The page sends one text with its abilities (:class:`PageEars`), then frames. A frame has one byte for the codec
 (:class:`Codec`, plus :data:`EXTRA` if the frame repeats a sound for hearers without Opus), and the coded sound. The
 page receives texts (JSON with ``may_speak``, ``send``, which lists the requested kinds of frames, and ``tones``) and
-frames. A frame consists of :data:`FRAME_HEADER`, the speaker's name, and the coded sound.
+frames. A frame to the page consists of :data:`FRAME_HEADER`, the speaker's name, and the coded sound.
 """
 
 from __future__ import annotations
@@ -23,13 +24,13 @@ from vinesim.audio.frame import FRAME, MAX_OPUS, Codec, find_fault
 log = logging.getLogger(__name__)
 
 EXTRA = 128
-"""Added to the codec of a frame whose sound was also sent in another codec."""
+"""Number that is added to the codec of a frame whose sound was also sent in another codec."""
 
 FRAME_HEADER = struct.Struct("<BBH3f")
 """Header of a frame to the page: codec, length of the speaker's name, frame number, position [m] of the speaker."""
 
 MAX_WAITING = 64
-"""Largest number of frames that wait for a page. Older frames are dropped and counted, so after a stall a page hears
+"""Largest number of frames that wait for a page. Older frames are dropped and counted, so after a stall a page plays
 the present sound."""
 
 _MAX_MESSAGE = 1 + max(MAX_OPUS, 1000)
@@ -79,7 +80,7 @@ class PageVoice:
 
 
 class Sound(Protocol):
-    """Interface of the client to the socket. All methods are called in the server's thread."""
+    """Interface of the client to the web socket for sound. All methods are called in the server's thread."""
 
     def join(self, page: PageVoice) -> None:
         """Called when a page begins to listen."""

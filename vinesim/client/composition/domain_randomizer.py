@@ -58,7 +58,7 @@ class SceneRandomizer:
         return {"share": self.share, "robots": list(ROBOT_NAMES)}
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """Snapshot of a random scene, see :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
+        """Returns a snapshot of a random scene, see :meth:`vinesim.sensors.export.dataset.SnapshotSource.snapshot`."""
         if rng.uniform() >= self.share:
             return None
         bunch = int(rng.integers(len(model.bunch_body)))
@@ -78,7 +78,7 @@ class SceneRandomizer:
 
 
 def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generator) -> SceneComposer:
-    """Random actors and crates around ``middle`` [2] m of the ground, clear of trunks, poles and each other."""
+    """Returns random actors and crates around ``middle`` [2] m of the ground, clear of trunks, poles and each other."""
     wood = np.isin(model.fixed_organ, [Organ.POLE, Organ.TRUNK])
     taken = [(spot, 0.12) for spot in model.fixed_start[wood, :2].astype(float)]
     taken += [(spot, FOOTPRINT_RADIUS["crate"]) for spot in model.box_pose[:, :2].astype(float)]
@@ -108,7 +108,10 @@ def random_composition(model: Model, middle: np.ndarray, rng: np.random.Generato
 def _free_place(
     middle: np.ndarray, taken: list[tuple[np.ndarray, float]], radius: float, rng: np.random.Generator
 ) -> np.ndarray | None:
-    """A random place [2] m for a disc that overlaps no other disc; None if none is found."""
+    """Returns a random place [2] m for a disc that overlaps no other disc; None if none is found.
+
+    ``taken``: centre [2] m and radius [m] of the other discs.
+    """
     for _ in range(_MAX_TRIES):
         away = rng.uniform(MIN_DISTANCE, MAX_DISTANCE)
         around = rng.uniform(0.0, 2.0 * np.pi)

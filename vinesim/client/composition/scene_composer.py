@@ -69,7 +69,7 @@ class PersonPlacement:
     yaw: float = 0.0
     posture: str = "stand"
     height: float = 1.75
-    """[m]"""
+    """Height of the person [m]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -99,7 +99,8 @@ class SceneComposer:
     """Crates in addition to the boxes of the scene, numbered after them."""
 
     def compose(self, model: Model, parameters: PhysicsParameters = PhysicsParameters()) -> Snapshot:
-        """Snapshot of the vineyard with actors and crates at rest; :class:`PlacementError` if two would overlap.
+        """Returns a snapshot of the vineyard with actors and crates at rest. Raises :class:`PlacementError` if two of
+        them overlap.
 
         ``parameters``: physics parameters of the model's scene.
         """
@@ -109,12 +110,12 @@ class SceneComposer:
             from vinesim.world import Physics
 
             return self.populate(Physics(furnished, parameters=parameters))
-        rigid = RigidWorld(furnished, parameters=parameters)  # no robot picks, so the plants need not move
+        rigid = RigidWorld(furnished, parameters=parameters)  # no bunches are picked, so the plants need not move
         self._add_actors(rigid)
         return rest_snapshot(model, rigid.visuals(), rigid.visual_q())
 
     def with_crates(self, model: Model) -> Model:
-        """The model with the crates added after its own boxes."""
+        """Returns the model with the crates added after its own boxes."""
         count = len(self.crates)
         pose = np.array([c.pose for c in self.crates])
         size = np.array([c.size for c in self.crates])
@@ -126,14 +127,15 @@ class SceneComposer:
         )
 
     def populate(self, physics: Physics) -> Snapshot:
-        """Fill the crates and add the actors in ``physics`` of a model from :meth:`with_crates`. Returns a snapshot."""
+        """Fill the crates and add the actors in ``physics``, whose model is from :meth:`with_crates`. Returns a
+        snapshot."""
         for number, crate in enumerate(self.crates, len(physics.model.box_size) - len(self.crates)):
             fill_crate(physics, number, crate)
         self._add_actors(physics.rigid)
         return physics.snapshot()
 
     def _add_actors(self, rigid: RigidWorld) -> None:
-        """Add robots and people; :class:`PlacementError` if one overlaps something."""
+        """Add robots and people. Raises :class:`PlacementError` if one overlaps something."""
         for index, one in enumerate(self.robots):
             pose = _ground_pose(one.x, one.y, one.yaw)
             rigid.add_robot(load_description(one.robot).to_spec(f"robot_{index}", index=index, pose=pose))
@@ -145,7 +147,7 @@ class SceneComposer:
         _check_clearance(rigid)
 
     def actor_records(self, model: Model) -> list[dict]:
-        """All robots, people and boxes as JSON values: kind, label, placement."""
+        """Returns kind, label and placement of all robots, people and boxes, as JSON values."""
         records = []
         for organ, things, start in (
             (Organ.ROBOT, self.robots, 0),
@@ -162,7 +164,7 @@ def _ground_pose(x: float, y: float, yaw: float) -> np.ndarray:
 
 
 def bunch_masses(model: Model) -> np.ndarray:
-    """Mass [bunch] kg of all bunches."""
+    """Returns the mass [bunch] kg of all bunches."""
     return model.bunch_berries * np.array([v.mass for v in VARIETIES])[model.bunch_variety]
 
 
@@ -205,7 +207,10 @@ def fill_crate(physics: Physics, number: int, crate: CratePlacement) -> list[int
 
 
 def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np.random.Generator) -> np.ndarray:
-    """Pose [7] of a bunch just above the height ``top`` [m] of a heap, in the crate's frame."""
+    """Returns a random pose [7] of a bunch just above the height ``top`` [m] of a heap, in the crate's frame.
+
+    ``inside``: inner size of the crate [3] m.
+    """
     length = float(model.bunch_length[bunch])
     radius = float(model.bunch_radius[bunch])
     room = np.maximum(0.5 * inside[:2] - [0.5 * length + 0.02, radius + 0.01], 0.0)
@@ -216,14 +221,14 @@ def _drop_pose(model: Model, bunch: int, inside: np.ndarray, top: float, rng: np
 
 
 def _rachis_ends(physics: Physics, bunch: int) -> np.ndarray:
-    """Both ends [2, 3] m of a free bunch's rachis, in the world."""
+    """Returns both ends [2, 3] m of a free bunch's rachis, in the world."""
     reach = np.array([[0.0, 0.0, 0.0], [float(physics.model.bunch_length[bunch]), 0.0, 0.0]])
     pose = physics.rigid.bunch_pose(bunch)
     return pose[:3] + frames.rotate(pose[3:], reach)
 
 
 def _top_height(physics: Physics, bunch: int) -> float:
-    """Upper bound of the height [m] of a bunch's highest point."""
+    """Returns an upper bound of the height [m] of a bunch's highest point."""
     return float(_rachis_ends(physics, bunch)[:, 2].max() + physics.model.bunch_radius[bunch])
 
 

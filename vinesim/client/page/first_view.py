@@ -11,8 +11,8 @@ from vinesim.scene.model import Model
 NEAR = 3.0
 """An actor nearer than this to a tree is viewed over its shoulder [m]. GUESSED."""
 BESIDE = 0.25
-"""Angle of the viewpoint to the side of the line behind an actor, used where plants hide more [rad]. A phone held
-upright still shows an actor at this angle from the middle."""
+"""Angle of the viewpoint to the side of the line behind an actor [rad], used if plants hide the actor more at other
+angles. A phone held upright still shows an actor at this angle from the middle."""
 YAWS = (FOLLOW_YAW, -FOLLOW_YAW, 0.45, -0.45, BESIDE, -BESIDE)
 """Angles of the viewpoint to the side of the line behind an actor among vines, in order of preference [rad]."""
 HEAD = 1.3
@@ -40,10 +40,10 @@ COLUMNS = 24
 
 
 def first_view(root: np.ndarray, model: Model, bodies: np.ndarray) -> np.ndarray:
-    """Pose [7] m, 1 of a viewpoint for an actor with its base at ``root`` [7].
+    """Returns the pose [7] m, 1 of a viewpoint for an actor with its base at ``root`` [7].
 
-    It is behind the shoulder of an actor among vines; for a distant actor it shows the nearest vines and the actor.
-    ``bodies`` [body, 3] m are the positions of plant bodies.
+    The viewpoint is behind the shoulder of an actor among vines. For a distant actor it shows the nearest vines and the
+    actor. ``bodies`` [body, 3] m are the positions of plant bodies.
     """
     distances = np.linalg.norm(model.tree_pose[:, :2] - root[:2], axis=1)
     if not len(distances) or distances.min() < NEAR:
@@ -63,7 +63,7 @@ def first_view(root: np.ndarray, model: Model, bodies: np.ndarray) -> np.ndarray
 
 
 def _behind(root: np.ndarray, heading: float, target: np.ndarray) -> np.ndarray:
-    """Pose [7] of eyes behind an actor at ``root`` [7], looking at ``target`` [2] m.
+    """Returns the pose [7] of eyes behind an actor at ``root`` [7], looking at ``target`` [2] m.
 
     ``heading`` [rad]: direction from the eyes to the actor.
     """
@@ -71,7 +71,7 @@ def _behind(root: np.ndarray, heading: float, target: np.ndarray) -> np.ndarray:
 
 
 def _before(vines: np.ndarray) -> list[np.ndarray]:
-    """Poses [7] of eyes in all directions around the point ``vines`` [2] m, looking at it."""
+    """Returns poses [7] of eyes in all directions around the point ``vines`` [2] m, looking at it."""
     return [
         _looking(vines + distance * np.array([np.cos(angle), np.sin(angle)]), vines)
         for distance in BEFORE_VINES
@@ -80,7 +80,7 @@ def _before(vines: np.ndarray) -> list[np.ndarray]:
 
 
 def _within(points: np.ndarray, place: np.ndarray, distance: float) -> np.ndarray:
-    """The subset of ``points`` [n, 3] m within the horizontal ``distance`` of ``place`` [2] m."""
+    """Returns the subset of ``points`` [n, 3] m within the horizontal ``distance`` [m] of ``place`` [2] m."""
     return points[np.linalg.norm(points[:, :2] - place, axis=1) < distance]
 
 
@@ -90,7 +90,8 @@ def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 
 def _shows(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> bool:
-    """Whether a view shows a distant actor at ``root`` [7] at the side of the picture, without a leaf that fills it."""
+    """Returns whether a view shows a distant actor at ``root`` [7] at the side of the picture, without a leaf that
+    fills the picture."""
     x, y, _ = frames.rotate(frames.conjugate(view[3:]), root[:3] - view[:3])
     if not AWAY[0] < abs(np.arctan2(y, x)) < AWAY[1]:
         return False
@@ -99,14 +100,14 @@ def _shows(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> bool:
 
 
 def _hiding(view: np.ndarray, root: np.ndarray, bodies: np.ndarray) -> int:
-    """Number of ``bodies`` [body, 3] m that hide an actor at ``root`` [7], or are around the eyes."""
+    """Returns the number of ``bodies`` [body, 3] m that hide an actor at ``root`` [7], or are too near to the eyes."""
     way = root[:3] + np.array([0.0, 0.0, HEAD]) - view[:3]
     along = np.clip((bodies - view[:3]) @ way / (way @ way), 0.0, 1.0)
     return int((np.linalg.norm(bodies - view[:3] - along[:, None] * way, axis=1) < HIDING).sum())
 
 
 def _columns_with_vines(view: np.ndarray, bodies: np.ndarray) -> int:
-    """Number of columns of the picture that contain near vines."""
+    """Returns the number of columns of the picture that contain near vines."""
     local = frames.rotate(frames.conjugate(view[3:]), bodies - view[:3])
     angles = np.arctan2(local[:, 1], local[:, 0])[np.hypot(local[:, 0], local[:, 1]) < LARGE]
     return int(np.count_nonzero(np.histogram(angles, COLUMNS, (-FIELD, FIELD))[0]))

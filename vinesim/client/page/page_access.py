@@ -1,7 +1,7 @@
-"""Access to a page from other machines of the network: by https and with a token.
+"""Access to a page from other machines on the network: by https and with a token.
 
-Browsers allow headsets and microphones only on https pages. A page without a token could be opened
-by anyone on the network, and its user moves the person.
+Browsers allow headsets and microphones only on https pages. Anyone on the network could open a page without a token,
+and would then control the person.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from vinesim.net.transport import certificates
 from vinesim.net.transport.access_control import SERVER, Role
 
 _ELSEWHERE = ("192.0.2.1", 9)
-"""An address that no machine has (RFC 5737), to find the own address of the route to it; nothing is sent."""
+"""An address that no machine has (RFC 5737). The route to it reveals the address of this machine; nothing is sent."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -32,10 +32,11 @@ class NetworkAccess:
 
 
 def network_access() -> NetworkAccess:
-    """Access at the address under which the network reaches this machine.
+    """Returns the settings for access at the address under which the network reaches this machine.
 
     The certificate is signed by this machine's own authority, which is stored in the folder for caches. Browsers warn
-    once about it, or never if its ``ca.pem`` is installed. Raises :class:`certificates.CryptographyMissing`.
+    once about the certificate, or never if the authority's ``ca.pem`` is installed. Raises
+    :class:`certificates.CryptographyMissing`.
     """
     host = own_address()
     folder = disk_cache.folder() / "page-certificate"
@@ -46,7 +47,7 @@ def network_access() -> NetworkAccess:
 
 
 def own_address() -> str:
-    """Address of this machine in its network; 127.0.0.1 without one."""
+    """Returns the address of this machine in its network; 127.0.0.1 without a network."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(_ELSEWHERE)

@@ -14,7 +14,7 @@ from vinesim.web.page_input import ReplayCommand
 from vinesim.web.page_server import PageServer
 
 LEAD = 1.0
-"""To seek a time, playing begins this much earlier [s], so that actors and clocks are known at that time."""
+"""To seek a time, playback begins this much earlier [s], so that actors and clocks are known at that time."""
 REPEAT = 50
 """Number of steps between two states while playing is paused, for pages that connect meanwhile."""
 
@@ -29,9 +29,9 @@ class PageReplay:
         start: float = 0.0,
         speed: float = 1.0,
     ) -> None:
-        """``make(start, eyes)`` makes a spectator at a time [s] of the recording, which is ``length`` [s] long.
+        """``make(start, eyes)`` returns a spectator at a time [s] of the recording, which is ``length`` [s] long.
 
-        The spectator looks from ``eyes`` [7], or from its own start position if that is None.
+        The spectator looks from ``eyes`` [7]; None: from its default start position.
         """
         self._make = make
         self._length = length
@@ -72,7 +72,8 @@ class PageReplay:
             self._command = ReplayCommand(command.paused, command.speed, seek)
 
     def step(self, server: PageServer) -> bool:
-        """Execute the last command, and play one step if a page has connected. Returns whether it is playing."""
+        """Execute the last command, and play one step if a page has connected. Returns whether the recording is
+        playing."""
         self._has_begun |= server.has_viewers
         with self._lock:
             command = self._command
@@ -93,7 +94,7 @@ class PageReplay:
     def _obey(self, command: ReplayCommand) -> None:
         goal = command.seek
         if goal is None and self._bus.ended and not command.paused:
-            goal = 0.0  # at the end: restart from the beginning
+            goal = 0.0  # at the end of the recording: restart from the beginning
         self._speed = command.speed
         self.is_paused = command.paused
         if goal is None:

@@ -37,7 +37,7 @@ class PageSound:
         self._client.sound.listen(self._name, listener)
 
     def leave(self, page: PageVoice) -> None:
-        """A page has disconnected."""
+        """Handle that a page has disconnected."""
         self._client.sound.stop_listening(self._pages.pop(page))
         if self._speaker is page:
             self._speaker = None
@@ -50,7 +50,7 @@ class PageSound:
         self._client.sound.speak(self._name, codec, data, is_main=is_main)
 
     def objection(self, page: PageVoice) -> str:
-        """Reason why a page may not speak, for its user; empty if it may."""
+        """Returns the reason why a page may not speak, for the page's user; empty if it may."""
         if self._kind == "robot":
             return "this page shows a robot, which speaks by the ROS topic speaker/audio"
         if self._speaker not in (None, page):
@@ -60,7 +60,7 @@ class PageSound:
         return ""
 
     def status(self, page: PageVoice, tones: dict[str, list[float]]) -> str:
-        """Status text for a page, sent when it changes."""
+        """Returns the status text for a page. It is sent when it changes."""
         voice = self._client.sound.voice_of(self._name)
         objection = self.objection(page)
         send = [] if objection else ["main"] * voice.is_heard + ["pcm"] * voice.is_heard_plain

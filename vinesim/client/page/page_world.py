@@ -40,12 +40,12 @@ LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BER
 ELSE_LOADED = 2.0
 """Loading distance of leaves and wood, relative to berries. GUESSED."""
 AMONG_VINES = 1.08
-"""Ratio of a page's exposure to the usual daylight exposure. Automatic exposure of cameras among vines gives 1.06 to
+"""Ratio of a page's exposure to the usual daylight exposure. Automatic exposure of cameras among vines yields 1.06 to
 1.12 in the pictures of docs/web.md."""
 MAX_SENTENCES = 4
-"""Number of the last closures of shears in a state, enough for both hands between two states."""
+"""Largest number of recent closings of shears in a state, enough for both hands between two states."""
 BLADE_STEPS = 5
-"""Number of steps between two reports of what is between the blades of shears."""
+"""Number of steps between two reports of the wood that is between the blades of shears."""
 _TURN_STEPS = 32767
 """Integer that encodes 1 in a component of a quaternion."""
 
@@ -63,7 +63,7 @@ class Replay(Protocol):
 
 
 class PageWorld:
-    """The world of one client for its pages. The client's loop writes it, the server's thread reads it.
+    """The world of one client as its pages receive it. The client's loop writes it, the server's thread reads it.
 
     Primitives are built when the first page requests them. A page starts with all trees at their rest poses. This
     object keeps the tick in which each tree last moved, and sends a page the trees that have moved since the last state
@@ -81,9 +81,9 @@ class PageWorld:
 
         Args:
             client: the client.
-            person: source of the client's own human, whom the first page moves.
+            person: source of the client's own human, whom the first page controls.
             most: largest number of primitives of plants and ground in a page; the nearest to its viewpoint are sent.
-            replay: the recording in which the client is, if any.
+            replay: the recording that the client plays, if any.
         """
         self._client = client
         self._person = person
@@ -93,13 +93,14 @@ class PageWorld:
         """Sum of the ticks of earlier clients, so that ticks of states always increase; see :meth:`show`."""
         self._at_rest = client.physics.snapshot().body_q.copy()
         self._moved_at = np.full(len(client.model.tree_first), -1)
-        """[tree] Tick in which each tree last moved."""
+        """Tick in which each tree last moved [tree]."""
         self._wires = wire_segments(client.model)
         """Segments of wires. Pages treat them as bodies, numbered after the plant bodies."""
         self._wire_q, self._wire_moved_at = self._wires.rest_q.astype(np.float32), np.full(len(self._wires), -1)
-        """[segment, 7] m, 1, last pose of each segment, and [segment] the tick in which it last moved."""
+        """Last pose of each segment of a wire [segment, 7] m, 1, and the tick in which the segment last moved
+        [segment]."""
         self._wires_away = self._wires.piece[:0].astype(int)
-        """[k] Segments that were displaced in the last step."""
+        """Indices [k] of the segments of wires that were displaced in the last step."""
         self._sway: Sway | None = None
         self._primitives: Primitives | None = None
         """Primitives of the world; None until a page requests them."""
@@ -108,32 +109,34 @@ class PageWorld:
         self._rigid_version = 0
         self._rigid = b""
         self._lamps: dict[str, np.ndarray] = {}
-        """Rows (within the rigid primitives), surfaces and materials of primitives whose lights have changed."""
+        """Changes of lights: rows within the rigid primitives, surfaces and materials of primitives whose lights have
+        changed."""
         self._laid_out: dict[str, np.ndarray] = {}
-        """Values of the rigid primitives that pages load first."""
+        """Values of the rigid primitives as pages first load them."""
         self._has_shone = np.zeros(0, bool)
-        """[row] Whether the row has ever differed from ``_laid_out``."""
+        """Whether each row of the rigid primitives has ever differed from ``_laid_out`` [row]."""
         self._visuals: tuple[Any, ...] | None = None
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
-        """Page that moves the spectator's eyes or the person: the first page that sends a message."""
+        """The page that controls the spectator's eyes or the person: the first page that sends a message."""
         self._eyes: np.ndarray | None = None
         self._intention = ""
         self._overlay_pages: set[int] = set()
         """Pages that show contacts and owners."""
         self._contacts: tuple[Contact, ...] = ()
         self._hands: dict[str, np.ndarray] = {}
-        """Poses [2, 7] of the person's left and right hand: simulated palms, and the controllers that they followed."""
+        """Poses [2, 7] of the person's left and right hand: the simulated palms, and the controllers that they
+        followed."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
         self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
-        """Number of closures of the person's shears, their last results, and what is between the open blades of both
+        """Number of closings of the person's shears, their last results, and what is between the open blades of both
         hands. The dictionary is replaced, never changed."""
 
     # ------------------------------------------------------------------ in the client's loop
 
     def show(self, client: Client) -> None:
-        """Show another client of the same vineyard from now on. All moved trees are sent again."""
+        """Show another client of the same vineyard from this call on. All moved trees are sent again."""
         with self._lock:
             self._ticks_before += self._client.physics.tick + 1
             self._client = client
@@ -210,11 +213,12 @@ class PageWorld:
     # ------------------------------------------------------------------ in the server's thread
 
     def scene(self) -> bytes:
-        """Message with fixed things and plants at rest, the tables of leaf outlines, and the light of the ground."""
+        """Returns a message with fixed things and plants at rest, the tables of leaf outlines, and the light of the
+        ground."""
         primitives = self._lay_out()
         scene = self._client.scene
         outline, hull = textures.leaf_outlines()
-        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes are signed
+        leaf = textures.leaf_texture() * [1.0, 0.5, 0.5, 1.0] + [0.0, 0.5, 0.5, 0.0]  # slopes are signed numbers
         ground = primitives.materials
         model = self._client.model
         sun = scene.sun.direction(0.0)
@@ -256,12 +260,13 @@ class PageWorld:
         )
 
     def plants(self, place: np.ndarray) -> bytes:
-        """As :meth:`scene` for the part around ``place`` [3] m of a vineyard that is too large for a page."""
+        """Returns the message of :meth:`scene` for the part around ``place`` [3] m, in a vineyard that is too large for
+        a page."""
         reach, plants = _nearest(self._lay_out(), place, self._most)
         return array_message.encode({"reach": reach, "place": place.tolist()}, plants)
 
     def _lay_out(self) -> Primitives:
-        """The primitives of plants and ground."""
+        """Returns the primitives of plants and ground; builds them at the first call."""
         if self._primitives is None:
             load_kernels(CameraMount.kind)
             self._sway = Sway(self._client.model)
@@ -269,11 +274,12 @@ class PageWorld:
         return self._primitives
 
     def rigid(self) -> bytes:
-        """Message with the present robots, people, boxes and picked bunches."""
+        """Returns a message with the present robots, people, boxes and picked bunches."""
         return self._rigid
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Message with bodies of trees that moved after tick ``since``, all rigid bodies, and the picked bunches."""
+        """Returns a message with bodies of trees that moved after tick ``since``, all rigid bodies, and the picked
+        bunches."""
         with self._lock:
             newest = self._snapshot
         if newest is None or self._primitives is None or newest[0] <= since:
@@ -345,7 +351,8 @@ class PageWorld:
         )
 
     def take(self, page: int, said: PageInput) -> None:
-        """Use the viewpoint and the person's state from a page's message, only for the first page."""
+        """Apply the viewpoint and the person's state in a page's message, if this page is the one that controls
+        them."""
         (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
         if said.replay is not None and self._replay is not None:
             self._replay.take(said.replay)
@@ -360,20 +367,20 @@ class PageWorld:
                 self._intention = said.person.intention
 
     def leave(self, page: int) -> None:
-        """A page has disconnected, so another one may move the person."""
+        """Handle that a page has disconnected: another page may then control the person."""
         self._overlay_pages.discard(page)
         if page == self._driver:
             self._driver = None
 
     def _bodies(self, trees: np.ndarray) -> np.ndarray:
-        """Bodies of ``trees``, tree by tree."""
+        """Returns the bodies of ``trees``, tree by tree."""
         model = self._client.model
         first = model.tree_first[trees]
         size = model.tree_size[trees]
         return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum())
 
     def _start_view(self) -> np.ndarray:
-        """First viewpoint of a page: a spectator's eyes, or the view of the client's own actor."""
+        """Returns the first viewpoint of a page: a spectator's eyes, or the view of the client's own actor."""
         client = self._client
         if isinstance(client, Spectator):
             return client.pose
@@ -385,19 +392,19 @@ class PageWorld:
 
 
 def _light(height: float) -> dict[str, Any]:
-    """Light as for cameras, by the sine of the sun's elevation; linear RGB."""
+    """Returns the light as for cameras, in linear RGB. ``height``: sine of the sun's elevation [1]."""
     light = OutdoorLight.of(height)
     colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
     return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
-    """Values from 0 to 1 as bytes."""
+    """Returns values from 0 to 1 as bytes."""
     return np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
 
 
 def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisual, ...]) -> bool:
-    """Whether two lists of rigid bodies differ only in the colours of indicator lights."""
+    """Returns whether two lists of rigid bodies differ only in the colours of indicator lights."""
     return len(before) == len(now) and all(
         one is other
         or (
@@ -426,10 +433,10 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
 
 
 def _within_reach(model: Model) -> dict[str, np.ndarray]:
-    """Objects that a person can reach for.
+    """Returns arrays about the objects that a person can reach for.
 
-    Bodies of wood with their lengths [m], and for each bunch its body, length and radius [m], and the last segment of
-    its peduncle.
+    They contain bodies of wood with their lengths [m], and for each bunch its body, length and radius [m], and the last
+    segment of its peduncle.
     """
     wood = np.flatnonzero(np.isin(model.body_organ, (Organ.CANE, Organ.PEDUNCLE)))
     stalk = model.body_parent[model.bunch_body]
@@ -445,12 +452,12 @@ def _within_reach(model: Model) -> dict[str, np.ndarray]:
 
 
 def _turns(pose: np.ndarray) -> np.ndarray:
-    """Quaternions of poses [k, 7] as integers [k, 4] int16; :data:`_TURN_STEPS` encodes 1."""
+    """Returns the quaternions of poses [k, 7] as integers [k, 4] int16; :data:`_TURN_STEPS` encodes 1."""
     return np.round(pose[:, 3:] * _TURN_STEPS).astype(np.int16)
 
 
 def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
-    """Values of primitives in the format of pages."""
+    """Returns the values of primitives in the format of pages."""
     columns = primitives.local_columns(rows)
     shape = np.concatenate([columns[name] for name in "abcd"], 1).astype(np.float32)
     colour = np.round(255.0 * np.clip(columns["tint"], 0.0, 1.0) ** (1.0 / 2.2))
@@ -465,10 +472,10 @@ def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.n
 
 
 def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> tuple[float | None, dict[str, np.ndarray]]:
-    """The clusters of plants and ground nearest to ``place`` [3] m, with at most ``most`` primitives.
+    """Select the clusters of plants and ground nearest to ``place`` [3] m, with at most ``most`` primitives.
 
     Returns the distance [m] up to which all berries are included (None: nothing is missing), and the primitives with
-    their clusters. :data:`LOADED` gives the distances of other materials.
+    their clusters. :data:`LOADED` has the distances of other materials.
     """
     count = len(primitives.cluster_first) - len(primitives.rigid_clusters)
     clusters = _clusters(primitives, slice(0, count))
@@ -490,7 +497,7 @@ def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> tuple[floa
 
 
 def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:
-    """Clusters in the format of pages: runs of primitives, counted from ``row``, and their bounding spheres."""
+    """Returns clusters in the format of pages: runs of primitives, counted from ``row``, and their bounding spheres."""
     return {
         "first": (primitives.cluster_first[which] - row).astype(np.uint32),
         "size": primitives.cluster_size[which].astype(np.uint32),
@@ -508,7 +515,7 @@ MAX_CONTACTS = 300
 
 
 def owners(client: Client) -> dict[str, str]:
-    """Names of the owners of all owned objects, by the name of the object."""
+    """Returns the names of the owners of all owned objects, by the name of the object."""
     found = {}
     for replicator in client.replicators.values():
         for number in sorted(replicator.known):
@@ -518,7 +525,7 @@ def owners(client: Client) -> dict[str, str]:
 
 
 def contact_arrays(contacts: Sequence[Contact]) -> dict[str, np.ndarray]:
-    """Positions [k, 3] m of contacts with plants, and the forces [k, 3] N on the plants."""
+    """Returns positions [k, 3] m of contacts with plants, and the forces [k, 3] N on the plants."""
     force = -np.array([contact.force for contact in contacts], np.float32).reshape(-1, 3)
     place = np.array([contact.position for contact in contacts], np.float32).reshape(-1, 3)
     strongest = np.argsort(-np.linalg.norm(force, axis=1), kind="stable")[:MAX_CONTACTS]

@@ -58,11 +58,11 @@ class Trace:
 
     @property
     def displacement(self) -> float:
-        """Distance from rest in the newest row [m]."""
+        """Distance of the bunch from its position at rest, in the newest row [m]."""
         return float(np.linalg.norm(self._position[self.length - 1] - self._rest)) if self.length else 0.0
 
     def rows(self) -> Rows:
-        """All rows so far."""
+        """Returns all rows so far."""
         n = self.length
         return Rows(
             self._clock[:n], self._time[:n], self._position[:n] - self._rest, self._force[:n], self._is_remote[:n]
@@ -100,9 +100,10 @@ MOVED = 1e-6
 
 
 def touch_to_motion(rows: Rows) -> int | None:
-    """Number of ticks from the first tick with a force to the first tick with motion; 0 if they are the same tick.
+    """Returns the number of ticks from the first tick with a force to the first tick with motion; 0 if they are the
+    same tick.
 
-    None if it was not touched, or it never moved (D6.4 section 2.1 asks for a direct response; F03).
+    None if the bunch was not touched, or never moved (D6.4 section 2.1 asks for a direct response; F03).
     """
     touched = np.flatnonzero(np.linalg.norm(rows.force, axis=1) > 0.0)
     if not len(touched):
@@ -114,7 +115,8 @@ def touch_to_motion(rows: Rows) -> int | None:
 
 
 def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[str, float] | None:
-    """Distance of the remote copy of a bunch from the owner's bunch at equal times of the host's clock [mm].
+    """Returns the distance of the remote copy of a bunch from the owner's bunch at equal times of the host's clock
+    [mm].
 
     It is evaluated while the owner's bunch was displaced by more than ``threshold`` [m] and the other client received
     its states. It includes the delay of the network. None if there is no such time.

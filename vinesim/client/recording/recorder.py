@@ -1,9 +1,9 @@
-"""Records the messages of a world, by default without changing what is sent.
+"""Records the messages of a world, by default without changing which messages are sent.
 
 ``docs/decisions/recording.md`` explains the subscriptions. The recorder subscribes to all messages about the
 environment; a client sends these only when another *actor* is near, and a recorder is not an actor. It subscribes to
-poses at the full rate only while an actor receives them. It knows this from a publisher on the same key, which never
-sends but reports whether there is a subscriber.
+poses at the full rate only while an actor receives them. To find out, it declares a publisher on the same key, which
+never sends but reports whether there is a subscriber.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from vinesim.scene.values import RobotUpdate
 log = logging.getLogger(__name__)
 
 CHOICES = tuple(dict.fromkeys(family.recorded_with for family in FAMILIES.values() if family.recorded_with))
-"""Choices of ``--only``. Presence and hellos are always recorded."""
+"""Kinds of messages that ``--only`` can choose. Presence and hellos are always recorded."""
 
 OBSERVER_SPACING = 7.0
 """Distance between observers in an area [m]. Every point is then within the interest radius (5 m) of an observer."""
@@ -62,19 +62,21 @@ class Recorder:
         digest: str = "",
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``everything``: record each actor at its full rate even if no actor receives it, which changes what is sent.
+        """Start recording from ``bus``.
 
-        ``digest``: digest of the scene to record; by default that of the first actor. ``clock``: the own clock [s].
+        ``everything``: record each actor at its full rate even if no actor receives it, which causes additional
+        messages. ``digest``: digest of the scene to record; by default the digest of the first actor's scene.
+        ``clock``: this process's clock [s].
         """
         self.bus = bus
         self.recording = recording
         self.digest = digest
         self.observers: set[str] = set()
-        """Names of the own observers, which are not recorded."""
+        """Names of this recorder's own observers, which are not recorded."""
         self.greetings: dict[str, Hello] = {}
         """Hellos of the actors, by name."""
         self.malformed = 0
-        """Messages that were recorded but cannot be decoded."""
+        """Number of messages that were recorded but cannot be decoded."""
         self._choices = frozenset(only)
         self._everything = everything
         self._clock = clock
@@ -87,8 +89,8 @@ class Recorder:
         self._positions: dict[str, np.ndarray] = {}
         self._far_poses: Subscription | None = None
         self._faster: dict[tuple[str, PoseLayer], tuple[Publisher, Subscription | None]] = {}
-        """By actor and faster pose layer: a publisher that reports whether the layer has subscribers, and the own
-        subscription."""
+        """By actor and faster pose layer: a publisher that reports whether the layer has subscribers, and this
+        recorder's subscription to the layer."""
         self._log_time = 0
 
     @property
@@ -133,7 +135,7 @@ class Recorder:
             if name != "a" and family.recorded_with in self._choices:  # poses: see _update_pose_subscriptions
                 self.bus.subscribe(f"{name}/**", KEEP_ALL)
         if "facts" in self._choices:
-            self.bus.query("snap/*/*")  # what became true before
+            self.bus.query("snap/*/*")  # records of earlier changes
 
     def _put(self, key: str, payload: bytes) -> None:
         self.recording.put(self._log_time, key, payload)
@@ -210,7 +212,8 @@ class Recorder:
     # ------------------------------------------------------------ who is heard by whom
 
     def _update_pose_subscriptions(self) -> None:
-        """Subscribe to poses that another actor receives: slow layers of all, fast layers of actors with company."""
+        """Subscribe to poses that another actor may receive: slow pose layers of all actors, fast layers of actors with
+        company."""
         has_company = self._everything or len(self._live) >= 2
         if has_company and self._far_poses is None:
             self._far_poses = self.bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_ALL)
@@ -237,7 +240,7 @@ class Recorder:
                 self._faster[name, layer] = publisher, None
 
     def _has_company(self, name: str, layer: PoseLayer) -> bool:
-        """Whether another actor may be the subscriber of a layer.
+        """Returns whether another actor may be the subscriber of an actor's pose layer.
 
         Otherwise the subscriber is a recorder, and two recorders would keep each other subscribed for ever.
         """
@@ -250,7 +253,8 @@ class Recorder:
 
 
 def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, float]]:
-    """Positions of observers [m] such that every point of an area (x0, y0, x1, y1) [m] is within 5 m of one.
+    """Returns positions of observers [m] such that every point of an area (x0, y0, x1, y1) [m] is within 5 m of an
+    observer.
 
     Raises :class:`AreaTooLarge`.
     """
@@ -275,7 +279,7 @@ class Observer:
     """A spectator without a simulation. Its presence makes actors publish what happens around it."""
 
     def __init__(self, bus: Bus, place: tuple[float, float], scene: str, digest: str, now: float) -> None:
-        """Join at ``place`` [m] through its own live bus; ``now``: time of the own clock [s]."""
+        """Join at ``place`` [m] through this observer's own live bus; ``now``: time of this process's clock [s]."""
         self.bus = bus
         hello = encode_hello(Hello(bus.name, kind="spectator", scene=scene, digest=digest, joints=0))
         bus.join(hello)
@@ -286,7 +290,7 @@ class Observer:
         self._due = -math.inf
 
     def step(self, now: float) -> None:
-        """Publish the own position five times a second."""
+        """Publish this observer's position five times a second."""
         self._network_clock.advance(now)
         self._network_clock.ping_if_due()
         for key, payload, age in self.bus.replies():

@@ -46,7 +46,7 @@ class Playhead:
     """A position in a recording, with the actors and the retained state at that position."""
 
     def __init__(self, recording: Recording, start: float = 0.0, end: float | None = None) -> None:
-        """From ``start`` to ``end`` [s] after the first message, with the retained state at ``start``."""
+        """Play from ``start`` to ``end`` [s] after the first message, with the retained state at ``start``."""
         self.recording = recording
         self.time = recording.start + start
         """Network time up to which the recording has been played [s]."""
@@ -54,7 +54,8 @@ class Playhead:
         self.live: set[str] = set()
         """Names of the actors that are present."""
         self.greetings: dict[str, bytes] = {}
-        """Encoded hello of each actor, also before the time at which it was recorded, because it had to be queried."""
+        """Encoded hello of each actor. It is known before the time at which it was recorded, because the recorder had
+        to query it."""
         self.records = RetainedState()
         """The retained state."""
         for entry in reversed(recording.messages):
@@ -73,7 +74,8 @@ class Playhead:
         return self.time >= self.end
 
     def play(self, until: float) -> list[RecordedMessage]:
-        """All messages up to network time ``until`` [s], at most the end, since the last call, in order."""
+        """Returns all messages since the last call up to network time ``until`` [s], in order, at most up to the
+        end."""
         first = self._next
         self.time = max(self.time, min(until, self.end))
         while self._next < len(self.recording.messages) and self.recording.messages[self._next].time <= self.time:
@@ -117,7 +119,7 @@ def _decode_records(payload: bytes) -> list[RetainedRecord]:
 
 
 def _cell(key: str) -> tuple[int, int] | None:
-    """The cell that a key names."""
+    """Returns the cell that a key contains, or None."""
     try:
         x, y = key.split("/")[1:3]
         return int(x), int(y)
@@ -137,7 +139,8 @@ class ReplayBus:
     def __init__(
         self, recording: Recording, name: str = "viewer", *, start: float = 0.0, end: float | None = None
     ) -> None:
-        """``start``, ``end``: [s] after the first message. :class:`NameTaken` if a recorded actor has ``name``."""
+        """``start``, ``end``: times after the first message [s]. Raises :class:`NameTaken` if a recorded actor has
+        ``name``."""
         if name in recording.actors:
             raise NameTaken(name, str(recording.path))
         self.name = name
@@ -262,7 +265,7 @@ class _NullPublisher:
 
 
 def _split_records(records: list[RetainedRecord]) -> Iterable[list[RetainedRecord]]:
-    """Records in parts that are small enough to send; at least one part, perhaps empty."""
+    """Yields the records in parts that are small enough to send; at least one part, which may be empty."""
     part: list[RetainedRecord] = []
     size = 0
     for record in records:
@@ -314,7 +317,7 @@ class Replay:
         self._network_clock = NetworkClock(bus, now, time.time() - now)
         self._buses: dict[str, Bus] = {}
         self._absent: dict[str, Bus] = {}
-        """Buses of actors that are not present and whose retained records are published now."""
+        """Buses of actors that are not present, by name; their retained records are published now."""
         self._publishers: dict[str, Publisher] = {}
         self._start = self.playhead.time
         self._begun: float | None = None
@@ -332,7 +335,7 @@ class Replay:
         return self.playhead.ended
 
     def step(self, now: float) -> None:
-        """Publish everything that is due at own time ``now`` [s]."""
+        """Publish all messages that are due at ``now`` [s], a time of the clock that was passed at the start."""
         self._network_clock.advance(now)
         self._network_clock.ping_if_due()
         for key, payload, age in self._bus.replies():
@@ -344,7 +347,7 @@ class Replay:
             self._begun, self._begun_at = now, self._network_clock.time
         entries = self.playhead.play(self._start + (now - self._begun) * self._speed)
         self._update_actors()
-        if self._buses:  # earlier retained records are sent once there is a world with a server that keeps them
+        if self._buses:  # earlier retained records are sent once a world exists whose server keeps them
             self._initial_messages = [
                 (key, payload) for key, payload in self._initial_messages if not self._publish(key, payload)
             ]
@@ -352,7 +355,7 @@ class Replay:
                 self._close_absent(set(self._absent))
         for entry in entries:
             if family_of(entry.key).is_published:
-                # as old as it was when the recorder had it
+                # the message has the same age as when the recorder received it
                 due = self._begun_at + (entry.time - self._start) / self._speed
                 self._publish(entry.key, shift_time(entry.payload, due - entry.time))
 

@@ -19,7 +19,7 @@ ENVIRONMENT_PERIOD = 0.1
 
 
 class RosReplay:
-    """Publishes after every step of a client; ``time()`` gives the time of the recording [s]."""
+    """Publishes the state of a client after each of its steps; ``time()`` returns the time of the recording [s]."""
 
     def __init__(self, client: Client, node: WorldNode, time: Callable[[], float]) -> None:
         self._node = node

@@ -19,5 +19,5 @@ class StateDigest:
             self._digest.update(array.tobytes())
 
     def hexdigest(self) -> str:
-        """The digest so far."""
+        """Returns the digest of all states so far."""
         return self._digest.hexdigest()

@@ -77,10 +77,10 @@ class MeshExchange:
         self.refused_count = 0
         """Number of meshes of other clients refused for a wrong digest or invalid triangles; boxes replace them."""
         self.refused_offers = 0
-        """Number of own meshes that the server did not accept."""
+        """Number of meshes of local robots that the server did not accept."""
         self._offers: list[tuple[Bus, str]] = []
         self._offered: dict[int, int] = {}
-        """By index in :attr:`_offers`: number of the admission at the server since which it has the meshes."""
+        """Number of the admission at the server since which the server has the meshes, by index in :attr:`_offers`."""
         self._robots: dict[str, _RobotMeshes] = {}
         self._changed: collections.deque[str] = collections.deque()
         self._refused: set[str] = set()
@@ -110,14 +110,14 @@ class MeshExchange:
             self._robots.pop(name, None)
 
     def changed(self) -> list[str]:
-        """Robots that have received, since the last call, all their meshes that the server has."""
+        """Returns the robots that, since the last call, have received all their meshes that the server has."""
         names = []
         while self._changed:
             names.append(self._changed.popleft())
         return names
 
     def received(self, name: str) -> Mapping[str, np.ndarray]:
-        """Corners [face, 3, 3] m of the received meshes of a robot, by digest. Safe from any thread."""
+        """Returns corners [face, 3, 3] m of the received meshes of a robot, by digest. Safe from any thread."""
         with self._lock:
             robot = self._robots.get(name)
             return {} if robot is None else dict(robot.received)
@@ -132,7 +132,7 @@ class MeshExchange:
                 robot.missing.clear()
 
     def close(self) -> None:
-        """End the thread; a running request is abandoned. Idempotent."""
+        """End the thread; a running request is abandoned. Further calls do nothing."""
         self._closing.set()
         self._wakeup.set()
 
@@ -185,7 +185,7 @@ class MeshExchange:
         return True
 
     def _fetch_all(self) -> None:
-        """One round of requests for missing meshes.
+        """Request all missing meshes once.
 
         A robot is reported when all its meshes on the server have arrived, so that it is compiled as rarely as
         possible.
@@ -236,7 +236,7 @@ class MeshExchange:
         return True
 
     def _load(self, bus: Bus, digest: str) -> np.ndarray:
-        """Corners [face, 3, 3] m of a mesh, from the disk cache or from the server."""
+        """Returns corners [face, 3, 3] m of a mesh, from the disk cache or from the server."""
         cached = (disk_cache.load(CACHE_NAME, digest) or {}).get("corners")
         if cached is not None and triangles.digest_of(cached.tobytes()) == digest:  # otherwise another program wrote it
             return triangles.decode_triangles(cached.tobytes())
@@ -246,7 +246,7 @@ class MeshExchange:
 
 
 def _ask(bus: Bus, part: MeshPart) -> MeshWanted | None:
-    """Offer a part of a mesh; the reply of the server, None if there was none that can be decoded."""
+    """Offer a part of a mesh. Returns the server's reply, or None if no reply came that can be decoded."""
     for reply in bus.fetch(f"offer/{bus.name}", encode_part(part)):
         try:
             return decode_wanted(reply)

@@ -22,13 +22,13 @@ from vinesim.scene.values import Detachment, ObjectUpdate, TreeUpdate
 from vinesim.world import Physics
 
 BLEND_PER_STEP = 0.2
-"""Share of the difference to its owner's state by which a copy is corrected in one step."""
+"""Share of the difference between a copy and its owner's state by which the copy is corrected in one step."""
 TOUCHED_BLEND_PER_STEP = 0.05
-"""``BLEND_PER_STEP`` for a copy that any actor touches here, because corrections must not pull the copy through a hand.
-TUNED."""
+"""``BLEND_PER_STEP`` for a copy that any actor touches on this client, because corrections must not pull the copy
+through a hand. TUNED."""
 FAR_ANGLE = 0.1
-"""Joint error [rad] from which a touched copy is corrected as fast as other copies, because one of the two bodies has
-slipped off. Below it the share is interpolated. TUNED."""
+"""Joint error [rad] from which a touched copy is corrected as fast as other copies: an error as large as this shows
+that a hand has slipped off the copy or the original. Below it the share is interpolated. TUNED."""
 ACTIVATION_PERIOD = 20
 """Ticks between two activations of dormant bunches."""
 CARRIED_DISTANCE = 3.0
@@ -39,7 +39,7 @@ ACTIVATION_BATCH = 4
 
 
 class ObjectSync:
-    """One client's state of shared objects and of changes to trees. Numbers are ids of :mod:`vinesim.scene.ids`."""
+    """One client's record of shared objects and of changes to trees. Numbers are ids of :mod:`vinesim.scene.ids`."""
 
     def __init__(
         self, physics: Physics, local_actors: Collection[str], is_present: Callable[[str], bool] = lambda _: True
@@ -63,7 +63,7 @@ class ObjectSync:
     # ------------------------------------------------------------------ received
 
     def receive(self, inbox: Inbox) -> None:
-        """Before every step: apply everything received from the network."""
+        """Before every step: apply all messages received from the network."""
         tracker = self.physics.support_tracker
         self.physics.remotely_posed = self.physics.remotely_posed[:0]
         self._apply_records(inbox.records)
@@ -81,7 +81,8 @@ class ObjectSync:
         self._activate_dormant_bunches()
 
     def _apply_records(self, records: Iterable[tuple[RetainedRecord, bool]]) -> None:
-        """Apply retained records (many at once after joining late), each with whether its pose still ``holds``."""
+        """Apply retained records (many at once after joining late), each with whether its pose still applies
+        (``holds``)."""
         newest: dict[int, tuple[RetainedRecord, bool]] = {}  # several local actors receive the same records
         for record, holds in records:
             if is_tree(record.object):
@@ -110,7 +111,8 @@ class ObjectSync:
             )
 
     def _apply_object_record(self, record: RetainedRecord, holds: bool) -> bool:
-        """Move a box or a bunch to the pose in a record. Returns True for a bunch that needs no body here yet."""
+        """Move a box or a bunch to the pose in a record. Returns True for a bunch that needs no body on this client
+        yet."""
         number = record.object
         kind, bunch = split_object_id(number)
         bodiless = kind == ObjectKind.BUNCH and number not in self.physics.support_tracker
@@ -130,7 +132,7 @@ class ObjectSync:
     def _let_fall(self, record: RetainedRecord, *, is_known: bool) -> None:
         """Let a box or a bunch move freely from the pose in a record.
 
-        ``is_known``: the present pose of its body is more exact than the record, so the body stays there.
+        ``is_known``: the present pose of its body is more exact than the record, so the body stays at that pose.
         """
         number = record.object
         tracker = self.physics.support_tracker
@@ -185,7 +187,7 @@ class ObjectSync:
         self._record_cut(body)
 
     def _ensure_body(self, number: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Detach a bunch that still hangs here, or activate it if it is dormant; boxes always have bodies."""
+        """Detach a bunch that still hangs on this client, or activate it if it is dormant; boxes always have bodies."""
         kind, bunch = split_object_id(number)
         if kind == ObjectKind.BUNCH and bunch in self.physics.dormant_bunches:
             self.physics.dormant_bunches.activate([bunch])
@@ -244,14 +246,14 @@ class ObjectSync:
             tracker.set_states(numbers, *there)
             for number, pose in zip(numbers, relative, strict=True):
                 tracker.set_at_rest(number, parent, pose)
-        elif self._is_present(_carrier(parent)):  # the carrier has no body here yet
+        elif self._is_present(_carrier(parent)):  # the carrier has no body on this client yet
             for number in numbers:
                 if (place := self._resting[number].place) is not None:
                     tracker.set_state(number, np.array(place), np.zeros(6))
                     tracker.set_at_rest(number, GROUND, np.array(place))
 
     def touched_blend(self, update: TreeUpdate) -> float:
-        """Share for :meth:`blend_tree` for a tree that an actor of this client touches."""
+        """Returns the share for :meth:`blend_tree` for a tree that an actor of this client touches."""
         here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
         return touched_share(float(dead_reckoning.angle_between(here, update.joint_q).max()))
 
@@ -285,7 +287,8 @@ class ObjectSync:
                 self._record_cut(detachment.body)
 
     def detached_by(self, name: str, *, all_others: bool) -> list[int]:
-        """Objects that actor ``name`` detached in the last step; with ``all_others`` also those of no local actor."""
+        """Returns the objects that actor ``name`` detached in the last step; with ``all_others`` also objects that no
+        local actor detached."""
         mine = [p for p in self._detachments if p.actor == name or (all_others and p.actor not in self._local_actors)]
         numbers = [object_id(ObjectKind.BUNCH, p.bunch) if p.bunch >= 0 else p.tree for p in mine]
         return [number for number in numbers if is_tree(number) or number in self.physics.support_tracker]
@@ -296,12 +299,13 @@ class ObjectSync:
         self._remote_updates.pop(number, None)
 
     def with_trees(self, detached: Iterable[int]) -> list[int]:
-        """Detached objects and the trees that they were detached from."""
+        """Returns detached objects together with the trees from which they were detached."""
         trees = [number if is_tree(number) else self._tree_of(split_object_id(number)[1]) for number in detached]
         return [*detached, *trees]
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
-        """Moving objects that a local actor touches, directly or through an object of ``mine``, or that slip off it."""
+        """Returns the moving objects that a local actor touches, directly or through an object of ``mine``, or that
+        slip off it."""
         tracker = self.physics.support_tracker
         touched = self.physics.touched
         found: set[int] = set()
@@ -318,7 +322,8 @@ class ObjectSync:
         return sorted(found)
 
     def _supporting_actor(self, number: int) -> str:
-        """Actor whose link supports an object, or who put down the box that contains it; empty on the ground."""
+        """Returns the actor whose link supports an object, or who put down the box that contains the object; empty on
+        the ground."""
         record = self._resting.get(number)
         if record is None or record.parent == GROUND:
             return ""
@@ -329,7 +334,7 @@ class ObjectSync:
         return resting[-1] if resting else ""
 
     def _supports(self, parent: str) -> tuple[list[int], str]:
-        """The chain of nested boxes from ``parent`` on, and the frame below the last box.
+        """Returns the chain of nested boxes from ``parent`` on, and the frame on which the last box rests.
 
         This frame is :data:`GROUND` if a box has no record of rest, or if the records form a cycle, which is possible
         with several authors.
@@ -344,11 +349,11 @@ class ObjectSync:
 
     @property
     def moving(self) -> list[int]:
-        """Everything that moves: awake trees, and objects that are not at rest in their parent's frame."""
+        """Returns all objects that move: awake trees, and objects that are not at rest in their parent's frame."""
         return [*self.physics.sleep_monitor.restless.tolist(), *self.physics.support_tracker.moving]
 
     def read_state(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """State of an object for :meth:`Replicator.send`."""
+        """Returns the state of an object, for :meth:`Replicator.send`."""
         if not is_tree(number):
             return self.physics.support_tracker.object_state(number)
         here = self.physics.model.bodies_of(number)
@@ -356,7 +361,7 @@ class ObjectSync:
         return state.joint_q[here], state.joint_qd[here]
 
     def cut_roots(self, tree: int) -> DetachedRoots:
-        """Bodies that were cut off a tree, for :meth:`Replicator.send`."""
+        """Returns the bodies that were cut off a tree, for :meth:`Replicator.send`."""
         bodies = self._cut_bodies.get(tree)
         if not bodies:
             return NO_ROOTS
@@ -365,11 +370,11 @@ class ObjectSync:
         return np.array(bodies) - first, state.joint_x[bodies].astype(float), state.joint_xd[bodies].astype(float)
 
     def is_changed(self, tree: int) -> bool:
-        """Whether picks or cuts have changed a tree permanently."""
+        """Returns whether picks or cuts have changed a tree permanently."""
         return tree in self._changed_trees
 
     def supported_by(self, name: str) -> list[int]:
-        """Objects with bodies that rest on the links of an actor according to their records."""
+        """Returns the objects with bodies that rest on the links of an actor according to their records."""
         tracker = self.physics.support_tracker
         return sorted(
             number
@@ -380,7 +385,7 @@ class ObjectSync:
         )
 
     def carried_on(self, name: str) -> list[int]:
-        """Objects at rest on an actor of this client that are far from the positions in their records."""
+        """Returns the objects at rest on an actor of this client that are far from the positions in their records."""
         if self.physics.tick % ACTIVATION_PERIOD:
             return []
         return [
@@ -391,7 +396,7 @@ class ObjectSync:
         ]
 
     def mark_resting(self, record: RetainedRecord | None) -> None:
-        """After a record of rest was sent: treat the object as at rest here, as all other clients do."""
+        """After a record of rest was sent: treat the object as at rest on this client, as all other clients do."""
         if record is not None and not record.moving and record.object in self.physics.support_tracker:
             self._set_resting(record.object, record)
             self.physics.support_tracker.set_at_rest(record.object, record.parent, np.array(record.pose))
@@ -411,10 +416,10 @@ class ObjectSync:
 
 
 def touched_share(away: float) -> float:
-    """Share by which a touched copy is corrected in one step; ``away`` [rad]: largest error of a joint."""
+    """Returns the share by which a touched copy is corrected in one step; ``away`` [rad]: largest error of a joint."""
     return max(TOUCHED_BLEND_PER_STEP, BLEND_PER_STEP * min(1.0, away / FAR_ANGLE))
 
 
 def _carrier(parent: str) -> str:
-    """The actor to which the link of a parent frame belongs; empty for the ground and for boxes."""
+    """Returns the actor to which the link of a parent frame belongs; empty for the ground and for boxes."""
     return "" if parse_object_name(parent) is not None else parent.partition("/")[0]

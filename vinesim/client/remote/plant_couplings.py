@@ -40,7 +40,7 @@ SLIDE = 0.005
 
 @dataclasses.dataclass(slots=True)
 class _Tie:
-    """The tie of one coupling."""
+    """The tie that applies one coupling to a body."""
 
     tie: int
     point: np.ndarray
@@ -62,7 +62,7 @@ class PlantCouplings:
         return {int(self.physics.model.body_tree[body]) for _, body in self._ties}
 
     def of_actor(self, actor: str, trees: Collection[int]) -> list[Coupling]:
-        """Couplings for a local actor's contacts with ``trees`` in the last step."""
+        """Returns couplings for a local actor's contacts with ``trees`` in the last step."""
         model = self.physics.model
         found = {}
         for contact in self.physics.contacts if trees else ():
@@ -125,7 +125,7 @@ class PlantCouplings:
         self.physics.plants.remove_tie(key[1], self._ties.pop(key).tie)
 
     def _carrier(self, body: int) -> int:
-        """The body of the bunch for a berry cluster; ``body`` itself otherwise."""
+        """Returns the body of the bunch for a berry cluster; ``body`` itself otherwise."""
         model = self.physics.model
         tree = int(model.body_tree[body])
         while body - model.tree_first[tree] >= model.tree_core[tree]:
@@ -133,6 +133,6 @@ class PlantCouplings:
         return body
 
     def _is_attached(self, body: int) -> bool:
-        """Whether a body is on its plant; false for picked bunches."""
+        """Returns whether a body is on its plant; false for picked bunches."""
         bunch = np.flatnonzero(self.physics.model.bunch_body == body)
         return not len(bunch) or bool(self.physics.state.bunch_attached[bunch[0]])

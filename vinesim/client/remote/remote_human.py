@@ -1,4 +1,4 @@
-"""The copy of a person whom another client moves."""
+"""The copy of a person whom another client controls."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ class RemoteHuman:
 
 
 def human_spec(hello: Hello, update: HumanUpdate) -> HumanSpec:
-    """Description of a person for the physics from messages of another client.
+    """Returns the description of a person for the physics, from messages of another client.
 
-    An outfit that is unknown here is replaced by the outfit that follows from the person's name.
+    An outfit that is unknown on this client is replaced by the outfit that follows from the person's name.
     """
     outfit = hello.outfit if hello.outfit in appearance.outfit_names() else ""
     return HumanSpec(hello.name, hello.index, update.pose, hello.height, outfit=outfit)

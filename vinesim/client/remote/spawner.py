@@ -40,10 +40,10 @@ class Prepared:
 
 
 class RemoteSpawner:
-    """Compiles worlds for remote actors that have no body here yet.
+    """Compiles worlds for remote actors that have no body on this client yet.
 
-    It also compiles when bodies for free bunches run out, and when meshes of robots arrive after their bodies were
-    made.
+    It also compiles a world when the bodies for free bunches run out, and when meshes of robots arrive after their
+    bodies were made.
     """
 
     def __init__(
@@ -53,13 +53,14 @@ class RemoteSpawner:
         executor: concurrent.futures.Executor | None = None,
         meshes: MeshExchange | None = None,
     ) -> None:
-        """``own``: a description that is already loaded, if any; ``executor``: None to compile actors in the caller.
+        """``own``: a description that is already loaded, if any. ``executor``: runs the compilation; None: the caller's
+        thread does.
 
         ``meshes``: exchange of meshes of remote robots; without it boxes replace their meshes.
         """
         self.meshes = meshes or MeshExchange()
         self._spawned: dict[str, Hello] = {}
-        """Remote robots with bodies here."""
+        """Remote robots that have bodies on this client, by name."""
         self._outdated: set[str] = set()
         """Robots with meshes that arrived after their last compilation began."""
         self._renewing: concurrent.futures.Future[Prepared] | None = None
@@ -94,13 +95,14 @@ class RemoteSpawner:
             self._leaving[name] = copy
 
     def removed(self) -> list[str]:
-        """Actors whose copies were removed since the last call."""
+        """Returns the actors whose copies were removed since the last call."""
         names = self._removed
         self._removed = []
         return names
 
     def spawn(self, updates: Mapping[str, RobotUpdate | HumanUpdate]) -> dict[str, RemoteRobot | RemoteHuman]:
-        """The copies of enqueued actors that became ready, at their poses in ``updates``. Call it between steps.
+        """Returns the copies of enqueued actors that became ready, at their poses in ``updates``. Call it between
+        steps.
 
         All waiting actors are compiled together. An actor that cannot be compiled is logged and removed.
         """
@@ -139,7 +141,7 @@ class RemoteSpawner:
     def _body_of(
         self, hello: Hello, description: RobotDescription | None, update: RobotUpdate | HumanUpdate
     ) -> RemoteRobot | RemoteHuman:
-        """The copy of an actor that is in the rigid world now."""
+        """Returns the copy of an actor that is in the rigid world now."""
         if description is None or not isinstance(update, RobotUpdate):
             return RemoteHuman(self.rigid, hello.name)
         self._spawned[hello.name] = hello
@@ -150,7 +152,7 @@ class RemoteSpawner:
         return other
 
     def renewed(self) -> list[RemoteRobot]:
-        """Robots whose boxes were replaced by received meshes; their states are unchanged."""
+        """Returns the robots whose boxes were replaced by received meshes; their states are unchanged."""
         self._outdated.update(self.meshes.changed())
         if self._renewing is None:
             hellos = [self._spawned[name] for name in sorted(self._outdated & self._spawned.keys())]
@@ -205,7 +207,7 @@ class RemoteSpawner:
         return done
 
     def _prepare(self, arrived: list[tuple[Hello, RobotUpdate | HumanUpdate]], without: tuple[str, ...]) -> Prepared:
-        """Compile a world with all actors that can be compiled, ``without`` the actors that leave."""
+        """Compile a world with all actors that can be compiled, except the actors ``without`` that leave."""
         refused: list[tuple[Hello, ValueError | OSError]] = []
         loaded: list[tuple[Hello, RobotDescription | None, RobotSpec | HumanSpec]] = []
         for hello, update in arrived:
@@ -235,7 +237,8 @@ class RemoteSpawner:
     def _load(
         self, hello: Hello, update: RobotUpdate | HumanUpdate
     ) -> tuple[RobotDescription | None, RobotSpec | HumanSpec]:
-        """Description (None for a human) and specification of an actor; ValueError if it cannot be loaded."""
+        """Returns description (None for a human) and specification of an actor. Raises ValueError if the actor cannot
+        be loaded."""
         if isinstance(update, HumanUpdate):
             return None, human_spec(hello, update)
         description = resolve_description(hello, self.own)
@@ -247,7 +250,8 @@ class RemoteSpawner:
 def resolve_description(
     hello: Hello, own: RobotDescription | None, received: Mapping[str, np.ndarray] | None = None
 ) -> RobotDescription:
-    """Description of another client's robot: an installed robot with equal URDF text and sidecar, or the sent URDF.
+    """Returns the description of another client's robot: an installed robot with equal URDF text and sidecar, or the
+    sent URDF.
 
     ``received``: corners [face, 3, 3] m of its meshes by digest; boxes replace missing meshes.
     """

@@ -15,7 +15,8 @@ from vinesim.scene.values import TreeUpdate
 from vinesim.world import Physics
 
 CONTACT_MEMORY = 0.15
-"""A copy counts as pressed for this time after a contact ended [s], so that a contact may open briefly. GUESSED."""
+"""Time after the end of a contact for which a copy still counts as pressed [s], so that a contact may open briefly.
+GUESSED."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -27,18 +28,18 @@ class _Copy:
     is_new: bool
     """Whether ``update`` has not yet corrected the copy."""
     correction: np.ndarray
-    """[body, 3] rad, remaining rotation of the joints, each in its own frame."""
+    """Remaining correcting rotation of each joint, in the joint's own frame [body, 3] rad."""
     pressed_at: float = -np.inf
-    """Time at which copies of actors or objects last pressed on the copy [s, own clock]."""
+    """Time at which copies of actors or objects last pressed on the copy [s, client's clock]."""
 
 
 class TreeCopies:
     """Simulated copies of the trees that other clients own.
 
-    A copy feels its weight, wind and contacts, including contacts with the copies of other clients' actors. If no other
-    forces act on the owner's tree, this simulation predicts it better than any extrapolation, and each received state
-    corrects the copy once. If a force is missing here, such as a hand that holds the owner's tree, the copy is pulled
-    to the extrapolated state in every step.
+    The simulation of a copy includes its weight, wind and contacts, also contacts with the copies of other clients'
+    actors. If no other forces act on the owner's tree, this simulation predicts it better than any extrapolation, and
+    each received state corrects the copy once. If a force is missing on this client, such as a hand that holds the
+    owner's tree, the copy is pulled to the extrapolated state in every step.
     """
 
     def __init__(self, physics: Physics, objects: ObjectSync) -> None:
@@ -63,9 +64,10 @@ class TreeCopies:
         local_actors: Collection[str],
         coupled_trees: Collection[int],
     ) -> None:
-        """Before every step: take new states from owners and correct the copies; ``now`` [s] on the client's own clock.
+        """Before every step: take new states from owners and correct the copies; ``now``: time of the client's clock
+        [s].
 
-        ``coupled_trees``: trees that couplings of other clients hold here.
+        ``coupled_trees``: trees that couplings of other clients hold on this client.
         """
         solver = self.physics.contact_solver
         copies = self._copies
@@ -88,7 +90,8 @@ class TreeCopies:
             touching.setdefault(tree, set()).add(actor)
         for tree, copy in copies.items():
             self.physics.plants.wake(tree)
-            solver.trees_touched_by_copies[tree] = tree not in coupled_trees  # or their forces would act here twice
+            # otherwise the forces of couplings would act twice on this client
+            solver.trees_touched_by_copies[tree] = tree not in coupled_trees
             self._correct(copy, now, touching.get(tree, set()), local_actors)
 
     def _correct(self, copy: _Copy, now: float, touching: set[str], local_actors: Collection[str]) -> None:
@@ -121,7 +124,7 @@ class TreeCopies:
 
 
 def _extrapolated(update: TreeUpdate, now: float) -> TreeUpdate:
-    """Extrapolate a state from its arrival to ``now`` [s]; its velocities fade to zero."""
+    """Extrapolate a state from its arrival to ``now`` [s] with velocities that fade to zero; return it."""
     age = float(dead_reckoning.clamp_age(now - update.time))
     rate = dead_reckoning.quaternion_rate(update.joint_q, update.joint_qd)
     return dataclasses.replace(

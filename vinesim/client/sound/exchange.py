@@ -41,7 +41,7 @@ class Spoken(NamedTuple):
     speaker: str
     frame: VoiceFrame
     place: np.ndarray
-    """[3] m"""
+    """Position of the source [3] m."""
 
 
 class Tone(NamedTuple):
@@ -51,7 +51,7 @@ class Tone(NamedTuple):
     frequency: float
     """[Hz]; 0: the tone has ended"""
     place: np.ndarray
-    """[3] m"""
+    """Position of the robot's lights [3] m."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -83,7 +83,7 @@ class Listener(Protocol):
 
 
 class Voice(NamedTuple):
-    """State of the audience of an actor."""
+    """Audience of an actor."""
 
     may_speak: bool
     """Whether anyone may hear the actor."""
@@ -102,7 +102,8 @@ class _Speaker:
         self.number = 0
 
     def stamp(self, now: float, is_main: bool) -> float | None:
-        """Start time [s] of a frame that has just arrived. Frames of one voice follow without gaps or overlap.
+        """Returns the start time [s] of a frame that has just arrived. Frames of one voice follow without gaps or
+        overlap.
 
         None if the frame must be dropped, because a page stalled and now sends many frames at once.
         """
@@ -179,7 +180,7 @@ class SoundExchange:
         self._loudspeakers.setdefault(robot, Loudspeaker()).play(pcm)
 
     def voice_of(self, actor: str) -> Voice:
-        """State of the audience of a local actor, after the first request for it."""
+        """Returns the audience of a local actor, which is computed from the first request on."""
         self._speaker(actor)
         return self._voices.get(actor, Voice(True))
 
@@ -242,7 +243,7 @@ class SoundExchange:
         return said
 
     def _tones(self) -> list[Tone]:
-        """Tones of all robots whose lights sound."""
+        """Returns the tones of all robots whose lights sound."""
         client = self._client
         tones = []
         time = client.physics.time + client.world_time.offset
@@ -253,7 +254,8 @@ class SoundExchange:
         return tones
 
     def place_of(self, actor: str) -> np.ndarray:
-        """Position [3] m of a local actor's voice and ears: person's head, spectator's eyes, above a robot's base."""
+        """Returns the position [3] m of a local actor's voice and ears: person's head, spectator's eyes, above a
+        robot's base."""
         client = self._client
         if actor in client.humans:
             return client.humans[actor].pose.head[:3]

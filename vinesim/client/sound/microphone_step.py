@@ -27,7 +27,7 @@ class MicrophoneStep(NamedTuple):
 
 
 def at_place(step: SoundStep, place: np.ndarray) -> MicrophoneStep:
-    """The sounds of a step that are heard at ``place`` [3] m; sounds beyond reach are left out."""
+    """Returns the sounds of a step that are heard at ``place`` [3] m; sounds beyond reach are left out."""
 
     def loudness(source: np.ndarray) -> float:
         return gain(float(np.linalg.norm(source - place)))

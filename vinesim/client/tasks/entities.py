@@ -36,7 +36,7 @@ BOX_MASS = 1.6
 PERSON_HEIGHT = 1.75
 """[m] Height of a spawned person."""
 BUNCH_REACH = 0.35
-"""[m] Room for a bunch; no bunch is longer."""
+"""Space kept free around a bunch [m]; no bunch is longer."""
 MAX_DISTANCE = 10_000.0
 """[m] Poses further from the origin are refused, because single precision does not resolve a millimetre there."""
 _UNKNOWN = np.full(6, np.nan)
@@ -77,9 +77,10 @@ class _Spawned:
 
 
 class WorldEditor:
-    """Lists and changes the entities of one client. :class:`RequestRefused` gives the reason of a refusal.
+    """Lists and changes the entities of one client. :class:`RequestRefused` has the reason of a refusal.
 
-    Changes are possible only in a client without a server, because otherwise other clients and owners are concerned.
+    Changes are possible only in a client without a server, because otherwise they would affect other clients and
+    owners.
     """
 
     def __init__(self, client: Client) -> None:
@@ -94,7 +95,7 @@ class WorldEditor:
         return _SPAWNABLES
 
     def entities(self) -> Iterator[Entity]:
-        """Robots, people, boxes and bunches in this client's world."""
+        """Yields the robots, people, boxes and bunches in this client's world."""
         client = self._client
         physics = client.physics
         rigid = client.physics.rigid
@@ -185,7 +186,7 @@ class WorldEditor:
         self._spawned.pop(name, None)
 
     def set_state(self, given: EntityArguments) -> None:
-        """Move a box, a loose bunch, a robot's base or a person; robots and people then stand still."""
+        """Move a box, a loose bunch, a robot's base or a person. A moved robot or person stands still afterwards."""
         self._require_alone("moves nothing by services")
         entity, number = self._movable(given.name)
         pose = _checked_pose(given.pose)
@@ -238,7 +239,7 @@ class WorldEditor:
             )
 
     def _movable(self, name: str) -> tuple[Entity, tuple[ObjectKind, int]]:
-        """An entity that can be moved, with the kind and number of its object; (TREE, -1) for actors."""
+        """Returns an entity that can be moved, with the kind and number of its object; (TREE, -1) for actors."""
         entity = next((one for one in self.entities() if one.name == name), None)
         if entity is None:
             raise RequestRefused(Refusal.NOT_FOUND, f"no entity {name!r}; get_entities lists them")
@@ -252,7 +253,7 @@ class WorldEditor:
         return entity, (ObjectKind.BUNCH if kind == "bunch" else ObjectKind.BOX, int(number))
 
     def _free_name(self, given: EntityArguments, stem: str) -> str:
-        """The requested name, or another one if that is allowed."""
+        """Returns the requested name, or another one if renaming is allowed."""
         taken = {one.name for one in self.entities()}
         if given.name in taken and not given.allow_renaming:
             raise RequestRefused(Refusal.NAME_NOT_UNIQUE, f"there is an entity {given.name!r}; allow renaming")
@@ -269,7 +270,7 @@ class WorldEditor:
         return next(name for i in itertools.count(1) if (name := f"{stem[:40]}_{i}") not in taken)
 
     def _bunch_to_spawn(self, number: str) -> int:
-        """The bunch with the number in a URI; it must hang on its vine."""
+        """Returns the bunch with the number in a URI; it must hang on its vine."""
         physics = self._client.physics
         model = self._client.model
         attached = physics.state.bunch_attached
@@ -302,19 +303,19 @@ class WorldEditor:
             physics.support_tracker.set_state(object_id(ObjectKind.BUNCH, one.number), one.pose, np.zeros(6))
 
     def _stand(self, name: str, root: np.ndarray) -> None:
-        """Let a spawned person stand at ``root`` [7]."""
+        """Place a spawned person standing at ``root`` [7]."""
         pose = standing_pose(root, PERSON_HEIGHT)
         self._client.humans[name].source = lambda _: pose
 
 
 def _is_free_form(name: str) -> bool:
-    """Whether a name is valid and differs from the names of the scene's boxes and bunches."""
+    """Returns whether a name is valid and differs from the names of the scene's boxes and bunches."""
     kind, _, number = name.partition("_")
     return is_valid_name(name) and not (kind in ("box", "bunch") and number.isdecimal())
 
 
 def _checked_pose(pose: np.ndarray | None) -> np.ndarray:
-    """A pose [7] with a unit quaternion; :class:`RequestRefused` if ``pose`` is not one."""
+    """Returns a pose [7] with a unit quaternion. Raises :class:`RequestRefused` if ``pose`` is not a pose."""
     if pose is None:
         raise RequestRefused(Refusal.INVALID_POSE, "the pose is not in the frame map, the only one that is known")
     if not np.isfinite(pose).all() or np.abs(pose[:3]).max() > MAX_DISTANCE:
@@ -325,5 +326,5 @@ def _checked_pose(pose: np.ndarray | None) -> np.ndarray:
 
 
 def _upright(pose: np.ndarray) -> np.ndarray:
-    """The pose on the ground with the same x, y and yaw."""
+    """Returns the pose on the ground with the same x, y and yaw."""
     return frames.pose(np.array([pose[0], pose[1], 0.0]), frames.from_yaw(frames.to_yaw(pose[3:])))

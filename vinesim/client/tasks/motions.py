@@ -12,7 +12,7 @@ from vinesim.scene.values import CameraMount
 
 
 class DriveTo:
-    """Drives the base to a place roughly straight ahead and stops there. Call it once in each step."""
+    """Drives the base to a place roughly straight ahead of it and stops there. Call it once in each step."""
 
     POSITION_TOLERANCE = 0.05
     """[m] Distance at which the base has reached the place. GUESSED"""
@@ -44,12 +44,13 @@ class DriveTo:
 
 
 class LookAt:
-    """Keeps the head camera pointed at a place, through the Jacobian of any head. Call it once in each step."""
+    """Keeps the head camera pointed at a place, by the Jacobian of the robot's head joints. Call it once in each
+    step."""
 
     GAIN = 3.0
     """[1/s] Feedback gain of the pointing angle. GUESSED"""
     PERIOD = 0.05
-    """[s] Period of corrections; a head does not need 100 Hz. GUESSED"""
+    """Period of corrections [s]; a head does not need corrections at 100 Hz. GUESSED"""
 
     def __init__(self, robot: Robot, point: Callable[[], np.ndarray]) -> None:
         """``point()`` returns the place to look at [3] m in the world. A robot without a head camera does nothing."""

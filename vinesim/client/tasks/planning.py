@@ -33,7 +33,8 @@ Cell = tuple[int, int]
 
 
 def find_path(model: Model, start: np.ndarray, goal: np.ndarray, clearance: float) -> np.ndarray | None:
-    """Waypoints [n, 2] m of a short path with ``clearance`` [m] on either side, ends included; None if there is none.
+    """Returns waypoints [n, 2] m of a short path with ``clearance`` [m] on either side, ends included; None if there is
+    none.
 
     Waypoints of the grid that a straight line can replace are dropped.
     """
@@ -61,7 +62,8 @@ def find_path(model: Model, start: np.ndarray, goal: np.ndarray, clearance: floa
 
 
 def search_grid(free: np.ndarray, first: Cell, last: Cell) -> list[Cell] | None:
-    """Shortest path over the cells that are ``free`` [n, m] bool, both ends included; None if there is none.
+    """Returns the shortest path over the cells that are ``free`` [n, m] bool, both ends included; None if there is
+    none.
 
     A* with eight neighbours and Euclidean costs (Hart, Nilsson and Raphael 1968).
     """
@@ -92,12 +94,12 @@ def search_grid(free: np.ndarray, first: Cell, last: Cell) -> list[Cell] | None:
 
 
 def _cell(index: np.ndarray) -> Cell:
-    """Integer indices of the cell at ``index`` [2]."""
+    """Returns the integer indices of the cell at ``index`` [2]."""
     return int(index[0]), int(index[1])
 
 
 def _is_line_free(model: Model, start: np.ndarray, end: np.ndarray, clearance: float) -> bool:
-    """Whether the straight line from ``start`` to ``end`` [2] m has ``clearance`` [m] on either side."""
+    """Returns whether the straight line from ``start`` to ``end`` [2] m has ``clearance`` [m] on either side."""
     count = max(int(np.linalg.norm(end - start) / (0.5 * GRID_SIZE)), 2)
     line = start + np.linspace(0.0, 1.0, count)[:, None] * (end - start)
     return bool((ground_clearance(model, line) > clearance - 0.5 * GRID_SIZE).all())
@@ -115,7 +117,7 @@ BUNCH_ASIDE = 0.28
 HAND_LOWER = np.array([-0.45, -0.11, -0.05])
 """[m] Lower corner of the box that an open hand sweeps around the grasp; x along the hand, z up."""
 HAND_UPPER = np.array([0.06, 0.11, 0.09])
-"""[m] Upper corner of that box."""
+"""Upper corner of the box that an open hand sweeps around the grasp [m]; x along the hand, z up."""
 GRASP_HEIGHT = (1.3, 1.75)
 """[m] Range of heights of the grasp that arm and lift reach with a level hand."""
 MAX_BUNCH_RADIUS = 0.060
@@ -125,13 +127,14 @@ GRASP_DEPTH = 0.06
 MIN_HAND_CLEARANCE = 0.005
 """[m] Smallest gap between the moving hand and anything but its bunch. GUESSED"""
 FULL_CLEARANCE = 0.03
-"""[m] Gap from which on a wider gap is not rated better. GUESSED"""
+"""Gap from which on a wider gap does not improve the rating of a grasp [m]. GUESSED"""
 BASE_CLEARANCE = 0.68
-"""[m] Free distance that a base with tucked arms needs around its centre."""
+"""Free distance that a base with folded arms needs around its centre [m]."""
 BOX_AHEAD = 0.10
 BASE_HALF_WIDTH = 0.35
 BOX_GAP = 0.06
-"""[m] Distance of a box ahead of the base's centre, half of the base's width, and the gap between both."""
+"""Gap between a box and the side of the base [m]. ``BOX_AHEAD`` is the distance of the box ahead of the base's centre,
+and ``BASE_HALF_WIDTH`` half of the base's width."""
 APPROACH_LENGTHS = (1.1, 0.8)
 """[m] Lengths of the straight approach along a box; the first one with room is used."""
 LANE_HALF_WIDTH = 0.36
@@ -145,7 +148,8 @@ MAX_CANDIDATES = 200
 
 
 def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
-    """Feasible plans, best first: bunches with the most clearance, with a preference for bunches near ``near`` [2] m.
+    """Yields feasible plans, best first: bunches with the most clearance, with a preference for bunches near ``near``
+    [2] m.
 
     Raises :class:`PlacementError` if no box can be approached or no bunch can be picked.
     """
@@ -171,11 +175,11 @@ def plan_picks(model: Model, near: np.ndarray) -> Iterator[PickPlan]:
 
 
 def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
-    """The bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, even without room for the hand.
+    """Yields the bunches within ``distance`` [m] of ``near`` [2] m that a hand reaches, even without room for the hand.
 
-    Yields for each bunch its number, the side of the arm, the pose [7] of the base where the hand has the most room,
-    and the clearance [m] of the hand, at most :data:`FULL_CLEARANCE`. It is negative if the open hand would overlap
-    wood or fruit.
+    Each item has the bunch's number, the side of the arm, the pose [7] of the base where the hand has the most room,
+    and the clearance [m] of the hand, at most :data:`FULL_CLEARANCE`. The clearance is negative if the open hand would
+    overlap wood or fruit.
     """
     seen: set[int] = set()
     middles = bunch_centres(model)
@@ -186,7 +190,7 @@ def freest_bases(model: Model, near: np.ndarray, distance: float) -> Iterator[tu
 
 
 def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterator[tuple[int, str, np.ndarray, float]]:
-    """Bunch, side, pose [7] of the base and clearance of the hand [m] for all reachable grasps, best first."""
+    """Yields bunch, side, pose [7] of the base and clearance of the hand [m] for all reachable grasps, best first."""
     points, radius, owner = _obstacles(model)
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
@@ -233,7 +237,7 @@ def _base_poses(model: Model, near: np.ndarray, min_clearance: float) -> Iterato
 
 
 def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Spheres that fill wood, trellis and bunches at rest.
+    """Fill wood, trellis and bunches at rest with spheres.
 
     Returns centres [n, 3] m, radii [n] m, and the bunch of each sphere [n], -1 if it is not part of a bunch.
     """
@@ -260,7 +264,7 @@ def _obstacles(model: Model) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _fixed_spheres(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Spheres along all fixed pieces: centres [n, 3] m and radii [n] m."""
+    """Returns spheres along all fixed pieces: centres [n, 3] m and radii [n] m."""
     along = (model.fixed_end - model.fixed_start).astype(float)
     count = np.ceil(np.linalg.norm(along, axis=1) / OBSTACLE_SPACING).astype(int) + 1
     piece = np.repeat(np.arange(len(count)), count)
@@ -276,15 +280,15 @@ class BoxApproach:
     box: int
     side: str
     place: np.ndarray
-    """[2] m"""
+    """Position of the base next to the box [2] m."""
     start: np.ndarray
-    """[2] m"""
+    """Start of the approach [2] m."""
     heading: float
-    """[rad]"""
+    """Heading of the base [rad]."""
 
 
 def box_approaches(model: Model) -> Iterator[BoxApproach]:
-    """All positions along the long sides of boxes with room for a base and its approach."""
+    """Yields all positions along the long sides of boxes with room for a base and its approach."""
     for box, (pose, size) in enumerate(zip(model.box_pose.astype(float), model.box_size.astype(float), strict=True)):
         long = frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0]) if size[0] >= size[1] else np.array([0.0, 1.0, 0.0]))
         apart = BASE_HALF_WIDTH + BOX_GAP + 0.5 * float(size[:2].min())
@@ -305,7 +309,7 @@ def box_approaches(model: Model) -> Iterator[BoxApproach]:
 
 
 TURNING_RADIUS = 0.92
-"""[m] Free distance around its centre that a carrier with a box at either end needs to turn."""
+"""Free distance around its centre that a carrier (a robot with a box at either end) needs to turn [m]."""
 TURNING_DISTANCES = (1.20, 1.35, 1.50)
 """[m] Distances from the centre of a box at which a carrier may turn; the first one with room is used."""
 CARRYING_HALF_WIDTH = 0.40
@@ -315,7 +319,10 @@ BUNCHES_PER_LAYER = 6
 
 
 def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) -> SwapPlan:
-    """Plan the exchange of two boxes, from a base at ``start`` [7]; :class:`PlacementError` if there is no room."""
+    """Plan the exchange of two boxes, from a base at ``start`` [7]. Raises :class:`PlacementError` if there is no room.
+
+    ``full``, ``empty``: numbers of the boxes that are full and empty at the start.
+    """
     if max(full, empty) >= len(model.box_pose):
         raise PlacementError(f"no box {max(full, empty)}: this scene has {len(model.box_pose)}; name more in its file")
     here = start[:2]
@@ -334,7 +341,7 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
 
 
 def turning_places(model: Model, box: int) -> list[np.ndarray]:
-    """Positions [2] m in front of the long sides of a box, with room to turn and a free lane to the box."""
+    """Returns positions [2] m in front of the long sides of a box, with room to turn and a free lane to the box."""
     pose = model.box_pose[box].astype(float)
     size = model.box_size[box].astype(float)
     across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])
@@ -392,16 +399,21 @@ BUNCH_HEIGHT = (1.1, 1.75)
 MAX_PULL = 75.0
 """[N] Bunches that need a larger pull are not chosen; a hand pulls with 100 N."""
 KEPT_AWAY = 2.2
-"""[m] Distance of the carrier from the place where the person picks: half the carrier's length, the box, and some steps
+"""Distance of the carrier from the place where the person picks [m]: half the carrier's length, the box, and some steps
 back. GUESSED"""
 MAX_PATHS = 3
 """Number of waiting places that are tried for each place of a person; a search takes a second."""
 DISTANCES = (1.2, 1.5, 1.8, 2.2)
-"""[m] Distances from the place where the person picks to the place where it gives; the first one with room is used."""
+"""Distances from the place where the person picks to the place where the person puts the bunch into the box [m]; the
+first one with room is used."""
 
 
 def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
-    """Plan a meeting at the bunch nearest to a base at ``near`` [7] that has room; :class:`PlacementError` without."""
+    """Plan a meeting of a person with a carrier that starts at ``near`` [7] and fetches ``box``.
+
+    The place is the bunch nearest to the box that has room for person and carrier. Raises :class:`PlacementError` if
+    there is none.
+    """
     if box >= len(model.box_pose):
         raise PlacementError(f"no box {box}: this scene has {len(model.box_pose)}; name more in its file")
     ways = [find_path(model, near[:2], place, TURNING_RADIUS) for place in turning_places(model, box)]
@@ -424,7 +436,8 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
 
 
 def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
-    """Whether the ``path`` [n, 2] m of a carrier leaves room for a person who steps back from ``stand`` [2] m."""
+    """Returns whether the ``path`` [n, 2] m of a carrier leaves room for a person who steps back from ``stand`` [2]
+    m."""
     start = path[:-1]
     way = np.diff(path, axis=0)
     share = np.clip(((stand - start) * way).sum(1) / np.maximum((way * way).sum(1), 1e-12), 0.0, 1.0)
@@ -432,7 +445,7 @@ def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
 
 
 def _standing_places(model: Model, bunch: np.ndarray) -> np.ndarray:
-    """Places [k, 2] m around a bunch [2] m with room for a person, most room first."""
+    """Returns places [k, 2] m around a bunch [2] m with room for a person, most room first."""
     angles = np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False)
     places = bunch + REACH * np.stack([np.cos(angles), np.sin(angles)], 1)
     room = ground_clearance(model, places)
@@ -440,7 +453,8 @@ def _standing_places(model: Model, bunch: np.ndarray) -> np.ndarray:
 
 
 def _waiting_places(model: Model, stand: np.ndarray) -> list[tuple[float, np.ndarray]]:
-    """Headings [rad] and places [2] m of a carrier whose box a person can reach straight from ``stand`` [2] m."""
+    """Returns headings [rad] and places [2] m of a carrier whose box a person can reach straight from ``stand`` [2]
+    m."""
     found = []
     for far in DISTANCES:
         for angle in np.linspace(0.0, 2.0 * np.pi, 16, endpoint=False).tolist():
@@ -468,7 +482,7 @@ class UnknownTask(ValueError):
 
 
 def validate_task_name(job: str | None) -> str | None:
-    """The name ``job``, or None; :class:`UnknownTask` if there is no such task."""
+    """Returns the name ``job``, or None. Raises :class:`UnknownTask` if there is no such task."""
     if job is not None and job not in TASKS:
         raise UnknownTask(f"no job {job!r}; give {', '.join(TASKS[:-1])} or {TASKS[-1]}")
     return job

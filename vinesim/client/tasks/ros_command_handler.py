@@ -44,7 +44,7 @@ _STATUS = {Outcome.SUCCESSFUL: GoalStatus.SUCCEEDED, Outcome.CANCELED: GoalStatu
 
 
 class RosCommandHandler:
-    """Applies commands from ROS to a robot, by its controllers."""
+    """Applies commands from ROS to a robot through the robot's controllers."""
 
     def __init__(
         self,
@@ -54,10 +54,11 @@ class RosCommandHandler:
         world_time: WorldTime | None = None,
         play: Callable[[bytes], None] = lambda _: None,
     ) -> None:
-        """``commands`` returns the commands that have arrived since the last call; ``finish`` receives ended goals.
+        """``commands`` returns the commands that have arrived since the last call; ``finish`` is called with each ended
+        goal.
 
-        ``world_time``: the time in which commands are stamped; by default simulated time. ``play``: receives PCM16 for
-        the loudspeaker.
+        ``world_time``: the time in which commands are stamped; by default simulated time. ``play``: is called with
+        PCM16 for the loudspeaker.
         """
         self.robot = robot
         self.controllers = ControllerManager(robot)
@@ -101,7 +102,7 @@ class RosCommandHandler:
         self.controllers.take_results()
 
     def begin_anew(self, robot: Robot) -> None:
-        """Abort all goals, and command ``robot``, which has replaced the former robot, from now on."""
+        """Abort all goals. From this call on, command ``robot``, which has replaced the former robot after a reset."""
         self.controllers.abort_all("the simulation was reset")
         for result in self.controllers.take_results():
             self._finish(_goal_result(result))
@@ -141,7 +142,7 @@ class RosCommandHandler:
 
 
 def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
-    """A trajectory with its start in simulated time; ``offset`` [s]: world time minus simulated time."""
+    """Returns a trajectory whose start is in simulated time; ``offset`` [s]: world time minus simulated time."""
 
     def tolerance(given: JointTolerances | None) -> Tolerance | None:
         return None if given is None else Tolerance(given.position, given.velocity)
@@ -159,7 +160,8 @@ def _trajectory(command: JointTrajectory, offset: float) -> Trajectory:
 
 
 def _goal_result(result: controller_manager.GoalResult) -> GoalResult:
-    """A result in ROS terms. A goal replaced by another one is aborted with the code of ros2_controllers."""
+    """Convert a controller's result to ROS terms. A goal that another goal replaced is aborted with the code of
+    ros2_controllers."""
     outcome = result.outcome
     code = {Outcome.PREEMPTED: Outcome.INVALID_GOAL, Outcome.CANCELED: Outcome.SUCCESSFUL}.get(outcome, outcome)
     return GoalResult(result.goal, _STATUS.get(outcome, GoalStatus.ABORTED), int(code), result.text, result.gripper)

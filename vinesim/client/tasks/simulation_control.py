@@ -25,8 +25,8 @@ MAX_STEPS = 100_000
 class SimulationControl:
     """Answers requests between the steps of one client; any thread may :meth:`put` requests.
 
-    Only a client without a server may pause. Otherwise other clients would see its actors stand still and take over
-    their objects.
+    Only a client without a server may pause. If other clients were present, its actors would stand still for them, and
+    they would take over its objects.
     """
 
     def __init__(self, client: Client, reply: Callable[[SimulationReply | StepProgress], None]) -> None:
@@ -37,7 +37,7 @@ class SimulationControl:
         self._stepping: SimulationRequest | None = None
         """Request whose steps are being simulated."""
         self._reported_steps = 0
-        """Number of its steps that a :class:`StepProgress` has reported."""
+        """Number of steps of the present request that a :class:`StepProgress` has reported."""
 
     def put(self, request: SimulationRequest) -> None:
         """Add a request."""

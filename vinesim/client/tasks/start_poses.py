@@ -32,7 +32,8 @@ class PlacementError(ValueError):
 
 
 def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
-    """Pose [7] of a start place, moved backwards by ``back`` [m]; a place beside the vines if the scene has none.
+    """Returns the pose [7] of a start place, moved backwards by ``back`` [m]; a place next to the vines if the scene
+    has none.
 
     Raises :class:`PlacementError` if the scene has no start place of that ``number``.
     """
@@ -47,25 +48,27 @@ def spawn_pose(scene: Scene, number: int, back: float = 0.0) -> np.ndarray:
 
 
 def start_pose(scene: Scene, number: int, back: float = 0.0, queue: int = 0) -> np.ndarray:
-    """Pose [7] of the ``queue``-th robot of a client: at the next start places, then in line behind the first ones."""
+    """Returns the pose [7] of the ``queue``-th robot of a client: at the next start places, then in line behind the
+    first robots."""
     lap, place = divmod(number + queue, max(len(scene.spawns), 1)) if queue else (0, number)
     return spawn_pose(scene, place, back + QUEUE_SPACING * lap)
 
 
 def with_start_pose(scene: Scene, x: float, y: float, yaw: float) -> Scene:
-    """A copy of the scene with a single start place, at (x, y) [m] with ``yaw`` [rad]."""
+    """Returns a copy of the scene with a single start place, at (x, y) [m] with ``yaw`` [rad]."""
     return msgspec.structs.replace(scene, spawns=(Spawn(name="given", x=x, y=y, yaw=yaw),))
 
 
 def bunch_centres(model: Model) -> np.ndarray:
-    """Centres of all bunches at rest [bunch, 3] m, world."""
+    """Returns the centres of all bunches at rest [bunch, 3] m in the world."""
     body_q = model.forward_kinematics(model.joint_settled)[model.bunch_body]
     axis = frames.rotate(body_q[:, 3:], np.array([1.0, 0.0, 0.0]))
     return body_q[:, :3] + 0.5 * model.bunch_length[:, None] * axis
 
 
 def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
-    """The bunch that an arm reaches best from a base at ``pose`` [7]: ahead, at arm's height, closest to 0.6 m away.
+    """Returns the bunch that an arm reaches best from a base at ``pose`` [7]: ahead, at arm's height, closest to 0.6 m
+    away.
 
     Raises :class:`PlacementError` if no bunch is in reach.
     """
@@ -89,16 +92,17 @@ def find_reachable_bunch(model: Model, pose: np.ndarray) -> int:
 
 
 def validate_bunch(model: Model, bunch: int | None) -> int | None:
-    """The number ``bunch``, or None; :class:`PlacementError` if the vineyard has no such bunch."""
+    """Returns the number ``bunch``, or None. Raises :class:`PlacementError` if the vineyard has no such bunch."""
     if bunch is not None and not 0 <= bunch < len(model.bunch_body):
         raise PlacementError(f"no bunch {bunch}: this vineyard has 0 to {len(model.bunch_body) - 1}")
     return bunch
 
 
 def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> np.ndarray:
-    """Horizontal distance [n] m from points [n, 2] m to the nearest obstacle or box; infinite if there is none.
+    """Returns the horizontal distance [n] m from points [n, 2] m to the nearest obstacle or box; infinite if there is
+    none.
 
-    Obstacles are poles, trunks, wires and arms, except those wholly above :data:`OVERHEAD`.
+    Obstacles are poles, trunks, wires and arms, except those that are entirely above :data:`OVERHEAD`.
 
     ``without``: number of a box that is ignored.
     """
@@ -122,7 +126,7 @@ def ground_clearance(model: Model, points: np.ndarray, *, without: int = -1) -> 
 
 
 def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
-    """A bunch that an arm can push, and a pose [7] of the base with room around it, nearest to ``near`` [2] m.
+    """Returns a bunch that an arm can push, and a pose [7] of the base with room around it, nearest to ``near`` [2] m.
 
     Raises :class:`PlacementError` if there is no such bunch.
     """
@@ -146,7 +150,8 @@ def find_push_pose(model: Model, near: np.ndarray) -> tuple[int, np.ndarray]:
 
 
 def find_approach_pose(model: Model, place: np.ndarray, length: float) -> np.ndarray:
-    """A pose [7] 1.6 m from a robot at ``place`` [7] at the end of a free straight line of ``length`` [m]."""
+    """Returns the pose [7] of a base 1.6 m from a robot at ``place`` [7], at the end of the straight line of ``length``
+    [m] with the most room. Another robot can approach along that line."""
     heading = np.linspace(0.0, 2.0 * np.pi, 48, endpoint=False)
     best = place
     most = -np.inf
