@@ -3,18 +3,18 @@
 import * as THREE from "./vendor/three.module.js";
 
 const NEAREST = 0.05; // m from the eyes
-/** Angle beside the ray that counts as much as a metre of distance [rad]. */
+/** Angle between an object and the ray that counts as much as a metre of distance from the eye [rad]. */
 const FARNESS = 0.01;
 /** Depth to which hands go into a bunch, as a share of its radius, and into a rigid body [m]. */
 const INTO_BUNCH = 0.3,
   INTO_RIGID = 0.02;
 
 /**
- * The object to which a ray from the `eye` in the direction `ray` (both Vector3, world) points, or which it misses by
- * less than `spread` [rad]. The result has `carrier` and its `name`, a point `at` in the carrier's frame, the `distance`
- * of this point from the eye [m], and `what` it is. Among several objects it prefers those within `reach` [m] of an arm,
- * then those next to the ray; null: nothing within `farthest` [m]. With shears only wood counts, for a bunch the last
- * segment of its peduncle. Leaves are ignored.
+ * Returns the object that a ray from the `eye` in the direction `ray` (both Vector3, world) hits, or misses by less than
+ * `spread` [rad]; null: there is no such object within `farthest` [m]. The result has `carrier` and its `name`, a point
+ * `at` in the carrier's frame, the `distance` of this point from the eye [m], and `what` the object is. Objects within
+ * `reach` [m] of an arm have priority, then objects near the ray. With shears only wood counts; for a bunch it is the
+ * last segment of the peduncle. Leaves are ignored.
  */
 export function pointAt(world, eye, ray, { spread, reach, farthest, withShears }) {
   const { wood, wood_length, bunch_body, bunch_length, bunch_radius, bunch_stalk, stalk_length } = world.header.arrays;

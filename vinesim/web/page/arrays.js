@@ -11,7 +11,7 @@ const KINDS = {
   f8: Float64Array,
 };
 
-/** Header of a message; its `arrays` are typed arrays over the message's own memory. */
+/** Returns the header of a message; its `arrays` are typed arrays over the message's own memory. */
 export function decode(buffer) {
   const length = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, length)));
@@ -25,7 +25,7 @@ export function decode(buffer) {
   return header;
 }
 
-/** The message at a path of this server. */
+/** Loads the message at a path of this server. */
 export async function load(path) {
   const response = await fetch(path);
   if (!response.ok) throw Object.assign(new Error(`${path}: ${await response.text()}`), { status: response.status });

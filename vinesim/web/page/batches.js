@@ -38,7 +38,7 @@ export class Batches {
     this.seen.count = this.unseen.count = 0;
   }
 
-  /** Number of triangles drawn for the eyes. */
+  /** Number of triangles drawn in the picture for the eyes. */
   get triangles() {
     return (this.instances(this.seen.count) * this.geometry.index.count) / 3;
   }
@@ -47,7 +47,7 @@ export class Batches {
     return Math.ceil(count / this.copies);
   }
 
-  /** From now on draw the primitives in `seen` for the eyes and the sun, those in `unseen` only for the sun. */
+  /** Draw the primitives in `seen` for the eyes and the sun, those in `unseen` only for the sun, until the next call. */
   update() {
     const { listed } = this.uniforms,
       { seen, unseen } = this,

@@ -24,7 +24,7 @@
     return "";
   }
 
-  /** Called by main.js when the vineyard is loaded; from then on main.js reports failures itself. */
+  /** Called by main.js when the vineyard is loaded; after that main.js reports failures itself. */
   window.pageStarted = () => {
     started = true;
   };

@@ -24,7 +24,7 @@ export function outermost({ shape, first, size, kind, carrier }) {
   return new Map([...hulls].map(([of, { points }]) => [of, points]));
 }
 
-/** Extent of `points` in a direction. */
+/** Returns the largest coordinate of `points` along a direction [m]. */
 export function farthest(points, { x, y, z }) {
   let along = -Infinity;
   for (let at = 0; at < points.length; at += 3)
@@ -34,7 +34,7 @@ export function farthest(points, { x, y, z }) {
 
 /** Bounding box of `points` from `outermost`. */
 export function boxAround(points) {
-  return new THREE.Box3().setFromArray(points.subarray(0, 18)); // those along the axes
+  return new THREE.Box3().setFromArray(points.subarray(0, 18)); // the points in the directions of the axes
 }
 
 class Hull {
@@ -53,7 +53,7 @@ class Hull {
   }
 }
 
-/** Outermost point of a primitive (not a triangle) in the direction `u`. */
+/** Returns the outermost point of a primitive (not a triangle) in the direction `u`. */
 function support(shape, at, kind, u) {
   const [a, b, c] = [0, 4, 8].map((from) => new THREE.Vector3().fromArray(shape, at + from)),
     radius = shape[at + 3];

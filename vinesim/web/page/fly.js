@@ -17,7 +17,8 @@ const REST = 0.15;
 /** Numbers of buttons of a gamepad with the standard mapping. */
 const LEFT_TRIGGER = 6,
   RIGHT_TRIGGER = 7;
-/** Angles to the side of the line behind what is followed, in order of preference [rad]; height of the target [m]. */
+/** Angles of the eyes to the side of the line behind a followed actor, in order of preference [rad]; height of the point
+ * that the eyes look at [m]. */
 const SIDES = [0.6, -0.6, 0.4, -0.4, 0.2, -0.2],
   AIM = 1.1;
 /** A chosen angle is kept until the target has moved this far [m] or turned by twice the angle with this sine. */
@@ -91,12 +92,12 @@ export class FlyingEyes {
     this.place[2] = Math.min(Math.max(this.place[2] + ahead * Math.sin(this.pitch) + up, 0.1), 200);
   }
 
-  /** Apply keys and gamepad for a time [s]. Returns whether the user has moved. */
+  /** Apply keys and gamepad for a time [s]. Returns whether the viewpoint has moved. */
   update(seconds) {
     const way = [0, 0, 0];
     for (const code of this.held) way[KEYS[code][0]] += KEYS[code][1];
     for (const pad of navigator.getGamepads?.() ?? []) {
-      if (!pad?.connected) continue; // some browsers keep one that is gone, with its last axes
+      if (!pad?.connected) continue; // some browsers keep a disconnected gamepad, with its last axes
       const { ahead, left, up, turn, nod } = wishOf(pad);
       [ahead, left, up].forEach((value, axis) => {
         way[axis] += value;
@@ -109,8 +110,8 @@ export class FlyingEyes {
   }
 
   /**
-   * Look at a point from a distance, over the shoulder, from the side where the least is in between according to
-   * `between(eye, point)`. The side is chosen again when the point has moved far or turned.
+   * Look at a point from a distance, over the shoulder. Of several sides the one with the fewest objects in between is
+   * chosen, which `between(eye, point)` counts. The side is chosen again when the point has moved far or turned.
    */
   follow(point, heading, between, distance = 3.2) {
     const behind = (side) => [

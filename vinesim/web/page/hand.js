@@ -1,4 +1,4 @@
-// The right hand of a person without a headset. It reaches to where the mouse points, or for a tapped object.
+// The right hand of a person without a headset. It reaches to the point under the mouse, or for a tapped object.
 
 import * as THREE from "./vendor/three.module.js";
 
@@ -36,10 +36,10 @@ export class Hand {
     this.fingers = null;
     this.reaching = this.closed = false;
     this.opensAfterCut = false;
-    this.distance = 0.5; // m from the eyes, of what follows the cursor
+    this.distance = 0.5; // m from the eyes, of the point under the cursor to which the hand reaches
     this.cursor = [0, 0]; // -1 to 1, right and up
-    this.target = null; // what was tapped, as `pointAt` finds it
-    this.kept = null; // Vector3 in the head's frame, where the target was when the hand closed
+    this.target = null; // the tapped object, as `pointAt` returns it
+    this.kept = null; // Vector3 in the head's frame: the target at the time when the hand closed
     this.angles = { left: 0, up: 0, roll: 0 };
     this.listenToMouse(element);
     this.listenToTaps(element, tap);
@@ -125,7 +125,7 @@ export class Hand {
     if (this.opensAfterCut) this.closed = this.opensAfterCut = false;
   }
 
-  /** Show on the buttons what the hand does, and with shears what is `between` the blades. */
+  /** Show on the buttons the state of the hand, and with shears the wood that is `between` the blades. */
   show(between) {
     const { reach, hold } = this.buttons;
     reach.setAttribute("aria-pressed", String(this.reaching));
@@ -143,7 +143,7 @@ export class Hand {
     return this.kept.clone().applyQuaternion(head);
   }
 
-  /** Move `place` back along `ahead`, less if the hand is near the line of its approach. */
+  /** Move `place` back along `ahead`; the nearer the hand is to the line of its approach, the less. */
   stopBefore(place, ahead) {
     if (!this.offset) return;
     const way = place.clone().sub(this.offset),

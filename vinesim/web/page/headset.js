@@ -29,8 +29,8 @@ const HIP = { above: 0.45, below: 0.9, beside: 0.3 };
 export class Headset {
   /**
    * `rig` carries camera and controllers: the floor that the person stands on. `poses`: finger poses of the buttons a
-   * and b; `press(side)` is called when a stick is pressed, or a hand without a controller closes at the hip, `choose()`
-   * when the right stick is pulled back.
+   * and b; `press(side)` is called when a stick is pressed, or a hand without a controller closes at the hip;
+   * `choose()` when the right stick is pulled back.
    */
   constructor(renderer, rig, camera, poses, press, choose) {
     this.poses = poses;
@@ -39,7 +39,7 @@ export class Headset {
     this.wrist = new THREE.Group(); // goes with the left hand
     this.pulled = false;
     this.mark = new THREE.Mesh(
-      new THREE.RingGeometry(0.18, 0.22, 32).rotateX(-Math.PI / 2), // where a jump leads
+      new THREE.RingGeometry(0.18, 0.22, 32).rotateX(-Math.PI / 2), // marks the place to which a jump leads
       new THREE.MeshBasicMaterial({ color: 0x30c060, depthTest: false, transparent: true, toneMapped: false }),
     );
     this.mark.visible = false;
@@ -58,7 +58,7 @@ export class Headset {
     this.rays = [0, 1].map((k) => rig.add(renderer.xr.getController(k)) && renderer.xr.getController(k));
     this.sources = [null, null];
     this.tracked = [null, null]; // hands without a controller, on the rig
-    this.closed = [false, false]; // as last seen
+    this.closed = [false, false]; // in the last frame
     this.closedAtHip = [false, false]; // and not opened since
     this.rays.forEach((ray, k) => {
       ray.addEventListener("connected", (event) => {
@@ -145,7 +145,7 @@ export class Headset {
     this.mark.visible = false;
   }
 
-  /** A hand tracked by the headset: palm on the rig, bend of each finger, whether it holds; null: not tracked. */
+  /** Returns a hand that the headset tracks: palm on the rig, bend of each finger, whether it is closed; null: not tracked. */
   trackHand(frame, hand) {
     if (!frame?.getJointPose || !hand) return null;
     const space = this.renderer.xr.getReferenceSpace();
@@ -177,7 +177,7 @@ export class Headset {
     return { matrix, fingers, closed };
   }
 
-  /** A hand without a controller that closes at the hip acts as a press; it holds nothing until it opens again. */
+  /** Handle a hand without a controller that closes at the hip: it presses, and holds nothing until it opens again. */
   takeFromHip(seen, k) {
     const way = new THREE.Vector3()
       .setFromMatrixPosition(seen.matrix)
@@ -224,7 +224,7 @@ export class Headset {
         hands[source.handedness] = { pose, closed: seen.closed, fingers: seen.fingers };
         return;
       }
-      if (source.hand) return; // not seen now: it hangs down
+      if (source.hand) return; // not tracked now: the hand hangs down
       const buttons = source.gamepad?.buttons ?? [],
         trigger = buttons[0]?.value ?? 0,
         grip = buttons[1]?.value ?? 0;
@@ -248,7 +248,7 @@ export class Headset {
   }
 }
 
-/** Pose [7] in the world of something that looks along -z with y up in the browser's axes. */
+/** Returns the pose [7] in the world of an object that looks along -z with y up in the browser's axes. */
 function worldPose(matrix) {
   const place = new THREE.Vector3(),
     turn = new THREE.Quaternion(),

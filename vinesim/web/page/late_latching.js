@@ -1,4 +1,4 @@
-// Late latching: the person's own hands are drawn at their present poses, not at those when the state was sent.
+// Late latching: the person's own hands are drawn at their present poses, not at their poses in the newest state.
 
 import * as THREE from "./vendor/three.module.js";
 
@@ -9,7 +9,7 @@ export class LateHands {
   constructor(world) {
     this.world = world;
     this.parts = []; // [side, carrier, pose in the state]
-    this.held = null; // by side: from the controller of the state to the hand as simulated
+    this.held = null; // by side: offset of the simulated hand from the controller, in the newest state
   }
 
   /** Called when a state was applied, with the simulated hands and the controllers that they followed. */
@@ -36,13 +36,13 @@ export class LateHands {
     });
   }
 
-  /** Present pose (Matrix4, world) of the palm of a side, 0 left and 1 right; null: not known. */
+  /** Returns the present pose (Matrix4, world) of the palm of a side, 0 left and 1 right; null: not known. */
   palm(person, k) {
     const seen = person[SIDES[k]];
     return seen === null || this.held === null ? null : matrix(seen.pose).multiply(this.held[k].offset);
   }
 
-  /** Move the hands with their present tracked poses. A free hand has no delay; a hand that is held back keeps its
+  /** Move the hands with their present tracked poses. A free hand has no delay; a hand that a contact holds back keeps its
    * offset. */
   draw(person) {
     if (this.held === null) return;

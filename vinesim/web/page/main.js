@@ -27,10 +27,10 @@ const FINGER = 22; // px: a tap within this distance of a thing selects it
  * of view, this rotation, and the angle of one pixel of the finest displays [rad]. */
 const TURN = 0.35,
   IN_HEADSET = { field: 1.2, turn: 0.7, pixel: 7e-4 };
-const FARTHEST = 3; // m: what is tapped further away is not meant for the hand
+const FARTHEST = 3; // m: the hand ignores tapped objects that are further away
 // sizes of the names of distant and near actors [px], distance of near ones and gap above heads [m]
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 };
-/** A browser whose first pictures have a median rate below SLOW [Hz] draws less from then on: FEW triangles (as a share
+/** A browser whose first pictures have a median rate below SLOW [Hz] then draws less: FEW triangles (as a share
  * of a phone's) and FEW_PIXELS. A browser without a graphics card does so from the start. */
 const SLOW = 5,
   FIRST_PICTURES = 12,
@@ -44,7 +44,7 @@ const NOBODY =
   "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
 const element = (id) => document.getElementById(id);
 
-/** A number in the page's address (triangles, rate or shadows), null if it is missing. */
+/** Returns a number in the page's address (triangles, rate or shadows), null if it is missing. */
 const asked = (name) => {
   const given = new URLSearchParams(location.search).get(name);
   return given === null ? null : Number(given);
@@ -122,7 +122,7 @@ class Viewer {
     const { replay } = world.header;
     this.timeline = replay === null ? null : new Timeline(replay, (wish) => this.ask(wish));
     this.newest = null;
-    this.shapes = null; // of the rigid bodies as loaded, until a state comes that has the same ones
+    this.shapes = null; // loaded shapes of rigid bodies, until a state comes with the same bodies
     this.heardAt = performance.now();
     this.pace = new Pace(LONGEST);
     this.followed = -1;
@@ -130,7 +130,7 @@ class Viewer {
     this.isAdvised = false;
     this.shadowAt = asked("shadows") === 0 ? Infinity : -1e9;
     this.lastFrame = performance.now();
-    this.shortest = 0; // time between two pictures of a desktop at least [s]
+    this.shortest = 0; // smallest time between two pictures on a screen [s]
     this.frame = 1 / 60; // time of a frame, smoothed [s]
     this.first = new FirstPictures(FIRST_PICTURES);
     if (this.isSlow) this.drawLess();
@@ -155,7 +155,7 @@ class Viewer {
       button.setAttribute("aria-pressed", "false");
       button.addEventListener("click", () => {
         this.indicate(this.intention === intention ? "" : intention);
-        button.blur(); // keys go on to move
+        button.blur(); // so that keys move the viewpoint again
       });
     }
   }
@@ -226,7 +226,7 @@ class Viewer {
     if (this.shears.take(state)) this.hand.cut();
     if (state.rigid > Math.max(this.world.rigidVersion, this.shapes?.version ?? 0) && !this.loading) {
       this.loading = true;
-      this.shapes = await load("rigid").catch(() => null); // a client that goes meanwhile is waited for by the socket
+      this.shapes = await load("rigid").catch(() => null); // if the client has ended meanwhile, the socket waits for it
       this.loading = false;
       this.takeRigid(this.latest);
     }
@@ -265,7 +265,7 @@ class Viewer {
     if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
 
-  /** Robots and people: name, and the first body of each. */
+  /** Returns robots and people: name, and the first body of each. */
   actors() {
     const first = new Map();
     this.world.names.forEach((name, k) => {
@@ -351,13 +351,14 @@ class Viewer {
   async loadPlants({ x, y, z }) {
     if (this.isLoadingPlants) return;
     this.isLoadingPlants = true;
-    const plants = await load(`plants?x=${x}&y=${y}&z=${z}`).catch(() => null); // a client that goes is waited for by the socket
+    // if the client has ended, the socket waits for it
+    const plants = await load(`plants?x=${x}&y=${y}&z=${z}`).catch(() => null);
     if (plants === null) await new Promise((tryAgain) => setTimeout(tryAgain, RETRY));
     else this.world.setPlants(plants, plants.place);
     this.isLoadingPlants = false;
   }
 
-  /** Set the number of triangles to draw from now on, as a multiple of a phone's. */
+  /** Set the number of triangles to draw, as a multiple of a phone's. */
   setBudget(multiple) {
     this.world.setBudget(multiple * TRIANGLE_BUDGET);
   }
@@ -375,7 +376,7 @@ class Viewer {
     say(TOO_SLOW);
   }
 
-  /** Draw few triangles and pixels from now on. */
+  /** Reduce the numbers of triangles and pixels to draw. */
   drawLess() {
     this.isSlow = true;
     this.detail = null;
@@ -480,7 +481,7 @@ class Viewer {
     return this.world.names.flatMap((name, k) => (name.startsWith(`${actor}/`) ? [this.world.bodies + 1 + k] : []));
   }
 
-  /** Position of a point (Vector3, world) in the picture: -1 to 1, right and up; z above 1 means behind the eyes. */
+  /** Returns the position of a point (Vector3, world) in the picture: -1 to 1, right and up; z above 1 means behind the eyes. */
   project(point) {
     return point.clone().applyEuler(this.world.group.rotation).project(this.camera);
   }

@@ -1,10 +1,10 @@
 // Messages for the user: changes while nothing was drawn, and features that this address cannot offer.
 
 const SHOWN_FOR = 12_000; // ms
-const FIRST = 5; // pictures in which a browser compiles shaders, however long that takes
+const FIRST = 5; // number of first pictures, which may be slow because the browser compiles shaders
 const TIMES = 5;
 
-/** Whether a time between two pictures is much longer than usual, which means an absence, also on slow machines. */
+/** Returns whether a time between two pictures is much longer than usual on this machine, so that the user missed something. */
 export function isUnusual(passed, usual) {
   return passed > TIMES * usual;
 }
@@ -24,10 +24,10 @@ export function say(text, { stays = false } = {}) {
 /** Compares the world before and after a gap, and reports the changes. */
 export class Absence {
   constructor() {
-    this.known = null; // before the newest picture: time, picked bunches, actors
+    this.known = null; // the world in the newest picture: time, picked bunches, actors
     this.before = null; // the world before a gap that was not reported yet
-    this.told = []; // sentences so far
-    this.long = 3; // a longer world time between two pictures is reported unless it is usual here [s]
+    this.told = []; // sentences shown so far
+    this.long = 3; // a longer world time between two pictures is reported unless it is usual on this machine [s]
     this.usual = 0; // time of the world between two pictures, smoothed [s]
     this.pictures = 0;
   }

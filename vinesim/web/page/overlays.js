@@ -12,7 +12,7 @@ const METRES_PER_NEWTON = 0.02,
   CORNERS = 64;
 
 export class Overlays {
-  /** `group`: the world's axes. */
+  /** Draws into the group of the `world`, which has the world's axes. */
   constructor(world) {
     this.world = world;
     this.shown = new Set();
@@ -44,7 +44,7 @@ export class Overlays {
     this.buttons[name].setAttribute("aria-pressed", String(this.shown.has(name)));
   }
 
-  /** Whether the client must send more than poses. */
+  /** Whether overlays are shown, for which the client must send forces and owners. */
   get areShown() {
     return this.shown.size > 0;
   }
@@ -92,7 +92,7 @@ export class Overlays {
     }
   }
 
-  /** Position [3] of a tree, box or bunch; null: not loaded. */
+  /** Returns the position [3] of a tree, box or bunch; null: not loaded. */
   place(name) {
     const [kind, index] = name.split("/"),
       { world } = this;
@@ -126,7 +126,7 @@ function fill(mesh, points) {
   mesh.geometry.setDrawRange(0, points.length / 3);
 }
 
-/** Pairs of points of arrows that show forces [k, 3] N at places [k, 3]. */
+/** Returns pairs of points of arrows that show forces [k, 3] N at places [k, 3]. */
 function arrows(place, force) {
   const points = [];
   for (let k = 0; k < place.length; k += 3) {
@@ -145,7 +145,7 @@ function arrows(place, force) {
   return points;
 }
 
-/** Pairs of points of circles on the ground. */
+/** Returns pairs of points of circles on the ground. */
 function circles(centres, radius) {
   const points = [];
   for (const { x, y } of centres)

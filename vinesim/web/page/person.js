@@ -4,7 +4,7 @@ import { FlyingEyes } from "./fly.js";
 
 const WALK = 1.4,
   CROUCH = 0.55; // m/s, m
-const LONGEST_WISH = 1; // m that fingers ask for in advance
+const LONGEST_WISH = 1; // m that fingers may request in advance
 
 /**
  * A person walks and reaches in the world's time. If the client is slower than real time or pauses, so does the person,
@@ -24,7 +24,7 @@ export class Pace {
     this.left = passed < 0 ? this.most : Math.min(this.left + passed, this.most);
   }
 
-  /** The part of the time since the last picture in which the person moves [s]. */
+  /** Returns the part of the time since the last picture in which the person moves [s]. */
   spend(passed) {
     const seconds = Math.min(passed, this.left);
     this.left -= seconds;
@@ -39,7 +39,7 @@ export class WalkingEyes extends FlyingEyes {
     this.height = pose[2];
     this.speed = WALK;
     this.crouch = 0;
-    this.wish = [0, 0]; // m ahead and to the left that fingers have asked for, and that are not walked yet
+    this.wish = [0, 0]; // m ahead and to the left that fingers have requested and the person has not walked yet
   }
 
   /** Limit the motion, because fingers may be faster than a person. */

@@ -1,6 +1,6 @@
 // Measures the rate of pictures and adapts the detail to it. Times in seconds.
 
-/** Rate of the first pictures of a page; one of them waits for the compilers of the graphics card. */
+/** Measures the rate of the first pictures of a page; one of them waits for the compilers of the graphics card. */
 export class FirstPictures {
   constructor(count) {
     this.count = count;
@@ -17,16 +17,16 @@ export class FirstPictures {
   }
 }
 
-const WINDOW = 36; // pictures by which the detail is judged
-const LATE = 1.4; // periods: a picture that takes longer has missed one
-const MOST_LATE = 0.25; // share of a window
+const WINDOW = 36; // number of pictures after which the detail is judged
+const LATE = 1.4; // a picture that takes longer than this number of periods is late
+const MOST_LATE = 0.25; // largest share of late pictures in a window
 const STRAY = 1; // late pictures of a window that are ignored: a garbage collector ran, or a list was rebuilt
-const LONGEST_CALM = 16; // times the calm at first
+const LONGEST_CALM = 16; // largest value of `calm`, as a multiple of its first value
 
 /**
  * Amount that is drawn, 1 at first, adapted so that pictures keep a rate. It is multiplied by `less` after a window with
- * many late pictures, and by `more` after `calm` windows without, between `least` and `most`. An increase that was too
- * much is tried again after twice the time.
+ * many late pictures, and by `more` after `calm` windows without, between `least` and `most`. If an increase was too
+ * much, the next one follows after twice the time.
  */
 export class Detail {
   constructor({ least, most, less, more, calm }) {
@@ -39,7 +39,7 @@ export class Detail {
     this.isTrial = false;
   }
 
-  /** Called when a picture was drawn `seconds` after the last one; `rate` [Hz] is wanted. Returns whether the value has
+  /** Called when a picture was drawn `seconds` after the last one; `rate` [Hz] is the aim. Returns whether the value has
    * changed. */
   add(seconds, rate) {
     this.late += seconds > LATE / rate;

@@ -25,7 +25,7 @@ uint row;                     // of the primitive
 out vec3 vPlace;
 out vec3 vNormal;
 out vec3 vLocal;              // of leaves: u, v, outline; of berries: seed, depth, along; of others: place in the grain
-out float vSky;               // share of the sky that is seen
+out float vSky;               // share of the sky that is visible
 flat out uvec4 vSurface;      // as in surfaces, and the bits of a seed
 flat out vec4 vDetail;
 
@@ -87,7 +87,7 @@ export const VERTEX = {
   n = pole ? axis * (s * 2.0 - 1.0) : side * position.x + up * position.y;
   p = mix(a.xyz, b.xyz, s) + n * r;
   vLocal = vec3(position.xy * r, shape(2).x + s * len);
-  if (shape(2).w > 0.0) vSky = mix(vSky, shape(2).z, s); // light runs on from one piece of wood to the next
+  if (shape(2).w > 0.0) vSky = mix(vSky, shape(2).z, s); // light is continuous from one piece of wood to the next
 ` +
     FINISH,
   // position: x y on the unit circle, z: 0 and 1 sides, -1 and 2 ends (flat), or their centres

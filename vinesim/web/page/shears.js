@@ -12,13 +12,13 @@ const NOTHING = 0xffffff,
   TOO_STRONG = 0xff4d3d;
 
 export class Shears {
-  /** `mouth` [3]: point where the shears cut, in the palm's frame [m]; null: the page has no person to take them. */
+  /** `mouth` [3]: point where the shears cut, in the palm's frame [m]; null: the page controls no person. */
   constructor(mouth, group) {
     this.mouth = mouth;
     this.taken = { left: false, right: false };
-    this.between = ["", ""]; // of the blades of both hands, what they would cut
-    this.closures = null; // how often they have closed, as far as the page knows
-    this.told = []; // sentences so far
+    this.between = ["", ""]; // the kind of wood that the blades of both hands would cut
+    this.closures = null; // number of closings that the page has reported
+    this.told = []; // sentences shown so far
     document.getElementById("tools").hidden = mouth === null;
     this.button = document.getElementById("shears");
     this.button.addEventListener("click", () => {
@@ -44,7 +44,7 @@ export class Shears {
     return SIDES.map((side) => this.taken[side]);
   }
 
-  /** Called when a state has arrived: report what each closing of the shears since the last state has cut. Returns
+  /** Called when a state has arrived: report the result of each closing of the shears since the last state. Returns
    * whether they have closed. */
   take({ shears }) {
     if (!shears) return false;

@@ -1,4 +1,4 @@
-// The timeline of a recording: pause, go to any time, faster and slower.
+// The timeline of a recording: pause, seek to any time, change the speed.
 
 const SPEEDS = [0.25, 0.5, 1, 2, 4];
 
@@ -12,7 +12,7 @@ export class Timeline {
     this.slider = this.panel.querySelector("input");
     this.speed = this.panel.querySelector("select");
     this.text = this.panel.querySelector("span");
-    this.isHeld = false; // the slider
+    this.isHeld = false; // whether the user holds the slider
     for (const speed of new Set([...SPEEDS, status.speed].sort((a, b) => a - b)))
       this.speed.append(new Option(`${speed} x`, speed));
     this.button.addEventListener("click", () => {
@@ -30,7 +30,7 @@ export class Timeline {
     this.slider.addEventListener("change", () => {
       this.isHeld = false;
       this.tell({ seek: Number(this.slider.value) });
-      this.slider.blur(); // keys go on to move
+      this.slider.blur(); // so that keys move the viewpoint again
     });
     this.show(status);
   }

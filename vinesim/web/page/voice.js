@@ -5,7 +5,7 @@ const RATE = 48000,
   PCM_FACTOR = 3; // Hz, samples, to 16 kHz
 const OPUS = 1,
   PCM16 = 2,
-  EXTRA = 128; // codecs as on the socket
+  EXTRA = 128; // codes of the codecs on the socket
 const BITRATE = 24000,
   RETRY = 1000,
   SILENCE = 10000; // bit/s, ms, ms without a frame until a speaker is forgotten
@@ -39,7 +39,7 @@ class Downsampler {
   }
 }
 
-/** Samples at 48 kHz from PCM16 at 16 kHz by linear interpolation, beginning at the last sample of the frame before. */
+/** Returns samples at 48 kHz from PCM16 at 16 kHz by linear interpolation, beginning at the last sample of the frame before. */
 function upsample(pcm, last) {
   const samples = new Float32Array(pcm.length * PCM_FACTOR);
   for (let i = 0; i < pcm.length; ++i) {
@@ -50,7 +50,7 @@ function upsample(pcm, last) {
   return samples;
 }
 
-/** A source of sound: 1/d by the panner, and the fade to zero at the end of hearing reach. */
+/** A source of sound. The panner makes loudness fall with 1/d; a gain fades it to zero at the end of hearing reach. */
 class Source {
   constructor(context, law) {
     [this.reference, this.reach, this.fade] = law;
@@ -225,7 +225,7 @@ export class Voice {
     this.socket.onclose = () => setTimeout(() => this.connect(), RETRY);
   }
 
-  /** Handle a text from the client: whether this page may speak, which frames are wanted, and which lights sound. */
+  /** Handle a text from the client: whether this page may speak, which kinds of frames it must send, which lights sound. */
   obey(status) {
     this.status = status;
     if (this.microphone) this.say(status.objection);
@@ -379,7 +379,7 @@ async function hasOpus() {
   }
 }
 
-/** Show a sentence to a user who wanted to speak. */
+/** Return a sentence that explains to the user why the microphone does not work. */
 function explain(failure) {
   const sentences = {
     NotFoundError: "no microphone was found: connect one, then press speak again",

@@ -6,8 +6,8 @@ const START = 1.5 * FRAME,
   LARGEST = 12 * FRAME; // samples
 const RESERVE = FRAME / 2; // samples by which frames may come too early
 const EASE = 8; // the delay is reduced by 1 / EASE of the time by which frames were early
-const SPARE = 4 * FRAME; // samples that may wait beyond these
-const SILENT = 0.01; // amplitude below which a frame may be the last one of a while: nothing is sent for silence
+const SPARE = 4 * FRAME; // samples that may wait in addition to the delay
+const SILENT = 0.01; // amplitude below which a frame may be the last before silence, which is not sent
 const RAMP = 96; // samples of a fade, 2 ms
 
 class Capture extends AudioWorkletProcessor {
@@ -39,24 +39,24 @@ class Capture extends AudioWorkletProcessor {
 /**
  * Plays a voice half a frame after its first frame has arrived. If the queue runs empty within a voice, the delay is
  * increased. If all frames of a sentence arrived early, the delay of the next sentence is reduced by this time, and a
- * sentence longer than a second is shortened by a frame. So the delay of a voice soon is only that of its network.
+ * sentence longer than a second is shortened by a frame. So the delay of a voice soon approaches the delay of its network.
  */
 class Player extends AudioWorkletProcessor {
   constructor() {
     super();
     this.frames = [];
     this.waiting = 0; // samples
-    this.at = 0; // in the first frame
+    this.at = 0; // index in the first frame of the next sample to play
     this.target = START;
     this.plays = false;
-    this.waited = 0; // samples since the first frame of those that wait has come
-    this.level = 0; // of the fade, 0 to 1
+    this.waited = 0; // samples since the first of the waiting frames has arrived
+    this.level = 0; // gain of the fade, 0 to 1
     this.last = 0;
     this.counts = { stalls: 0, cut: 0 };
-    this.peak = 0; // of the last frame
-    this.least = Infinity; // samples that still waited when a frame came, since the voice began or was cut
-    this.passed = 0; // samples since then
-    this.hasStalled = false; // in this sentence
+    this.peak = 0; // largest amplitude of the last frame
+    this.least = Infinity; // smallest number of samples that still waited when a frame arrived, since the voice began or was shortened
+    this.passed = 0; // samples played since the voice began or was shortened
+    this.hasStalled = false; // whether the voice has stalled in this sentence
     this.port.onmessage = ({ data }) => {
       if (this.plays) this.least = Math.min(this.least, this.waiting);
       this.frames.push(data);
@@ -73,7 +73,7 @@ class Player extends AudioWorkletProcessor {
     this.port.postMessage(this.counts);
   }
 
-  /** During a voice that continues: drop samples that waited without need. */
+  /** While a voice continues: drop samples that waited longer than necessary. */
   follow(count) {
     if (!this.plays) return;
     this.passed += count;

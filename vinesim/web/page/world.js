@@ -16,12 +16,12 @@ const COARSEST = 1000;
  * coarser by at most the first factor, or the second one with budgets below a phone's, where bunches are dropped last. */
 const NEAR_COARSER = 1.5,
   MOST_SHORT = 5;
-/** Factors by which plants are coarser than wanted, from which on rigid bodies are drawn one and two levels coarser. */
+/** If plants are coarser than intended by these factors, rigid bodies are drawn one and two levels coarser, too. */
 const RIGID_COARSER = [3, 8];
 /** Largest error of the shape of round parts of rigid bodies, in pixels. */
 const ROUNDNESS = 0.5;
-/** Share of a cluster's bounding sphere that hides what is behind it, and share of a line of sight up to which plants
- * count as hiding; at its end, where an actor works, there must be plants. */
+/** Share of a cluster's bounding sphere that hides objects behind it, and share of a line of sight up to which plants
+ * count as hiding; at the end of the line, where an actor works, there must be plants. */
 const HALF_FULL = 0.5,
   MOST_BETWEEN = 0.8;
 /** The list is rebuilt when the distance of a rigid body changes by this factor, unless it stays below NEAR [m]. */
@@ -31,7 +31,7 @@ const COMES_NEARER = 1.3,
 const VANISHING = 2600;
 /** VANISHING for leaves and grass. It is smaller, because missing bunches and posts are more noticeable. */
 const VANISHING_LEAVES = 1300;
-/** Smallest share of the budget for plants, however many triangles robots and people have. */
+/** Share of the budget that plants have at least, however many triangles robots and people have. */
 const LEAST_PLANTS = 0.5;
 /** A body further than this from its rest position is always drawn [m]. */
 const STRAY = 0.2;
@@ -52,8 +52,8 @@ export class World {
   constructor(header) {
     const { arrays } = header;
     this.header = header;
-    this.bodies = header.bodies; // of plants, then segments of wires
-    this.plants = header.room; // primitives of plants and ground, at most
+    this.bodies = header.bodies; // number of bodies of plants; segments of wires follow them
+    this.plants = header.room; // largest number of primitives of plants and ground
     this.group = new THREE.Group();
     this.group.rotation.x = -Math.PI / 2; // the world's z is up, the browser's y
     this.rows = this.plants + RIGID_ROOM;
@@ -69,16 +69,16 @@ export class World {
     );
     this.poses = dataTexture(THREE.RGBAFormat, THREE.FloatType, Float32Array, 4, this.carriers * 2, POSE_SHIFT);
     for (let k = 0; k < this.carriers; ++k) this.poses.image.data[8 * k + 7] = 1;
-    this.strayed = new Set(); // bodies of plants
+    this.strayed = new Set(); // bodies of plants that are far from their rest positions
     this.rest(arrays.poses);
     this.setPlants(header, arrays.start);
     this.rigidClusters = clusters({ first: [], size: [], kind: [], bunch: [], ball: [], shape: [], carrier: [] });
     this.picked = new Set();
     this.names = [];
-    this.outermost = new Map(); // of rigid bodies: points, by carrier, in its frame
-    this.bounds = new Map(); // boxes around them
+    this.outermost = new Map(); // outermost points of rigid bodies, by carrier, in the carrier's frame
+    this.bounds = new Map(); // bounding boxes of rigid bodies, by carrier
     this.hidden = new Set(); // carriers whose rigid primitives are not drawn
-    this.listedAway = new Map(); // from the eye to carriers of round parts, as last listed [m]
+    this.listedAway = new Map(); // distance from the eye to carriers of round parts, in the last list [m]
     this.rigidVersion = 0;
     this.eye = new THREE.Vector3();
     this.coarser = 1;
@@ -96,11 +96,11 @@ export class World {
     this.reach = reach;
     this.around = new THREE.Vector3(...place.slice(0, 3));
     this.listedAt = null;
-    this.surfaces.clearUpdateRanges(); // all of it
+    this.surfaces.clearUpdateRanges(); // all rows are uploaded
     this.shapes.needsUpdate = this.surfaces.needsUpdate = true;
   }
 
-  /** Whether the eyes have moved so far that the plants around them should be loaded. */
+  /** Returns whether the eyes have moved so far that the plants around them should be loaded. */
   isLeft(eye) {
     return this.reach !== null && eye.distanceTo(this.around) > LEFT * this.reach;
   }
@@ -316,7 +316,7 @@ export class World {
     return new THREE.Vector3().fromArray(this.poses.image.data, 8 * carrier);
   }
 
-  /** Name of a carrier's rigid body, "" for plants. A body's carrier changes when other bodies are added or removed. */
+  /** Returns the name of a carrier's rigid body, "" for plants. A body's carrier changes when other bodies are added or removed. */
   nameOf(carrier) {
     return this.names[carrier - this.bodies - 1] ?? "";
   }
@@ -356,7 +356,7 @@ export class World {
 
   /** Set the largest number of triangles, from the next list on. */
   setBudget(triangles) {
-    if (triangles > this.budget) this.coarser = 1; // the list finds how much coarser it has to be
+    if (triangles > this.budget) this.coarser = 1; // `list` then increases it as needed
     this.budget = triangles;
     this.listedAt = null;
   }
@@ -364,7 +364,7 @@ export class World {
   /**
    * Choose what is drawn and at which level of detail, for an eye [3] in the world that looks along `ahead` with half
    * the field of view `field` and pixels of the angle `pixel`. The list is valid until the eyes have turned by `turn` or
-   * their field of view changes; things that cannot be seen until then only cast shadows.
+   * their field of view changes; objects that cannot become visible until then only cast shadows.
    */
   list(eye, ahead, { field, turn, pixel }) {
     this.eye.copy(eye);
@@ -409,7 +409,7 @@ export class World {
     }
   }
 
-  /** Number of clusters of plants on the line from an eye [3] to a point [3] in the world, or around the eye. */
+  /** Returns the number of clusters of plants on the line from an eye [3] to a point [3] in the world, or around the eye. */
   countBetween(eye, point) {
     const { first, ball } = this.plantClusters,
       way = point.map((value, axis) => value - eye[axis]);
@@ -426,7 +426,7 @@ export class World {
     return count;
   }
 
-  /** Lower bound of the distance from the eye to the surface of a rigid body [m]. */
+  /** Returns a lower bound of the distance from the eye to the surface of a rigid body [m]. */
   away(carrier) {
     const { min, max } = this.bounds.get(carrier),
       { x, y, z } = this.eye,
@@ -492,7 +492,7 @@ export class World {
   }
 }
 
-/** Parts of the page's own person that would hide its view. */
+/** Returns the parts of the page's own person that would hide the person's view. */
 function partsBeforeEyes({ person }) {
   return new Set(person === null ? [] : ["head", "neck"].map((part) => `${person}/${part}`));
 }
@@ -505,7 +505,7 @@ function lightOf({ balance, exposure, dim, ...colours }) {
   return uniforms;
 }
 
-/** A texture of a table with mipmaps. */
+/** Returns a texture of a table, with mipmaps. */
 function smoothTable(texture) {
   texture.minFilter = THREE.LinearMipmapLinearFilter;
   texture.magFilter = THREE.LinearFilter;
@@ -538,7 +538,7 @@ function dataTexture(format, type, Kind, channels, texels, shift) {
   return texture;
 }
 
-/** Runs of primitives with the mean thickness of their parts and their largest radius [m]. */
+/** Returns runs of primitives with the mean thickness of their parts and their largest radius [m]. */
 function clusters(arrays) {
   const { first, size, kind, bunch, ball, shape } = arrays,
     count = first.length;

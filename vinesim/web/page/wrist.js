@@ -1,18 +1,18 @@
-// What a person in a headset reads at the left wrist: intentions to choose from, and the newest sentence of the page.
+// Text at the left wrist of a person in a headset: intentions to choose from, and the newest sentence of the page.
 
 import * as THREE from "./vendor/three.module.js";
 
 const WIDTH = 0.16,
   PIXELS = 512,
   LINE = 38; // m; px wide and of a line
-const LETTERS = 28; // of a line
+const LETTERS = 28; // letters in a line
 const NOTHING = "nothing";
 
 export class Wrist {
-  /** `carrier`: what the left hand carries; `intentions`: what a person may indicate, without nothing. */
+  /** `carrier`: group that moves with the left hand; `intentions`: intentions that a person may indicate. */
   constructor(carrier, intentions) {
     this.intentions = ["", ...intentions];
-    this.lines = []; // as shown: text, and whether it is the chosen one
+    this.lines = []; // the shown lines: text, and whether the line is the chosen intention
     this.canvas = document.createElement("canvas");
     this.canvas.width = PIXELS;
     this.canvas.height = LINE * (this.intentions.length + 5);
@@ -23,17 +23,17 @@ export class Wrist {
       new THREE.MeshBasicMaterial({ map: this.texture, transparent: true, toneMapped: false }),
     );
     this.panel.position.set(0, 0.03 + height / 2, 0);
-    carrier.rotation.x = -0.6; // towards the eyes
+    carrier.rotation.x = -0.6; // tilted towards the eyes
     carrier.add(this.panel);
     this.panel.visible = false;
   }
 
-  /** The intention that comes after another one in the list; nothing comes after the last. */
+  /** Returns the intention that follows another one in the list; after the last one, an empty string. */
   after(intention) {
     return this.intentions[(this.intentions.indexOf(intention) + 1) % this.intentions.length];
   }
 
-  /** Show what is `chosen` and what was `said`; without either there is nothing to see. */
+  /** Show the `chosen` intention and the sentence that was `said`; hide the text if both are empty. */
   show(chosen, said) {
     this.panel.visible = Boolean(chosen || said);
     const choice = chosen ? this.intentions.map((one) => [one || NOTHING, one === chosen]) : [];
@@ -58,7 +58,7 @@ export class Wrist {
   }
 }
 
-/** Lines of a sentence, four at most. */
+/** Returns the lines of a sentence, at most four. */
 function wrapped(sentence) {
   const lines = [];
   for (const word of sentence.split(" ")) {
