@@ -3,7 +3,7 @@
 #
 # Pictures from random places in vineyards of several seeds, each with the mask and box of every bunch. Seeds, not
 # pictures, are split into training and test, since two pictures of one vineyard show the same bunches. `vinesim
-# dataset` does this at scale, with people, robots, weather and the usual formats; here is what is in it.
+# dataset` does this at scale, with people, robots, weather and the usual formats; this notebook shows the principle.
 
 # %%
 import pathlib
@@ -19,7 +19,7 @@ camera = vinesim.Camera("pinhole", size=(240, 180), quality="fast")
 
 
 def picture(seed: int) -> dict[str, np.ndarray]:
-    """One picture of the vineyard of a seed: colours, depth, number of the bunch of each pixel (0: none), boxes."""
+    """Returns one picture of the vineyard of a seed: colours, depth, bunch number of each pixel (0: none), boxes."""
     rng = np.random.default_rng(seed)
     simulation = vinesim.Simulation(vinesim.load_scene("demo", seed=seed))
     eye = np.array([rng.uniform(0.5, 2.5), -1.0, rng.uniform(1.2, 1.5)])
@@ -52,7 +52,7 @@ for axis, file in zip(axes, files, strict=True):
 plt.show()
 
 # %% [markdown]
-# The check: boxes hold the masks, splits share no vineyard, and the same seed gives the same bits.
+# The check: boxes contain the masks, splits share no vineyard, and the same seed yields the same bits.
 
 # %% The check
 again = picture(SEEDS["test"][0])

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Picking against clearance
 #
-# How much room must the open hand have about a bunch? `reachable_grasps` lists what a hand reaches and the room
-# it has there; `attempt_pick` tries one in a vineyard of its own. Here the freest, the narrowest and one between;
-# `python -m benchmarks picking` tries all.
+# How much room does the open hand need around a bunch? `reachable_grasps` lists the bunches that a hand reaches, with
+# the room around each. `attempt_pick` picks one bunch in a separate vineyard. This notebook tries the bunches with
+# most, least and medium room; `python -m benchmarks picking` tries all.
 
 # %%
 import matplotlib.pyplot as plt
@@ -27,11 +27,11 @@ figure, axis = plt.subplots(figsize=(7, 4))
 axis.hist(1e3 * clearance, bins=12, color="lightgray", label="bunches in reach")
 for one in attempts:
     axis.axvline(1e3 * one.clearance, color="green" if one.picked else "red")
-axis.set(xlabel="room of the open hand [mm]", ylabel="bunches", title="green: picked, red: not picked")
+axis.set(xlabel="clearance of the open hand [mm]", ylabel="bunches", title="green: picked, red: not picked")
 axis.legend()
 plt.show()
 
-# %% The check: the freest is picked, and nothing else comes off
+# %% The check: the bunch with most clearance is picked, and no other bunch comes off
 assert len(grasps) > 5
 assert attempts[-1].picked, attempts[-1].reason
 assert attempts[-1].others == 0

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Pushing a robot's arm
 #
-# All seven joints of the left arm are made compliant. A hand pushes the last link with a few newtons: the arm
-# gives way, and at rest stiffness times deflection is the moment of the push about each joint, K dq = J^T F.
+# All seven joints of the left arm are compliant. A hand pushes the last link with a few newtons, and the arm yields.
+# At rest, stiffness times deflection equals the moment of the push about each joint, K dq = J^T F.
 
 # %%
 import matplotlib.pyplot as plt
@@ -22,7 +22,7 @@ simulation.step(20)
 before = robot.sample(simulation.time).joints
 
 # %% [markdown]
-# The force acts where the frame of the last link begins, for six seconds.
+# The force acts at the origin of the last link's frame, for six seconds.
 
 # %%
 times, way = [], []
@@ -34,15 +34,15 @@ for _ in range(600):
 pushed = robot.sample(simulation.time).joints
 
 # %% [markdown]
-# By virtual work the moment about a joint is the force times the way of that point for a small turn of the joint;
-# the geometry comes from the URDF.
+# By virtual work, the moment about a joint is the force times the displacement of that point for a small rotation of
+# the joint, per radian. The geometry comes from the URDF.
 
 # %%
 TURN = 1e-5  # rad
 
 
 def point(joint: int, turn: float) -> np.ndarray:
-    """Where the frame of the last link is in the base when one joint turns a little farther [3] m."""
+    """Returns the origin of the last link's frame in the base [3] m, after a small rotation of one joint."""
     position = pushed.position.copy()
     position[joint] += turn
     return robot.description.link_poses(position)[LINK][:3]
@@ -56,7 +56,7 @@ print("J^T F [N m]:", moment.round(3))
 # %%
 figure, (chart, bars) = plt.subplots(1, 2, figsize=(12, 4))
 chart.plot(times, np.degrees(way), label=[f"joint {number}" for number in range(1, 8)])
-chart.set(xlabel="time [s]", ylabel="deflection [deg]", title="the arm gives way")
+chart.set(xlabel="time [s]", ylabel="deflection [deg]", title="the arm yields")
 chart.legend(ncols=2)
 bars.bar(np.arange(1, 8) - 0.2, spring, 0.4, label="K dq")
 bars.bar(np.arange(1, 8) + 0.2, moment, 0.4, label="J^T F")
@@ -64,7 +64,7 @@ bars.set(xlabel="joint", ylabel="N m", title="at rest")
 bars.legend()
 plt.show()
 
-# %% The check: the law, and the arm is back after the push
+# %% The check: the law holds, and the arm returns after the push
 simulation.step(600)
 back = robot.sample(simulation.time).joints.position[joints] - before.position[joints]
 assert np.abs(way[-1]).max() > np.radians(2.0)

@@ -1,10 +1,10 @@
 # %% [markdown]
 # # Tune a cane to its swing
 #
-# A cane is pulled aside by 10 cm, let go, and filmed for three seconds. From the track of its tip follow Young's
-# modulus and damping, with 90 % intervals; with a spring balance on the string the mass as well.
+# A cane is pulled aside by 10 cm, let go, and filmed for three seconds. The track of its tip determines Young's
+# modulus and damping, with 90 % intervals; with a spring balance on the string also the mass.
 #
-# The track here is synthetic, so that the truth is known at the end. Yours comes from `read_trajectory("pull.csv")`.
+# This track is synthetic, so that the true values are known. Your own track comes from `read_trajectory("pull.csv")`.
 
 # %%
 import pathlib
@@ -20,7 +20,7 @@ FOLDER = pathlib.Path(tempfile.mkdtemp())
 # %% [markdown]
 # ## The laboratory
 #
-# The file says what was measured with ruler and scales. The truth differs from it in modulus and damping.
+# The file has the values measured with ruler and scales. The true plant has another modulus and damping.
 
 # %%
 FILE = """[specimen]
@@ -42,7 +42,7 @@ print((FOLDER / "pull.csv").read_text()[:200])
 # %% [markdown]
 # ## Without a model
 #
-# A damped sinusoid through the track gives frequency and logarithmic decrement: what a fit must agree with.
+# A damped sinusoid that is fitted to the track has a frequency and a logarithmic decrement; a fit must agree with both.
 
 # %%
 track = read_trajectory(FOLDER / "pull.csv")
@@ -58,29 +58,29 @@ fit = tune(guess, track)
 print("\n".join(fit.lines()))
 
 # %% [markdown]
-# Track with its 90 % band and what is left over; posterior and prior: the data know the modulus hundreds of times
-# better than a book does.
+# The track with its 90 % band, and the residuals; posterior and prior. The data determine the modulus hundreds of times
+# more exactly than published values do.
 
 # %%
 plots.draw_fit(fit, plt.figure(figsize=plots.SIZE, layout="constrained"))
 
 # %% [markdown]
-# ## A release that the fit has not seen
+# ## A held-out release
 #
-# Another pull, half as far and to the side. Only the pull and its moment are fitted; the plant stays as it is.
+# Another pull, half as far and to the side. Only the pull and the time of release are fitted, not the plant.
 
 # %%
 other = measure(truth, Experiment(seed=4, displacement=0.05, angle=20.0))
 held_out = tune(fit.fitted_specimen(), other, ())
 figure, axes = plt.subplots(figsize=(8, 3))
 plots.draw_held_out(fit, held_out, axes)
-print(f"left over: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
+print(f"residuals: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
 
 # %% [markdown]
-# ## What a swing cannot tell
+# ## What a swing does not determine
 #
-# A free swing depends on modulus over mass. Fitted together without a force they run along a ridge as wide as the
-# prior; the spring balance ends it.
+# A free swing depends on the ratio of modulus to mass. Fitted together without a force, they have a ridge as wide as the
+# prior; with a spring balance there is no ridge.
 
 # %%
 blind = measure(truth, Experiment(seed=3))
@@ -94,7 +94,7 @@ print([line for line in ridge.lines() if line.startswith("ridge")])
 # %% [markdown]
 # ## Into a vineyard
 #
-# The file that `write_plant` makes is one of plant parameters; a scene loads it by `plants = "fitted.toml"`.
+# `write_plant` writes a file of plant parameters; a scene loads it with `plants = "fitted.toml"`.
 
 # %%
 fit.write_plant(FOLDER / "fitted.toml")

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Tune the swing of a bunch
 #
-# A bunch hangs on its peduncle like a pendulum on a spring. Weight gives it most of its frequency and the peduncle the
-# rest, so the mass must be known: it is weighed after picking. The track of its lowest point then gives the peduncle's
-# modulus and damping.
+# A bunch hangs on its peduncle like a pendulum on a spring. Its frequency depends mostly on its weight, and also on the
+# peduncle. So the mass must be known: the bunch is weighed after picking. The track of its lowest point then determines
+# the peduncle's modulus and damping.
 
 # %%
 import pathlib
@@ -40,28 +40,28 @@ print("\n".join(fit.lines()))
 plots.draw_fit(fit, plt.figure(figsize=plots.SIZE, layout="constrained"))
 
 # %% [markdown]
-# ## How much the weight hides
+# ## How much the weight hides the stiffness
 #
-# The interval of the modulus is wider than a cane's: a tenth more of it changes the frequency by a few percent only.
-# Draws from the posterior itself, each a simulated bunch, say whether the normal approximation is to be trusted; the
-# interval above is theirs.
+# The interval of the modulus is wider than a cane's: a modulus larger by a tenth changes the frequency only by a few
+# per cent. Draws from the exact posterior, each a simulated bunch, show whether the normal approximation is good; the
+# interval above comes from these draws.
 
 # %%
 assert fit.sample is not None
 own = fit.estimate("modulus")
 low, high = np.exp(fit.posterior.interval("modulus")) * guess.modulus.value / 1e9
-print(f"modulus {own.low / 1e9:.3f} to {own.high / 1e9:.3f} GPa by draws worth {fit.sample.effective:.0f}")
+print(f"modulus {own.low / 1e9:.3f} to {own.high / 1e9:.3f} GPa by {fit.sample.effective:.0f} effective draws")
 print(f"{low:.3f} to {high:.3f} GPa by the normal approximation")
 
 # %% [markdown]
-# ## A release that the fit has not seen
+# ## A held-out release
 
 # %%
 other = measure(truth, Experiment(seed=2, displacement=0.07, duration=4.0, angle=30.0, axes="xy"))
 held_out = tune(fit.fitted_specimen(), other, ())
 figure, axes = plt.subplots(figsize=(8, 3))
 plots.draw_held_out(fit, held_out, axes)
-print(f"left over: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
+print(f"residuals: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
 
 # %% [markdown]
 # ## Check

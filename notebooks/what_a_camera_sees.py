@@ -1,8 +1,7 @@
 # %% [markdown]
 # # What a camera sees
 #
-# A D435 looks under a pergola: colours, the depth that it would measure, the depth that is true, and what every
-# pixel shows.
+# A D435 looks under a pergola. Its picture has colours, measured depth, exact depth, and a label for every pixel.
 
 # %%
 import itertools
@@ -31,8 +30,8 @@ for axis, (title, picture) in zip(axes.flat, shown.items(), strict=True):
 plt.show()
 
 # %% [markdown]
-# How wrong is the measured depth? A stereo camera's noise grows with the square of the distance. At edges of
-# leaves it measures something between front and back, so the spread is taken from the middle half of the errors.
+# How large is the error of the measured depth? A stereo camera's noise grows with the square of the distance. At edges
+# of leaves the measured depth is between front and back, so the spread is taken from the middle half of the errors.
 
 # %%
 measured = np.isfinite(frame.depth) & (frame.exact_depth > 0.5) & (frame.exact_depth < 6.0)
@@ -46,11 +45,11 @@ for low, high in itertools.pairwise(bounds):
     spreads.append(0.5 * np.subtract(*np.quantile(error[inside], (0.75, 0.25))))
 figure, axis = plt.subplots(figsize=(6, 4))
 axis.loglog(middles, 1e3 * np.array(spreads), "o-")
-axis.set(xlabel="true distance [m]", ylabel="half of the middle half [mm]", title="error of depth in a canopy")
+axis.set(xlabel="true distance [m]", ylabel="half of the interquartile range [mm]", title="error of depth in a canopy")
 plt.show()
 
 # %% [markdown]
-# Which organs fill the picture, and of how many pixels has the sensor no depth?
+# Which organs fill the picture, and how many pixels have no depth?
 
 # %%
 for organ in vinesim.Organ:
@@ -66,4 +65,4 @@ assert len(np.unique(frame.instances[bunch])) >= 3
 assert 0.0 < holes < 0.9
 assert np.median(np.abs(error[distance < 2.0])) < 0.02 * 2.0  # the maker's 2 % at 2 m
 assert spreads[-1] > spreads[0]
-print("the truth is exact, the measurement is not")
+print("the exact depth has no error, the measured depth has")

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Who hears what
 #
-# Three robots share a hedge through a server. Ada drives into the vines. Bob stands 3 m away and must see them
-# move; Eve stands 25 m away and must not be bothered: motion is sent only to those within 5 m of it.
+# Three robots share a hedge through a server. Ada drives into the vines. Bob stands 3 m away, so his copy of the vines
+# must move, too. Eve stands 25 m away and must receive nothing: motion is sent only to actors within 5 m of it.
 
 # %%
 import pathlib
@@ -51,7 +51,7 @@ except ImportError:  # run as a script
 
 # %%
 def displacement(client: vinesim.Client, rest: np.ndarray) -> np.ndarray:
-    """By how much each body of the plants has moved in a client's copy [body] m."""
+    """Returns the displacement of each body of the plants in a client's copy [body] m."""
     return np.linalg.norm(client.state.body_q[:, :3] - rest, axis=1)
 
 
@@ -94,7 +94,7 @@ ground.add_patch(plt.Circle(touched[:, :2].mean(0), 5.0, fill=False, linestyle="
 for name, (x, y) in ends.items():
     ground.plot(x, y, "ks")
     ground.annotate(f"{name}: {heard[name] / 1e3:.1f} kB", (x, y))
-ground.set(xlabel="x [m]", ylabel="y [m]", title="motion reaches 5 m")
+ground.set(xlabel="x [m]", ylabel="y [m]", title="motion is sent up to 5 m")
 ground.set_aspect("equal")
 ground.legend()
 plt.show()
@@ -105,4 +105,4 @@ assert abs(moved["ada"][body] - moved["bob"][body]) < 0.02
 assert heard["bob"] > 0
 assert heard["eve"] == 0
 assert moved["eve"].max() < 1e-3
-print("Bob has seen it, Eve has received nothing of it")
+print("Bob's copy has moved, Eve has received nothing")
