@@ -79,8 +79,8 @@ print(f"residuals: {1e3 * held_out.noise:.2f} mm; the camera's noise is 2 mm")
 # %% [markdown]
 # ## What a swing does not determine
 #
-# A free swing depends on the ratio of modulus to mass. Fitted together without a force, they have a ridge as wide as the
-# prior; with a spring balance there is no ridge.
+# A free swing depends on the ratio of modulus to mass. If both are fitted without a force, there is a ridge as wide as
+# the prior; with a spring balance there is none.
 
 # %%
 blind = measure(truth, Experiment(seed=3))
