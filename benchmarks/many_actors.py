@@ -160,7 +160,7 @@ class Crowd:
         return source
 
     def tick(self) -> None:
-        """One step of all clients and of the server."""
+        """Step all clients and the server once."""
         start = time.thread_time()
         for client in self.clients:
             client.tick()

@@ -81,7 +81,7 @@ _EXTREMES = (
 
 
 class Sender(Protocol):
-    """The actor that a made message claims as its sender."""
+    """The actor in whose name messages are made."""
 
     @property
     def name(self) -> str: ...

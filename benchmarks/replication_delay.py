@@ -122,7 +122,7 @@ class Pair:
             client.replicator.send = rule  # a bench replaces the method
 
     def tick(self) -> None:
-        """One step of both clients."""
+        """Step both clients once."""
         for client in self.clients:
             client.tick()
         self.hub.advance(DT)

@@ -40,7 +40,7 @@ OPTIONS = (
 SOFTWARE = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 """Options of a browser that draws without a graphics card."""
 IWER = pathlib.Path(__file__).parents[2] / "build" / "page" / "iwer.min.js"
-"""The emulator of headsets; ``tools/build_page`` puts it there."""
+"""Path of the headset emulator, which ``tools/build_page`` copies."""
 
 GUARD = '"$@" & read -r _; kill -9 $!'
 """Shell script that runs a program until the script's standard input ends: it ends with this process, however that

@@ -122,7 +122,7 @@ class FakeClient:
         self._now = 0.0
 
     def tick(self, now: float) -> None:
-        """One step of a client."""
+        """Step this client once, at ``now`` [s] of its own clock."""
         self._now = now
         inbox = self.replicator.receive(now)
         for hello in inbox.joined:

@@ -66,7 +66,8 @@ class LawBroken(AssertionError):
 
 
 def small_vineyard() -> Model:
-    """Eight trees in two rows, every second with berry clusters, and a box beside each of the first four."""
+    """Returns a model of eight trees in two rows, every second one with berry clusters, and a box next to each of the
+    first four."""
     trees = []
     for number in range(8):
         tree = TreeBuilder(frames.pose(np.array([0.8 * (number % 4) - 1.2, 1.5 - number // 4, 1.5])))

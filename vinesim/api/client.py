@@ -89,7 +89,7 @@ class Client:
 
     @property
     def robot(self) -> Robot:
-        """The robot that this client moves."""
+        """The robot that this client controls."""
         return self._client.robot
 
     @property

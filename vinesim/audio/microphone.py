@@ -1,4 +1,5 @@
-"""A microphone: records the sum of all voices and tones near it in blocks of 20 ms, each as loud as it is there.
+"""A microphone: records the sum of all voices and tones near it in blocks of 20 ms, each with its loudness at the
+microphone.
 
 A frame of sound is stamped with the network time at which it began. A block is recorded :attr:`Microphone.delay` after
 its end, so that frames on their way still reach it. A frame that arrives later is counted, and the delay grows.
@@ -55,7 +56,7 @@ class Block:
     time: float
     """[s] Network time of the first sample."""
     samples: np.ndarray
-    """[:data:`FRAME_SAMPLES`] float32; the sum of loud sounds may exceed 1."""
+    """Samples of the block [:data:`FRAME_SAMPLES`] float32; the sum of loud sounds may exceed 1."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -87,7 +88,7 @@ class Microphone:
         """Index of the first sample of the next block; None until the first block."""
         self._voices: dict[str, _Voice] = {}
         self._tones: dict[str, tuple[int, float, float]] = {}
-        """By source: sample up to which its tone is mixed, the amplitude at that sample, and the frequency [Hz]."""
+        """Sample up to which a tone is mixed, its amplitude at that sample, and its frequency [Hz], by source."""
 
     @property
     def missed(self) -> int:

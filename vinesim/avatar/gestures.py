@@ -61,7 +61,7 @@ class Gestures:
     """The finger poses that one person can make."""
 
     poses: Mapping[str, FingerBend] = dataclasses.field(default_factory=lambda: dict(GESTURES))
-    """By name: the poses of :data:`GESTURES` and the person's own."""
+    """Finger poses by name: those of :data:`GESTURES` and the person's own poses."""
     buttons: Mapping[str, FingerBend] = dataclasses.field(default_factory=dict)
     """Poses assigned to the buttons ``a`` and ``b`` of either controller (labelled x and y on a left one)."""
 

@@ -8,11 +8,11 @@ from vinesim.core import frames
 from vinesim.scene.values import HumanPose
 
 STEP_LENGTH = 0.28
-"""[m] A foot that is further than this from its place under the hips makes a step. GUESSED."""
+"""Distance of a foot from its place under the hips, beyond which the foot makes a step [m]. GUESSED."""
 SWING_TIME = 0.35
 """[s] Duration of a step. GUESSED."""
 LIFT_HEIGHT = 0.08
-"""[m] How high a foot is lifted. GUESSED."""
+"""Height to which a foot is lifted in a step [m]. GUESSED."""
 
 
 class LegEstimator:
@@ -30,7 +30,7 @@ class LegEstimator:
         self._feet = np.stack([pose.left_foot, pose.right_foot]).astype(float)
         self._start = self._feet.copy()
         self._swing = [1.0, 1.0]
-        """[foot] Phase of the foot's step, 0 to 1."""
+        """Phase of each foot's step, 0 to 1 [foot]."""
         self._head = np.asarray(pose.head[:3], float).copy()
 
     def stand(self, head: np.ndarray) -> None:

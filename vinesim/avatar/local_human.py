@@ -21,7 +21,7 @@ class LocalHuman:
     """A person in the physics whose head and hands follow a pose source in every step."""
 
     def __init__(self, physics: Physics, spec: HumanSpec, source: Callable[[float], HumanPose]) -> None:
-        """``source(time)`` gives the pose at the end of the step that begins at simulation ``time`` [s]."""
+        """``source(time)`` returns the pose at the end of the step that begins at simulation ``time`` [s]."""
         self.physics = physics
         self.name = spec.name
         self.source = source

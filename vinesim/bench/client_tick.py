@@ -53,7 +53,7 @@ TRUTH_PERIOD = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """One client that is measured, with its budgets [ms, median]."""
+    """Properties of a client that is measured, and budgets of its median times [ms]."""
 
     scene: str
     robots: int = 1

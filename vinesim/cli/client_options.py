@@ -24,7 +24,7 @@ STATUS_FORMATS = ("text", "json", "none")
 
 @dataclasses.dataclass(frozen=True)
 class OnlyFor:
-    """The roles that an option belongs to. An option without this annotation belongs to all roles."""
+    """Annotation of an option of the command line: the roles that have the option. Without it, all roles have it."""
 
     roles: tuple[str, ...]
 

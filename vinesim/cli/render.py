@@ -157,7 +157,7 @@ class _Stage:
     spec: CameraSpec
     info: CameraInfo
     time: float
-    """[s] Simulated time; it sets the sun."""
+    """Simulated time, which determines the position of the sun [s]."""
     sensors: tuple[RenderedMount, ...]
     """Further sensors that measure from the camera's place."""
 

@@ -157,20 +157,20 @@ class Client:
         self.steps_before_pause: int | None = None
         """Number of steps that are still simulated before the simulation pauses. None: it runs without a pause."""
         self.between_steps: list[Callable[[], None]] = []
-        """Called at the start of every tick, also while the simulation pauses."""
+        """Functions that are called at the start of every tick, also while the simulation pauses."""
         self.pre_step: list[Callable[[float], None]] = []
-        """Called before every step with the simulation time [s]: tasks and commands of robots."""
+        """Functions that are called before every step with the simulation time [s]: tasks and commands of robots."""
         self.post_step: list[Callable[[Client], None]] = []
-        """Called after every step, with this client: sensors, ROS, recorders."""
+        """Functions that are called after every step with this client: sensors, ROS, recorders."""
         self.wake_readers: list[Callable[[], None]] = []
-        """Called at the end of a tick. They wake the processes that take its results. They come last because a process
-        that is woken may get this core at once."""
+        """Functions that are called at the end of a tick and wake the processes that take the tick's results. They come
+        last because a woken process may get this core immediately."""
         self.script = ""
         """Command line option that lets the robots act by themselves, or "". Services do not reset a client that has
         such an option."""
         self.after_reset: list[Callable[[], None]] = []
-        """Called after :meth:`reset`, so that parts that hold references to the physics or a robot take the new
-        objects."""
+        """Functions that are called after :meth:`reset`, so that parts with references to the physics or a robot take
+        the new objects."""
         self.earlier_faults: collections.Counter[str] = collections.Counter()
         """Number of faults of the physics and of couplings before the last reset, by kind of fault."""
         # Each returns the fault counts of a part that serves this client, such as its page.
@@ -557,7 +557,8 @@ class InterestAudit:
     """Counts the bytes with states of touched plants that are sent while no remote actor is near. It must stay 0."""
 
     MARGIN = 3.0
-    """An actor counts as far if its distance exceeds the interest radius by this much [m], as a tree is not a point."""
+    """An actor counts as far if its distance from this client's actor exceeds the interest radius by more than this
+    [m]: a tree is not a point."""
 
     def __init__(self) -> None:
         self.bytes = 0

@@ -15,7 +15,8 @@ HEADROOM = 0.9
 WINDOW = 0.5
 """Length of a span of real time over which work is measured [s]; the last two spans count."""
 HELD_SHARE = 0.1
-"""Share of the time. If steps are held back for more than it, the client reports its present speed as its limit."""
+"""If steps are held back for more than this share of the time [1], the client reports its present speed as its
+limit."""
 REPORT_PERIOD = 0.05
 """Real time between two reports to the clock of a client without a server, :class:`OwnPace` [s]."""
 
@@ -135,7 +136,7 @@ class _Span:
         self.idle = 0.0
         """Time for which no step was due [s]."""
         self.held: dict[str, float] = {}
-        """Time for which a due step was held, by cause [s]."""
+        """Time for which a due step was held back, by cause [s]."""
 
 
 class PaceMeter:

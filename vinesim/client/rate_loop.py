@@ -29,13 +29,13 @@ class TickLog:
     """A record of steps, for statistics of any part of a run."""
 
     begins: np.ndarray
-    """[step] Time at which each step began, by ``time.monotonic`` of this machine [s]."""
+    """Time at which each step began, by ``time.monotonic`` of this machine [step] s."""
     work: np.ndarray
-    """[step] Duration of the work of each step [s]."""
+    """Duration of the work of each step [step] s."""
     dt: float
     """Simulated time of a step [s]."""
     periods: np.ndarray
-    """[step] Real time from one deadline to the next [s]: longer than ``dt`` if the world is slower than real time."""
+    """Real time from one deadline to the next [step] s: longer than ``dt`` if the world is slower than real time."""
 
     def between(self, since: float, until: float) -> dict[str, float]:
         """Returns rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of

@@ -20,11 +20,11 @@ class Sweep:
     """A sine of constant amplitude whose frequency changes linearly with time."""
 
     direction: np.ndarray
-    """[3] Unit vector in the world."""
+    """Direction of the motion: unit vector in the world [3]."""
     amplitude: float
     """Amplitude [m]."""
     frequencies: tuple[float, float]
-    """[Hz] Frequencies at the start and at the end."""
+    """Frequencies at the start and at the end of the sweep [Hz]."""
     start: float
     """Time at which the sweep starts [s]."""
     duration: float

@@ -39,11 +39,11 @@ class Motion:
     """Positions of markers at some ticks after the release, with velocity and acceleration over the following tick."""
 
     position: np.ndarray
-    """[candidate, tick, marker, 3] m"""
+    """Positions of the markers [candidate, tick, marker, 3] m."""
     velocity: np.ndarray
-    """[candidate, tick, marker, 3] m/s"""
+    """Velocities of the markers over the following tick [candidate, tick, marker, 3] m/s."""
     acceleration: np.ndarray
-    """[candidate, tick, marker, 3] m/s^2"""
+    """Accelerations of the markers over the following tick [candidate, tick, marker, 3] m/s^2."""
 
     def at(self, index: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Interpolate positions and velocities [candidate, sample, marker, 3] between ticks.

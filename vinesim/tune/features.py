@@ -48,11 +48,11 @@ class Features:
     """[s] Time of the release on the track's clock: the turning point at or before the onset of motion. For a shaken
     base it is the start of the track."""
     rest: np.ndarray
-    """[column] m, rest position."""
+    """Rest position of each column [column] m."""
     displacement: np.ndarray
-    """[column] m, displacement of the sinusoid from rest at the release, or largest response of the oscillator."""
+    """Displacement of the sinusoid from rest at the release, or largest response of the oscillator [column] m."""
     noise: float
-    """[m] Robust standard deviation of the residuals of the curve, which is at least the noise."""
+    """Robust standard deviation of the residuals of the curve [m]. The noise of the track is at most this."""
     explained: float
     """[1] Fraction of the motion after the release, relative to the base, that the curve explains."""
 

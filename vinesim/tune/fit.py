@@ -66,13 +66,14 @@ class Fit:
     noise: float
     """[m] Robust standard deviation of the residuals of all columns together."""
     column_noise: np.ndarray
-    """[column] m, robust standard deviation of each column; cameras measure distances less exactly than directions."""
+    """Robust standard deviation of the residuals of each column [column] m. Cameras measure distances less exactly than
+    directions."""
     frequency: float
     """[Hz] Frequency of the fitted plant."""
     damping_ratio: float
     """[1] Damping ratio of the fitted plant."""
     model: np.ndarray
-    """[sample, column] m, the fitted track in the columns of ``track.tracked``; NaN where the data are NaN."""
+    """The fitted track in the columns of ``track.tracked`` [sample, column] m; NaN where the data are NaN."""
     jacobian: np.ndarray
     """[observation, parameter] Derivatives of the fitted track."""
     minima: tuple[Minimum, ...]

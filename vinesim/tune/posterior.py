@@ -38,7 +38,7 @@ class Posterior:
     """Number of parameters of the plant, which come first; the others belong to the experiment."""
     ridges: tuple[Ridge, ...]
     correlation_time: float
-    """[sample] Correlation time of the residuals, 1 if they are independent. Its square root widens the intervals."""
+    """Correlation time of the residuals in samples, 1 if they are independent. Its square root widens the intervals."""
 
     @property
     def deviation(self) -> np.ndarray:
@@ -117,7 +117,7 @@ class Sample:
     """Draws from the exact posterior, by importance resampling of draws from Laplace's approximation."""
 
     draws: np.ndarray
-    """[n, parameter] Draws with equal weights."""
+    """Draws of the parameters with equal weights [n, parameter]."""
     effective: float
     """Effective number of independent draws (Kish)."""
 

@@ -38,13 +38,13 @@ class Evaluation:
     """Model and derivatives for one set of parameters."""
 
     model: np.ndarray
-    """[observation] m, positions of the model."""
+    """Positions of the simulated markers [observation] m."""
     jacobian: np.ndarray
-    """[observation, parameter] m, derivatives of ``model``."""
+    """Derivatives of ``model`` by the parameters [observation, parameter] m."""
     extra: np.ndarray
     """[row] Residuals of force reading and priors, in standard deviations."""
     extra_jacobian: np.ndarray
-    """[row, parameter] Derivatives of ``extra``."""
+    """Derivatives of ``extra`` by the parameters [row, parameter]."""
 
 
 class Problem:

@@ -36,17 +36,18 @@ class Trajectory:
     """
 
     time: np.ndarray
-    """[sample] s, increasing, not necessarily at regular intervals."""
+    """Times of the samples [sample] s, increasing; intervals may differ."""
     position: np.ndarray
-    """[sample, marker, 3] m, world axes (z up); NaN where a marker was not seen. An axis not tracked is all NaN."""
+    """Positions of the markers [sample, marker, 3] m, world axes (z up); NaN where a marker was not visible. An axis
+    that was not tracked is all NaN."""
     markers: tuple[str, ...] = (TIP,)
     """Names of the markers; see :attr:`~vinesim.scene.plant_parameters.Specimen.markers`."""
     force: np.ndarray | None = None
-    """[sample] N, pull measured by a gauge at the tip; NaN without a reading. None without a gauge."""
+    """Pull measured by a gauge at the tip [sample] N; NaN without a reading. None without a gauge."""
     source: str = "data"
     """Name of the file for messages."""
     base: np.ndarray | None = None
-    """[sample, 3] m, displacement of the base from its position at the first sample; the base does not rotate. None:
+    """Displacement of the base from its position at the first sample [sample, 3] m; the base does not rotate. None:
     the base did not move."""
 
     def __post_init__(self) -> None:

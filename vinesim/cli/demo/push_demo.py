@@ -38,7 +38,7 @@ class ListenedTopics:
     events: tuple[str, ...]
     """Topics that may stay silent, so that the start does not wait for them."""
     owners: Mapping[str, str]
-    """By topic: the sensor that publishes it, in words."""
+    """Text that names the sensor which publishes a topic, by topic."""
 
     def describe(self, topic: str) -> str:
         """Returns a text for the progress display: what is missing while a topic has had no message."""

@@ -26,7 +26,7 @@ class Finding:
     found: str
     """Result of the check in one line."""
     remedy: str = ""
-    """What to do; empty if nothing is wrong."""
+    """Instruction for the user that solves the problem; empty if there is none."""
 
     @property
     def line(self) -> str:

@@ -22,9 +22,9 @@ HIDING = 0.3
 AROUND = 2.5
 """Radius of the group of trees around the tree nearest to a distant actor [m]. GUESSED."""
 BEFORE_VINES = (2.5, 3.5, 4.5, 5.5, 6.5)
-"""Distances of the viewpoint from the centre of this group that are tried [m]. GUESSED."""
+"""Tried distances of the viewpoint from the centre of the group of trees nearest to a distant actor [m]. GUESSED."""
 BEARINGS = 32
-"""Number of directions around this centre that are tried."""
+"""Number of tried directions of the viewpoint around the group of trees nearest to a distant actor."""
 AWAY = (0.15, 0.55)
 """Range of angles of a distant actor from the middle of the picture [rad]; a desktop shows 0.8."""
 FREE = 0.7

@@ -20,7 +20,7 @@ class Trace:
         self.body = int(model.bunch_body[bunch])
         clusters = int(model.bunch_cluster[bunch]) + np.arange(model.bunch_clusters[bunch])
         self.bodies = frozenset([self.body, *clusters.tolist()])
-        """The bodies of the bunch and of its berry clusters, which hands touch."""
+        """Indices of the bodies of the bunch and of its berry clusters, which hands may touch."""
         self._com = np.array([0.5 * float(model.bunch_length[bunch]), 0.0, 0.0])
         self._rest = self._centre(rest_q)
         # filled instead of np.zeros, so that all memory pages exist from the start and a run's memory does not grow
@@ -74,15 +74,15 @@ class Rows:
     """A trace as arrays with one row for each step."""
 
     clock: np.ndarray
-    """[tick] s, the host's monotonic clock, which is comparable between processes of one host."""
+    """Time of each row on the host's monotonic clock, which processes of one host share [tick] s."""
     time: np.ndarray
-    """[tick] s, simulation time of the client."""
+    """Simulation time of the client in each row [tick] s."""
     displacement: np.ndarray
-    """[tick, 3] m, displacement of the bunch's centre from rest."""
+    """Displacement of the bunch's centre from rest [tick, 3] m."""
     force: np.ndarray
-    """[tick, 3] N, force on the bunch."""
+    """Force on the bunch [tick, 3] N."""
     is_remote: np.ndarray
-    """[tick] bool, whether another client owned the bunch and its states were applied."""
+    """Whether another client owned the bunch and that client's states were applied [tick] bool."""
 
     def save(self, path: pathlib.Path) -> None:
         """Write the rows as an .npz file."""

@@ -276,7 +276,7 @@ def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, 
 
 
 class Observer:
-    """A spectator without a simulation. Its presence makes actors publish what happens around it."""
+    """A spectator without a simulation. Its presence makes actors publish the motion of objects around it."""
 
     def __init__(self, bus: Bus, place: tuple[float, float], scene: str, digest: str, now: float) -> None:
         """Join at ``place`` [m] through this observer's own live bus; ``now``: time of this process's clock [s]."""

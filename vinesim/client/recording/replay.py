@@ -57,7 +57,7 @@ class Playhead:
         """Encoded hello of each actor. It is known before the time at which it was recorded, because the recorder had
         to query it."""
         self.records = RetainedState()
-        """The retained state."""
+        """Retained records of all objects at the present position in the recording."""
         for entry in reversed(recording.messages):
             if entry.key.startswith("hello/"):
                 self.greetings[sender_of(entry.key)] = entry.payload
@@ -70,7 +70,7 @@ class Playhead:
 
     @property
     def ended(self) -> bool:
-        """Whether the end was reached."""
+        """Whether the end of the recording was reached."""
         return self.time >= self.end
 
     def play(self, until: float) -> list[RecordedMessage]:
@@ -164,7 +164,7 @@ class ReplayBus:
 
     @property
     def ended(self) -> bool:
-        """Whether the end was reached."""
+        """Whether the end of the recording was reached."""
         return self._playhead.ended
 
     def play(self, dt: float) -> None:
@@ -331,7 +331,7 @@ class Replay:
 
     @property
     def ended(self) -> bool:
-        """Whether the end was reached."""
+        """Whether the end of the recording was reached."""
         return self.playhead.ended
 
     def step(self, now: float) -> None:

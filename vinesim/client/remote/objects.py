@@ -227,7 +227,7 @@ class ObjectSync:
             self._supported[record.parent].discard(number)
 
     def _is_moved_remotely(self, parent: str) -> bool:
-        """Whether a remote actor moves a parent frame directly or through the support of the frame."""
+        """Returns whether a remote actor moves a parent frame directly, or moves a body that supports the frame."""
         boxes, base = self._supports(parent)
         if any(box in self._remote_updates for box in boxes):
             return True

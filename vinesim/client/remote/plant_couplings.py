@@ -52,7 +52,7 @@ class PlantCouplings:
     def __init__(self, physics: Physics) -> None:
         self.physics = physics
         self.refused = 0
-        """Number of couplings that found no free tie, each counted once."""
+        """Number of refused couplings: those that found no free tie in the solver, each counted once."""
         self._ties: dict[tuple[str, int], _Tie] = {}
         self._refused: set[tuple[str, int]] = set()
 

@@ -98,7 +98,8 @@ class _Speaker:
     def __init__(self) -> None:
         self.waiting: collections.deque[tuple[Codec, bytes, bool]] = collections.deque(maxlen=MAX_WAITING)
         self.next_time: dict[bool, float] = {}
-        """[s] By kind of frame (main or extra): time at which the next frame begins if the voice continues."""
+        """Time at which the next frame begins if the voice continues [s], by kind of frame (True: main, False:
+        extra)."""
         self.number = 0
 
     def stamp(self, now: float, is_main: bool) -> float | None:
@@ -146,7 +147,7 @@ class SoundExchange:
         self._client = client
         self._listeners: list[tuple[str, Listener]] = []
         self._was_open = False
-        """Whether anything listened after the last step."""
+        """Whether any listener was open after the last step."""
         self._speakers: dict[str, _Speaker] = {}
         self._loudspeakers: dict[str, Loudspeaker] = {}
         self._voices: dict[str, Voice] = {}

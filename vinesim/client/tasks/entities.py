@@ -67,7 +67,7 @@ _SPAWNABLES = (
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class _Spawned:
-    """A spawned entity."""
+    """An entity that a request from ROS has added to the world."""
 
     kind: EntityCategory
     number: int
