@@ -89,7 +89,7 @@ def test_an_invalid_scene_is_refused_with_file_field_and_remedy(tmp_path):
         ("push", "--amplitude", "0.005", "amplitude is 0.005, but belongs to shake, not to push; leave it out"),
         ("pull-release", "--to", "4", "to_frequency is 4.0, but belongs to shake, not to pull-release; leave it out"),
         ("shake", "--displacement", "0.2", "displacement is 0.2, but belongs to pull-release or push, not to shake"),
-        ("shake", "--force-noise", "0.01", "force_noise is 0.01; nothing pulls at a shaken plant, leave it out"),
+        ("shake", "--force-noise", "0.01", "force_noise is 0.01, but a shaken plant is not pulled; leave it out"),
     ],
 )
 def test_an_option_of_another_kind_of_experiment_is_refused(kind, option, value, said, tmp_path):

@@ -53,8 +53,8 @@ def test_each_viewpoint_of_a_path_gives_the_picture_that_it_gives_alone(kind: st
         ("x,y,z\n1,2,3\n", "KeyError 'look_x'"),
         (HEADER + "1,2,three,4,5,6\n", "three"),
         (HEADER + "1,2\n", "columns x, y, z"),
-        (HEADER + "1,2,1.5,1,2,1.5\n", "viewpoint 0 looks at where the camera stands"),
-        (HEADER + "0,0.5,1,2,2,1\n1,2,-1.5,1,2,1.5\n", "viewpoint 1 lies in the ground"),
+        (HEADER + "1,2,1.5,1,2,1.5\n", "viewpoint 0 looks at the position of the camera"),
+        (HEADER + "0,0.5,1,2,2,1\n1,2,-1.5,1,2,1.5\n", "viewpoint 1 is below the ground"),
         (HEADER + "nan,2,1,1,2,1.5\n", "position [nan, 2.0, 1.0]"),
     ],
 )
@@ -113,7 +113,9 @@ def test_a_viewpoint_is_needed_and_only_once(tmp_path: pathlib.Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: pathlib.Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(WriteError, match=r"--out .* cannot be written: Not a directory; make room .* render again"):
+    with pytest.raises(
+        WriteError, match=r"--out .* cannot be written: Not a directory; free some space .* render again"
+    ):
         render(tmp_path / "file" / "out", at="0.4,1.2,1.3", look="3,1,1.7")
 
 

@@ -124,7 +124,7 @@ def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
         errors = run.communicate(timeout=deadline())[1]
     assert run.returncode == 5
     assert [line for line in errors.splitlines() if line.strip()] == [
-        "vinesim: a worker was killed by SIGKILL; what is done is kept, the same command goes on"
+        "vinesim: a worker was killed by SIGKILL; finished images are kept; run the same command to continue"
     ]
     last = programs.run(_command(scene, out, 1), timeout=deadline())
     assert last.returncode == 0, last.stderr

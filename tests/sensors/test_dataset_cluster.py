@@ -75,7 +75,7 @@ def test_dask_workers_make_the_same_files_though_one_is_killed(tmp_path, capsys)
 
 
 def test_misuse_of_a_scheduler_is_one_line(tmp_path) -> None:
-    with pytest.raises(UsageError, match="the workers are those of --scheduler; leave one out"):
+    with pytest.raises(UsageError, match="--scheduler has workers of its own; leave one of the options out"):
         run(**options(tmp_path, "set", workers=2, scheduler="tcp://127.0.0.1:8786"))
     pytest.importorskip("distributed", reason="Dask is an extra (dask)")
     with pytest.raises(UsageError, match=r"--scheduler is 'nowhere'.*give the address that dask scheduler prints"):

@@ -114,7 +114,7 @@ def test_shaking_tells_modulus_over_mass_and_the_fit_says_so() -> None:
         ({"to_frequency": 12.0}, "reaches 12 Hz, .* give a rate of 40 or more"),
         ({"amplitude": 0.0}, "amplitude is 0.0; give a finite number above 0"),
         ({"from_frequency": math.nan}, "from_frequency is nan"),
-        ({"force_noise": 0.01}, "nothing pulls at a shaken plant"),
+        ({"force_noise": 0.01}, "a shaken plant is not pulled"),
         ({"displacement": 0.1}, "displacement is 0.1, but belongs to pull-release or push, not to shake; leave it out"),
         ({"kind": "shakes"}, "there are: pull-release, push, shake"),
     ],

@@ -67,7 +67,9 @@ def run(
     if seed < 0:
         raise UsageError(f"--seed is {seed}: give 0 or more")
     if scheduler is not None and workers is not None:
-        raise UsageError(f"--workers is {workers}, but the workers are those of --scheduler; leave one out")
+        raise UsageError(
+            f"--workers is {workers}, but --scheduler has workers of its own; leave one of the options out"
+        )
     if not 0.0 <= actors <= 1.0:
         raise UsageError(f"--actors is {actors:g}: give a share of the images, 0 to 1")
     find_device(device)
@@ -104,7 +106,7 @@ def run(
     except KeyboardInterrupt:
         _stop_workers(running, out)
         done = images - len(dataset.missing_images(out, images))
-        print(f"stopped with {done} of {images} images in {out}; the same command goes on")
+        print(f"stopped with {done} of {images} images in {out}; run the same command to continue")
         return 130
     finally:
         _stop_workers(running, out)
@@ -211,7 +213,8 @@ def _wait_for(workers: list[Worker], advance: Callable[[], None]) -> None:
                 process.join()
                 if process.exitcode:
                     raise WorkerDied(
-                        f"a worker {_how_it_ended(process.exitcode)}; what is done is kept, the same command goes on"
+                        f"a worker {_how_it_ended(process.exitcode)}; finished images are kept; run the same "
+                        "command to continue"
                     ) from None
                 continue
             if isinstance(message, Exception):

@@ -39,7 +39,9 @@ def run(
         raise UsageError(f"--only {','.join(map(str, unknown))}: give some of {','.join(CHOICES)}")
     stands = observer_grid(area) if area is not None else []
     about = {"world": world, "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")}
-    about["asked"] = "what is sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)
+    about["asked"] = (
+        "only messages that are sent anyway" if area is None else "area " + " ".join(f"{edge:g}" for edge in area)
+    )
     about |= _vineyard(scene, seed)
 
     stop = stop_at_signals(threading.Event())
@@ -80,7 +82,7 @@ def _vineyard(scene: str | None, seed: int | None) -> dict[str, str]:
     """Returns scene name, seed and digest of the only vineyard that may be recorded, from a scene file."""
     if scene is None:
         if seed is not None:
-            raise UsageError(f"--seed {seed}: a seed is of a scene, give --scene too")
+            raise UsageError(f"--seed {seed} without a scene: give --scene as well")
         return {}
     from vinesim.scene.generation.vineyard import generate
     from vinesim.scene.spec import load_scene, with_seed
@@ -95,7 +97,7 @@ def _progress(recorder: Recorder, elapsed: float, alone: bool) -> None:
         return
     trouble = recorder.bus.status_message
     company = ", ".join(sorted(recorder.actors)) or "no actors"
-    hint = "  (with fewer than two actors nothing is sent; --area asks for it)" if alone else ""
+    hint = "  (with fewer than two actors nothing is sent; --area requests messages)" if alone else ""
     line = f"{elapsed:7.1f} s  {recorder.recording.count} messages  {recorder.recording.size / 1e6:.2f} MB  {company}"
     width = os.get_terminal_size(sys.stderr.fileno()).columns - 1
     print(f"\r{(trouble or line + hint)[:width]:<{width}}", end="", file=sys.stderr, flush=True)

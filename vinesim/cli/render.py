@@ -41,9 +41,9 @@ class Viewpoint:
             if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > 1e4:
                 raise UsageError(f"{self.place} has the {name} {point.tolist()}; give x, y, z in metres")
         if np.linalg.norm(self.target - self.eye) < 1e-6:
-            raise UsageError(f"{self.place} looks at where the camera stands; look at another point")
+            raise UsageError(f"{self.place} looks at the position of the camera; give another point")
         if self.eye[2] <= 0.0:
-            raise UsageError(f"{self.place} lies in the ground; give a height above 0")
+            raise UsageError(f"{self.place} is below the ground; give a height above 0")
 
 
 def run(
@@ -120,8 +120,8 @@ def run(
             written[-1].result()
     except OSError as bad:
         raise WriteError(
-            f"--out {out} cannot be written: {bad.strerror or bad}; make room there or give another folder, and render "
-            "again"
+            f"--out {out} cannot be written: {bad.strerror or bad}; free some space or give another folder, and "
+            "render again"
         ) from None
     return 0
 
@@ -223,7 +223,7 @@ def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:
     inside = enclosing_primitive(primitives, viewpoint.eye)
     if inside >= 0:
         organ, index = unlabel(int(primitives.label[inside]))
-        raise UsageError(f"{viewpoint.place} lies inside {organ.name.lower()} {index}; move the camera out of it")
+        raise UsageError(f"{viewpoint.place} is inside {organ.name.lower()} {index}; move the camera out of it")
 
 
 def _viewpoints(at: str | None, look: str | None, path: pathlib.Path | None) -> list[Viewpoint]:

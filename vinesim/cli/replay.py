@@ -51,8 +51,8 @@ def run(
     """Play a recording. Returns 0 when its end is reached, or after Ctrl-C."""
     if sum(way is not None for way in (connect, listen, out, page)) + ros != 1:
         raise UsageError(
-            "give one of --connect (play to a server), --listen (be one), --page (look at it in a browser), --out (as "
-            "pictures) and --ros (publish topics)"
+            "give one of --connect (play to a server), --listen (act as a server), --page (show it in a browser), "
+            "--out (pictures) and --ros (topics)"
         )
     if listen is not None:
         check_exposure([listen], insecure=insecure)
@@ -245,7 +245,7 @@ def _vineyard(tape: Recording, scene: str | None, seed: int | None) -> tuple[Sce
     from vinesim.scene.spec import SceneError, load_scene, with_seed
 
     if scene is None and "scene" not in tape.metadata:
-        raise UsageError(f"{tape.path} does not say which scene it is of: give --scene")
+        raise UsageError(f"{tape.path} does not contain the name of its scene: give --scene")
     if seed is None and "seed" in tape.metadata:
         seed = int(tape.metadata["seed"])
     try:

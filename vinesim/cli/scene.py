@@ -32,7 +32,7 @@ def write_imported_plant(file: pathlib.Path, out: pathlib.Path | None, **options
     print(f"read     {plant.source}: {len(plant.nodes)} points, {len(plant.bunches)} bunches")
     print(
         f"moves    {counts['tree']} trees of {counts['body']} bodies, {model.body_mass.sum():.3g} kg; "
-        f"{counts['fixed']} pieces of wood thicker than {1e3 * plant.wood.old_wood.value:.4g} mm stand still"
+        f"{counts['fixed']} pieces of wood thicker than {1e3 * plant.wood.old_wood.value:.4g} mm are rigid"
     )
     for note in plant.notes:
         print(f"note     {note}")

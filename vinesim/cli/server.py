@@ -41,7 +41,7 @@ def run(
     if spectators_speak_to not in tuple(SpectatorsSpeakTo):
         raise UsageError(f"--spectators-speak-to {spectators_speak_to!r}: give nobody, people or all")
     if min(quota) <= 0.0:
-        raise UsageError(f"--quota {quota[0]:g} {quota[1]:g}: both must be above zero, or nothing is ever kept")
+        raise UsageError(f"--quota {quota[0]:g} {quota[1]:g}: give values above zero")
     if seed is not None and scene is None:
         raise UsageError(f"--seed {seed} without a scene: give --scene as well")
     places = listen or default_listen(secured=tls is not None, insecure=insecure)

@@ -121,7 +121,7 @@ def _read_marker(text: str) -> tuple[str, tuple[int, int, int]]:
         raise UsageError(f"--marker is {text!r}; give its colour in a picture as R,G,B of 0 to 255, e.g. 224,60,130")
     red, green, blue = (int(part) for part in parts)
     if max(red, green, blue) - min(red, green, blue) < LEAST_CHROMA * max(red, green, blue):
-        raise UsageError(f"--marker is {text!r}, nearly grey; take a marker of a colour that nothing else has")
+        raise UsageError(f"--marker is {text!r}, nearly grey; use a marker with a colour that nothing else has")
     return name.strip() or "tip", (red, green, blue)
 
 

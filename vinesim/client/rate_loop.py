@@ -172,7 +172,7 @@ class RateLoop:
         """Real time until the next step may begin [s]."""
         lead = self.next_time - self.clock.time(now)
         if not -self.MAX_SKIP <= lead <= self.MAX_LEAD:
-            log.info("another clock: its time is %+.1f s away", -lead)
+            log.info("the loop follows another clock, whose time differs by %+.1f s", -lead)
             self.next_time -= lead
             lead = 0.0
         if self.ticks == 0:

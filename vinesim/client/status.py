@@ -129,29 +129,29 @@ def network_trouble(client: Client) -> str:
     return next((text for one in client.replicators.values() if (text := one.bus.status_message)), "")
 
 
-# Faults of a client are counted whenever something was stopped, left out or refused, so that none stays unnoticed.
+# A client counts everything that was stopped, left out or refused as a fault, so that no fault remains unnoticed.
 
 
 log = logging.getLogger(__name__)
 
 DESCRIPTIONS = {
-    "trees_stopped": "trees moved too fast, or by a number that is not finite, and were put to rest",
-    "trees_slowed": "trees turned faster than max_joint_rate and were slowed below it, which takes energy from them",
-    "robots_stopped": "robots or boxes moved by a number that is not finite, or too fast, and were put back",
-    "contacts_dropped": "contacts were left out, as there were more than there is room for",
-    "geoms_skipped": "static geoms near a tree were left out, as there are more than max_static_geoms_per_tree",
-    "grasps_refused": "hands closed on plants in vain, as too many bodies of plants were held",
-    "couplings_refused": "forces of other actors on plants were refused, as too many bodies of plants were held",
-    "messages_refused": "messages of other actors were refused, as they were malformed or cannot be true",
-    "messages_lost": "messages of other actors were lost here, as they were too many to be read, or too large",
-    "messages_foreign": "messages were dropped, as their session does not hold the name that they came under",
-    "network_failures": "messages could not be sent, as the network refused them or too many waited already",
-    "wrenches_refused": "wrenches of other actors were refused, as their hands are elsewhere",
-    "meshes_refused": "meshes of other clients were refused, as they were corrupt or too many: they stay boxes",
-    "meshes_not_taken": "meshes of robots here were not taken by the server: others see boxes in their place",
-    "commands_refused": "commands from ROS were refused, as they contradict themselves or what the robot has",
-    "page_messages_refused": "messages of pages were refused, as they were malformed or cannot be true",
-    "steps_skipped": "steps were skipped after the process had stood still",
+    "trees_stopped": "trees moved too fast, or their state was not finite; they were reset to rest",
+    "trees_slowed": "joints of trees turned faster than max_joint_rate and were slowed down, which removes energy",
+    "robots_stopped": "robots or boxes moved too fast, or their state was not finite; they were put back",
+    "contacts_dropped": "contacts were left out, because there were more than the capacity",
+    "geoms_skipped": "static geoms near a tree were left out, because there are more than max_static_geoms_per_tree",
+    "grasps_refused": "hands could not grasp plants, because too many bodies of plants were held already",
+    "couplings_refused": "forces of other actors on plants were refused, because too many bodies were held already",
+    "messages_refused": "messages of other actors were refused, because they were malformed or impossible",
+    "messages_lost": "messages of other actors were lost on this client, because they were too many or too large",
+    "messages_foreign": "messages were dropped, because their session does not own the name that they were sent under",
+    "network_failures": "messages could not be sent, because the network refused them or too many waited already",
+    "wrenches_refused": "wrenches of other actors were refused, because their hands are elsewhere",
+    "meshes_refused": "meshes of other clients were refused, because they were corrupt or too many; boxes replace them",
+    "meshes_not_taken": "meshes of this client's robots were refused by the server; other clients show boxes instead",
+    "commands_refused": "commands from ROS were refused, because they were contradictory or did not fit the robot",
+    "page_messages_refused": "messages of pages were refused, because they were malformed or impossible",
+    "steps_skipped": "steps were skipped after a stall of the process",
 }
 """Description of each kind of fault, for people."""
 

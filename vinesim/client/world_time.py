@@ -51,7 +51,7 @@ class WorldTime:
             self.is_shared = True
             self.offset += away
         elif away < -MAX_LEAD:
-            log.warning("the server's clock is %.1f s behind what it was: time goes back", -away)
+            log.warning("the server's clock was set back by %.1f s: time goes back", -away)
             self.offset += away
         else:
             change = min(max(GAIN * away, -MAX_RATE * self._dt), MAX_RATE * self._dt)

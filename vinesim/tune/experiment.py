@@ -86,11 +86,11 @@ class Experiment:
             fastest = max(self.number("from_frequency"), self.number("to_frequency"))
             if fastest > MAX_SHARE * self.rate:
                 raise UsageError(
-                    f"the sweep reaches {fastest:g} Hz, of which {self.rate:g} pictures a second see too little; give "
+                    f"the sweep reaches {fastest:g} Hz, for which {self.rate:g} pictures a second are too few; give "
                     f"a rate of {fastest / MAX_SHARE:g} or more, or lower frequencies"
                 )
             if self.force_noise is not None:
-                raise UsageError(f"force_noise is {self.force_noise}; nothing pulls at a shaken plant, leave it out")
+                raise UsageError(f"force_noise is {self.force_noise}, but a shaken plant is not pulled; leave it out")
         for name in ("hold", "noise", "force_noise"):
             value = getattr(self, name)
             if value is not None and not 0.0 <= value < math.inf:
@@ -167,7 +167,7 @@ def pull_for(candidates: Candidates, displacement: float, angle: float) -> np.nd
             return size * way
         size *= min(max(displacement / max(reached, 1e-9), 0.1), 10.0)
     reach = specimen.length.value
-    raise UsageError(f"displacement is {displacement} m; no pull does that to a plant of {reach} m, give less")
+    raise UsageError(f"displacement is {displacement} m; a plant of {reach} m cannot be pulled that far; give less")
 
 
 def expected_deviations(

@@ -143,7 +143,7 @@ class Fit:
             f"{f.frequency:.3f} Hz, {f.damping_ratio:.4f} (log decrement {f.log_decrement:.3f})"
         )
         lines.append(
-            f"noise    {self._noise_words()}; {self.outliers} outliers weigh less, {self.gaps} positions missing"
+            f"noise    {self._noise_words()}; {self.outliers} outliers have less weight, {self.gaps} positions missing"
         )
         for ridge in self.posterior.ridges:
             way = ", ".join(f"{name} {x:+.2f}" for name, x in ridge.direction.items())
@@ -168,10 +168,13 @@ class Fit:
 
     def _remedy(self, direction: dict[str, float]) -> str:
         if "modulus" in direction and "mass" in direction and self.track.base is not None:
-            return "shaking tells modulus over mass only; fix the mass, or measure a pull and its force"
+            return "shaking determines only the ratio of modulus to mass; fix the mass, or measure a pull and its force"
         if "modulus" in direction and "mass" in direction and self.force is None:
-            return "a free swing tells modulus over mass only; fix the mass, or add a column 'force [N]' of the pull"
-        return "what is given there is the prior; fix one of them, or measure it otherwise"
+            return (
+                "a free swing determines only the ratio of modulus to mass; fix the mass, or add a column 'force [N]' "
+                "of the pull"
+            )
+        return "the value is mostly the prior's; fix one of the numbers, or measure it otherwise"
 
     def as_json(self) -> dict[str, Any]:
         """Returns the fit as plain values for JSON."""

@@ -66,7 +66,7 @@ class Trajectory:
         elif self.base is not None and not np.isfinite(self.base).all():
             trouble = "the motion of the base has gaps; give it at every sample"
         elif self.base is not None and self.force is not None:
-            trouble = "it has a pull at the tip and a motion of the base; remove the columns of one"
+            trouble = "the track has both a pull at the tip and a motion of the base; remove the columns of one"
         elif not self.tracked.any():
             trouble = "no axis of a marker was tracked; give a column such as 'x [mm]'"
         if trouble:

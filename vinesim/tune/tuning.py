@@ -69,7 +69,9 @@ def tune(
     """
     fitted = _columns(parameters)
     if specimen.axis and "rest" in parameters:
-        raise UsageError("'rest' cannot be fitted beside specimen.axis, which tells the shape; leave out one of them")
+        raise UsageError(
+            "'rest' cannot be fitted together with specimen.axis, which defines the shape; leave out one of them"
+        )
     if track.base is not None and (pushed or release is not None):
         what = "push" if pushed else "release"
         raise UsageError(f"{track.source}: its base is shaken, so there is no {what}; leave out --{what}")
@@ -130,7 +132,7 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
     if duration * features.frequency < 1.0 and not shaken:
         raise TrajectoryError(
             f"{track.source}: {duration:.2g} s after the release at {features.release:.2f} s are less than one period "
-            f"of {1.0 / features.frequency:.2g} s; track longer, or say when it was let go (--release)"
+            f"of {1.0 / features.frequency:.2g} s; track longer, or give the time of the release (--release)"
         )
     reach = float(np.nanmax(np.abs(features.displacement)))
     length = specimen.length.value + 0.3 * (specimen.organ == "bunch")
@@ -230,17 +232,18 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
     curve = "sinusoid" if problem.shaking is None else "oscillator"
     if noise > UNEXPLAINED * features.noise:
         faults.append(
-            f"the fit leaves {1e3 * noise:.3g} mm, a damped {curve} only {1e3 * features.noise:.3g} mm: another "
-            "minimum, or a plant that the specimen does not describe (length, diameters, direction, tip mass)"
+            f"the residuals of the fit are {1e3 * noise:.3g} mm, those of a damped {curve} "
+            f"only {1e3 * features.noise:.3g} mm: another minimum, or a plant that the specimen "
+            "does not describe (length, diameters, direction, tip mass)"
         )
     if posterior.correlation_time > 4.0:
         faults.append(
-            f"neighbouring residuals are alike over {posterior.correlation_time:.1f} samples: the model misses some of "
-            "the motion (a second plane or mode, a slipping clamp, wind)"
+            f"neighbouring residuals are correlated over {posterior.correlation_time:.1f} samples: the model misses "
+            "some of the motion (a second plane or mode, a slipping clamp, wind)"
         )
     for name, (low, high) in {"modulus": (-3.7, 3.7), "damping": (-5.0, 5.0)}.items():
         if name in problem.names and not low < posterior.mean[problem.names.index(name)] < high:
-            faults.append(f"{name} went {math.exp(posterior.mean[problem.names.index(name)]):.3g} times off its start")
+            faults.append(f"{name} is {math.exp(posterior.mean[problem.names.index(name)]):.3g} times its start value")
     assert set(problem.fitted) <= set(COLUMNS)
     return tuple(faults)
 
@@ -265,7 +268,7 @@ def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> l
         prior = problem.priors[at]
         if abs(theta[at] - prior.mean) > CONTRADICTS * prior.deviation:
             faults.append(
-                f"the mass is {math.exp(theta[at]):.3g} times that of the specimen, beyond what wood is: check unit "
+                f"the mass is {math.exp(theta[at]):.3g} times that of the specimen, which wood cannot have: check unit "
                 "and zero of the force, and the diameters"
             )
     return faults

@@ -281,7 +281,7 @@ class PageServer:
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 if self.refused == 0:
-                    log.warning("a page sent what is no message of a page: refused (further ones are only counted)")
+                    log.warning("a page sent an invalid message, which was refused (further ones are only counted)")
                 self.refused += 1
                 continue
             while flight and flight[0] <= said.drawn:

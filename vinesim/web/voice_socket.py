@@ -121,7 +121,9 @@ class VoiceSocket:
                 if credit < 1.0 or not self._take(page, message.type, message.data):
                     self.refused += 1
                     if self.refused == 1:
-                        log.warning("a page sent what is no sound, or too much: dropped; more is only counted")
+                        log.warning(
+                            "a page sent invalid sound, or too much; it was dropped (further sound is only counted)"
+                        )
                     continue
                 credit -= 1.0
         except (ConnectionError, asyncio.CancelledError):

@@ -49,5 +49,5 @@ def run(as_json: bool, checks: Sequence[Callable[[], Finding]] = CHECKS) -> int:
     for each in findings:
         print(each.line)
     counts = ", ".join(f"{sum(each.state == state for each in findings)} {state}" for state in (OK, WARNING, ERROR))
-    print(f"{counts}: " + ("a client can run here" if is_ready else "mend the errors first"))
+    print(f"{counts}: " + ("a client can run here" if is_ready else "fix the errors first"))
     return int(not is_ready)

@@ -49,7 +49,7 @@ def cpu(description: pathlib.Path = pathlib.Path("/proc/cpuinfo"), cgroup: pathl
             "cpu",
             WARNING,
             found,
-            f"a client with cameras needs {CORES}: else fewer steps and pictures a second",
+            f"a client with cameras needs {CORES}; otherwise there are fewer steps and pictures a second",
         )
     if platform.machine() in ("x86_64", "AMD64") and flags and "avx2" not in flags:
         return Finding("cpu", WARNING, found, "without avx2 plants and pictures take several times as long")
@@ -92,7 +92,7 @@ def gpu(driver: pathlib.Path = pathlib.Path("/proc/driver/nvidia/version")) -> F
                 "an NVIDIA driver is installed, but Warp finds no GPU",
                 "see 'nvidia-smi'; a container needs '--gpus all'; an old driver needs an update",
             )
-        return Finding("gpu", OK, "none of NVIDIA; everything runs on the CPU")
+        return Finding("gpu", OK, "no NVIDIA GPU; everything runs on the CPU")
     names = [f"cuda:{number}" for number in range(count)]
     faults = {name: fault for name in names if (fault := device_fault(name))}
     if faults:
@@ -161,14 +161,14 @@ def datagrams(proc: pathlib.Path = NETWORK) -> Finding:
         )
         buffer = int((proc / "sys/net/core/rmem_default").read_text())
     except (OSError, ValueError):
-        return Finding("datagrams", OK, f"what is dropped cannot be told on this {platform.system()}")
+        return Finding("datagrams", OK, f"dropped datagrams are not counted on this {platform.system()}")
     counts = dict(zip(names, map(int, values), strict=True))
     dropped = counts.get("RcvbufErrors", 0)
     arrived = counts.get("InDatagrams", 0)
     found = f"{dropped} of {dropped + arrived} dropped since boot; buffers of {buffer / 1e3:.0f} kB"
     if dropped <= MOST_DROPPED * (dropped + arrived):
         return Finding("datagrams", OK, found)
-    remedy = "programs here read too slowly: run fewer, or give subscribers deeper queues"
+    remedy = "programs on this machine read too slowly: run fewer of them, or give subscribers deeper queues"
     if buffer < ADVISED_BUFFER:
         remedy += f", and sockets larger buffers: sysctl -w net.core.rmem_default={ADVISED_BUFFER}, as root"
     return Finding("datagrams", WARNING, found, remedy)
@@ -182,7 +182,7 @@ def clock() -> Finding:
         return Finding("clock", WARNING, found, "steps of 10 ms cannot be paced; choose another clock source")
     status = _clock_status()
     if status is None:
-        return Finding("clock", OK, f"{found}; whether NTP runs cannot be told here")
+        return Finding("clock", OK, f"{found}; whether NTP runs is not known on this system")
     if status & _UNSYNCHRONISED:
         return Finding(
             "clock",

@@ -38,7 +38,7 @@ def python(version: tuple[int, ...] = sys.version_info[:3]) -> Finding:
         wanted = importlib.metadata.metadata("vinesim")["Requires-Python"]
     except (importlib.metadata.PackageNotFoundError, ImportError):
         return Finding(
-            "python", ERROR, f"{found}; the package vinesim is not installed, only found", "pip install --editable ."
+            "python", ERROR, f"{found}; the package vinesim is found, but not installed", "pip install --editable ."
         )
     if ".".join(map(str, version)) not in SpecifierSet(wanted):
         return Finding("python", ERROR, found, f"vinesim needs {wanted}: make a venv with another Python")
@@ -159,7 +159,7 @@ def caches() -> Finding:
                 "caches",
                 WARNING,
                 f"{folder}: {fault}",
-                f"set {variable} to a folder that can be written; every start computes anew until then",
+                f"set {variable} to a writable folder; until then every start computes everything again",
             )
     return Finding("caches", OK, found)
 

@@ -162,7 +162,7 @@ def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
         shift.plot(t, 1e3 * np.linalg.norm(rows.displacement, axis=1), style, label=name, linewidth=1.4)
         followed = t[rows.is_remote]
         if len(followed):
-            near = f"{name} is near: it is sent the bunch"
+            near = f"{name} is near and receives the bunch's states"
             for axes in (force, shift):
                 axes.axvspan(followed[0], followed[-1], color="0.94", zorder=0, label=near)
     force.set_ylabel("contact force [N]")

@@ -265,8 +265,8 @@ def observer_grid(area: tuple[float, float, float, float]) -> list[tuple[float, 
     rows = math.ceil((y1 - y0) / OBSERVER_SPACING)
     if columns * rows > MAX_OBSERVERS:
         raise AreaTooLarge(
-            f"an area of {x1 - x0:g} x {y1 - y0:g} m needs {columns * rows} who stand in it, at most {MAX_OBSERVERS}: "
-            f"give a smaller one, e.g. {4 * OBSERVER_SPACING:g} x {4 * OBSERVER_SPACING:g} m"
+            f"an area of {x1 - x0:g} x {y1 - y0:g} m needs {columns * rows} observers, at most {MAX_OBSERVERS} are "
+            f"possible: give a smaller one, e.g. {4 * OBSERVER_SPACING:g} x {4 * OBSERVER_SPACING:g} m"
         )
     return [
         (x0 + (column + 0.5) * (x1 - x0) / columns, y0 + (row + 0.5) * (y1 - y0) / rows)

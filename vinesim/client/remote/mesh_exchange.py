@@ -171,7 +171,7 @@ class MeshExchange:
                 try:
                     payload = triangles.encode_triangles(read_triangles(mesh.file))
                 except Exception as error:  # each mesh format raises its own errors
-                    log.warning("mesh %s cannot be offered to others any more: %s", mesh.file, error)
+                    log.warning("mesh %s can no longer be offered to other clients: %s", mesh.file, error)
                     self.refused_offers += 1
                     continue
                 while not wanted.refused and wanted.offset < len(payload) and not self._closing.is_set():
@@ -181,7 +181,7 @@ class MeshExchange:
                         return False
             if wanted.refused:
                 self.refused_offers += 1
-                log.warning("others see a box for %s, which the server does not take: %s", mesh.file, wanted.refused)
+                log.warning("the server refused %s, so other clients show a box: %s", mesh.file, wanted.refused)
         return True
 
     def _fetch_all(self) -> None:
@@ -225,7 +225,7 @@ class MeshExchange:
                 return False
             except (MessageError, triangles.TrianglesError) as error:
                 self._refused.add(digest)
-                log.warning("a mesh of another client cannot be used, a box stays in its place: %s", error)
+                log.warning("a mesh of another client cannot be used, a box replaces it: %s", error)
         with self._lock:
             robot.missing.discard(digest)
             if known is None or held + known.nbytes > MAX_HELD_BYTES:

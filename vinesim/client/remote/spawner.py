@@ -166,7 +166,7 @@ class RemoteSpawner:
         self._renewing = None
         prepared = done.result()
         for hello, error in prepared.refused:
-            log.warning("the meshes of %s cannot be used, boxes stay in their place: %s", hello.name, error)
+            log.warning("the meshes of %s cannot be used, boxes replace them: %s", hello.name, error)
             self.meshes.refuse(hello.name)
         is_current = all(self._spawned.get(hello.name) is hello for hello, _ in prepared.actors)
         if prepared.world is None or not is_current or not self.rigid.adopt(prepared.world):

@@ -151,7 +151,7 @@ class WorldEditor:
             raise RequestRefused(Refusal.NO_RESOURCE, f"no uri; give {_BOX_URI}, {_PERSON_URI} or {_BUNCH_URI}")
         scheme, _, number = given.uri.partition("/")
         if scheme not in {one.uri for one in _SPAWNABLES} or (number and scheme != _BUNCH_URI):
-            raise RequestRefused(Refusal.UNSUPPORTED_FORMAT, f"uri {given.uri!r}; get_spawnables lists those there are")
+            raise RequestRefused(Refusal.UNSUPPORTED_FORMAT, f"unknown uri {given.uri!r}; get_spawnables lists all")
         pose = _checked_pose(given.pose)
         bunch = self._bunch_to_spawn(number) if scheme == _BUNCH_URI else -1
         name = self._free_name(given, scheme.removeprefix("vinesim:"))
@@ -197,7 +197,9 @@ class WorldEditor:
             client.robots[given.name].stop()
         elif entity.category is EntityCategory.HUMAN:
             if given.name not in self._spawned:
-                raise RequestRefused(Refusal.UNSUPPORTED, f"person {given.name!r} is moved by the client that has it")
+                raise RequestRefused(
+                    Refusal.UNSUPPORTED, f"person {given.name!r} belongs to another client, which moves it"
+                )
             self._stand(given.name, _upright(pose))
         else:
             velocity = np.zeros(6) if given.velocity is None else np.nan_to_num(given.velocity, posinf=0.0, neginf=0.0)
@@ -218,7 +220,7 @@ class WorldEditor:
             return
         if script := self._client.script:
             raise RequestRefused(
-                Refusal.INCORRECT_STATE, f"what {script} has begun cannot begin anew; start without it"
+                Refusal.INCORRECT_STATE, f"the task of {script} cannot be started again; start the client without it"
             )
         spawned = self._spawned
         self._spawned = {}
@@ -317,7 +319,7 @@ def _is_free_form(name: str) -> bool:
 def _checked_pose(pose: np.ndarray | None) -> np.ndarray:
     """Returns a pose [7] with a unit quaternion. Raises :class:`RequestRefused` if ``pose`` is not a pose."""
     if pose is None:
-        raise RequestRefused(Refusal.INVALID_POSE, "the pose is not in the frame map, the only one that is known")
+        raise RequestRefused(Refusal.INVALID_POSE, "the pose is not in the frame map, which is the only known frame")
     if not np.isfinite(pose).all() or np.abs(pose[:3]).max() > MAX_DISTANCE:
         raise RequestRefused(Refusal.INVALID_POSE, f"position {pose[:3].tolist()} m; give three numbers up to 10 km")
     if abs(float(np.linalg.norm(pose[3:])) - 1.0) > 1e-3:
