@@ -13,7 +13,7 @@ from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.jacobians import write_rows
-from vinesim.kernels.contact.row_solver import solve_rows
+from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
@@ -298,7 +298,7 @@ def solve_small_trees(
 ):
     """``lanes`` threads of a GPU per tree, in full warps. Solve for the tree's impulses.
 
-    Trees with more rows are skipped; see :func:`vinesim.kernels.contact.row_solver.solve_rows`.
+    Trees with more rows are skipped; see :func:`vinesim.kernels.contact.row_solver.row_solver`.
     """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
@@ -307,7 +307,7 @@ def solve_small_trees(
         count = tree_contacts_out.count[tree]
     system = view_system(system_out, tree, trees, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-    sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
+    sweeps = solve_few_rows(lane, count, max_sweeps, newton_end, tolerance, system)
     if lane == 0 and count > 0 and sweeps >= 0:
         tree_contacts_out.sweeps[tree] = sweeps
 
@@ -346,7 +346,7 @@ def solve_busy_trees(
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
         sweeps = int(-1)
         if lanes > 1:
-            sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
+            sweeps = solve_many_rows(lane, count, max_sweeps, newton_end, tolerance, system)
         if sweeps < 0:
             sweeps = tree_contacts_out.sweeps[tree]
             copy_system(lane, lanes, 3 * count, system, dense)
