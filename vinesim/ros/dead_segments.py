@@ -1,9 +1,10 @@
-"""Removes shared memory of Fast DDS whose process was killed. Otherwise 24 MiB of each sensor process stay until boot.
+"""Removes shared-memory segments of Fast DDS whose process was killed. Otherwise 24 MiB of each killed sensor process
+would stay until the machine restarts.
 
-Fast DDS keeps a lock (flock) on ``NAME_el`` while the owner of segment ``NAME`` lives; its own ``fastdds shm clean``
-goes by the same lock. Readers that still have a removed segment mapped keep it until they unmap it.
+Fast DDS keeps a lock (flock) on the file ``NAME_el`` while the owner of segment ``NAME`` lives. Its own tool ``fastdds
+shm clean`` tests the same lock. A reader that has a removed segment mapped can use the segment until it unmaps it.
 
-The port files of Fast DDS are left: they take 52 KB each, and the next node with that number uses them again.
+Port files of Fast DDS are not removed: they take 52 KB each, and the next participant with that port uses them again.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ log = logging.getLogger(__name__)
 
 FOLDER = pathlib.Path("/dev/shm")
 SMALLEST = 4 << 20
-"""The smallest segment of vinesim's profiles [B]. Smaller ones, such as the 0.5 MiB of Fast DDS itself, are left."""
+"""Size of the smallest segment that is removed [B]: the smallest one of vinesim's profiles. Fast DDS's own default is
+0.5 MiB."""
 YOUNGEST = 60.0
-"""A segment younger than this may belong to a process that is about to lock it [s]."""
+"""Age below which a segment is not removed [s], because it may belong to a process that is about to lock it."""
 
 
 def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
-    """Large segments of this user whose owner is dead, each with its lock file. The file stays locked until the next
-    segment is taken."""
+    """Yield each large segment of this user whose owner is dead, with its lock file. The lock file stays locked until
+    the iterator goes on."""
     try:
         import fcntl
     except ImportError:
@@ -44,8 +46,8 @@ def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path,
 
 
 def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
-    """Remove large segments of this user whose owner is dead. Returns their number. The log has their number and
-    size."""
+    """Remove the large segments of this user whose owner is dead, and log their number and size. Returns their number.
+    """
     removed = size = 0
     for path, lock in dead_segments(folder):
         with contextlib.suppress(OSError):  # another process removes them as well
