@@ -20,15 +20,15 @@ log = logging.getLogger(__name__)
 
 FOLDER = pathlib.Path("/dev/shm")
 SMALLEST = 4 << 20
-"""Size of the smallest segment that is removed [B]: the smallest one of vinesim's profiles. Fast DDS's own default is
-0.5 MiB."""
+"""Size of the smallest segment that is removed [B]. Segments of vinesim's profiles are larger, those of Fast DDS's
+own default (0.5 MiB) are smaller."""
 YOUNGEST = 60.0
 """Age below which a segment is not removed [s], because it may belong to a process that is about to lock it."""
 
 
 def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
-    """Yield each large segment of this user whose owner is dead, with its lock file. The lock file stays locked until
-    the iterator goes on."""
+    """Yield each large segment of this user whose owner is dead, with its lock file. The lock file stays locked
+    until the iterator goes on."""
     try:
         import fcntl
     except ImportError:
@@ -46,8 +46,8 @@ def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path,
 
 
 def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
-    """Remove the large segments of this user whose owner is dead, and log their number and size. Returns their number.
-    """
+    """Remove the large segments of this user whose owner is dead, and log their number and size. Returns their
+    number."""
     removed = size = 0
     for path, lock in dead_segments(folder):
         with contextlib.suppress(OSError):  # another process removes them as well

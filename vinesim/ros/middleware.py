@@ -60,9 +60,9 @@ def unavailable_reason() -> str | None:
 
 
 def profile_file(*, large_messages: bool, local: bool) -> pathlib.Path:
-    """Returns the Fast DDS profile for a process. ``large_messages``: whether the profile has a shared-memory segment
-    into which large messages fit; otherwise it uses UDP only, which never waits for stopped subscribers. ``local``:
-    whether all peers are on this machine."""
+    """Returns the Fast DDS profile for a process. ``large_messages``: whether the profile has a shared-memory
+    segment into which large messages fit; otherwise it uses UDP only, which never waits for stopped subscribers.
+    ``local``: whether all peers are on this machine."""
     return FOLDER / f"{'shared_memory' if large_messages else 'udp'}{'_loopback' if local else ''}.xml"
 
 
@@ -120,8 +120,8 @@ def discovers_this_machine_only() -> bool:
 
 
 def clear_profile() -> None:
-    """Remove vinesim's own Fast DDS profile from the environment, so that this process runs like any other ROS program.
-    """
+    """Remove vinesim's own Fast DDS profile from the environment, so that this process runs like any other ROS
+    program."""
     profile = os.environ.get(PROFILE_VARIABLE, "")
     if profile in OWN_PROFILES:
         del os.environ[PROFILE_VARIABLE]

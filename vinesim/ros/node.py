@@ -54,8 +54,8 @@ class Node:
     ) -> None:
         """``topics``: topic names given by the user, which are checked before anything starts. ``params_file``: YAML
         file with values of parameters, as for ``--params-file`` of ROS 2. ``parameters``: values that were set in an
-        earlier run of the node, by name of the parameter. ``beside``: a node whose ROS context this one shares and that
-        is closed later than this one; a context of its own takes 8 MB and seven threads."""
+        earlier run of the node, by name of the parameter. ``beside``: a node whose ROS context this one shares and
+        that is closed later than this one; a context of its own takes 8 MB and seven threads."""
         try:
             validate_node_name(name)
             validate_namespace(f"/{namespace}" if namespace else "/")
@@ -105,8 +105,8 @@ class Node:
         """Create the publishers and subscriptions of a subclass."""
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
-        """Returns the threads that a subclass needs besides the receiving one. They must end once ``_closing`` is set
-        and :meth:`_wake` was called."""
+        """Returns the threads that a subclass needs besides the receiving one. They must end once ``_closing`` is
+        set and :meth:`_wake` was called."""
         return []
 
     def _wake(self) -> None:

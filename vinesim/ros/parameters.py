@@ -74,8 +74,8 @@ class Parameters:
         return self._values[name]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse values that rclpy accepts but that are invalid: numbers that are not finite (NaN passes rclpy's range
-        check) and text that is no frame id."""
+        """Refuse values that rclpy accepts but that are invalid: numbers that are not finite (NaN passes rclpy's
+        range check) and text that is no frame id."""
         for one in parameters:
             if isinstance(one.value, float) and not math.isfinite(one.value):
                 reason = f"parameter {one.name} is {one.value}; give a finite number"

@@ -23,8 +23,8 @@ TRUTH = "publish_truth"
 
 
 class SensorPublisher(Protocol):
-    """Interface of a class that publishes the topics of one sensor. :class:`~vinesim.scene.values.SensorKind` names the
-    module whose ``PUBLISHER`` is the class for a kind of sensor."""
+    """Interface of a class that publishes the topics of one sensor. :class:`~vinesim.scene.values.SensorKind` names
+    the module whose ``PUBLISHER`` is the class for a kind of sensor."""
 
     packages: ClassVar[tuple[str, ...]]
     """Message packages that the publisher needs and that ROS may lack."""
@@ -56,8 +56,8 @@ def publisher(kind: str) -> type[SensorPublisher]:
 
 
 class SensorNode(Node):
-    """A node that publishes ``sensors``: a dictionary from the name of each sensor, which its topics begin with, to its
-    kind."""
+    """A node that publishes ``sensors``: a dictionary from the name of each sensor, which its topics begin with, to
+    its kind."""
 
     def __init__(
         self,
@@ -70,9 +70,9 @@ class SensorNode(Node):
         params_file: pathlib.Path | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """``channels``: names of a sensor's images, by sensor, if its data file defines them. ``rates``: initial values
-        of the ``rate`` parameters [Hz], by sensor; sensors that are not listed have no such parameter. ``params_file``,
-        ``parameters``: see :class:`Node`."""
+        """``channels``: names of a sensor's images, by sensor, if its data file defines them. ``rates``: initial
+        values of the ``rate`` parameters [Hz], by sensor; sensors that are not listed have no such parameter.
+        ``params_file``, ``parameters``: see :class:`Node`."""
         self._kinds = sensors
         self._channels = channels or {}
         needed = {package: None for kind in sensors.values() for package in publisher(kind).packages}
@@ -80,8 +80,8 @@ class SensorNode(Node):
             message_packages.ensure_importable(needed)
         self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}
-        """Function that builds the newest message of each topic, by topic. The topic that has waited longest is first.
-        """
+        """Function that builds the newest message of each topic, by topic. The topic that has waited longest is
+        first."""
         self._changed = threading.Condition()
         self._sending = False
         super().__init__(name, namespace, tuple(sensors), params_file, parameters)

@@ -86,8 +86,8 @@ class SimulationNode(Node):
         super().__init__(name, namespace, (), beside=beside)
 
     def answer(self, reply: SimulationReply | StepProgress) -> None:
-        """Pass a reply of the simulation, or the progress of its steps, to the service or action that waits for it. Any
-        thread may call this."""
+        """Pass a reply of the simulation, or the progress of its steps, to the service or action that waits for it.
+        Any thread may call this."""
         waiting = self._waiting.get(reply.number)
         if waiting is not None and isinstance(reply, SimulationReply):
             self._replies[reply.number] = reply
@@ -295,8 +295,8 @@ class SimulationNode(Node):
         result.error_message = text
 
     def _filtered(self, filters: Any, result: Any) -> list[Entity]:
-        """Returns the entities that pass ``filters``. Returns none, and fills ``result`` with an error, if a filter is
-        not supported or invalid."""
+        """Returns the entities that pass ``filters``. Returns none, and fills ``result`` with an error, if a filter
+        is not supported or invalid."""
         if filters.tags.tags or filters.bounds.points:
             self._fail(result, self._result.RESULT_FEATURE_UNSUPPORTED, "no filter by tags or bounds; name a category")
             return []

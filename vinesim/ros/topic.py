@@ -111,8 +111,8 @@ PendingMessage = tuple[Topic, Build]
 #
 # By default a subscription of rclpy keeps the last ten messages of a topic. If more arrive before its process runs, the
 # oldest are lost. So only a few messages may be unacknowledged at a time. Fast DDS tells only whether all subscribers
-# have acknowledged all messages of a topic. Subscribers acknowledge when the publisher asks them (``heartbeatPeriod`` in
-# ``udp.xml``). Best-effort subscribers never acknowledge, so nothing is known about their progress.
+# have acknowledged all messages of a topic. Subscribers acknowledge when the publisher asks them (``heartbeatPeriod``
+# in ``udp.xml``). Best-effort subscribers never acknowledge, so nothing is known about their progress.
 
 
 SUBSCRIBER_TIMEOUT = 3.0
@@ -141,8 +141,8 @@ class FlowControl:
         :data:`SUBSCRIBER_TIMEOUT`."""
 
     def must_wait(self, topics: Sequence[Topic], now: float) -> bool:
-        """Returns whether publishing on ``topics`` must wait at time ``now`` [s], because subscribers have not caught
-        up. Call it before each step, and many times a second while it returns True."""
+        """Returns whether publishing on ``topics`` must wait at time ``now`` [s], because subscribers have not
+        caught up. Call it before each step, and many times a second while it returns True."""
         if not any(map(self._is_behind, topics)):
             self._waits_since = None
             return False

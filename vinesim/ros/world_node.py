@@ -1,5 +1,5 @@
-"""The ROS 2 node of a whole world: publishes clock, robots and true poses of all other objects, and takes no commands.
-"""
+"""The ROS 2 node of a whole world: publishes clock, robots and true poses of all other objects, and takes no
+commands."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class WorldNode(Node):
         self._send(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish the true poses [name, 7] m, 1 of static objects in the map, once. Subscribers that join late receive
-        them, too."""
+        """Publish the true poses [name, 7] m, 1 of static objects in the map, once. Subscribers that join late
+        receive them, too."""
         for topic, build in self._ground_truth.pending_static(names, poses):
             topic.build_and_send(build)
 
