@@ -131,7 +131,7 @@ def test_image_of_a_strided_array_is_the_same():
 def test_image_of_wrong_size_says_so():
     frame = camera_frame()
     small = CameraFrame(frame.time, "left", INFO, frame.pose, frame.rgb[:10], frame.depth, frame.labels)
-    with pytest.raises(ValueError, match="camera left: rgb8 picture is 64x10, its info says 64x48"):
+    with pytest.raises(ValueError, match="camera left: rgb8 picture is 64x10, its camera info is 64x48"):
         convert.rgb_image(small)
 
 
