@@ -81,8 +81,8 @@ class RobotDescription:
         """Returns the opening of a gripper as a linear function of the common position of its driven fingers: the
         slope, and the opening at position 0 [m or rad].
 
-        ``fingers`` [k]: indices of the driven fingers. Prismatic fingers that mimic a driven finger count, too.
-        Revolute ones do not, because they are part of its linkage.
+        ``fingers`` [k]: indices of the driven fingers. Prismatic joints that mimic a driven finger count as fingers,
+        too. Revolute joints that mimic one do not, because they are part of its linkage.
         """
         moving = self.moving_joints
         is_driven = np.isin(moving.names, self.joints)

@@ -166,7 +166,7 @@ def _assemble(
         sidecar = msgspec.structs.replace(sidecar, groups=guess_groups(names, anchors))
     if sidecar.grippers is None:
         fingers = guess_fingers(sidecar.groups, sidecar.cutters)
-        if not is_remote:  # the list is not sent to other clients
+        if not is_remote:  # the list of controllers is not sent to other clients
             driven_by_group = {name: group.joints for name, group in sidecar.groups.items()}
             warn_of_unlisted_fingers(driven_by_group, fingers, robot.joints, assumed)
         sidecar = msgspec.structs.replace(sidecar, grippers=fingers)

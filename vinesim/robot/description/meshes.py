@@ -203,11 +203,11 @@ def _facts(mesh: etree._Element, file: pathlib.Path) -> _Facts:
     name = mesh.get("filename")
     try:
         return _file_facts(name, pathlib.Path(name).stat().st_mtime_ns)
-    except Exception as error:  # each format has errors of its own
+    except Exception as error:  # each format raises different errors
         raise description_error(file, f"mesh {name!r} cannot be read ({error})", "convert it to STL or OBJ") from error
 
 
-@functools.lru_cache(1024)  # a mesh is often there as visual and collision shape, and for several robots
+@functools.lru_cache(1024)  # a mesh is often used as visual and collision shape, and by several robots
 def _file_facts(name: str, modified: int) -> _Facts:
     """Returns the properties of a mesh file. ``modified`` [ns]: time of its last change, so that a changed file is
     read again."""
