@@ -230,15 +230,15 @@ class InverseKinematics:
         rows = sum(task_rows)
         self.jacobian = np.zeros((rows, joints))
         self.velocity = np.zeros(rows)
-        """[row] Input: requested velocity along each row of :attr:`jacobian`, which contains the rows [row, joint]
-        of all tasks in order."""
+        """[row] Input: requested velocity along each row of :attr:`jacobian`, whose rows [row, joint] are those of
+        all tasks in order."""
         self.posture_rates = np.zeros(joints)
+        """[joint] Input: rates towards a posture, applied in the null space of the tasks [rad/s or m/s]."""
         self.rates = np.zeros(joints)
-        """[joint] Input: rates towards a posture, applied in the null space of the tasks. Output: the result [rad/s
-        or m/s]."""
+        """[joint] Output: the result [rad/s or m/s]."""
         self.min_rates = np.zeros(joints)
         self.max_rates = np.zeros(joints)
-        """[joint] Largest rates [rad/s or m/s]."""
+        """[joint] Input: upper bounds of the rates [rad/s or m/s]. :attr:`min_rates` has the lower bounds."""
         scratch = SharedArrays(
             inverse_kinematics.IkScratch,
             weights=np.zeros(joints),

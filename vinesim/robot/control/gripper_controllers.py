@@ -59,13 +59,15 @@ class FingersController(GripperController):
         self._slow_since: float | None = None
 
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """See :class:`GripperController`."""
+        """Start to move the fingers to the opening ``position`` at ``time`` [s], with at most ``effort`` [N or N m]
+        each; None: the drives' own limit."""
         self.robot.command_gripper(self.group, position, effort)
         self._goal = position
         self._slow_since = None
 
     def state(self, time: float) -> GripperState:
-        """See :class:`GripperController`."""
+        """Returns opening and largest effort of the fingers at ``time`` [s], and whether they have reached their
+        goal or are stalled."""
         robot = self.robot
         _, velocity, effort, _ = robot.rigid.joint_measurements(robot.name)
         opening = robot.gripper_opening(self.group)
@@ -80,7 +82,7 @@ class FingersController(GripperController):
         return GripperState(opening, strongest, stalled=stalled)
 
     def cancel(self, time: float) -> None:
-        """Hold the fingers where they are."""
+        """Hold the fingers at their present positions."""
         self.start(self.robot.gripper_opening(self.group), None, time)
 
 
@@ -97,12 +99,13 @@ class CutterController(GripperController):
         self._closures = tuple(blade.closures for blade in robot.cutter_blades(group))
 
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """See :class:`GripperController`."""
+        """Close the cutter at ``time`` [s] with at most ``effort`` [N]; None: the cutter's own limit. ``position``
+        is ignored."""
         self.robot.command_cutter(self.group, effort)
         self._closures = tuple(blade.closures for blade in self.robot.cutter_blades(self.group))
 
     def state(self, time: float) -> GripperState:
-        """See :class:`GripperController`."""
+        """Returns whether the blades have closed, and the force [N] that they had to overcome."""
         blades = self.robot.cutter_blades(self.group)
         if any(blade.closures == before for blade, before in zip(blades, self._closures, strict=True)):
             return GripperState(1.0, 0.0)

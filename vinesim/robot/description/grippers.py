@@ -69,7 +69,8 @@ class Cutter(Gripper, frozen=True, tag="cutter"):
         return f"{stem}_controller"
 
     def check(self, groups: Container[str], links: Container[str], file: pathlib.Path) -> None:
-        """See :class:`Gripper`."""
+        """Raise :class:`DescriptionError` unless the cutter refers only to existing ``groups`` and ``links`` and all
+        its values are valid."""
         super().check(groups, links, file)
         if self.frame not in links:
             raise description_error(
