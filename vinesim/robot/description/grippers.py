@@ -74,13 +74,13 @@ class Cutter(Gripper, frozen=True, tag="cutter"):
         super().check(groups, links, file)
         if self.frame not in links:
             raise description_error(
-                file, f"the cutter of {self.group!r} sits in {self.frame!r}", "name a link of the URDF"
+                file, f"the cutter of {self.group!r} is mounted on {self.frame!r}", "name a link of the URDF"
             )
         if self.force is not None and not self.force > 0.0:
             raise description_error(file, f"the cutter of {self.group!r} has {self.force} N", "give more than 0")
         if min(self.half) <= 0.0:
             raise description_error(
-                file, f"the cutter of {self.group!r} has a mouth of {self.half}", "give half edges above 0"
+                file, f"the cutter of {self.group!r} has the half edges {self.half}", "give lengths above 0"
             )
 
 
@@ -116,6 +116,6 @@ def warn_of_unlisted_fingers(
         ]
         if group not in named and len(set(parents)) < len(parents):
             assumed.append(
-                f"group {group!r} is no gripper, though joints of it start at one link, as fingers do (say in the TOML "
+                f"group {group!r} is no gripper, though several of its joints start at one link (write in the TOML "
                 f'file: [[grippers]] kind = "fingers", group = "{group}"; or grippers = [], for none)'
             )

@@ -47,7 +47,7 @@ def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[CameraMount, 
         notes.append("no camera: no link is called camera or optical")
         return ()
     name = re.sub(r"(_(rgb|color|colour|depth))?(_optical_frame|_link|_frame)$", "", found)
-    notes.append(f"a d435 is taken to sit in {found!r}")
+    notes.append(f"a d435 is assumed to be mounted on {found!r}")
     if not optical:
         found, link = f"{name}_optical_frame", found
         etree.SubElement(root, "link", name=found)
@@ -65,7 +65,7 @@ def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[LidarMount, ..
     found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
     if not found:
         return ()
-    notes.append(f"a vlp16 is taken to sit in {found[0]!r}")
+    notes.append(f"a vlp16 is assumed to be mounted on {found[0]!r}")
     return (LidarMount("lidar", found[0], "vlp16"),)
 
 

@@ -72,7 +72,7 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
         found = find_mesh(uri, file)
         if found is None:
             raise description_error(
-                file, f"mesh {uri!r} is missing", "put it there, beside the URDF, or install its package"
+                file, f"mesh {uri!r} is missing", "put it into the folder of the URDF, or install its package"
             )
         mesh.set("filename", str(found))
     unread: set[str] = set()
@@ -100,7 +100,7 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
             link.remove(shape)
     if unread:
         formats = ", ".join(sorted(unread))
-        notes.append(f"meshes of format {formats} cannot be read: seen as collision shapes, touched as boxes")
+        notes.append(f"meshes of format {formats} cannot be read: shown as collision shapes, boxes in contacts")
     for mesh in root.iterfind("link//geometry/mesh"):
         facts = _facts(mesh, file)
         mesh.set("bounds", " ".join(f"{value:.6g}" for value in facts.bounds.ravel()))
@@ -175,7 +175,7 @@ def replace_unopened_meshes(
             else:
                 _replace_by_box(shape, mesh, np.array(mesh.get("bounds").split(), float).reshape(2, 3))
     if count:
-        assumed.append(f"{count} meshes of another client are not opened: boxes of their size stand in")
+        assumed.append(f"{count} meshes of another client are not opened: replaced by boxes of the same size")
     return meshes
 
 

@@ -81,7 +81,7 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
             unbounded.append(name)
     filled = list(dict.fromkeys(filled))
     if freed:
-        assumed.append(f"{some_names(freed)} mimics no joint that moves: driven by itself")
+        assumed.append(f"{some_names(freed)} mimics a joint that does not move: it has its own drive")
     if filled:
         assumed.append(
             f"{some_names(filled)} has no effort or no velocity above 0: "

@@ -144,7 +144,7 @@ def read_sidecar(file: pathlib.Path) -> Sidecar:
     try:
         return msgspec.toml.decode(file.read_bytes(), type=SidecarFile)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise description_error(file, str(error), "see data/robots/vinebot.toml for what may be said") from error
+        raise description_error(file, str(error), "see data/robots/vinebot.toml for all keys") from error
 
 
 MAX_REMOTE_SIDECAR = 1 << 16
@@ -203,7 +203,7 @@ def check_sidecar(
     mounts: Iterable[SensorMount] = (*sensors, *sidecar.imus, *sidecar.wrenches)
     for mount in mounts:
         if mount.frame not in links:
-            raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
+            raise description_error(file, f"{mount.name!r} is mounted on {mount.frame!r}", "name a link of the URDF")
     if not 0.01 <= sidecar.sensors.least_rate <= 1000.0:
         found = f"sensors have the least_rate {sidecar.sensors.least_rate}"
         raise description_error(file, found, "give 0.01 to 1000 Hz")
@@ -221,7 +221,7 @@ def _check_group(
     for joint in group.joints:
         if joint not in driven:
             raise description_error(
-                file, f"group {name!r} names {joint!r}, which no drive moves", "name driven joints only"
+                file, f"group {name!r} names {joint!r}, which is no driven joint", "name driven joints only"
             )
     for key, values in group.arrays().items():
         if values is not None and len(values) != len(group.joints):
@@ -229,9 +229,7 @@ def _check_group(
                 file, f"group {name!r} has {len(values)} of {key} for {len(group.joints)} joints", "give one each"
             )
     if (group.series_stiffness is None) != (group.series_damping is None):
-        raise description_error(
-            file, f"group {name!r} gives only half of its springs", "give elastic and elastic_damping"
-        )
+        raise description_error(file, f"group {name!r} gives only one of elastic and elastic_damping", "give both")
     if min((*(group.series_stiffness or ()), *(group.series_damping or ()), 0.0)) < 0.0:
         raise description_error(file, f"group {name!r} has a spring below zero", "give 0 or more")
     if group.tool and group.tool not in links:

@@ -73,7 +73,7 @@ def read_xml(file: pathlib.Path) -> etree._Element:
         root = etree.fromstring(file.read_bytes(), etree.XMLParser(remove_comments=True, resolve_entities=False))
     except etree.XMLSyntaxError as error:
         raise description_error(
-            file, f"not well-formed XML: {error.msg}", "mend that line (is it a xacro? expand it)"
+            file, f"not well-formed XML: {error.msg}", "correct this line (is it a xacro? expand it)"
         ) from error
     if root.getroottree().docinfo.internalDTD is not None:
         raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: a URDF needs none")
@@ -121,7 +121,7 @@ def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: l
     Then everything that reads the URDF knows them. Raises :class:`DescriptionError` if the file is missing or no SRDF.
     """
     if not file.is_file():
-        raise description_error(file, "this SRDF is missing", "mend its path in the robot's TOML file")
+        raise description_error(file, "this SRDF is missing", "correct its path in the robot's TOML file")
     pairs = read_xml(file).findall("disable_collisions")
     links = {link.get("name") for link in root.iterfind("link")}
     known = [pair for pair in pairs if links.issuperset((pair.get("link1"), pair.get("link2")))]
@@ -152,9 +152,9 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
                 raise description_error(file, f"{where} is not finite", "give a number")
             largest = MAX_LIMIT if tag == "limit" else MAX_NUMBER
             if max(map(abs, numbers)) > largest:
-                raise description_error(file, f"{where} is beyond {largest:g}", "give what a robot can have")
+                raise description_error(file, f"{where} is beyond {largest:g}", "give a smaller number")
             if tag in SOLIDS and key != "bounds" and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
-                raise description_error(file, f"{where} is no size", "give numbers above 0")
+                raise description_error(file, f"{where} is not a size", "give numbers above 0")
 
 
 def fix_wheels(root: etree._Element, notes: list[str]) -> None:
@@ -382,7 +382,7 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
         names = [element.name for element in elements]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise description_error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
+            raise description_error(file, f"{kind} {twice[0]!r} appears twice", "rename one")
     if "world" in links:
         raise description_error(
             file,
@@ -397,7 +397,7 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise description_error(
-                    file, f"joint {joint.name!r} names a link {link!r} that is not there", "add it or rename"
+                    file, f"joint {joint.name!r} names a link {link!r} that does not exist", "add it or rename"
                 )
         if joint.child in parent_of:
             other = parent_of[joint.child].name
@@ -444,9 +444,7 @@ def check_joints(robot: Robot, file: pathlib.Path) -> None:
         if joint.mimic is not None:
             source = names.get(joint.mimic.joint)
             if source is None or source.type not in MOVABLE_JOINT_TYPES or source.mimic is not None:
-                raise description_error(
-                    file, f"{where} mimics {joint.mimic.joint!r}", "let it mimic a joint that is driven itself"
-                )
+                raise description_error(file, f"{where} mimics {joint.mimic.joint!r}", "make it mimic a driven joint")
             continue
         limit = joint.limit
         needed = ("effort", "velocity") + (() if joint.type == "continuous" else ("lower", "upper"))

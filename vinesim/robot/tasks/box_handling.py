@@ -98,7 +98,7 @@ class BoxHandling(Task):
         while not follower.is_done:
             follower.control(self.time)
             if follower.is_stuck:
-                raise TaskFailed("something keeps the base from going on")
+                raise TaskFailed("the base is stuck")
             yield phase
 
     def _move_lift(self, phase: str, end: str, height: float) -> Iterator[str]:
@@ -108,7 +108,7 @@ class BoxHandling(Task):
         until = self.time + LIFT_TIMEOUT
         while abs(self.robot.rigid.joint_measurements(self.robot.name)[0][index[0]] - height) > LIFT_TOLERANCE:
             if self.time > until:
-                raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
+                raise TaskFailed(f"the {end} lift does not reach {height:.2f} m")
             yield phase
 
     def _lift_index(self, end: str) -> int:

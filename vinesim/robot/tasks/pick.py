@@ -205,7 +205,7 @@ class PickBunch(Task):
             if not self.physics.state.bunch_attached[self.plan.bunch]:
                 return
             yield from self.wait(0.2, "cut")
-        raise TaskFailed(f"the blade closed beside the stalk: {self._describe_stalk()}")
+        raise TaskFailed(f"the blades missed the stalk: {self._describe_stalk()}")
 
     def _drive(self) -> Iterator[str]:
         """Drive to the place where the box is within reach."""
@@ -214,7 +214,7 @@ class PickBunch(Task):
             self.arm.hold_position()
             follower.control(self.time)
             if follower.is_stuck:
-                raise TaskFailed("something keeps the base from going on")
+                raise TaskFailed("the base is stuck")
             self._check_grasp()
             yield "drive"
 
