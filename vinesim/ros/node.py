@@ -186,7 +186,7 @@ class Node:
             try:
                 self._executor.spin_once(timeout_sec=SUBSCRIPTION_COUNT_PERIOD)
             except Exception:
-                log.exception("a ROS callback failed; the node goes on")
+                log.exception("a ROS callback failed; the node continues")
             if wall.monotonic() >= next_count:
                 self._look_around()
                 for topic in list(self._topics.values()):

@@ -37,7 +37,8 @@ class LidarPublisher:
         self._scan = advertise(LaserScan, f"{name}/scan" if number else "scan", SENSOR_DATA)
 
     def wanted(self) -> CameraOutput:
-        """Returns depth with the errors of the lidar, or exact depth, if the topics have subscribers."""
+        """Returns whether ranges with the errors of the lidar or exact ranges are needed, or ``NONE`` without
+        subscribers."""
         if not (self._points.subscription_count or self._scan.subscription_count):
             return CameraOutput.NONE
         return CameraOutput.EXACT_DEPTH if self._parameters[self._exact] else CameraOutput.DEPTH

@@ -78,7 +78,7 @@ class RobotPublisher:
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """Yield the messages of one step."""
         sample = self._with_odometry(sample)
-        if sample.joints.names is not self._names:  # the same tuple every step
+        if sample.joints.names is not self._names:  # samples of one robot share this tuple
             self._names = sample.joints.names
             self._write_joints = joint_state_writer(sample.joints)
             self._odometry_frame = ""
@@ -138,7 +138,7 @@ class GroundTruthPublisher:
 
     def pending(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
         """Yield the message with true poses [name, 7] m, 1 of moving objects. Pass the same tuple object as long as
-        the names stay the same."""
+        the names stay the same: then only the numbers in the serialised message are replaced."""
         yield self._moving, partial(self._message, time, names, poses)
 
     def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
@@ -227,7 +227,7 @@ class ControlPublisher:
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
         """Yield the messages of one step."""
-        if sample.joints.names is not self._names:  # the same tuple every step
+        if sample.joints.names is not self._names:  # samples of one robot share this tuple
             self._names = sample.joints.names
             self._places = {name: i for i, name in enumerate(self._names)}
         self._steps += 1
