@@ -32,10 +32,10 @@ def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path,
     try:
         import fcntl
     except ImportError:
-        return  # no such system has Fast DDS's locks
+        return  # systems without fcntl have no locks of Fast DDS
     for path in (*folder.glob("fastrtps_*"), *folder.glob("fastdds_*")):
         lock = path.with_name(f"{path.name}_el")
-        with contextlib.suppress(OSError):  # gone, locked, or of another user: not ours to remove
+        with contextlib.suppress(OSError):  # removed meanwhile, locked, or of another user
             status = path.stat()
             is_ours = status.st_size >= SMALLEST and status.st_uid == os.getuid()
             if not is_ours or time.time() - status.st_mtime < YOUNGEST:
@@ -50,7 +50,7 @@ def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
     number."""
     removed = size = 0
     for path, lock in dead_segments(folder):
-        with contextlib.suppress(OSError):  # another process removes them as well
+        with contextlib.suppress(OSError):  # another process may remove the same segment
             length = path.stat().st_size
             path.unlink()
             lock.unlink()

@@ -52,9 +52,9 @@ class Tolerance:
     """Largest permitted errors, in the order of the trajectory's joints; infinite where there is no limit."""
 
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] Largest permitted position errors, rad or m."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] Largest permitted velocity errors, rad/s or m/s."""
 
     @classmethod
     def uniform(cls, count: int, position: float = np.inf, velocity: float = np.inf) -> Tolerance:
@@ -75,9 +75,9 @@ class Trajectory:
     times: np.ndarray
     """[point] s after the start, increasing. If the first is not 0, the path begins at the present positions."""
     positions: np.ndarray
-    """[point, joint] rad or m"""
+    """[point, joint] Positions at the waypoints, rad or m."""
     velocities: np.ndarray | None = None
-    """[point, joint] rad/s or m/s; None: linear interpolation"""
+    """[point, joint] Velocities at the waypoints, rad/s or m/s; None: linear interpolation."""
     start_time: float = 0.0
     """Simulation time [s] of the start; 0: the time at which the trajectory is accepted."""
     path_tolerance: Tolerance | None = None

@@ -24,7 +24,7 @@ FULL_EFFORT_DISTANCE = 0.005
 """[m] Position error at which the servo of a prismatic joint reaches full effort, by which gains that are not given
 are derived. GUESSED"""
 STANDARD_GRAVITY = 9.80665
-"""[m/s2]"""
+"""[m/s2] Standard acceleration of gravity, from which the weight on a drive is computed."""
 CENTRED_SHARE = 0.1
 """Share of a joint's range. If the middle of the range is nearer to 0 than this share, the home position is 0."""
 

@@ -88,7 +88,7 @@ AnyGripper = Fingers | Cutter
 """Union of the classes of all kinds of grippers."""
 
 GRIPPER_KINDS: dict[str, type[Gripper]] = {str(kind.__struct_config__.tag): kind for kind in get_args(AnyGripper)}
-"""Classes of grippers: name of the kind -> class."""
+"""Classes of grippers, by name of the kind."""
 
 
 def guess_fingers(groups: Iterable[str], cutters: Collection[Cutter]) -> tuple[Fingers, ...]:

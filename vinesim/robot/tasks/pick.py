@@ -53,7 +53,7 @@ ORIENTATION_TOLERANCE = 0.12
 CARRY_POSITION = np.array([0.45, 0.12, 1.20])
 """[m] Position of the left hand while the base drives, in the frame of the base. For the right hand it is mirrored."""
 CLEARANCE_ABOVE_RIM = 0.50
-"""[m] Height above the rim of the box from which the hand descends. GUESSED"""
+"""[m] Height of the hand above the rim of the box before it descends into the box. GUESSED"""
 RELEASE_HEIGHT = 0.19
 """[m] Height of the hand above the bottom of the box at release. vinebot's arm reaches no deeper next to its base,
 and the lower end of a bunch is about 0.12 m below the hand."""

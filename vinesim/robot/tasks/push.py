@@ -127,7 +127,7 @@ class PushBunch:
     # ------------------------------------------------------------------ phases
 
     def _plan(self) -> None:
-        """Compute the waypoints for the present position of the target."""
+        """Compute the waypoints of all phases for the present position of the target."""
         center = np.asarray(self.target(), float)
         ahead = center - self.arm.shoulder_position
         ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(PUSH_ELEVATION)

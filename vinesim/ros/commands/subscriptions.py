@@ -61,7 +61,7 @@ class CommandQueue:
         return commands
 
     def put(self, command: Command) -> None:
-        """Add a command."""
+        """Add a command. A set-point replaces an older one for the same target."""
         key = _setpoint_key(command)
         with self._lock:
             if key is not None:

@@ -20,9 +20,9 @@ class BaseVelocity:
     time: float
     """Header stamp [s]; 0 if the sender gave none."""
     linear: np.ndarray
-    """[3] m/s"""
+    """Linear velocity [3] m/s."""
     angular: np.ndarray
-    """[3] rad/s"""
+    """Angular velocity [3] rad/s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -62,9 +62,9 @@ class JointTolerances:
     """Largest permitted errors of some joints (control_msgs/JointTolerance); infinite where there is no limit."""
 
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] Largest permitted position errors, rad or m."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] Largest permitted velocity errors, rad/s or m/s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -77,11 +77,11 @@ class JointTrajectory:
     """Start time [s]; 0: at once."""
     joints: tuple[str, ...]
     times: np.ndarray
-    """[point] s after the start, increasing"""
+    """[point] Times of the waypoints, s after the start, increasing."""
     positions: np.ndarray
-    """[point, joint] rad or m"""
+    """[point, joint] Positions at the waypoints, rad or m."""
     velocities: np.ndarray | None
-    """[point, joint] rad/s or m/s, or None if no point gives any."""
+    """[point, joint] Velocities at the waypoints, rad/s or m/s; None if the message has none."""
     path_tolerance: JointTolerances | None = None
     """Tolerance on the way, for a goal of an action; None: the controller's tolerance."""
     goal_tolerance: JointTolerances | None = None
@@ -131,7 +131,7 @@ class LoudspeakerSound:
     earlier."""
 
     pcm: bytes
-    """PCM16 of 16 kHz, mono."""
+    """Samples as PCM16 of 16 kHz, mono."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -236,9 +236,9 @@ class Entity:
     name: str
     category: EntityCategory
     pose: np.ndarray
-    """[7] m, 1 in the map"""
+    """Pose in the map [7] m, 1."""
     velocity: np.ndarray
-    """[6] m/s, rad/s, world axes; NaN where it is not known"""
+    """Linear and angular velocity [6] m/s, rad/s in world axes; NaN if unknown."""
     description: str = ""
     """Description for people."""
 
@@ -250,9 +250,9 @@ class Spawnable:
     uri: str
     description: str
     low: tuple[float, float, float]
-    """[m] Lower corner of its bounding box, relative to its pose."""
+    """[m] Lower corner of the entity's bounding box, relative to the entity's pose."""
     high: tuple[float, float, float]
-    """[m] Upper corner of its bounding box, relative to its pose."""
+    """[m] Upper corner of the entity's bounding box, relative to the entity's pose."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -261,9 +261,9 @@ class EntityArguments:
 
     name: str
     pose: np.ndarray | None = None
-    """[7] m, 1 in the map, not checked yet."""
+    """Requested pose in the map [7] m, 1. It has not been checked."""
     velocity: np.ndarray | None = None
-    """[6] m/s, rad/s, world axes, not checked yet."""
+    """Requested linear and angular velocity [6] m/s, rad/s in world axes. It has not been checked."""
     uri: str = ""
     allow_renaming: bool = False
 

@@ -277,7 +277,7 @@ def label_image(frame: CameraFrame) -> Image:
 
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
     """Returns the colour picture as JPEG of a ``quality`` from 1 to 100."""
-    import cv2  # here, as a process that sends no pictures should not load it
+    import cv2  # not at the top: a process that publishes no pictures should not load it
 
     encoded, data = cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not encoded:

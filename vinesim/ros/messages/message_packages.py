@@ -239,7 +239,8 @@ def _run(command: list[str]) -> None:
 
 
 def main() -> None:
-    """``python -m vinesim.ros.messages.message_packages SOURCE --into FOLDER --scratch FOLDER``."""
+    """Build one message package: ``python -m vinesim.ros.messages.message_packages SOURCE --into FOLDER --scratch
+    FOLDER``."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("source", type=pathlib.Path)
     parser.add_argument("--into", type=pathlib.Path, required=True)
@@ -470,7 +471,7 @@ def install(packages: list[str]) -> None:
     """Install vinesim's builds of ``packages`` into this Python environment. They replace older builds."""
     if not packages:
         return
-    build(packages)  # side by side
+    build(packages)  # all packages in parallel
     if importlib.util.find_spec("pip") is None:
         raise InterfacesError(
             f"pip is missing in {sys.prefix}; write wheels with vinesim ros build-interfaces --wheel DIR and install "
