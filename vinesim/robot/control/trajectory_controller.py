@@ -258,8 +258,8 @@ class TrajectoryController:
         if unknown or len(set(t.joints)) < len(t.joints) or not t.joints:
             raise TrajectoryError(
                 Outcome.INVALID_JOINTS,
-                f"{name}: trajectory for {', '.join(t.joints) or 'no joints'}; this controller moves each of "
-                f"{', '.join(self.joints)} once",
+                f"{name}: trajectory for {', '.join(t.joints) or 'no joints'}; name joints among "
+                f"{', '.join(self.joints)}, each at most once",
             )
         shape = (len(t.times), len(t.joints))
         for what, values in (("positions", t.positions), ("velocities", t.velocities)):

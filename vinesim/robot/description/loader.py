@@ -101,7 +101,7 @@ def load_description(
         parsed = parse_robot(root)
     except ValueError as error:
         raise description_error(
-            file, f"not a URDF: {error}", "give every link, joint and shape what URDF requires"
+            file, f"not a URDF: {error}", "add what URDF requires to every link, joint and shape"
         ) from error
     base, order = check_tree(parsed, file)
     check_joints(parsed, file)

@@ -475,7 +475,7 @@ def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
         mass = inertial.mass
         inertia = inertial.inertia
         if mass < 0.0 or not math.isfinite(mass):
-            raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give it its mass")
+            raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give 0 or more")
         if inertia is not None and mass > 0.0:
             moments = np.linalg.eigvalsh(inertia)
             if moments[0] <= 0.0 and moments[2] > 0.0:
@@ -487,4 +487,4 @@ def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
             if moments[0] + moments[1] < moments[2] * (1.0 - 1e-6):
                 lopsided.append(link.name)
     if lopsided:
-        notes.append(f"{len(lopsided)} inertias no real body has (triangle inequality), first {lopsided[0]!r}")
+        notes.append(f"{len(lopsided)} inertias violate the triangle inequality, first {lopsided[0]!r}")

@@ -104,7 +104,7 @@ def elastic_command(message: JointState, controller: str, joint: str) -> Elastic
     positions = list(message.position)
     place = names.index(joint) if joint in names else 0
     if place >= len(positions) or (names and joint not in names) or not np.isfinite(positions[place]):
-        raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite one of {joint}")
+        raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite position of {joint}")
     return ElasticCommand(controller, joint, positions[place])
 
 
@@ -117,7 +117,8 @@ def joint_trajectory(
     unknown = [joint for joint in joints if joint not in known]
     if unknown or len(set(joints)) < len(joints) or (message.points and not joints):
         raise CommandError(
-            f"{controller}: a trajectory for {', '.join(joints) or 'nothing'}; it moves each of {', '.join(known)} once"
+            f"{controller}: a trajectory for {', '.join(joints) or 'nothing'}; "
+            f"name joints among {', '.join(known)}, each at most once"
         )
     for i, point in enumerate(message.points):
         if len(point.positions) != len(joints) or len(point.velocities) not in (0, len(joints)):
@@ -128,7 +129,7 @@ def joint_trajectory(
     start = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
     times = np.array(start, float)
     if (np.diff(times) <= 0.0).any() or (len(times) and times[0] < 0.0):
-        raise CommandError(f"{controller}: time_from_start does not rise from 0 on: {start}")
+        raise CommandError(f"{controller}: time_from_start does not increase from 0: {start}")
     positions = np.array([p.positions for p in message.points], float).reshape(len(times), len(joints))
     with_velocity = len(times) > 0 and all(len(p.velocities) for p in message.points) and len(joints) > 0
     velocities = np.array([p.velocities for p in message.points], float) if with_velocity else None
@@ -142,7 +143,7 @@ def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: b
     least one point."""
     plain = joint_trajectory(request.trajectory, controller, known, goal)
     if len(plain.times) == 0:
-        raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the goal before it")
+        raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the previous goal")
     late = request.goal_time_tolerance.sec + 1e-9 * request.goal_time_tolerance.nanosec
     return JointTrajectory(
         controller,
