@@ -34,7 +34,7 @@ POSTURE_GAIN = 1.0
 MAX_TOOL_RATE = 1.0
 """[rad/s] Largest rate at which the tool turns. GUESSED"""
 SHOULDER_DROP = 0.10
-"""[m] Height of the working height above the shoulder, to which the lift moves the shoulder. GUESSED"""
+"""[m] Distance below the working height at which the lift holds the shoulder. GUESSED"""
 MIN_SINGULAR_VALUE = 0.06
 """[m/rad] Singular value of the Jacobian below which damping begins. It limits joint rates near singular postures.
 GUESSED"""

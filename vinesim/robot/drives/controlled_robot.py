@@ -43,8 +43,11 @@ class Robot(RobotInstance):
         index: int = 0,
         pose: np.ndarray | None = None,
     ) -> None:
-        """See :class:`RobotInstance` for the arguments. The robot holds its joints at their home positions until it
-        is commanded."""
+        """Add the robot to ``rigid`` at ``pose`` [7] (the origin unless given), holding its joints at their home
+        positions.
+
+        ``name``: the name in the description unless given. ``index``: number of the robot's instance label.
+        """
         super().__init__(rigid, description, name, index, pose)
         self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
         self._cutters: dict[str, list[Blade]] = {}

@@ -13,10 +13,10 @@ every topic; its report is on one line, too. With ``--once TOPIC`` it ends the s
 message, so that the topic costs its publisher nothing more. With ``--arrivals FILE`` it writes sending time, arrival
 time, stamp and number of each message: one array [message, 4] int64 per topic, see :attr:`TopicStats.arrivals`.
 
-A hundred times a second it takes all waiting messages of every topic in serialised form, so that counting costs little.
-The first message of every topic is deserialised, to check that it is well-formed. The arrival time is the one at which
-the middleware of this process receives a message. The monitor runs without vinesim's middleware profile, like any other
-node.
+A hundred times a second the monitor takes all waiting messages of every topic in serialised form, so that counting
+costs little. The first message of every topic is deserialised, to check that it is well-formed. The arrival time is the
+one at which the middleware of this process receives a message. The monitor runs without vinesim's middleware profile,
+like any other node.
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ class SimulationClock:
 
 
 class TopicStats:
-    """Statistics of one topic."""
+    """Statistics of one topic. ``message``: class of its messages. ``publishers``: number of its publishers.
+    ``clock``: estimate of simulated time, for the age of header stamps."""
 
     def __init__(
         self, type_name: str, type_hash: str, message: type, publishers: int, clock: SimulationClock | None = None
