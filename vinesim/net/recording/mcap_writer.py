@@ -13,18 +13,14 @@ import pathlib
 import queue
 import threading
 import time
-import zlib
-from collections.abc import Iterator
 
 import msgspec
-from mcap.data_stream import RecordBuilder
-from mcap.records import ChunkIndex
-from mcap.writer import Writer
 
 from vinesim.core.errors import WriteError
 from vinesim.core.version import __version__
 from vinesim.net.codec.header import PROTOCOL, MessageError
 from vinesim.net.codec.messages import describe_message, schema_of, time_of
+from vinesim.net.recording.mcap_file import McapFile
 from vinesim.net.recording.mcap_reader import METADATA_NAME
 
 FLUSH_PERIOD = 0.5
@@ -43,32 +39,6 @@ def free_path(path: pathlib.Path) -> pathlib.Path:
         number += 1
         free = path.with_name(f"{path.stem}-{number}{path.suffix}")
     return free
-
-
-class _ChunkIndexes:
-    """The index of all chunks, which MCAP writes last: as compressed bytes of the records that it becomes.
-
-    Stands in for the list of objects in the library's writer. With 30 keys that took 16 MB an hour, this takes 1.
-    """
-
-    def __init__(self) -> None:
-        self._compressor = zlib.compressobj()
-        self._compressed = bytearray()
-
-    def append(self, index: ChunkIndex) -> None:
-        """Add the index of one chunk."""
-        builder = RecordBuilder()
-        index.write(builder)
-        self._compressed += self._compressor.compress(builder.end())
-
-    def __iter__(self) -> Iterator[_ChunkIndexes]:
-        """All of them as one that writes itself."""
-        yield self
-
-    def write(self, stream: RecordBuilder) -> None:
-        """Write all records."""
-        self._compressed += self._compressor.flush()
-        stream.write(zlib.decompress(self._compressed))
 
 
 _Work = tuple[int, str, bytes] | dict[str, str]
@@ -93,8 +63,7 @@ class RecordingWriter:
             self._file = path.open("xb")
         except OSError as error:
             raise RecordingStopped(f"cannot record into {path}: {error.strerror}; choose another file") from error
-        self._writer = Writer(self._file)
-        vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndexes()
+        self._writer = McapFile(self._file)
         self._channels: dict[str, int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
