@@ -52,10 +52,10 @@ class Inbox:
     joined: list[Hello] = dataclasses.field(default_factory=list)
     left: list[str] = dataclasses.field(default_factory=list)
     robots: dict[str, RobotUpdate] = dataclasses.field(default_factory=dict)
-    """Poses of the robots of all peers, by name. They are extrapolated by at most 150 ms, and corrections are blended
-    in over 100 ms."""
+    """Poses of all peers that are robots or spectators, by name. They are extrapolated by at most 150 ms, and
+    corrections are blended in over 100 ms."""
     people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
-    """Poses of all peers that are people or spectators, by name, extrapolated and blended like :attr:`robots`."""
+    """Poses of all peers that are people, by name, extrapolated and blended like :attr:`robots`."""
     messages: dict[int, Any] = dataclasses.field(default_factory=dict)
     """Contents of direct messages to this actor that are valid now, by kind of message: results of
     :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
