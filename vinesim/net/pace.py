@@ -65,7 +65,7 @@ class PaceReport(NamedTuple):
 
 @dataclasses.dataclass
 class _Client:
-    """A client for which the world waits, unless it is left behind."""
+    """The last report of a client, and how far the client is behind the clock of the world."""
 
     report: PaceReport
     arrived: float

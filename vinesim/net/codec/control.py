@@ -41,7 +41,7 @@ MAX_CAUSE = 120
 """Largest number of letters in the text that names what limits the real-time factor of a world."""
 
 HEIGHT_RANGE = (1.0, 2.5)
-"""Shortest and tallest person [m]. GUESSED."""
+"""Smallest and largest height of a person [m]. GUESSED."""
 
 MAX_SEED = (1 << 63) - 1
 """Largest seed of a scene."""
@@ -125,7 +125,7 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
 
     @property
     def claim(self) -> Claim:
-        """The claim that orders the records of one object: the record with the greatest claim holds."""
+        """The claim that orders the records of one object: the record with the greatest claim is valid."""
         return Claim(self.ownership, self.authority, self.author)
 
 

@@ -28,7 +28,7 @@ from vinesim.net.codec.rotation import TURN_LSB, quaternion, rotation_vector
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
 HUMAN = 6
-"""Number of this kind of message, its fourth byte."""
+"""Number of the kind of message with a person's pose, the fourth byte of the message."""
 
 POSITION_LSB = 2e-4
 """Quantisation step of a position relative to the root [m]. Positions are clipped at 6.5 m."""

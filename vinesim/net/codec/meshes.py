@@ -44,8 +44,8 @@ class MeshWanted(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     """The server's reply to a :class:`MeshPart` that an actor offers."""
 
     offset: int
-    """Position in the mesh of the part that the actor shall send next [B]. The size of the mesh: the server has it
-    all."""
+    """Position in the mesh of the part that the actor shall send next [B]. Equal to the size of the
+    mesh if the server has all parts."""
     refused: str = ""
     """Why the server does not take the mesh now; empty if it takes it."""
 

@@ -20,7 +20,7 @@ from vinesim.scene.ids import OBJECT_STRIDE, ObjectKind
 from vinesim.scene.values import ObjectUpdate
 
 OBJECTS = 5
-"""Number of this kind of message, its fourth byte."""
+"""Number of the kind of message with states of boxes and bunches, the fourth byte of the message."""
 
 POSITION_LSB = 1e-4
 """Quantisation step of a position in its cell [m]. Positions are clipped at 3.2 m from the cell's origin."""

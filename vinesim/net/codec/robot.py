@@ -17,7 +17,7 @@ from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quatern
 from vinesim.scene.values import LightPattern, Lights, RobotUpdate
 
 ROBOT = 1
-"""Number of this kind of message, its fourth byte."""
+"""Number of the kind of message with a robot's pose, the fourth byte of the message."""
 
 JOINT_RATE_LSB = 1e-5
 """Quantisation step of the scale of joint velocities [rad/s, m/s]. The largest scale encodes up to 83 rad/s or m/s."""

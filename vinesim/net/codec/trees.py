@@ -29,7 +29,7 @@ from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quatern
 from vinesim.scene.values import TreeUpdate
 
 TREES = 2
-"""Number of this kind of message, its fourth byte."""
+"""Number of the kind of message with states of trees, the fourth byte of the message."""
 
 TOUCHED = 1
 RESTING = 2

@@ -8,7 +8,7 @@ from vinesim.audio.frame import Codec, find_fault
 from vinesim.net.codec.header import HEADER, MessageError, pack_header, unpack_header
 
 VOICE = 9
-"""Number of this kind of message, its fourth byte."""
+"""Number of the kind of message with a frame of sound, the fourth byte of the message."""
 
 
 class VoiceFrame(NamedTuple):

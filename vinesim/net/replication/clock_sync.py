@@ -65,7 +65,7 @@ class ClockEstimate:
 
     pings: tuple[Ping, ...] = ()
     offset: float = 0.0
-    """Server's clock minus own clock that is used now [s]."""
+    """Server's clock minus own clock, as used at present [s]."""
 
     def with_ping(self, ping: Ping) -> ClockEstimate:
         """Returns the estimate with one more ping. Until eight pings have arrived, the best offset is used at once.

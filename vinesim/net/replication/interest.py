@@ -141,7 +141,7 @@ def check_radius(near: float) -> float:
 
 
 def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.ndarray:
-    """Returns the number of actors within the distance ``near`` [m] on the ground of each position: [k] int.
+    """Returns, for each position, the number of actors within the distance ``near`` [m] on the ground: [k] int.
 
     ``middles`` [k, 3] m: the positions. ``actors`` [a, 3] m: positions of the actors.
     """

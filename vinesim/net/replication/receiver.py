@@ -87,8 +87,8 @@ class _Step:
 class EarlyMessages:
     """Messages with retained records whose senders have not been accepted as peers yet.
 
-    They are kept until then, because records are published only once. Their number and size are limited. If there is no
-    room, messages of live senders displace those of senders that are not live.
+    The messages are kept until the sender is accepted, because records are published only once. Their number and size
+    are limited. If there is no room, messages of live senders displace those of senders that are not live.
     """
 
     def __init__(self) -> None:

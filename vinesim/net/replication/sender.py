@@ -164,9 +164,10 @@ class Sender:
     def _find_due_trees(
         self, entries: list[ObjectRecord], listeners: list[np.ndarray], contact: list[bool], step: LocalStep
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Returns for each of the two layers which of the ``k`` trees that were last read to publish: [k] bool.
+        """Decide which of the ``k`` trees that were last read to publish: [k] bool for each of the two layers.
 
-        A tree is published if the copies of the layer's receivers are wrong, or a listener, claim or contact is new.
+        A tree is published if the copies of the layer's receivers are wrong, if a peer has come near, if this actor has
+        just claimed the tree, or if its contact with the tree has begun or ended.
         ``listeners``: number of receivers of each layer [k]. ``contact`` [k]: whether this actor touches the tree.
         """
         stream = self._state.tree_stream
@@ -230,9 +231,10 @@ class Sender:
         contact: list[bool],
         step: LocalStep,
     ) -> np.ndarray:
-        """Returns which of ``k`` boxes and bunches to publish: [k] bool.
+        """Decide which of the ``k`` boxes and bunches ``active`` to publish: [k] bool.
 
-        An object is published if the copies are wrong, or a listener, claim or contact is new.
+        An object is published if its copies are wrong, if a peer has come near, if this actor has just claimed the
+        object, or if its contact with the object has begun or ended.
         """
         silence = step.time - np.array([entry.published_at for entry in entries])
         due = dead_reckoning.needs_update(*self._state.object_stream.prediction_error(active, silence), silence)

@@ -33,8 +33,8 @@ MAX_AGE = 2.0
 """Largest difference between the time of a frame and the present; other frames are refused [s]."""
 
 BURST = 25.0
-"""Number of frames that may arrive at once besides those of the passing time: those of half a second, for which a link
-may have held frames back."""
+"""Number of frames of one speaker that may arrive at once in addition to those of the elapsed time: half a second of
+sound, which a slow link may have delayed."""
 
 
 ROBOT_MOUTH = np.array([0.0, 0.0, 1.2])

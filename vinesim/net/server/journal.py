@@ -32,7 +32,7 @@ VERSION = 1
 SUFFIX = ".facts"
 
 MAX_OBSOLETE_RECORDS = 1000
-"""Number of obsolete frames, besides three for each record that holds, above which a journal is compacted."""
+"""Number of obsolete frames above which a journal is compacted, in addition to three for each current record."""
 
 _RECORD = struct.Struct("<II")  # length, CRC-32
 _CELL = struct.Struct("<ii")

@@ -18,7 +18,7 @@ from vinesim.net.codec.messages import FAMILIES
 from vinesim.net.transport.bus import BusError
 
 SERVER = "server"
-"""Common name in the certificates of all servers. Servers may exchange everything."""
+"""Common name in the certificates of all servers. The router denies servers nothing."""
 
 CA_NAME = "ca"
 """Name of the certificate authority, after which its files ``ca.pem`` and ``ca.key`` are named."""
@@ -93,8 +93,8 @@ def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
 def server_answers_config(root: str) -> dict[str, Any]:
     """Returns Zenoh's settings of access control for a server without certificates.
 
-    They keep other programs that connect to the server from answering queries that actors send to the server. ``root``:
-    first chunks of all keys, like ``vs/1``.
+    The settings keep other programs that connect to the server from answering queries that actors send to the server.
+    ``root``: first chunks of all keys, like ``vs/1``.
     """
     questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**")]
     rule = {

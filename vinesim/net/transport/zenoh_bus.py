@@ -161,8 +161,8 @@ class ZenohBus:
         self._worker.start()
 
     def _open_datagrams(self, endpoint: Endpoint) -> zenoh.Session:
-        """Open and return the session for poses, over datagrams. If no datagrams arrive, return the session that
-        exists."""
+        """Open and return the session for poses, over datagrams. If no router answers there, return
+        the session over the stream."""
         try:
             session = open_client(endpoint, self._credentials)
         except ServerUnreachable:
