@@ -74,7 +74,7 @@ class Journal:
             content = path.read_bytes()
         except OSError as error:
             raise JournalError(
-                f"{path}: cannot be read ({error.strerror}): mend that, or give another --state-dir"
+                f"{path}: cannot be read ({error.strerror}): repair that, or give another --state-dir"
             ) from error
         start = MAGIC + bytes((VERSION,))
         if not content.startswith(MAGIC):
@@ -109,7 +109,7 @@ class Journal:
             backup = _free_name(path)
             _write(backup, content)
             log.warning(
-                "%s: torn after %d of %d bytes; %d facts before that hold, the file as it was is kept as %s",
+                "%s: torn after %d of %d bytes; the %d facts before that are used, the original file is kept as %s",
                 path,
                 valid_end,
                 len(content),

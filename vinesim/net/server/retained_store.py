@@ -350,13 +350,13 @@ class RetainedStore:
             return True
         except JournalError as error:
             if not self.status_message:
-                log.error("records are kept in memory only until this is mended: %s", error)
+                log.error("records are kept in memory only until this is repaired: %s", error)
             self.status_message = str(error)
             return False
 
     def _count_malformed(self, world: str, actor: str, reason: str) -> None:
         self.counters.malformed += 1
-        self._warn_once(world, actor, f"sent what cannot be believed: {reason}")
+        self._warn_once(world, actor, f"sent an invalid message: {reason}")
 
     def _warn_once(self, world: str, actor: str, what: str) -> None:
         """Log a problem with the messages of an actor, but only the first one of each actor."""

@@ -109,7 +109,7 @@ class Server:
             raise UsageError(f"the real-time factor is {real_time_factor:g}: give auto, or {MIN_FACTOR:g} to 1")
         if linked and (state_folder, scene, max_actors, real_time_factor) != (None, None, None, None):
             raise UsageError(
-                f"a server linked to {linked[0]} only carries: give --state-dir, --scene, --max-clients and "
+                f"a server linked to {linked[0]} only routes: give --state-dir, --scene, --max-clients and "
                 "--real-time-factor to the one server that connects to no other"
             )
         self._certificates = certificates
@@ -380,7 +380,7 @@ class Server:
             )
         if not is_own:
             self.foreign += 1
-            self._warn_once(key, "records of a session that did not join with this name, or as a spectator: dropped")
+            self._warn_once(key, "dropped records of a session that did not join with this name, or of a spectator")
             return
         payload = sample.payload.to_bytes() if len(sample.payload) <= MAX_MESSAGE else b""
         self.store.submit(key, payload)
@@ -391,7 +391,7 @@ class Server:
             world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
             try:
                 if "*" in key or not is_valid_name(name):
-                    raise MessageError("the question names no world, or not the actor that asks")
+                    raise MessageError("the query names no world, or no valid actor")
                 question = decode_time(_query_payload(query))
             except MessageError as error:
                 self._count_malformed(key, error)
@@ -411,7 +411,7 @@ class Server:
         with query:
             key = _strip_root(query.key_expr)
             if "*" in key or key.count("/") != 3 or self.store is None:
-                self._count_malformed(key, MessageError("an actor asks for itself alone"))
+                self._count_malformed(key, MessageError("an actor can only ask for itself"))
                 return
             world, _, name, session = key.split("/")
             with self._lock:
@@ -429,7 +429,7 @@ class Server:
             key = _strip_root(query.key_expr)
             world, *_, x, y = key.split("/") if key.count("/") == 3 else ("*", "", "")
             if "*" in world or self.store is None:
-                self._count_malformed(key, MessageError("the question names no world and no cell"))
+                self._count_malformed(key, MessageError("the query names no world or no cell"))
                 return
             cells: list[Cell]
             try:
@@ -443,7 +443,7 @@ class Server:
                 else:
                     cells = [(int(x), int(y))]
             except ValueError:
-                self._count_malformed(_strip_root(query.key_expr), MessageError("the question names no cell"))
+                self._count_malformed(_strip_root(query.key_expr), MessageError("the query names no cell"))
                 return
             for cell, payload in self.store.snapshot(world, cells):
                 query.reply(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}", payload)
@@ -454,10 +454,10 @@ class Server:
             world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
             try:
                 if "*" in key:
-                    raise MessageError("an actor offers its own meshes")
+                    raise MessageError("an actor can only offer its own meshes")
                 with self._lock:
                     if not self._admission.is_admitted(world, name):
-                        raise MessageError("only an actor that has joined offers meshes")
+                        raise MessageError("only an actor that has joined can offer meshes")
                 wanted = self.meshes.offer((world, name), decode_part(_query_payload(query)))
             except MessageError as error:
                 self._count_malformed(key, error)
@@ -470,7 +470,7 @@ class Server:
             digest = key.rpartition("/")[2]
             try:
                 if not is_digest(digest) or "*" in key:
-                    raise MessageError("the question names no mesh")
+                    raise MessageError("the query names no mesh")
                 part = self.meshes.part(digest, decode_request(_query_payload(query)))
             except MessageError as error:
                 self._count_malformed(key, error)

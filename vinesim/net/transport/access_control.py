@@ -61,8 +61,8 @@ def refuse_authority_key(folder: pathlib.Path) -> None:
     if (folder / f"{CA_NAME}.key").exists():
         place = authority_folder(folder)
         raise CertificateError(
-            f"{folder / CA_NAME}.key: who has it can make certificates for every name, so no server or client may hold "
-            f"it: mkdir -m 700 {place} && cp {folder}/{CA_NAME}.pem {place}/ && mv {folder}/{CA_NAME}.key {place}/"
+            f"{folder / CA_NAME}.key: whoever has it can make certificates for every name, so no server or client may "
+            f"have it: mkdir -m 700 {place} && cp {folder}/{CA_NAME}.pem {place}/ && mv {folder}/{CA_NAME}.key {place}/"
         )
 
 

@@ -164,7 +164,7 @@ def expiring(folder: pathlib.Path) -> list[str]:
         last = _read(file).not_valid_after_utc
         if last < soon:
             lines.append(
-                f"{file} is valid until {last:%Y-%m-%d %H:%M} UTC, and refused afterwards: make it anew in time"
+                f"{file} is valid until {last:%Y-%m-%d %H:%M} UTC, and refused afterwards: make a new one in time"
             )
     return lines
 

@@ -292,7 +292,7 @@ class ZenohBus:
                 log.info("%s: connected to %s again", self.name, endpoint)
             else:
                 self._lost_endpoints.add(endpoint)
-                log.warning("%s: lost the server at %s; goes on alone and tries to come back", self.name, endpoint)
+                log.warning("%s: lost the server at %s; simulates alone and tries to reconnect", self.name, endpoint)
 
         return session.info.declare_transport_events_listener(on_event)
 
