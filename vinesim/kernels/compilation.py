@@ -166,7 +166,8 @@ class CompiledModules:
 
 
 class Compilers:
-    """A pool of compiler processes. Each one is served by a thread of this process and compiles one module at a time."""
+    """A pool of compiler processes. Each one is served by a thread of this process and compiles one module at a
+    time."""
 
     def __init__(
         self, names: Sequence[str], later: Sequence[str], compiled: CompiledModules, lock: contextlib.ExitStack
@@ -202,7 +203,8 @@ class Compilers:
             return len(self._done.intersection(names))
 
     def _feed(self) -> None:
-        """Send modules to one compiler process until none is left; start another process if it dies (one thread each)."""
+        """Send modules to one compiler process until none is left; start another process if it dies (one thread
+        each)."""
         process = None
         try:
             while (name := self._next()) is not None:
@@ -267,7 +269,8 @@ def _start_compiler() -> subprocess.Popen[str]:
 
 
 def _ask(process: subprocess.Popen[str], name: str) -> dict[str, str] | None:
-    """Let a compiler process compile module ``name``. Returns its answer (``folder`` or ``failure``); None if it died."""
+    """Let a compiler process compile module ``name``. Returns its answer (``folder`` or ``failure``); None if it
+    died."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:

@@ -18,7 +18,8 @@ import threading
 
 
 def main() -> None:
-    """Compile the module named by each line of standard input, and print a line of JSON with ``folder`` or ``failure``."""
+    """Compile the module named by each line of standard input, and print a line of JSON with ``folder`` or
+    ``failure``."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # all other output goes to standard error
     # a folder of its own, so that the compiler's files are deleted however the process ends

@@ -41,7 +41,8 @@ No other thread may call ``wp.launch`` during a capture, because that would writ
 
 @dataclasses.dataclass(frozen=True)
 class KernelLaunch:
-    """One launch in a sequence: a kernel and its arguments (numbers, structs, and arrays whose addresses never change)."""
+    """One launch in a sequence: a kernel and its arguments (numbers, structs, and arrays whose addresses never
+    change)."""
 
     kernel: wp.Kernel
     inputs: Sequence[Any]

@@ -1,1 +1,2 @@
-"""Kernels that find the primitive in each pixel or ray: rasterisers for cameras, and the ray caster that verifies them."""
+"""Kernels that find the primitive in each pixel or ray: rasterisers for cameras, and the ray caster that verifies
+them."""

@@ -23,7 +23,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class PosedPrimitive:
-    """The four vectors ``a b c d`` of one primitive in the world, and the corners of its axis-aligned bounding box [m]."""
+    """The four vectors ``a b c d`` of one primitive in the world, and the corners of its axis-aligned bounding box
+    [m]."""
 
     a: wp.vec4
     b: wp.vec4

@@ -1,4 +1,5 @@
-"""Inverse kinematics of people from tracked head, hips, feet and hands; differences of poses. Poses are [7]: m, xyzw."""
+"""Inverse kinematics of people from tracked head, hips, feet and hands; differences of poses. Poses are [7]: m,
+xyzw."""
 
 import warp as wp
 

@@ -47,7 +47,8 @@ class Texels:
 
 @wp.func
 def texels_around(x: float, y: float) -> Texels:
-    """Returns the texels and weights for a bilinear sample at (x, y) of a 256 x 256 table that repeats with period 1."""
+    """Returns the texels and weights for a bilinear sample at (x, y) of a 256 x 256 table that repeats with period
+    1."""
     fx = (x - wp.floor(x)) * 256.0
     fy = (y - wp.floor(y)) * 256.0
     i = int(fx) & 255

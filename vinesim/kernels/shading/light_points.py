@@ -71,7 +71,8 @@ class FloatTables:
 
 @wp.struct
 class ShadowMaps:
-    """The near and the far shadow map with their depths in one array, so that eight SIMD lanes can read different maps."""
+    """The near and the far shadow map with their depths in one array, so that eight SIMD lanes can read different
+    maps."""
 
     near: ShadowMap
     far: ShadowMap
@@ -189,7 +190,8 @@ def write_light(code: int, width: int, colour: wp.vec3, radiance_out: wp.array(d
 
 @wp.func
 def falling_exp(x: float) -> float:
-    """Returns exp(-x) for x >= 0 with an error up to 0.012, by arithmetic that LLVM can vectorise (it cannot ``exp``)."""
+    """Returns exp(-x) for x >= 0 with an error up to 0.012, by arithmetic that LLVM can vectorise (it cannot
+    ``exp``)."""
     y = wp.max(1.0 - x * 0.0625, 0.0)
     y = y * y
     y = y * y

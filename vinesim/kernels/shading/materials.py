@@ -1,4 +1,5 @@
-"""Materials (linear RGB): tables of textures, the class of a shaded surface, and surfaces of ground, berries, leaves."""
+"""Materials (linear RGB): tables of textures, the class of a shaded surface, and surfaces of ground, berries,
+leaves."""
 
 import warp as wp
 

@@ -1,4 +1,5 @@
-"""Visibility of sun and sky: shadow maps drawn from the sun, and the share of sky light that passes through the leaves."""
+"""Visibility of sun and sky: shadow maps drawn from the sun, and the share of sky light that passes through the
+leaves."""
 
 import warp as wp
 

@@ -1,4 +1,5 @@
-"""Tone mapping to 8-bit sRGB on a CPU, eight pixels at once: ``deferred.tone_map`` for pictures of one sample a pixel."""
+"""Tone mapping to 8-bit sRGB on a CPU, eight pixels at once: ``deferred.tone_map`` for pictures of one sample a
+pixel."""
 
 import warp as wp
 

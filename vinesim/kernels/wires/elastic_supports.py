@@ -259,7 +259,8 @@ def balance_supports(
 
 @wp.func
 def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: SupportedSprings):
-    """Returns the stiffness k [N/m] of the tie at node ``i`` of a wire, and its force k s [N]; see :func:`pull_of_tie`."""
+    """Returns the stiffness k [N/m] of the tie at node ``i`` of a wire, and its force k s [N]; see
+    :func:`pull_of_tie`."""
     stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
     stiffness, moved, _ = pull_of_tie(i, stiffness, nodes, bodies)
     return stiffness, moved
