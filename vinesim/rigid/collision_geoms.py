@@ -22,12 +22,12 @@ PLANE_HALF_SIZE = 1e6
 
 @dataclasses.dataclass(frozen=True)
 class RigidGeoms:
-    """Rigid geoms that plants can touch, sorted by MuJoCo geom."""
+    """Arrays of the rigid geoms that plants can collide with, sorted by MuJoCo's geom index."""
 
     id: np.ndarray
     """[geom] index in MuJoCo's geom arrays."""
     body: np.ndarray
-    """[geom] MuJoCo body."""
+    """[geom] index of the geom's MuJoCo body."""
     kind: np.ndarray
     """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
     replaced by its bounding box."""
@@ -43,7 +43,7 @@ class RigidGeoms:
     radius: np.ndarray
     """[geom] m, radius of the bounding sphere around ``center``."""
     material: np.ndarray
-    """[geom] :class:`Material`"""
+    """[geom] contact material, a number of :class:`Material`."""
     friction: np.ndarray
     """[geom] the geom's own Coulomb coefficient; 0: the coefficient depends on the two materials in contact."""
     dof: np.ndarray

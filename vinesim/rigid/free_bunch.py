@@ -26,8 +26,9 @@ PARKING_HEIGHT = -100.0
 CONAFFINITY = ALL_BITS & ~CRATE_FLOOR
 """Collision bits with which the shapes of a free bunch collide."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
-"""MuJoCo's constraint impedance. TUNED: with harder contacts a bunch is held with a penetration of a few micrometres,
-and a moving hand loses contact for a step. Fingers that hold with 25 N then move by 3 mm, and the bunch falls."""
+"""Constraint impedance (MuJoCo's ``solimp``) of contacts of free bunches. TUNED: with harder contacts a bunch is held
+with a penetration of a few micrometres, and a moving hand loses contact for a step. Fingers that hold with 25 N then
+move by 3 mm, and the bunch falls."""
 
 BODY_ARRAYS = (
     "body_mass",
@@ -66,7 +67,7 @@ class FreeBunch:
     """Mass and shapes of a picked bunch, in the frame of its former plant body."""
 
     mass: float
-    """[kg]"""
+    """Mass [kg]."""
     com: np.ndarray
     """[3] m, centre of mass."""
     inertia: np.ndarray
@@ -78,7 +79,7 @@ class FreeBunch:
     end: np.ndarray
     """[shape, 3] m, end of a capsule's axis."""
     radius: np.ndarray
-    """[shape] m"""
+    """[shape] m, radius of each sphere or capsule."""
 
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
@@ -132,7 +133,10 @@ def _parking_pose(slot: int) -> np.ndarray:
 
 
 def compile_alone(bunch: FreeBunch, parameters: PhysicsParameters) -> mujoco.MjModel:
-    """Compile a bunch in its own world; ``ValueError`` if it has too many shapes or none."""
+    """Compile a MuJoCo model that contains only ``bunch``, for the constants that MuJoCo derives.
+
+    Raises ``ValueError`` if the bunch has too many shapes or none.
+    """
     spec = mujoco.MjSpec()
     add_free_bunch(spec, bunch, parameters)
     return spec.compile()

@@ -166,7 +166,7 @@ class HumanBody:
         self.hands = tuple(HandBody(side, stiffness, force, parameters) for side in SIDES)
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
-        """[part] MuJoCo bodies of :data:`BODY_PARTS`."""
+        """[part] Indices of the MuJoCo bodies of :data:`BODY_PARTS`."""
         self.part_dofs = np.zeros((0, 6), int)
         """[part, 6] MuJoCo's degrees of freedom of :data:`BODY_PARTS`."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
@@ -296,7 +296,7 @@ class HumanBody:
             )
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames) -> None:
-        """Find the person's bodies and joints in a recompiled world."""
+        """Look up the indices of the person's bodies and joints in a recompiled world."""
         name = self.spec.name
         self.part_bodies = np.array([names.body[f"{name}/{part}"] for part in BODY_PARTS], int)
         joints = [names.joint[f"{name}/{part}"] for part in BODY_PARTS]
@@ -365,7 +365,7 @@ class HumanBody:
         return float(moved @ moved) > self.parameters.teleport_distance * self.parameters.teleport_distance
 
     def _teleport(self, d: mujoco.MjData) -> None:
-        """Place the whole person without velocity. Hands that hold something stay where they are."""
+        """Place the whole person at the tracked points, at rest, except hands that hold something."""
         self._last_poses = self._poses
         for hand in self.hands:
             if hand.held is None:
@@ -378,7 +378,7 @@ class HumanBody:
 
 
 def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], friction: float, material: Material) -> None:
-    """Add a collision shape; ``bits``: contype and conaffinity."""
+    """Add a collision shape to a MuJoCo ``body``; ``bits``: contype and conaffinity."""
     size = [*shape.size, 0.0, 0.0][:3]
     body.add_geom(
         type=_KINDS[shape.kind],
@@ -401,7 +401,7 @@ def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], frictio
 class HandBody:
     """State of one hand and its indices in MuJoCo's arrays.
 
-    A free hand moves exactly with its controller. When it touches something, a spring pulls it to its controller
+    A free hand follows its controller. When it touches something, a spring pulls it to its controller
     instead, until it has touched nothing for ``hand_contact_duration``. A hand that holds something does not collide.
     """
 
@@ -430,7 +430,7 @@ class HandBody:
         self.grasp_pose = np.zeros(7)
         """[7] pose of the hand in the frame of the object that it holds."""
         self.on_plant = False
-        """Whether the hand holds a plant and is placed on it, see :mod:`vinesim.interaction.hand_grasp`."""
+        """Whether the hand holds a plant and moves with it, see :mod:`vinesim.interaction.hand_grasp`."""
         self.collision_bits: tuple[int, int] = (0, 0)
         """MuJoCo's contype and conaffinity while the hand can touch something."""
         self.body = self.weld = -1
@@ -447,7 +447,7 @@ class HandBody:
         return self.steps_since_contact < self.contact_steps
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames, actor: str) -> None:
-        """Find the hand of ``actor`` in a recompiled world."""
+        """Look up the MuJoCo indices of the hand of ``actor`` in a recompiled world."""
         name = f"{actor}/{self.link}"
         joint = names.joint[name]
         self.body = names.body[name]
@@ -560,7 +560,7 @@ class HandBody:
     # ------------------------------------------------------------------ holding
 
     def weld_to(self, m: mujoco.MjModel, d: mujoco.MjData, body: int | None) -> None:
-        """Weld the hand to a MuJoCo body at ``grasp_pose``; None: the hand holds a plant and is placed on it."""
+        """Weld the hand to a MuJoCo ``body`` at ``grasp_pose``; None: the hand holds a plant and moves with it."""
         self.on_plant = body is None
         self.steps_since_contact = 0
         d.eq_active[self.weld] = body is not None

@@ -36,15 +36,16 @@ HIP_HALF_WIDTH = 0.095
 TRUNK_LENGTH = 0.288
 
 EYES_TO_HEAD_BACK = 0.09
-"""[m] Backward distance from the point between the eyes to the middle of the head. GUESSED."""
+"""Backward distance [m] from the point between the eyes to the middle of the head. GUESSED."""
 EYES_TO_HEAD_DOWN = 0.02
-"""[m] Downward distance from the point between the eyes to the middle of the head. GUESSED."""
+"""Downward distance [m] from the point between the eyes to the middle of the head. GUESSED."""
 HAND_HALF_THICKNESS = 0.012
-"""[m] Half of the thickness of a palm. GUESSED."""
+"""Half of the thickness of a palm [m]. GUESSED."""
 PALM_TO_FINGERTIP = 0.13
-"""[m] Distance from the middle of the palm to the fingertips. GUESSED."""
+"""Distance [m] from the middle of the palm to the fingertips. GUESSED."""
 GRASP_POINTS = np.array([[0.0, 0.0, 0.0], [0.085, 0.0, 0.0]])
-"""[2, 3] m, middle of the palm and of the fingers, in the palm's frame."""
+"""Points [2, 3] m of a hand from which grasps are searched: middle of the palm and of the fingers, in the palm's frame.
+"""
 SKIN_COLOR = (0.85, 0.62, 0.5, 1.0)
 CLOTH_COLOR = (0.98, 0.47, 0.16, 1.0)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
@@ -105,11 +106,11 @@ VISUAL_PARTS = (
 )
 """Names of a person's visible parts without collisions: neck and arms, which connect head, chest and hands; fingers."""
 EYE_HEIGHT = 0.939
-"""[1] Height of the eyes of a standing person, as a fraction of the person's height. READ: Winter 2009."""
+"""Height of the eyes of a standing person, as a fraction of the person's height. READ: Winter 2009."""
 HIP_HEIGHT = 0.53
-"""[1] Height of the hips of a standing person, as a fraction of the person's height. READ: Winter 2009."""
+"""Height of the hips of a standing person, as a fraction of the person's height. READ: Winter 2009."""
 NECK_BELOW_EYES = -0.2
-"""[m] Height of the neck relative to the eyes. GUESSED."""
+"""Height of the neck relative to the eyes [m]. GUESSED."""
 
 
 def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:

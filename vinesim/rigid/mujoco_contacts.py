@@ -28,7 +28,8 @@ class PairFriction:
         self._table = pair_table("friction", parameters.friction)
         self._is_listed = self._table != parameters.friction
         self._material = np.zeros(0, np.int32)
-        """[geom] material; UNKNOWN if the geom has its own coefficient, which MuJoCo then uses."""
+        """[geom] Material of each geom; UNKNOWN for a geom with its own friction coefficient, which MuJoCo then uses.
+        """
 
     def find_materials(self, m: mujoco.MjModel) -> None:
         """Look up the materials of all geoms of a recompiled world."""

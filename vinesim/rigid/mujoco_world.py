@@ -48,7 +48,7 @@ class CompiledWorld:
     bunches: dict[int, tuple[int, FreeBunch]]
     """Free bunches that already have bodies in the world, each with its slot."""
     hulls: SharedArrays
-    """See :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
+    """Convex hulls of all meshes, see :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
     removed: tuple[RobotBody | HumanBody, ...] = ()
     """Actors of the present world that do not exist in the compiled one."""
 
@@ -79,7 +79,8 @@ class MujocoWorld:
         """Free bunches that do not collide with fixed pieces, because they have overlapped one ever since they were
         picked."""
         self._derived: weakref.WeakKeyDictionary[FreeBunch, mujoco.MjModel] = weakref.WeakKeyDictionary()
-        """Constants that MuJoCo derives from the mass and shapes of each free bunch."""
+        """Models of single free bunches (:func:`compile_alone`), with the constants that MuJoCo derives for each bunch.
+        """
         self._pool_size = 0
         self._static_spec = static_world.build_static_world(model, parameters)
         self._compile_lock = threading.Lock()
@@ -412,7 +413,7 @@ class LinkSensors:
         self._row: dict[tuple[str, str], int] = {}
         """Row of a sensor, by robot and link."""
         self._body = self._root = np.zeros(0, int)
-        """[sensor] MuJoCo body of the link, and of the root of its robot."""
+        """[sensor] Index of the MuJoCo body of the link, and of the root of its robot."""
         self._wrench = np.zeros((0, 6))
         """[sensor, 6] N m, N, moment about ``_com`` and force that the parent link exerts on the link, world axes."""
         self._com = np.zeros((0, 3))
@@ -422,7 +423,7 @@ class LinkSensors:
         self._rotation = np.zeros((0, 9))
         """[sensor, 9] rotation matrix of the link in the world, row by row."""
         self._acceleration = np.zeros((0, 6))
-        """[sensor, 6] rad/s^2, m/s^2, see :meth:`acceleration`."""
+        """[sensor, 6] rad/s^2, m/s^2, result of :meth:`acceleration`."""
 
     def find_indices(self, m: mujoco.MjModel, robots: Mapping[str, RobotBody]) -> None:
         """Look up the links with sensors in a recompiled world. Measurements of the last step are kept."""

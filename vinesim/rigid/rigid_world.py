@@ -216,7 +216,7 @@ class RigidWorld(MujocoWorld):
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
     def apply_controls(self) -> None:
-        """Turn the targets of all robots into MuJoCo's controls."""
+        """Compute MuJoCo's controls from the targets of all robots."""
         for robot in self._robots.values():
             robot.apply_controls(self.mj_data, self.dt)
 
@@ -253,7 +253,7 @@ class RigidWorld(MujocoWorld):
         return self._effective_mass.is_constrained(self.mj_data, bodies)
 
     def impulse_response(self, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see
+        """Returns the change of velocity [dof, k] by unit impulses along the rows of ``J`` [k, dof]; see
         :class:`EffectiveMass`."""
         return self._effective_mass.impulse_response(self.mj_data, J)
 
@@ -292,7 +292,7 @@ class RigidWorld(MujocoWorld):
         self._kinematics_current = False
 
     def rebind(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-        """Use another MuJoCo world in which the robots' joints and bodies have the same names."""
+        """Use another MuJoCo model and data, in which the joints and bodies have equal names."""
         self.mj_model = mj_model
         self.mj_data = mj_data
         self.contact_force = np.zeros(mj_model.nv)
@@ -577,7 +577,7 @@ class RigidWorld(MujocoWorld):
         self._update_geoms()
 
     def place_hand(self, name: str, side: str, pose: np.ndarray) -> None:
-        """Put a hand at ``pose`` [7], at rest."""
+        """Put a person's hand at ``pose`` [7], at rest."""
         self.human(name).hand(side).place(self.mj_data, pose)
         self._kinematics_current = False
 
@@ -672,7 +672,7 @@ class RigidWorld(MujocoWorld):
         self._set_passing(clear, False)
 
     def _set_passing(self, bunches: set[int], passing: bool) -> None:
-        """Set whether free bunches pass through fixed pieces."""
+        """Set whether free ``bunches`` pass through fixed pieces (wood, wires, poles) or collide with them."""
         m = self.mj_model
         bits = free_bunch.CONAFFINITY & ~FIXED if passing else free_bunch.CONAFFINITY
         for bunch in bunches:

@@ -84,7 +84,7 @@ class RobotBody:
         """Stiffness and damping [3] of the base's servos along x, y and about z."""
         self._base_slip = np.array([parameters.base_slip])
         self.has_exact_damping = np.zeros(joints, bool)
-        """[joint] bool, whether the joint has exactly its own damping; see :func:`split_damping`."""
+        """[joint] bool, whether the joint is damped by exactly the set damping; see :func:`split_damping`."""
         self.damping_at_start = np.zeros(joints)
         """[joint] N m s/rad, part of the damping that acts on the velocity at the start of the step."""
         self.damping_at_end = np.zeros(joints)
@@ -142,7 +142,7 @@ class RobotBody:
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
     def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
-        """Find the robot's bodies and joints in a recompiled world."""
+        """Look up the MuJoCo indices of the robot's bodies and joints in a recompiled world."""
         name = self.spec.name
         driven = [f"{name}/{drive.joint}" for drive in self.spec.drives]
         planar = [f"{name}:{axis}" for axis in _PLANAR]
@@ -313,7 +313,7 @@ class RobotBody:
     # ------------------------------------------------------------------ inside
 
     def _set_gains(self, m: mujoco.MjModel) -> None:
-        """Write gains and limits into MuJoCo's model."""
+        """Write the servos' gains and effort limits into MuJoCo's model."""
         dt = m.opt.timestep
         at_end, at_start = split_damping(
             self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt

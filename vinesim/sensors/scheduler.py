@@ -36,7 +36,7 @@ class ScheduledSensor:
 
     sensor: Sensor
     deliver: Callable[[Any], None]
-    """Called with every frame."""
+    """Function that is called with every rendered frame of the sensor."""
     wanted: DemandQuery = lambda: CameraOutput.ALL
     rate: float | None = None
     """Frames a second of simulated time [Hz]; None: the sensor's own rate."""
@@ -62,7 +62,7 @@ SensorPoses = Mapping[str, np.ndarray]
 
 
 class SensorScheduler:
-    """Renders the sensors of one robot, in the caller's thread."""
+    """Renders the sensors of one robot when they are due and wanted, in the caller's thread."""
 
     def __init__(
         self,

@@ -100,7 +100,7 @@ class ConeBounds:
     """Region of the picture that contains a cone: a box and, if ``banded``, a slanted band within the box."""
 
     box: wp.vec4i
-    """First and last + 1 column, first and last + 1 row."""
+    """Box in pixels: first and last + 1 column, first and last + 1 row."""
     banded: int
     x: float
     y: float

@@ -56,7 +56,8 @@ UNBOUNDED_STRIP = wp.constant(wp.vec3(0.0, -1.0e6, 1.0e6))
 
 @wp.struct
 class Outline:
-    """Region of the picture that contains a primitive: a box and two strips ``low <= x - slope y <= high``."""
+    """Region of the picture that contains a primitive: the intersection of a box and two slanted strips
+    ``low <= x - slope y <= high`` [px]."""
 
     box: wp.vec4i
     """First and last + 1 column, first and last + 1 row."""

@@ -121,11 +121,11 @@ def pose_clusters(
     upper_out: wp.array(dtype=wp.vec3),
     ball_out: wp.array(dtype=wp.vec4),
 ):
-    """One thread transforms the primitives of one cluster whose bodies moved into the world, and bounds them.
+    """One thread transforms the primitives of one cluster from their bodies' frames into the world, and bounds them.
 
-    local: [primitive] in the frame of its body; carrier: [primitive] row of the body in ``poses``; dirty: clusters to
-    transform; lower, upper: [primitive] bounding box [m]; ball: [cluster] centre and radius of the bounding sphere [m],
-    radius -1 for a hidden cluster.
+    local: [primitive] in the frame of its body; carrier: [primitive] row of the body in ``poses``; dirty: clusters
+    whose bodies moved; lower, upper: [primitive] bounding box [m]; ball: [cluster] centre and radius of the bounding
+    sphere [m], radius -1 for a hidden cluster.
     """
     cluster = dirty[wp.tid()]
     kind = clusters.kind[cluster]

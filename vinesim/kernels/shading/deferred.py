@@ -41,9 +41,9 @@ class Light:
     sun_colour: wp.vec3
     sky_colour: wp.vec3
     ground_colour: wp.vec3
-    """Colour of the light from the ground."""
+    """Linear RGB of the light that the ground reflects."""
     canopy_colour: wp.vec3
-    """Colour of the light through the canopy."""
+    """Linear RGB of the green light that leaves transmit."""
     haze_colour: wp.vec3
     shadow_taps: int
     """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
@@ -218,7 +218,7 @@ def shade_surface(
 def seen_surface(
     shapes: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3, footprint: float, slant: float
 ) -> Surface:
-    """Returns the surface of primitive ``i`` (-2: the ground) at ``p``, seen along the unit ray ``d``.
+    """Returns the material properties of primitive ``i`` (-2: the ground) at ``p`` [m], seen along the unit ray ``d``.
 
     ``footprint`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m].
     """

@@ -58,13 +58,13 @@ class FloatTables:
     outline: wp.array(dtype=wp.int8)
     """[outline * 256 * 256] signed distance to the leaf's edge, as in ``Shapes.outline``."""
     leaf_texture: wp.array2d(dtype=wp.float32)
-    """[texel, 4]"""
+    """[texel, 4] Vein strength, slopes of the relief and tone of leaves."""
     noise: wp.array2d(dtype=wp.float32)
-    """[texel, 4]"""
+    """[texel, 4] Four octaves of noise."""
     soil: wp.array2d(dtype=wp.float32)
-    """[texel, 4]"""
+    """[texel, 4] Tone, sod and slopes of the ground."""
     sky_table: wp.array2d(dtype=wp.float32)
-    """[texel, 3]"""
+    """[texel, 3] Radiance of the sky, linear RGB."""
     ground_sky: wp.array(dtype=wp.float32)
     """[cell] Share of the sky that is visible from the ground; flattened from rows and columns."""
 
@@ -77,12 +77,13 @@ class ShadowMaps:
     near: ShadowMap
     far: ShadowMap
     depth: wp.array(dtype=wp.float32)
-    """[near texels, then far texels] m"""
+    """Depths [m] of the near map's texels, followed by those of the far map's."""
 
 
 @wp.func
 def point_class(shapes: Shapes, materials: Materials, i: int) -> int:
-    """Returns the class of a point on primitive ``i`` (-1: the sky, -2: the ground)."""
+    """Returns the shading class (0 to :data:`CLASS_COUNT` - 1) of a point on primitive ``i`` (-1: the sky, -2: the
+    ground)."""
     if i < 0:
         return wp.where(i == -1, SKY, GROUND)
     kind = shapes.kind[i]

@@ -81,11 +81,11 @@ def sample_nearest(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.v
 
 @wp.struct
 class Surface:
-    """Reflection properties of a surface at one point."""
+    """Reflection properties of a surface at one point, for shading."""
 
     normal: wp.vec3
     geometric_normal: wp.vec3
-    """Normal of the shape, without relief."""
+    """Unit normal of the primitive's shape, without the relief of the material."""
     albedo: wp.vec3
     transmission: wp.vec3
     """Colour of the light that passes through the surface."""

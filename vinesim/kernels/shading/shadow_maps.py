@@ -61,7 +61,8 @@ def sky_visibility(
     # out
     sky_out: wp.array(dtype=wp.float32),
 ):
-    """One thread finds the share of the sky light that reaches one point through leaves (Beer-Lambert, 13 directions).
+    """One thread computes the share of the sky light that reaches one point through leaves (Beer-Lambert, 13
+    directions).
 
     density: [x, y, z] leaf area per volume [1/m] in cells of ``cell`` [m] from ``corner`` on; position: [point] m;
     sky: [point] 0 to 1.

@@ -104,13 +104,13 @@ class SupportedSprings:
 
 @wp.func
 def vec3d(v: wp.vec3):
-    """Returns the vector in double precision."""
+    """Returns ``v`` converted to double precision."""
     return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
 
 @wp.func
 def vec3f(v: wp.vec3d):
-    """Returns the vector in single precision."""
+    """Returns ``v`` converted to single precision."""
     return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 

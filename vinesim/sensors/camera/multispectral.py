@@ -32,7 +32,7 @@ from vinesim.sensors.raster.primitive_arrays import LEAF
 from vinesim.sensors.sensor import Export, SensorMaker, SensorSetting
 
 FULL_SCALE = 32768
-"""Value of a reflectance of 1 in 16-bit images, as in MicaSense's own images."""
+"""Value in 16-bit images that stands for a reflectance of 1, as in MicaSense's images."""
 SHADOW_PERIOD = 0.2
 """Period [s] at which shadows of moving objects are redrawn."""
 DARK_BERRY = 0.55
@@ -114,7 +114,7 @@ class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     full_well: Annotated[Number, "1", (10.0, 1e9)]
     """Number of electrons of a pixel at full scale, for shot noise (standard deviation: square root of the number)."""
     read_noise: Annotated[Number, "1", (0.0, 1e4)]
-    """Standard deviation of a dark pixel [electron]."""
+    """Read noise: standard deviation of a pixel without light [electron]."""
     transmission: Annotated[Number, "1", (0.0, 2.0)]
     """Transmittance of a leaf divided by its reflectance, equal in all bands."""
     bands: tuple[BandSpec, ...]

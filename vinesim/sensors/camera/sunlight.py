@@ -312,7 +312,7 @@ class Sunlight:
         workers = workers or ThreadPool(1)
         side = 1024 * fine
         self.depth = wp.empty(side * side + 1024 * 1024, dtype=float, device=device)
-        """Depths of both shadow maps [texel]: the near one, then the far one."""
+        """[texel] Depths [m] of the near shadow map, followed by those of the far one."""
         near = self.depth[: side * side]
         far = self.depth[side * side :]
         self._near = ShadowSquare(0.007 / fine, side, 2.5, 0.8, True, near, device, workers)

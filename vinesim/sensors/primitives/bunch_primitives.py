@@ -35,12 +35,12 @@ _SHOT_BERRY_SHARE = 0.06
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ripeness:
-    """Ripeness of fruit: 0 is green and hard, 1 is as the variety is harvested."""
+    """Ripeness of all bunches of a vineyard, from 0 (green and hard) to 1 (as the variety is harvested)."""
 
     bunch: np.ndarray
     """[bunch] Mean ripeness of the berries of each bunch."""
     seed: int = 0
-    """Seed of the differences between berries."""
+    """Seed of the random differences in ripeness between berries of a bunch."""
 
     @classmethod
     def random(cls, count: int, seed: int) -> Ripeness:

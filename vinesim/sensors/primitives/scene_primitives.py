@@ -70,7 +70,8 @@ _TEXTURES = (
     "ground_y",
     "ground_cell",
 )
-"""Fields of ``Materials`` that do not depend on the primitives: textures and the sky above the ground."""
+"""Fields of ``Materials`` that do not depend on the primitives: textures, rows of vines, visible sky above the ground.
+"""
 
 
 class Primitives:
@@ -114,9 +115,9 @@ class Primitives:
         self._hull = wp.array(hull, dtype=wp.vec2, device=device)
         self._body_q = State.at_rest(model).body_q
         self.pose_version = 0
-        """Number of changes of any pose."""
+        """Counter that increases when any primitive moves."""
         self.layout_version = 0
-        """Number of changes of the set of primitives."""
+        """Counter that increases when primitives are added or removed."""
         self._columns: dict[str, wp.array] = {}
         """Columns of the tables of primitives and clusters, by name, with spare capacity for rigid bodies."""
         self._poses = np.zeros((0, 7), np.float32)
@@ -168,9 +169,12 @@ class Primitives:
     # -- building
 
     def _bake(self, grass: float) -> disk_cache.Arrays:
-        """Lay out plants and the static scene in clusters, and compute the share of the sky that is visible through the
-        leaves. It is computed in the shape at rest: for each primitive, for the far end of each piece of wood, and for
-        the ground."""
+        """Compute clusters of primitives of plants and the static scene, and the share of the sky that is visible
+        through the leaves, both for plants at rest.
+
+        The visible share is computed for each primitive, for the far end of each segment of wood, and for the ground.
+        ``grass``: tufts per square metre.
+        """
         low, high = _ground_extent(self.model)
         layout = lay_out(self._plant_batches(grass, low, high), [], self._static_carrier)
         baked = {field.name: getattr(layout, field.name) for field in dataclasses.fields(layout)}
