@@ -179,8 +179,7 @@ def newton_impulse(
     surface: Surface,
     matrix: wp.array2d(dtype=float),
 ):
-    """Returns the impulse along a thread's row that fits the present states of all contacts, projected into its
-    cone."""
+    """Returns the impulse along a thread's row that fits the present states of all contacts, projected into its cone."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     c = lane // 3
