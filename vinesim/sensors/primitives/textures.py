@@ -229,8 +229,8 @@ def _soil_texture() -> disk_cache.Arrays:
 def _sky_layers() -> disk_cache.Arrays:
     """Compute the parts of the sky's texture that do not depend on the sun, as float64.
 
-    ``cloud``: share of clouds; ``ridges``, ``tree_share``: share of hills and of trees in front of the sky, in the
-    lowest :data:`_RIDGE_ROWS` rows; ``trees``: colour of the trees.
+    Array ``cloud`` is the share of clouds, ``ridges`` and ``tree_share`` are the shares of hills and of trees in front
+    of the sky, in the lowest :data:`_RIDGE_ROWS` rows, and ``trees`` is the colour of the trees.
     """
     height, azimuth = (np.ascontiguousarray(part) for part in np.broadcast_arrays(*_sky_directions()))
     flat = np.sqrt(1.0 - height**2)
