@@ -10,7 +10,7 @@ import warp as wp
 
 from vinesim.contact.plant_capsules import PlantCapsules
 from vinesim.core import frames
-from vinesim.core.warp_arrays import SharedArrays, share, zeros
+from vinesim.core.warp_arrays import SharedArrays, share, struct_fields, zeros
 from vinesim.kernels.contact import broadphase, structs
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.graph import KernelLaunch
@@ -43,7 +43,7 @@ def material_pairs(p: PhysicsParameters) -> np.ndarray:
     tables["damping"] = p.contact_damping_time * stiffness
     tables["compliance"] = 1.0 / (p.dt * (stiffness * p.dt + tables["damping"]))
     pairs = zeros(Surface, stiffness.shape)
-    for name in Surface.vars:
+    for name in struct_fields(Surface):
         pairs[name] = tables[name]
     return pairs
 

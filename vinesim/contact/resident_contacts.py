@@ -15,7 +15,7 @@ import warp as wp
 
 from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.contact.plant_capsules import plant_capsules
-from vinesim.core.warp_arrays import SharedArrays
+from vinesim.core.warp_arrays import SharedArrays, struct_fields
 from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
 from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
 from vinesim.kernels.contact.friction_law import Surface
@@ -101,20 +101,20 @@ class ResidentContacts:
         ``source``.
         """
         made = kind()
-        for name, field in kind.vars.items():
+        for name, field in struct_fields(kind).items():
             given = values.get(name)
             if isinstance(given, np.ndarray):
-                given = wp.array(given, dtype=field.type.dtype, device=self._device)
+                given = wp.array(given, dtype=field.dtype, device=self._device)
             setattr(made, name, wp.clone(getattr(source, name), self._device) if given is None else given)
         return made
 
     def _allocated(self, kind: Any, sizes: dict[str, int], width: dict[str, int]) -> Any:
         """Returns a struct of zeroed arrays, with ``sizes`` by name (default 1) and the ``width`` of 2-D arrays."""
         made = kind()
-        for name, field in kind.vars.items():
+        for name, field in struct_fields(kind).items():
             size = sizes.get(name, 1)
-            shape = size if field.type.ndim == 1 else (size, width.get(name, 1))
-            setattr(made, name, wp.zeros(shape, dtype=field.type.dtype, device=self._device))
+            shape = size if field.ndim == 1 else (size, width.get(name, 1))
+            setattr(made, name, wp.zeros(shape, dtype=field.dtype, device=self._device))
         return made
 
     def _take_over_plants(self, arrays: PlantArrays) -> None:
@@ -127,7 +127,7 @@ class ResidentContacts:
         self._bodies.q, self._bodies.qd, self._bodies.qd_free = rows["body_q"], rows["body_qd"], rows["body_qd_free"]
         self._capsules = self._interleaved(arrays.capsules)
         self._capsule_states = self._allocated(
-            structs.CapsuleStates, dict.fromkeys(structs.CapsuleStates.vars, self._capsule_count), {}
+            structs.CapsuleStates, dict.fromkeys(struct_fields(structs.CapsuleStates), self._capsule_count), {}
         )
 
     def _interleaved(self, capsules: SharedArrays) -> Any:
@@ -141,7 +141,7 @@ class ResidentContacts:
         tree = np.repeat(np.arange(self._trees), np.diff(start))
         at = number * self._trees + tree
         given: dict[str, np.ndarray] = {}
-        for name in structs.Capsules.vars:
+        for name in struct_fields(structs.Capsules):
             source = getattr(capsules, name)
             if len(source) == start[-1]:
                 given[name] = np.zeros((self._capsule_count, *source.shape[1:]), source.dtype)
@@ -205,8 +205,8 @@ class ResidentContacts:
         pairs = PAIRS_PER_SLOT * slots
         self.candidates = self._allocated(structs.Candidates, {}, {})
         for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
-            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, 2 * pairs))
-        of_all: dict[str, int] = dict.fromkeys(structs.Contacts.vars, trees * slots)
+            setattr(self.candidates, name, self._by_slot(struct_fields(structs.Candidates)[name].dtype, 2 * pairs))
+        of_all: dict[str, int] = dict.fromkeys(struct_fields(structs.Contacts), trees * slots)
         self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("island", "block", "place"), 1), {})
         of_rows: dict[str, int] = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
         self.rows = self._allocated(structs.Rows, of_rows, {"plant_jacobian": 12})
@@ -215,15 +215,17 @@ class ResidentContacts:
         self._system.surface = self.contacts.surface
         self._system.impulse = self.rows.impulse
         searched = trees * rows if self._device.is_cpu else 1  # a GPU searches in registers
-        self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, searched), {"factor": rows + 1})
-        busy_rows = self._groups * rows
-        self._dense = self._allocated(TreeSystem, dict.fromkeys(TreeSystem.vars, busy_rows), {"matrix": rows})
-        self._dense_search = self._allocated(
-            TreeSearch, dict.fromkeys(TreeSearch.vars, busy_rows), {"factor": rows + 1}
+        self._search = self._allocated(
+            TreeSearch, dict.fromkeys(struct_fields(TreeSearch), searched), {"factor": rows + 1}
         )
-        of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
+        busy_rows = self._groups * rows
+        self._dense = self._allocated(TreeSystem, dict.fromkeys(struct_fields(TreeSystem), busy_rows), {"matrix": rows})
+        self._dense_search = self._allocated(
+            TreeSearch, dict.fromkeys(struct_fields(TreeSearch), busy_rows), {"factor": rows + 1}
+        )
+        of_all = dict.fromkeys(struct_fields(structs.WarmStart), trees * slots) | {"count": trees}
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
-        of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
+        of_trees = dict.fromkeys(struct_fields(tree_narrowphase.TreeContacts), trees)
         of_trees |= dict.fromkeys(("near_total", "busy_count"), 1) | {"loaded": trees * slots}
         of_trees |= dict.fromkeys(("near", "near_place", "found"), trees * pairs)
         self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import warp as wp
 
-from vinesim.core.warp_arrays import SharedArrays
+from vinesim.core.warp_arrays import SharedArrays, struct_fields
 from vinesim.kernels.contact import row_response
 from vinesim.kernels.contact.structs import SideGroups
 from vinesim.kernels.graph import KernelLaunch
@@ -33,7 +33,7 @@ class RowResponse:
         self.jacobian = buffers.pinned(np.zeros((3 * contacts, 12)))
         self.body, self.tree_end = (buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for _ in range(2))
         self.body_slot, self.other_slot = (buffers.pinned(np.zeros(contacts, np.int32)) for _ in range(2))
-        lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in SideGroups.vars}
+        lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in struct_fields(SideGroups)}
         self.groups = SharedArrays(SideGroups, **lists)
         self._counters = counters
         self._there = SideGroups()

@@ -26,7 +26,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
-from vinesim.core.warp_arrays import share
+from vinesim.core.warp_arrays import share, struct_fields
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants import first_mode, structs
 from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
@@ -1063,9 +1063,9 @@ class KernelLaunches:
         buffers.add_constant("body_branches", self._branching(model.body_parent), wp.bool)
         trees = len(model.tree_first)
         self.budget = structs.EnergyBudget()
-        for name, field in structs.fields(structs.EnergyBudget).items():
+        for name, field in struct_fields(structs.EnergyBudget).items():
             count = buffers.slot_count if name == "start_q" else trees
-            setattr(self.budget, name, wp.zeros(count, dtype=field.type.dtype, device=buffers.device))
+            setattr(self.budget, name, wp.zeros(count, dtype=field.dtype, device=buffers.device))
         self.budget.limit.fill_(NO_LIMIT)
         rows = (self.budget.limit, self.budget.watch)
         self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
@@ -1100,7 +1100,7 @@ class KernelLaunches:
     def _filled(self, struct: Any, arrays: dict[str, wp.array], values: dict[str, Any]) -> Any:
         filled = struct()
         values = {"pitch": self.buffers.pitch} | values
-        for field in structs.fields(struct):
+        for field in struct_fields(struct):
             value = values.get(field, field)
             setattr(filled, field, arrays[value] if isinstance(value, str) else value)
         return filled
@@ -1466,7 +1466,7 @@ class KernelLaunches:
         matrix: Any = wp.mat33
         columns = {
             name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
-            for name in structs.fields(structs.ResponseColumns)
+            for name in struct_fields(structs.ResponseColumns)
         }
         self._respond = self.graph(
             self.launch(

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from vinesim.core.warp_arrays import host_element
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.gather_scatter import copy_rows
 
@@ -143,7 +144,7 @@ class DeviceBuffers:
             if data.size and shared.ptr != data.ctypes.data:
                 raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
             return shared
-        shape = data.shape[: data.ndim - len(getattr(dtype, "_shape_", ()))]
+        shape = data.shape[: data.ndim - host_element(dtype).ndim]
         return wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
 
     def host_array(self, name: str) -> wp.array:

@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.plants import structs
 from vinesim.kernels.plants.residual_motion import REST_STEP, residual_motion
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -48,7 +49,7 @@ class EquilibriumFinder:
         launches = plants.launches
         s = structs
         fill = launches.fill
-        numbers = {name: getattr(launches.parameters, name) for name in s.fields(s.SolverParameters)}
+        numbers = {name: getattr(launches.parameters, name) for name in struct_fields(s.SolverParameters)}
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         measure = launches.launch(
             residual_motion,

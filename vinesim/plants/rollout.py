@@ -28,6 +28,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.plants import integration, kinematics, prediction, structs
 from vinesim.plants.articulation_solver import ArticulationSolver, kernel_parameters
 from vinesim.plants.device_buffers import DeviceBuffers, find_device
@@ -36,7 +37,7 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
 _PREDICT, _INTEGRATE, _FORWARD_KINEMATICS = (
-    wp.kernel(kernel.func, module="vinesim.plants.rollout", enable_backward=True)
+    wp.kernel(inspect.unwrap(kernel), module="vinesim.plants.rollout", enable_backward=True)
     for kernel in (prediction.predict, integration.integrate, kinematics.forward_kinematics)
 )
 _STRUCT = type(structs.JointState)
@@ -264,9 +265,9 @@ class Rollout:
     def _record(self) -> None:
         """Allocate arrays for every step of a segment, and record the forward and adjoint launches that work on
         them."""
-        self._states = tuple(structs.fields(structs.JointState))
-        for name, field in structs.fields(structs.JointState).items():
-            self._stacks[name] = self._zeros(name, field.type.dtype, self._slots + 1)
+        self._states = tuple(struct_fields(structs.JointState))
+        for name, field in struct_fields(structs.JointState).items():
+            self._stacks[name] = self._zeros(name, field.dtype, self._slots + 1)
         self._stacks[_COUNTER] = self._zeros(_COUNTER, wp.int32, self._slots + 1)
         self._steps = [(self._launch(_PREDICT, slot), self._launch(_INTEGRATE, slot)) for slot in range(self._slots)]
         self._ends = [self._launch(_FORWARD_KINEMATICS, slot + 1, end=True) for slot in range(self._slots)]
@@ -274,7 +275,7 @@ class Rollout:
 
     def _launch(self, kernel: Any, slot: int, end: bool = False) -> tuple[Any, Any]:
         """The forward launch of one kernel in one step, and its adjoint launch."""
-        types = inspect.get_annotations(kernel.func)
+        types = inspect.get_annotations(kernel)
         values = [self._argument(kernel, name, kind, slot, end) for name, kind in types.items()]
         adjoints = [self._adjoint(kind, value) for kind, value in zip(types.values(), values, strict=True)]
         common: dict[str, Any] = {"dim": len(self.model.tree_first), "inputs": values, "device": self.device}
@@ -287,8 +288,8 @@ class Rollout:
         if not isinstance(kind, _STRUCT):
             return self._value(kernel, name.removesuffix("_out"), kind, written, slot, end)
         filled = kind()
-        for field, var in structs.fields(kind).items():
-            setattr(filled, field, self._value(kernel, field, var.type, written, slot, end))
+        for field, field_type in struct_fields(kind).items():
+            setattr(filled, field, self._value(kernel, field, field_type, written, slot, end))
         return filled
 
     def _adjoint(self, kind: Any, value: Any) -> Any:

@@ -6,14 +6,7 @@ numbered as :mod:`vinesim.plants.device_buffers` places them: those of a tree ``
 inertia and of its factors are about the body's origin; see :mod:`vinesim.kernels.plants`.
 """
 
-from typing import Any
-
 import warp as wp
-
-
-def fields(struct: Any) -> dict[str, Any]:
-    """Returns the names of a struct's fields, with Warp's variables that hold their types."""
-    return struct.vars
 
 
 @wp.struct
