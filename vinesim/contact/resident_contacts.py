@@ -1,8 +1,9 @@
-"""Contacts of many independent trees with the static geoms of a scene, solved on the device that holds the trees.
+"""Contacts of many independent trees with the static geoms of a scene, solved on the CPU or GPU that holds the trees'
+arrays.
 
-This is for batches. Every tree is a world of its own: trees do not touch each other, and no geom that they touch moves.
-The contacts of a tree then form one island, no data has to return to the host between steps, and a GPU uses one thread
-for each tree. Detection, rows, Delassus matrix and solve use the functions that
+This is for batches of simulations, in which every tree is a separate world: trees do not touch each other, and no geom
+moves. The contacts of a tree then form one island, no data has to return to the host between steps, and a GPU uses one
+thread for each tree. Detection, rows, Delassus matrix and solve use the functions that
 :class:`vinesim.contact.contact_solver.ContactSolver` launches.
 """
 
@@ -33,9 +34,9 @@ FULL_BLOCK = 128
 """CUDA threads in a block, for kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
 DEFAULT_SLOTS = 8
-"""Default for the number of contacts that one tree can have at once. They take 10 kB a tree."""
+"""Default for the largest number of contacts of one tree. This many contacts take 10 kB for each tree."""
 PAIRS_PER_SLOT = 4
-"""Room for pairs of capsules and geoms whose boxes overlap: this many for each contact that a tree can have."""
+"""Capacity for pairs of capsules and geoms with overlapping bounding boxes, per contact slot of a tree."""
 FIRST_LANES = 16
 """Number of GPU threads that share a tree with few contacts; each thread solves one row."""
 WARPS = 132 * 32
@@ -45,9 +46,9 @@ WARPS = 132 * 32
 class ResidentContacts:
     """Contacts of all trees of a solver with the static geoms of its model, from step to step on the solver's device.
 
-    ``plants.advance(steps, contacts.solve)`` steps with them. Each tree touches ground, poles, wires and fixed wood as
-    it would in :class:`vinesim.world.Physics`, and no other tree. All trees must be awake and stand on their
-    roots, and their first modes must be slow enough for whole steps.
+    ``plants.advance(steps, contacts.solve)`` takes steps with these contacts. Each tree touches ground, poles, wires
+    and fixed wood as it would in :class:`vinesim.world.Physics`, and no other tree. All trees must be awake, without
+    cut-off parts, and with first modes slow enough for whole steps.
 
     Args:
         plants: trees, on any device.
@@ -163,7 +164,7 @@ class ResidentContacts:
         return wp.zeros(shape, dtype=dtype, device=self._device)
 
     def _take_over_geoms(self, rigid: RigidArrays) -> None:
-        """Copy the static geoms to the device, with boxes around each and around blocks.
+        """Copy the static geoms to the device, with a bounding box of each geom and of each block of geoms.
 
         The ground's box has no lower end.
         """
@@ -188,8 +189,8 @@ class ResidentContacts:
         self._pairs = wp.array(material_pairs(self.parameters), dtype=Surface, device=device)
 
     def _by_slot(self, dtype: Any, columns: int) -> wp.array:
-        """Returns a table [tree, column] of zeros, stored column by column: neighbouring trees are neighbours in
-        memory.
+        """Returns a table [tree, column] of zeros that is stored column by column, so that the entries of consecutive
+        trees are adjacent in memory.
         """
         flat = self._zeros(dtype, self._trees * columns)
         strides = (flat.strides[0], flat.strides[0] * self._trees)
@@ -421,7 +422,8 @@ class ResidentContacts:
         )
 
     def solve(self) -> None:
-        """Launch the kernels that run between the prediction and the integration of a step. For ``advance()``."""
+        """Launch the kernels of the contacts of one step. An argument of :meth:`ArticulationSolver.advance`, which
+        calls it between prediction and integration."""
         self._before()
         if self._beside is None:
             self._solve_most()

@@ -6,7 +6,7 @@ import pathlib
 
 
 class DataFileNotFound(FileNotFoundError):
-    """A data file that neither exists nor ships with vinesim; the message lists the known names."""
+    """Raised when a name is neither an existing file nor a data file of vinesim. The message lists the known names."""
 
 
 def data_dir() -> pathlib.Path:
@@ -16,7 +16,8 @@ def data_dir() -> pathlib.Path:
 
 
 def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:
-    """The file ``name`` if it exists, else ``data/<kind>/<name><suffix>``; :class:`DataFileNotFound` otherwise."""
+    """Returns the path ``name`` if that file exists, else ``data/<kind>/<name><suffix>``. Raises
+    :class:`DataFileNotFound` if neither exists."""
     given = pathlib.Path(name)
     if given.is_file():
         return given

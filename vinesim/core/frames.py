@@ -147,7 +147,8 @@ def to_yaw(q: np.ndarray) -> float:
 
 
 def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np.ndarray:
-    """Quaternion [..., 4] that turns the x axis to ``x`` [..., 3], with the z axis in the half plane of x and ``up``.
+    """Quaternion [..., 4] of a frame with its x axis along ``x`` [..., 3] and its z axis as close to ``up`` as
+    possible.
 
     Where ``x`` and ``up`` are parallel, the z axis leans towards world y.
     """
@@ -168,7 +169,8 @@ def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.nd
 
 
 def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = ValueError) -> np.ndarray:
-    """A pose [7] as an array of floats; ``error`` naming ``what`` unless it is finite with a unit quaternion."""
+    """Returns the pose ``given`` [7] as an array of floats. Raises ``error``, with a message that names ``what``,
+    unless all numbers are finite and the quaternion has length 1."""
     values = np.asarray(given, float)
     if values.shape != (7,) or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
         raise error(
@@ -178,13 +180,14 @@ def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = Valu
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of poses [..., 7]: expresses ``b``, which is given in the frame ``a``, in the parent frame of ``a``."""
+    """Product of poses [..., 7]. ``b`` is a pose in the frame ``a``; the result is the same pose in the parent frame of
+    ``a``."""
     a = np.asarray(a)
     b = np.asarray(b)
     return np.concatenate([a[..., :3] + rotate(a[..., 3:], b[..., :3]), multiply(a[..., 3:], b[..., 3:])], axis=-1)
 
 
 def inverse(p: np.ndarray) -> np.ndarray:
-    """Inverse of a pose [..., 7]: the pose of the parent frame in the frame ``p``."""
+    """Inverse of a pose [..., 7]: the pose of the parent frame, expressed in the frame ``p``."""
     back = conjugate(np.asarray(p)[..., 3:])
     return np.concatenate([-rotate(back, np.asarray(p)[..., :3]), back], axis=-1)

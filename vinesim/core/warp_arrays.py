@@ -15,7 +15,8 @@ def struct_fields(kind: Any) -> dict[str, Any]:
 
 
 class SharedArrays:
-    """One NumPy array for each field of a Warp struct, and ``struct``, the Warp struct over the same memory.
+    """A NumPy array for each field of a Warp struct, and the attribute ``struct``: the Warp struct over the same
+    memory.
 
     The arrays are attributes of this object and keep their addresses as long as it lives.
     """
@@ -33,7 +34,7 @@ class SharedArrays:
 
     @classmethod
     def zeros(cls, kind: Any, /, *shape: int, **arrays: np.ndarray) -> SharedArrays:
-        """Arrays of zeros, each of ``shape``, for all fields that are not in ``arrays``."""
+        """Returns a ``SharedArrays`` of zeros. Every field has ``shape``, except the fields given in ``arrays``."""
         made = {name: zeros(field.dtype, shape) for name, field in struct_fields(kind).items() if name not in arrays}
         return cls(kind, **made, **arrays)
 
@@ -42,7 +43,8 @@ class SharedArrays:
 
 
 def share(data: np.ndarray, dtype: Any) -> wp.array:
-    """A Warp array over the memory of a NumPy array; ValueError if that is not contiguous."""
+    """Returns a Warp array over the memory of the NumPy array ``data``. Raises ValueError if ``data`` is not
+    contiguous."""
     array = wp.array(data, dtype=dtype, device="cpu", copy=False)
     if data.size and array.ptr != data.ctypes.data:
         raise ValueError(f"an array of {data.shape} {data.dtype} is not contiguous: Warp would work on a copy")
@@ -50,7 +52,8 @@ def share(data: np.ndarray, dtype: Any) -> wp.array:
 
 
 def zeros(dtype: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """NumPy zeros for a Warp array of ``shape``: vectors and matrices add their own dimensions, structs are records."""
+    """Returns NumPy zeros that :func:`share` turns into a Warp array of ``shape``. A vector or matrix ``dtype`` adds
+    dimensions; a struct ``dtype`` yields NumPy records."""
     element = host_element(dtype)
     return np.zeros(shape + element.shape, element.dtype)
 

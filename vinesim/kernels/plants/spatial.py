@@ -1,7 +1,7 @@
 """Rotations and inertias: exponential map, rotated tensors, point masses.
 
-Functions of a prediction have no branches: :mod:`vinesim.kernels.plants.eight_trees` calls them in loops that LLVM
-is to make vectors of.
+Functions that a prediction calls have no branches, so that LLVM can vectorise the loops of
+:mod:`vinesim.kernels.plants.eight_trees`.
 """
 
 import warp as wp
@@ -24,7 +24,7 @@ def exponential(v: wp.vec3):
 
 @wp.func
 def half_rotation(q: wp.quat):
-    """Half of the rotation of the unit quaternion q, the short way round."""
+    """Returns the rotation by half the angle of the unit quaternion q, in the direction of the shorter way."""
     w = wp.abs(q[3])
     scale = 1.0 / wp.sqrt(2.0 * (1.0 + w))
     sine = scale
@@ -43,7 +43,7 @@ def rotated_diagonal(frame: wp.mat33, v: wp.vec3):
 
 @wp.func
 def cross_rows(A: wp.mat33, d: wp.vec3):
-    """A [d]x: every row of A crossed with d."""
+    """Returns A [d]x, with [d]x the cross-product matrix of d: every row of A crossed with d."""
     return wp.matrix_from_rows(wp.cross(A[0], d), wp.cross(A[1], d), wp.cross(A[2], d))
 
 
@@ -64,13 +64,14 @@ def world_inertia(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
 
 @wp.func
 def symmetric(m: wp.mat33):
-    """The matrix with the upper triangle of m in its lower one too, so that no rounding sets them apart."""
+    """Returns the symmetric matrix with the upper triangle of m. It removes asymmetry due to rounding."""
     return wp.mat33(m[0, 0], m[0, 1], m[0, 2], m[0, 1], m[1, 1], m[1, 2], m[0, 2], m[1, 2], m[2, 2])
 
 
 @wp.func
 def inverse_symmetric(m: wp.mat33):
-    """Inverse of a symmetric matrix by its cofactors, of which only the upper triangle is read; 0 if it is singular."""
+    """Returns the inverse of a symmetric matrix, of which only the upper triangle is read, from its cofactors; 0 if it
+    is singular."""
     xx = m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2]
     xy = m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2]
     xz = m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1]
