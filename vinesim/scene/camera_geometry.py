@@ -9,7 +9,7 @@ import numpy as np
 from vinesim.scene.values import CameraFrame, CameraInfo
 
 MAX_MILLIMETRES = 65535.5
-"""Depths from this value on [mm] overflow 16 bits."""
+"""Smallest depth [mm] that does not fit into 16 bits."""
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 """One point of a cloud: metres in the optical frame, colour packed as 0x00RRGGBB (as in the PCL)."""
 
@@ -65,7 +65,8 @@ def back_project(pixels: np.ndarray, depth: np.ndarray, info: CameraInfo) -> np.
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth [height, width] m as 16UC1 of REP-118: millimetres, 0 where nothing was measured or 16 bits overflow."""
+    """Returns a depth picture [height, width] m in the encoding 16UC1 of REP-118: millimetres, 0 for pixels without a
+    measurement or beyond 16 bits."""
     millimetres = np.where(np.isfinite(depth), depth * 1000.0, 0.0)
     return np.where(millimetres < MAX_MILLIMETRES, np.round(millimetres), 0.0).astype(np.uint16)
 
@@ -104,7 +105,7 @@ NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
 """No distortion."""
 _STEPS = 20
 _TOLERANCE = 1e-9
-"""Tolerance of Newton's method for points of the plane at depth 1, where a pixel is about 1e-3 wide."""
+"""Tolerance of Newton's method for points in the plane at depth 1, in which a pixel is about 1e-3 wide."""
 
 
 def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
@@ -147,10 +148,10 @@ def _jacobian(points: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.n
 
 
 def undistort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Inverse of :func:`distort` by Newton's method; NaN for ``points`` [..., 2] without an inverse.
+    """Returns the inverse of :func:`distort` at ``points`` [..., 2], by Newton's method; NaN where there is no inverse.
 
-    A solution counts only if the map is one-to-one from the axis up to it. Further out, a lens with these coefficients
-    would show two directions at one point.
+    A solution is accepted only if the map is one-to-one from the optical axis to the solution. Further out, a lens with
+    these coefficients would show two directions at one point.
     """
     points = np.asarray(points, float)
     found = points.copy()

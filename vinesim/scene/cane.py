@@ -47,8 +47,8 @@ class CaneBuilder:
     """[1] Damping ratio of the first bending mode (see :meth:`first_mode`); it sets ``beta`` = 2 ratio / angular
     frequency."""
     beta: float | None = None
-    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or ``damping_ratio`` is
-    given."""
+    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. If neither ``beta`` nor
+    ``damping_ratio`` is given, beta is 0."""
     pose: np.ndarray | tuple[float, ...] = _HORIZONTAL
     """[7] m, 1, pose of the base in the world (position, quaternion xyzw); the cane grows along its x axis."""
     base: Literal["clamped", "pinned"] = "clamped"
@@ -57,8 +57,8 @@ class CaneBuilder:
     """[segments, 3] rad, rotation vector of each segment relative to the segment before it, in the drawn shape. By
     default the cane is straight."""
     shape: Literal["slack", "equilibrium"] = "slack"
-    """State of the drawn shape. In ``slack`` all springs are slack, and a released cane sags under its weight. In
-    ``equilibrium`` the springs balance gravity, and a released cane stays."""
+    """State of the drawn shape. ``slack``: all springs are slack in it, and a released cane sags under its weight.
+    ``equilibrium``: the springs balance gravity, and a released cane keeps the drawn shape."""
 
     @property
     def angular_stiffness(self) -> np.ndarray:
@@ -85,7 +85,7 @@ class CaneBuilder:
     def first_mode(self) -> float:
         """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
 
-        It is the mode of the chain of segments. With many segments it converges to the mode of the Euler-Bernoulli
+        This is the mode of the chain of segments. With many segments it converges to the mode of the Euler-Bernoulli
         beam, 1.8751^2 sqrt(E I / (rho A L^4)) for a cane without taper and tip mass.
         """
         self._check()
@@ -123,7 +123,7 @@ class CaneBuilder:
         return builder.assemble([self.tree()])
 
     def _check(self) -> None:
-        """:class:`ValueError` naming the first field that is out of range."""
+        """Raise :class:`ValueError` for the first field that is out of range."""
         vars(self).pop("_undamped", None)
         if np.shape(self.radius) not in ((), (2,)):
             raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")

@@ -51,7 +51,8 @@ def _circle(shape: int) -> tuple[float, float]:
 
 
 def blade_outline(theta: np.ndarray, shape: int = 0) -> np.ndarray:
-    """Distance from the petiole's junction to the edge at ``theta`` [rad, -pi..pi], in units of ``leaf_size``."""
+    """Returns the distance from the petiole's junction to the blade's edge at the angle ``theta`` [rad], -pi to pi, in
+    units of ``leaf_size``."""
     return _blade(np.asarray(theta, float), shape) / _circle(shape)[0]
 
 
@@ -62,7 +63,8 @@ def blade_area(shape: int = 0) -> float:
 
 
 def blade_shape(leaf: np.ndarray) -> np.ndarray:
-    """Index of the outline [leaf] of leaves with these numbers; equal on all clients."""
+    """Returns the index of the outline [leaf] of each leaf, computed from the leaf's number, so that it is equal on all
+    clients."""
     scrambled = np.asarray(leaf, np.uint32) * np.uint32(2654435761)
     return (scrambled >> np.uint32(16)).astype(np.int32) % SHAPE_COUNT
 
@@ -97,10 +99,10 @@ class LeafNodes:
 def grow_leaves(
     scene: Scene, leaf: Leaf, nodes: LeafNodes, normal: np.ndarray, uniform: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Leaves of a scene's season at ``nodes``.
+    """Grow leaves at ``nodes`` according to the scene's season.
 
     Args:
-        scene: gives season and training.
+        scene: its season and training are used.
         leaf: sizes and weights of leaves.
         nodes: positions of the leaves.
         normal: [8, ...] standard normal random numbers.
@@ -131,7 +133,7 @@ def grow_leaves(
     base = np.stack([along, 0.0 * along, 0.0 * along], -1) + nodes.thick[..., None] * local
     blade = base + petiole[..., None] * local
 
-    # blades face the light: flat over the net in a tendone, hanging and facing outwards in a hedge
+    # blades face the light: flat above the net in a tendone, hanging and facing outwards in a hedge
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
     midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
     upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)

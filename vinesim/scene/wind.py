@@ -1,4 +1,4 @@
-"""Wind: a steady mean and gusts that travel with it. Plants feel it as drag on leaves and wood.
+"""Wind: a steady mean and gusts that travel with it. It acts on plants as drag on leaves and wood.
 
 Turbulence is *frozen* (Taylor, Proc. R. Soc. A 164, 1938): the mean carries a fixed pattern along, so a gust that is
 here now is downwind later, and trees in a row bend one after the other. The pattern is a sum of divergence-free plane

@@ -1,11 +1,11 @@
 """The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU, with one thread for each row.
 
 The matrices of trees are small, and their solve is a chain of dependent steps. Each step takes many times longer
-through memory, even shared memory, than through registers and shuffles. The steps, their order and their conditions are
-those of ``tree_solver``. A Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
+through memory, even shared memory, than through registers and shuffles. The algorithm is that of ``tree_solver``. A
+Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
 
-The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It knows nothing
-of contacts. All threads of a warp must call every function that contains native code.
+The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It does not
+depend on contacts. All threads of a warp must call every function that contains native code.
 """
 
 import warp as wp
@@ -25,11 +25,11 @@ from vinesim.kernels.contact.tree_solver import FIRST_SWEEPS, TreeSystem, slidin
 wp.set_module_options({"enable_backward": False})
 
 MOST_ROWS = wp.constant(30)
-"""Largest number of rows of a tree that the threads of a warp solve. Fewer threads solve one row each."""
+"""Largest number of rows of a tree that this solver handles. Each thread of a warp has one row."""
 
 
 def _on_gpu(code: str, elsewhere: str = "0") -> str:
-    """Returns native code for a GPU. A CPU compiles ``elsewhere`` in its place, but never calls it."""
+    """Returns native code for a GPU. On a CPU ``elsewhere`` is compiled instead, but never called."""
     about = f"constexpr int ROWS = {int(MOST_ROWS)};\nconstexpr unsigned ALL = 0xffffffffu;"
     return f"#if defined(__CUDA_ARCH__)\n{about}\n{code}\n#else\nreturn {elsewhere};\n#endif\n"
 
@@ -44,7 +44,7 @@ def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
     _on_gpu("return __ballot_sync(ALL, value) >> (threadIdx.x % 32 - lane) & (0xffffffffu >> (32 - lanes));")
 )
 def lanes_where(value: bool, lane: int, lanes: int) -> wp.uint32:
-    """Returns a bit for each thread of the tree: whether its value is true."""
+    """Returns a bit mask of the tree's threads: a bit is set if the thread's value is true."""
     ...
 
 
@@ -56,7 +56,8 @@ def any_of_warp(value: bool) -> bool:
 
 @wp.func_native(_on_gpu("return __reduce_max_sync(ALL, value);"))
 def most_of_warp(value: int) -> int:
-    """Returns the largest value of the warp's threads. The compiler knows that it is the same for all."""
+    """Returns the largest value of the warp's threads, in a form that the compiler can treat as uniform over the
+    warp."""
     ...
 
 
@@ -92,7 +93,7 @@ def of_contact(c: int, value: wp.float64, lanes: int):
 
 @wp.func
 def component(part: int, of: wp.vec3d):
-    """Returns an entry of a vector, without an index that would move the vector to memory."""
+    """Returns entry ``part`` of a vector. Indexing would move the vector from registers to memory."""
     return wp.where(part == 0, of[0], wp.where(part == 1, of[1], of[2]))
 
 
@@ -108,8 +109,8 @@ def coupling(j: int, lane: int, size: int, matrix: wp.array2d(dtype=float)):
 def row_velocity(
     x: wp.float64, outside: wp.float64, lane: int, lanes: int, size: int, most: int, matrix: wp.array2d(dtype=float)
 ):
-    """Returns ``outside`` [m/s] plus the velocity along a thread's row by the impulses of all rows, at most ``most``
-    rows.
+    """Returns ``outside`` [m/s] plus the velocity along a thread's row by the impulses of all rows. ``most``: upper
+    bound of the number of rows.
     """
     v = outside
     for j in range(most):
@@ -179,7 +180,8 @@ def newton_impulse(
     surface: Surface,
     matrix: wp.array2d(dtype=float),
 ):
-    """Returns the impulse along a thread's row that fits the present states of all contacts, projected into its cone."""
+    """Returns the impulse along a thread's row from a Newton step with all contacts in their present states, projected
+    into the contact's friction cone."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     c = lane // 3
@@ -225,7 +227,8 @@ def sweep_rows(
     """One sweep over all contacts.
 
     Returns the impulse and the velocity along the row of a thread, the size of the change of its contact's impulse, and
-    the normal impulse [N s]. Each thread computes for its own contact, and uses the result at that contact's turn.
+    the normal impulse [N s]. Every thread computes a step for its own contact, but only the result of the contact whose
+    turn it is is used.
     """
     c = lane // 3
     part = lane % 3
@@ -247,7 +250,7 @@ def sweep_rows(
 
 @wp.func
 def further_along(change: wp.float64, direction: wp.float64, gradient: wp.float64, gradient_before: wp.float64):
-    """Returns how far a thread's impulse moves on in the conjugate direction after a sweep.
+    """Returns the change of a thread's impulse along the conjugate direction after a sweep.
 
     See :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
     """
@@ -268,13 +271,13 @@ def solve_rows(
     """Solve for the impulses of ``count`` contacts of a tree with ``lanes`` threads; this thread has the index
     ``lane``.
 
-    Returns the number of sweeps, or -1 if there are more rows than threads; nothing is changed then.
+    Returns the number of sweeps. If there are more rows than threads, returns -1 and changes nothing.
 
     Variables that the loop assigns under a condition stay in registers from one turn to the next, since generated code
     declares all variables before the loop. So the loop selects values instead of branching, and computes in functions.
     """
     size = wp.where(3 * count <= wp.min(lanes, MOST_ROWS), 3 * count, 0)
-    most = most_of_warp(size)  # all trees of a warp go through the same steps
+    most = most_of_warp(size)  # all trees of a warp take the same steps
     if most == 0:
         return wp.where(count > 0, -1, 0)
     is_row = lane < size
@@ -323,7 +326,7 @@ def solve_rows(
         done = wp.where(busy, sweeps, done)
         changing = lanes_where(
             change > tolerance * largest, lane, lanes
-        )  # all threads call this, also of finished trees
+        )  # all threads call this, including those of finished trees
         busy = busy and changing != wp.uint32(0)
     if is_row:
         system_out.impulse[lane] = x

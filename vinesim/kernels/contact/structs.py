@@ -47,7 +47,7 @@ PAIRED_TREES = wp.constant(17)
 COUNTERS = 18
 
 AABB_BLOCK = wp.constant(32)
-"""Number of boxes in a block. They share one box around them, so that one comparison can skip them all."""
+"""Number of boxes in a block. A block has a common bounding box, so that one comparison can skip all its boxes."""
 
 
 @wp.struct
@@ -57,13 +57,13 @@ class Parameters:
     dt: wp.float64
     """[s] Time step."""
     margin: wp.float64
-    """[m] Contacts with movable geoms exist from this gap on."""
+    """[m] Gap below which contacts with movable geoms exist."""
     static_margin: wp.float64
-    """[m] Contacts with static geoms and other plants exist from this gap on."""
+    """[m] Gap below which contacts with static geoms and other plants exist."""
     max_separation_speed: wp.float64
     """[m/s] Largest velocity with which a contact pushes overlapping sides apart."""
     impact_speed: wp.float64
-    """[m/s] A contact that closes faster is an impact."""
+    """[m/s] Closing speed above which a contact is an impact."""
     wire_damping_time: wp.float64
     """[s] Damping of a wire divided by its stiffness."""
 
@@ -81,7 +81,7 @@ class Trees:
     """State of all trees; a tree is one kinematic tree of a plant."""
 
     awake: wp.array(dtype=wp.int32)
-    """[k] Indices of the trees that this step handles. The thread count is their number."""
+    """[k] Indices of the trees that this step handles. Kernels with a thread for each awake tree have k threads."""
     is_awake: wp.array(dtype=wp.bool)
     """[tree] Whether the tree is awake."""
     is_fine: wp.array(dtype=wp.bool)
@@ -122,7 +122,7 @@ class Capsules:
     bunch: wp.array(dtype=wp.int32)
     """[capsule] Index of the bunch that the capsule belongs to; -1 for wood."""
     level: wp.array(dtype=wp.int32)
-    """[capsule] Level of detail of its tree at which the capsule exists: 0 both, 1 coarse, 2 fine."""
+    """[capsule] Level of detail of the tree at which the capsule exists: 0 always, 1 only coarse, 2 only fine."""
     local_start: wp.array(dtype=wp.vec3)
     """[capsule] Start of the axis, m, in the body's frame."""
     local_end: wp.array(dtype=wp.vec3)
@@ -150,7 +150,8 @@ class Capsules:
 
 @wp.struct
 class CapsuleStates:
-    """The capsules [capsule] at the start of the step. For sleeping trees: where they fell asleep."""
+    """Positions and boxes of the capsules [capsule] at the start of the step. For sleeping trees: in the pose in which
+    they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
@@ -169,7 +170,8 @@ class Clearances:
     """[m] Start of the capsule's axis at that comparison."""
     end: wp.array(dtype=wp.vec3)
     distance: wp.array(dtype=float)
-    """[m] Distance that the capsule may move from there without a new comparison. Negative: compare in any case."""
+    """[m] Distance that the capsule may move from ``start`` without a new comparison. Negative: compare in every
+    step."""
     reach: wp.array(dtype=float)
     """[m] Distance around the capsule that is searched in this step; 0 for no search."""
 
@@ -208,12 +210,14 @@ class Geoms:
     friction: wp.array(dtype=wp.float64)
     """[1] The geom's own friction coefficient, for all contacts. 0: the coefficient of the two materials applies."""
     is_remote: wp.array(dtype=wp.bool)
-    """[geom] Whether the geom belongs to a copy of another client's robot or person. It touches remote trees only."""
+    """[geom] Whether the geom belongs to a copy of another client's robot or person. Such a geom touches remote trees
+    only."""
 
 
 @wp.struct
 class PassingBunches:
-    """Free bunches that pass through some trees, because they overlapped them when they were picked and still do."""
+    """Free bunches that pass through trees without contact, because they have overlapped these trees since they were
+    picked."""
 
     by_tree: wp.array2d(dtype=wp.int32)
     """[tree, k] Index of a bunch that passes through the tree; -1 for an empty place."""
@@ -223,7 +227,7 @@ class PassingBunches:
 
 @wp.struct
 class Hulls:
-    """Convex hulls of meshes. Each is given in the frame of its geoms, relative to their centre."""
+    """Convex hulls of meshes, in the frame of the geoms with that mesh, relative to the centre of their box."""
 
     first_plane: wp.array(dtype=wp.int32)
     """[hull + 1] Index of the hull's first plane."""
@@ -296,9 +300,9 @@ class RigidBodies:
     velocity_free: wp.array(dtype=wp.float64)
     """[dof] Velocity at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)
-    """[dof] By how much plants changed that predicted velocity in the last step."""
+    """[dof] Change of the predicted velocity by plants in the last step."""
     correction_before: wp.array(dtype=wp.float64)
-    """[dof] By how much plants changed the predicted velocity in the step before the last."""
+    """[dof] Change of the predicted velocity by plants in the step before the last."""
     tree_island: wp.array(dtype=wp.int32)
     """[MuJoCo tree] Label that all trees coupled by active constraints share."""
 
@@ -392,7 +396,7 @@ class Contacts:
 
 @wp.struct
 class TouchedBodies:
-    """Plant bodies in contact [slot], sorted, each listed once. The bodies of one tree are neighbours in the list."""
+    """Plant bodies in contact [slot], sorted, each listed once. The bodies of one tree are adjacent in the list."""
 
     body: wp.array(dtype=wp.int32)
     tree_start: wp.array(dtype=wp.int32)
@@ -405,7 +409,8 @@ class TouchedBodies:
 
 @wp.struct
 class SideGroups:
-    """Sides of contacts on plants, in groups of at most ten on one tree: see :mod:`vinesim.kernels.contact.row_response`."""
+    """Sides of contacts on plants, in groups of at most ten sides on one tree; see
+    :mod:`vinesim.kernels.contact.row_response`."""
 
     side: wp.array(dtype=wp.int32)
     """[place] 2 * contact, plus 1 for the side of the other plant body.
@@ -429,9 +434,10 @@ class SideGroups:
 
 @wp.struct
 class Islands:
-    """Islands: sets of contacts that do not affect each other within the step. Each consists of blocks.
+    """Islands: sets of contacts. Contacts of different islands do not affect each other within the step. An island
+    consists of blocks.
 
-    A block is a set of contacts that plants couple. The blocks of an island are coupled by rigid bodies only.
+    A block is a set of contacts that a tree or touching trees couple. Only rigid bodies couple the blocks of an island.
     """
 
     start: wp.array(dtype=wp.int32)

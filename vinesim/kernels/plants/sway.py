@@ -25,7 +25,7 @@ def steady_share(pressure: wp.vec3, mean: wp.vec3):
 
 @wp.func
 def small_turn(turn: wp.vec3):
-    """Returns the quaternion of a small rotation vector [rad], with an error of fourth order or less."""
+    """Returns the quaternion of a small rotation vector [rad], exact to fifth order in its angle."""
     square = wp.dot(turn, turn)
     half = 0.5 - square / 48.0 + square * square / 3840.0
     w = 1.0 - square / 8.0 + square * square / 384.0

@@ -10,9 +10,10 @@ from vinesim.scene.values import Mesh, Shape
 
 
 def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
-    """Shapes of one description: one shape, or a mesh for each paint of a loft; with ``twin`` also the mirrored ones.
+    """Returns the shapes of one description: one shape, or for a loft a mesh for each paint. With ``twin`` the mirrored
+    shapes follow.
 
-    ``scale`` [1] multiplies all lengths. ``mirror`` mirrors the shapes to the other side (y).
+    ``scale`` [1] multiplies all lengths. ``mirror``: whether the shapes are mirrored to the other side (y).
     """
     sides = (False, True) if spec.twin else (mirror,)
     if spec.kind == "loft":
@@ -82,7 +83,7 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
 
 
 CREASE_ANGLE = np.radians(50.0)
-"""Faces that meet at a larger angle [rad] form an edge; other faces form one smooth surface."""
+"""Angle [rad] between adjacent faces above which they form an edge. Below it they form one smooth surface."""
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE_ANGLE)) -> np.ndarray:

@@ -48,7 +48,7 @@ class Bodies:
     length: np.ndarray
     """[shoot, slot] m"""
     radius: np.ndarray
-    """[shoot, slot, 2] m, where the body begins and ends."""
+    """[shoot, slot, 2] m, radius of the body at its start and at its end."""
     mass: np.ndarray
     """[shoot, slot] kg"""
     com: np.ndarray
@@ -68,7 +68,7 @@ class Bodies:
 
 
 def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
-    """Bodies of main axes, laterals, peduncles and bunches, with the drag of wood and bunches."""
+    """Returns the bodies of main axes, laterals, peduncles and bunches, with the drag of wood and bunches."""
     count = len(shoots.vine)
     cane = parameters.cane
     peduncle = parameters.peduncle
@@ -136,7 +136,7 @@ def _allocate(count: int) -> Bodies:
 
 
 def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """Parent slots [shoot, segment] of a rod that grows on slot ``first`` [shoot].
+    """Returns the parent slots [shoot, segment] of a rod that grows on slot ``first`` [shoot].
 
     ``chain`` [segment - 1] are the rod's own slots.
     """

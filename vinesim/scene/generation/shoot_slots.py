@@ -1,4 +1,4 @@
-"""Slots (columns) of the table of shoots, one for each segment, bunch or cluster.
+"""Slots (columns) of the table of bodies [shoot, slot]: one for each segment, bunch or berry cluster.
 
 Every shoot has the same slots: main axis, lateral, and for each of two bunches the peduncle, the bunch and its
 clusters.

@@ -1,4 +1,4 @@
-"""States of robots, people, trees and objects as they cross the network."""
+"""States of robots, people, trees and objects as sent over the network."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class TreeUpdate:
     """Authority sequence number, u16 with wraparound; every touch increments it."""
     time: float
     resting: bool
-    """True in the last record, which is sent reliably; no further records follow."""
+    """Whether the tree is at rest. Such a record is the last one for the tree and is sent reliably."""
     touched: bool
     """Whether the owner of the tree, or an object of the owner, is in contact with the tree."""
     joint_q: np.ndarray

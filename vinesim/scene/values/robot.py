@@ -31,7 +31,8 @@ class Drive:
     armature: float = 0.0
     """Inertia of motor and gear at the joint [kg m2 or kg]. It grows with the square of the gear ratio.
 
-    A stiff servo at its effort limit needs it: a hand of 0.02 kg m2 alone under 40 N m gains 20 rad/s in a tick.
+    A stiff servo at its effort limit needs an armature: a hand of 0.02 kg m2 without one gains 20 rad/s in a tick under
+    40 N m.
     """
     series_stiffness: float = 0.0
     """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain is used instead."""
@@ -44,9 +45,9 @@ class RobotSpec:
     """Description of a robot for the physics. ``robot/description/description.py`` makes one from a URDF."""
 
     name: str
-    """The actor's name, which prefixes the names of everything it owns."""
+    """The actor's name, which is a prefix of the names of its bodies."""
     index: int
-    """Index of the robot in its label."""
+    """Index of the robot in labels of label images."""
     urdf: str
     """URDF as text, every mesh by absolute path."""
     base: str
@@ -67,7 +68,7 @@ class RobotSpec:
 
 
 class ControllerKind(enum.StrEnum):
-    """What a controller of a robot does, in the words of ros2_controllers where they have one."""
+    """Kind of a robot's controller, with the name of ros2_controllers if one exists."""
 
     JOINT_TRAJECTORY = "joint_trajectory"
     GRIPPER = "gripper"
@@ -89,9 +90,9 @@ class ControllerSpec:
     name: str
     kind: ControllerKind
     joints: tuple[str, ...]
-    """In the order of its commands; none for a gripper that has no joints, such as a cutter."""
+    """Joints in the order of the controller's commands; empty for a gripper without joints, such as a cutter."""
     group: str = ""
-    """The joint group, if it is one of a gripper."""
+    """Joint group of the gripper, if the controller is one of a gripper."""
     gripper: str = ""
     """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
 
@@ -124,15 +125,15 @@ class JointReference:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GripperState:
-    """How far a gripper's goal is, or how it ended (control_msgs/GripperCommand).
+    """Progress or result of a gripper's goal (control_msgs/GripperCommand).
 
-    What the values mean is said by the controller of each kind, in :mod:`vinesim.robot.control.gripper_controllers`.
+    :mod:`vinesim.robot.control.gripper_controllers` defines the meaning of the values for each kind of gripper.
     """
 
     position: float
     effort: float
     stalled: bool = False
-    """It stopped before its goal."""
+    """Whether the gripper stopped before it reached its goal."""
     reached_goal: bool = False
 
     @property

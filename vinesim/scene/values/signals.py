@@ -49,7 +49,8 @@ class Lights:
     pattern: LightPattern = LightPattern.OFF
     color: Color = UNLIT
     has_sound: bool = False
-    """Whether a tone is heard while the lamps are lit. The hearers generate the tone; no sound crosses the network."""
+    """Whether a tone sounds while the lamps are lit. Clients that play the tone generate it; no sound is sent over the
+    network."""
 
     def shown(self, time: float) -> Color | None:
         """The colour at world ``time`` [s], :data:`UNLIT` between flashes; None: lights are off, as in the URDF.
