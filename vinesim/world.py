@@ -265,7 +265,7 @@ class Physics:
         return self._visuals[2]
 
     def visual_q(self) -> np.ndarray:
-        """World poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of :meth:`visuals`."""
         rigid = self.rigid.visual_q()
         return np.concatenate([rigid, self.dormant_bunches.visual_q()]) if len(self.dormant_bunches) else rigid
 

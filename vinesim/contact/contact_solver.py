@@ -261,7 +261,8 @@ class ContactSolver:
         self.detection.update_tree_bounds(trees)
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Let a picked bunch pass through the trees that it overlaps: :meth:`ContactDetection.ignore_overlaps`."""
+        """Disable contacts of a picked bunch with the trees that it overlaps; see
+        :meth:`ContactDetection.ignore_overlaps`."""
         self.detection.ignore_overlaps(bunch, low, high)
 
     def _update_rigid_world(self) -> None:

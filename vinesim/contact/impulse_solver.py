@@ -130,7 +130,8 @@ class ImpulseSolver:
         self.make_graphs()
 
     def renumber_geoms(self, number: np.ndarray) -> None:
-        """Renumber the geoms of the warm start: ``number`` [geom] is a former geom's new index, -1 if it is gone."""
+        """Renumber the geoms of the warm start. ``number`` [geom]: new index of each former geom; -1 for a removed
+        geom."""
         other = self.warm_start.other[: self.warm_start.count[0]]
         of_geoms = (other >= 0) & (other != REMOVED_GEOM)
         now = number[other[of_geoms]]

@@ -34,7 +34,7 @@ _MMAP_THRESHOLD = -3
 
 @functools.cache
 def _glibc() -> ctypes.CDLL | None:
-    """The C library of this process; None unless it is glibc."""
+    """Returns the C library of this process; None unless it is glibc."""
     if sys.platform != "linux":
         return None
     library = ctypes.CDLL(None)

@@ -50,7 +50,7 @@ class StructOfArrays:
 
     @classmethod
     def array_fields(cls) -> dict[str, ArraySpec]:
-        """Every array field with its :class:`ArraySpec`, in order of declaration."""
+        """Returns every array field with its :class:`ArraySpec`, in order of declaration."""
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
         return {field.name: field.metadata["dim"] for field in fields if "dim" in field.metadata}
 
@@ -99,5 +99,5 @@ class StructOfArrays:
         return self
 
     def copy(self) -> Self:
-        """A deep copy of the arrays."""
+        """Returns a deep copy of the arrays."""
         return type(self)(**{name: getattr(self, name).copy() for name in self.array_fields()})

@@ -45,14 +45,14 @@ _warned = threading.Event()
 
 
 def folder() -> pathlib.Path:
-    """The folder of the cache; it need not exist."""
+    """Returns the folder of the cache; it need not exist."""
     if chosen := os.environ.get("VINESIM_CACHE"):
         return pathlib.Path(chosen)
     return user_folder() / "vinesim"
 
 
 def user_folder() -> pathlib.Path:
-    """The folder in which this user's programs keep their caches; it need not exist."""
+    """Returns the folder in which this user's programs keep their caches; it need not exist."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
     elif sys.platform == "darwin":
@@ -87,7 +87,7 @@ def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndar
 
 
 def load(name: str, digest: str) -> Arrays | None:
-    """The arrays stored by :func:`keep` or :func:`load_or_make`; None if the file is missing or broken."""
+    """Returns the arrays stored by :func:`keep` or :func:`load_or_make`; None if the file is missing or broken."""
     try:
         return _read(folder() / f"{name}-{digest}.npz")
     except RuntimeError as error:  # no home folder
@@ -104,7 +104,8 @@ def keep(name: str, digest: str, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def source_digest(*sources: pathlib.Path | str | bytes) -> str:
-    """A digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and bytes.
+    """Returns a digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and
+    bytes.
 
     The digest includes the version of NumPy, because results may differ in the last bit between versions.
     """

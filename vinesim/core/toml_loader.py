@@ -91,7 +91,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
 
 
 def _step_in(kind: Any, steps: list[Any]) -> Any:
-    """The msgspec type at the path ``steps`` inside ``kind``."""
+    """Returns the msgspec type at the path ``steps`` inside ``kind``."""
     at: Any = msgspec.inspect.type_info(kind)
     for step in steps:
         if isinstance(at, msgspec.inspect.StructType):

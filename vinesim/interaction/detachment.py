@@ -340,6 +340,6 @@ class DetachmentMonitor:
 
 
 def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner [3] m of the world-aligned bounding box of a bunch at ``pose`` [7]."""
+    """Returns the lower and upper corner [3] m of the world-aligned bounding box of a bunch at ``pose`` [7]."""
     ends = pose[:3] + frames.rotate(pose[3:], np.stack([bunch.start, bunch.end]))
     return (ends - bunch.radius[:, None]).min((0, 1)), (ends + bunch.radius[:, None]).max((0, 1))

@@ -94,7 +94,7 @@ class DormantBunches:
             self._visuals = None
 
     def _world_state(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
-        """World pose [7] and velocity [6] of a dormant bunch."""
+        """Returns the world pose [7] and velocity [6] of a dormant bunch."""
         state = self.supports.to_world(self._support[bunch], self._relative[bunch])
         return (self._place[bunch], np.zeros(6)) if state is None else state
 
@@ -109,7 +109,7 @@ class DormantBunches:
         return [visuals[i].index for i in np.argsort(distance, kind="stable")[:most].tolist() if distance[i] < radius]
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """All dormant bunches, as in :meth:`RigidWorld.visuals`."""
+        """Returns all dormant bunches, as in :meth:`RigidWorld.visuals`."""
         if self._visuals is None:
             order = sorted(self._bunches)
             self._visuals = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes) for i in order)
@@ -121,7 +121,7 @@ class DormantBunches:
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
-        """World poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of :meth:`visuals`."""
         pose = np.zeros((len(self.visuals()), 7))
         for support, rows, relative, place in self._groups:
             frame = self.supports.support_state(support)

@@ -65,7 +65,7 @@ class GraspManager:
     # ------------------------------------------------------------------ the step
 
     def begin_step(self) -> None:
-        """Before a step: close and open hands, and pull the held plants."""
+        """Close and open hands before a step, and pull the held plants."""
         for human, hand in self._local_hands():
             key = human.spec.name, hand.side
             if key in self._grasps and not hand.on_plant:  # the person left the world and joined again
@@ -83,7 +83,8 @@ class GraspManager:
             self.plants.wake(self.held_trees)
 
     def end_step(self, detachments: tuple[Detachment, ...]) -> None:
-        """After a step: place hands on the plants that they hold, and weld detached bunches to their hands."""
+        """Place hands on the plants that they hold after a step, and weld detached bunches to the hands that hold
+        them."""
         detached = {detachment.body: detachment.bunch for detachment in detachments if detachment.bunch >= 0}
         contacts = []
         if self._grasps:
@@ -154,7 +155,7 @@ class GraspManager:
         self.plants.tie_anchor[grasp.tie] = at + pull * min(1.0, most / max(float(np.linalg.norm(pull)), 1e-12))
 
     def _grasped_point(self, grasp: _PlantGrasp) -> np.ndarray:
-        """Position [3] m of the grasped point in the world."""
+        """Returns the position [3] m of the grasped point in the world."""
         pose = self.plants.state.body_q[grasp.body].astype(float)
         return pose[:3] + frames.rotate(pose[3:], grasp.point)
 

@@ -140,7 +140,7 @@ class SupportTracker:
         return self._touched
 
     def objects_moved_by(self, actor: str) -> set[int]:
-        """Moving objects that ``actor`` touches directly or through other objects."""
+        """Returns the moving objects that ``actor`` touches directly or through other objects."""
         self._update_tables()
         moves = self._still_steps < self._rest_steps
         if not moves.any():
@@ -182,7 +182,8 @@ class SupportTracker:
         return object_id in self._row_of_object
 
     def object_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] of an object, and its velocity [6] (linear velocity of the origin, then angular; world axes)."""
+        """Returns the pose [7] of an object, and its velocity [6] (linear velocity of the origin, then angular; world
+        axes)."""
         row = self._row_of(object_id)
         d = self.rigid.mj_data
         pose = self._poses(np.array([row]))[0]
@@ -197,7 +198,7 @@ class SupportTracker:
         return self._support_name(int(self._support[row])), self._relative(self._poses(at), self._support[at])[0]
 
     def support_state(self, support: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """Pose [7] and velocity [6] of a support; None if it does not exist."""
+        """Returns the pose [7] and velocity [6] of a support; None if it does not exist."""
         if support == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
         self._update_tables()
@@ -216,7 +217,7 @@ class SupportTracker:
         return pose, np.concatenate([twist[3:], twist[:3]])
 
     def to_world(self, support: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns world poses [..., 7] and velocities [..., 6] of objects that rest on a support with the poses
+        """Returns the world poses [..., 7] and velocities [..., 6] of objects that rest on a support with the poses
         ``relative`` [..., 7] in its frame.
 
         None if the support does not exist.
@@ -287,7 +288,7 @@ class SupportTracker:
         return pose
 
     def _relative(self, pose: np.ndarray, support: np.ndarray) -> np.ndarray:
-        """World poses ``pose`` [k, 7] expressed in the frames of the MuJoCo bodies ``support`` [k]."""
+        """Returns the world poses ``pose`` [k, 7] expressed in the frames of the MuJoCo bodies ``support`` [k]."""
         moves = np.flatnonzero(support)
         if len(moves) == 0:
             return pose
@@ -411,7 +412,7 @@ class SupportTracker:
         return next(name for name, other in self._body_named.items() if other == body)
 
     def _body_of_support(self, support: str) -> int:
-        """The MuJoCo body of a support; the ground's if it does not exist."""
+        """Returns the MuJoCo body of a support; 0 (the ground) if the support does not exist."""
         return self._body_named.get(support, 0)
 
 

@@ -267,7 +267,7 @@ class ArticulationSolver:
                     setattr(owner, name, self.buffers.pinned(value))
 
     def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
-        """All arrays that kernels read or write, by element type and name."""
+        """Returns all arrays that kernels read or write, by element type and name."""
         model = self.model
         state = self.state
         ties = self.ties
@@ -373,7 +373,8 @@ class ArticulationSolver:
         self.awake_list[: len(self._awake)] = self._awake
 
     def awake_trees(self) -> list[wp.array]:
-        """Number of awake trees [1] and list of awake trees [tree], as Warp arrays for kernels on a CPU."""
+        """Returns the number of awake trees [1] and the list of awake trees [tree], as Warp arrays for kernels on a
+        CPU."""
         return [share(self.awake_count, wp.int32), share(self.awake_list, wp.int32)]
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
@@ -1089,7 +1090,7 @@ class KernelLaunches:
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
 
     def _branching(self, parent: np.ndarray) -> np.ndarray:
-        """[place] Returns for each place in the kernels' arrays whether the body there has a child other than the next
+        """Returns for each place [place] in the kernels' arrays whether the body there has a child other than the next
         body."""
         places = np.zeros(self.buffers.slot_count, np.bool_)
         apart = (parent >= 0) & (parent != np.arange(len(parent)) - 1)
@@ -1112,7 +1113,7 @@ class KernelLaunches:
         return self._filled(struct, self._arrays, values)
 
     def fill_resident(self, struct: Any, **values: Any) -> Any:
-        """As :meth:`fill`, with the arrays of :attr:`resident`."""
+        """Returns a filled kernel argument like :meth:`fill`, with the arrays of the :attr:`resident` kernels."""
         return self._filled(struct, self.resident_arrays, values)
 
     def _filled(self, struct: Any, arrays: dict[str, wp.array], values: dict[str, Any]) -> Any:
@@ -1129,7 +1130,7 @@ class KernelLaunches:
         return KernelLaunch(kernel, self._named(arguments), **options)
 
     def graph(self, *launches: KernelLaunch) -> KernelGraph:
-        """A graph of launches that follow each other on the device."""
+        """Returns a graph of launches that follow each other on the device."""
         return KernelGraph(*launches, device=str(self.buffers.device))
 
     def _named(self, arguments: Sequence[object]) -> list[Any]:
@@ -1516,7 +1517,7 @@ class KernelLaunches:
         self._carry = self.graph(self._joint_wrenches.launch)
 
     def joint_wrenches(self, capacity: int) -> JointWrenches:
-        """The arrays and the launch that compute the wrenches of up to ``capacity`` joints in the last step."""
+        """Returns the arrays and the launch that compute the wrenches of up to ``capacity`` joints in the last step."""
         buffers = self.buffers
         places = buffers.pinned(np.zeros(capacity, np.int32))
         count = buffers.pinned(np.zeros(1, np.int32))

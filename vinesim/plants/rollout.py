@@ -168,7 +168,7 @@ class Rollout:
         joint_q: np.ndarray | None = None,
         joint_qd: np.ndarray | None = None,
     ) -> Trajectory:
-        """Roll out and return the motion of the watched bodies.
+        """Simulate all ticks, and return the motion of the watched bodies.
 
         Args:
             stiffness: [body, 3] N m/rad, replaces ``joint_stiffness``.

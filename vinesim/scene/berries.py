@@ -99,7 +99,8 @@ def segment_of(position: np.ndarray, length: float | np.ndarray, pieces: int | n
 def mass_by_segment(
     count: np.ndarray, seed: np.ndarray, pieces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass of the berries on ``pieces`` [n] equal pieces of the rachis, for bunches [n] of unit mass and length.
+    """Returns the mass of the berries on ``pieces`` [n] equal pieces of the rachis, for bunches [n] of unit mass and
+    length.
 
     Returns:
         Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3] in the
@@ -133,7 +134,8 @@ def mass_by_segment(
 
 @functools.cache
 def _packed() -> tuple[np.ndarray, np.ndarray]:
-    """Positions [prototype, MAX_BERRIES, 3] and radii [prototype, MAX_BERRIES], rounded as in :func:`_tables`."""
+    """Returns the positions [prototype, MAX_BERRIES, 3] and radii [prototype, MAX_BERRIES], rounded as in
+    :func:`_tables`."""
     position = np.zeros((len(prototypes()), MAX_BERRIES, 3))
     radius = np.zeros((len(prototypes()), MAX_BERRIES))
     for i, bunch in enumerate(prototypes()):
@@ -275,7 +277,7 @@ def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: li
 
 
 def _near(p: np.ndarray, sizes: list[int], reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of berries of the same bunch that are closer than ``reach``."""
+    """Returns the pairs of berries of the same bunch that are closer than ``reach``."""
     firsts = []
     seconds = []
     start = 0

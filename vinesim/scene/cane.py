@@ -83,7 +83,8 @@ class CaneBuilder:
         return base, tip
 
     def first_mode(self) -> float:
-        """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
+        """Returns the angular frequency [rad/s] of the first bending mode of the straight, clamped cane without
+        gravity.
 
         This is the mode of the chain of segments. With many segments it converges to the mode of the Euler-Bernoulli
         beam, 1.8751^2 sqrt(E I / (rho A L^4)) for a cane without taper and tip mass.
@@ -104,7 +105,8 @@ class CaneBuilder:
         return float(1.0 / np.sqrt(np.linalg.eigvalsh(root[:, None] * matrix * root)[-1]))
 
     def tree(self) -> TreeBuilder:
-        """The cane as a :class:`~vinesim.scene.builder.TreeBuilder`, to which branches and bunches can be added."""
+        """Returns the cane as a :class:`~vinesim.scene.builder.TreeBuilder`, to which branches and bunches can be
+        added."""
         self._check()
         beta = self.beta or 0.0
         if self.damping_ratio is not None:
@@ -119,7 +121,7 @@ class CaneBuilder:
         return tree
 
     def build(self) -> Model:
-        """A model of this cane alone."""
+        """Returns a model of this cane alone."""
         return builder.assemble([self.tree()])
 
     def _check(self) -> None:
@@ -169,10 +171,10 @@ def _add_point_mass(body: dict, mass: float) -> None:
 
 
 def cane(**fields: object) -> Model:
-    """A model of one cane; the arguments are the fields of :class:`CaneBuilder`."""
+    """Returns a model of one cane. ``fields``: fields of :class:`CaneBuilder`."""
     return CaneBuilder(**fields).build()  # pyright: ignore[reportArgumentType] # checked by the builder
 
 
 def assemble(canes: Iterable[CaneBuilder | TreeBuilder]) -> Model:
-    """One model of several canes. Each cane is a tree; trees are numbered in the given order."""
+    """Returns one model of several canes. Each cane is a tree; trees are numbered in the given order."""
     return builder.assemble([one.tree() if isinstance(one, CaneBuilder) else one for one in canes])

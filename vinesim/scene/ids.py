@@ -41,7 +41,7 @@ OBJECT_STRIDE = 1 << 24
 
 
 def object_id(kind: ObjectKind, index: int) -> int:
-    """The id of a tree, a free bunch or a box. ``index`` counts the objects of each kind from 0."""
+    """Returns the id of a tree, a free bunch or a box. ``index`` counts the objects of each kind from 0."""
     return int(kind) * OBJECT_STRIDE + index
 
 
@@ -51,12 +51,12 @@ def split_object_id(value: int) -> tuple[ObjectKind, int]:
 
 
 def is_tree(value: int) -> bool:
-    """Whether an object id belongs to a tree; all other objects are rigid."""
+    """Returns whether an object id belongs to a tree; all other objects are rigid."""
     return value < OBJECT_STRIDE
 
 
 def object_name(value: int) -> str:
-    """Link name of a box or a free bunch, such as ``box/3``."""
+    """Returns the link name of a box or a free bunch, such as ``box/3``."""
     kind, index = split_object_id(value)
     return f"{kind.name.lower()}/{index}"
 
@@ -73,10 +73,10 @@ LABEL_STRIDE = 1 << 20
 
 
 def label(organ: Organ, index: int) -> int:
-    """The label of one object in a label image. ``index`` counts bunches, boxes, trees or actors from 0."""
+    """Returns the label of one object in a label image. ``index`` counts bunches, boxes, trees or actors from 0."""
     return int(organ) * LABEL_STRIDE + index
 
 
 def unlabel(value: int) -> tuple[Organ, int]:
-    """Organ and index of a label."""
+    """Returns the organ and index of a label."""
     return Organ(value // LABEL_STRIDE), value % LABEL_STRIDE

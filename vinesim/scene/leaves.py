@@ -28,7 +28,7 @@ _TEETH_PER_LOBE = 11.0
 
 
 def _blade(theta: np.ndarray, shape: int) -> np.ndarray:
-    """Radius of the outline in units of the length of the middle lobe."""
+    """Returns the radius of the outline in units of the length of the middle lobe."""
     radius = np.full_like(theta, 0.05)
     for (angle, length), kappa in zip(_LOBES, _KAPPA[shape], strict=True):
         for side in (1.0, -1.0) if angle else (1.0,):
@@ -43,7 +43,7 @@ def _blade(theta: np.ndarray, shape: int) -> np.ndarray:
 
 @functools.cache
 def _circle(shape: int) -> tuple[float, float]:
-    """Half width and area of the unscaled blade."""
+    """Returns the half width and area of the unscaled blade."""
     theta = np.linspace(-np.pi, np.pi, 4001)
     radius = _blade(theta, shape)
     width = float(np.abs(radius * np.sin(theta)).max())
@@ -57,7 +57,7 @@ def blade_outline(theta: np.ndarray, shape: int = 0) -> np.ndarray:
 
 
 def blade_area(shape: int = 0) -> float:
-    """Area of the flat blade [leaf_size^2]."""
+    """Returns the area of the flat blade [leaf_size^2]."""
     width, blade = _circle(shape)
     return blade / width**2
 
@@ -183,6 +183,6 @@ def add_point_masses(
 
 
 def _squared_distances(p: np.ndarray) -> np.ndarray:
-    """Squared distances [..., 3] of points [..., 3] from the three axes."""
+    """Returns the squared distances [..., 3] of points [..., 3] from the three axes."""
     square = p * p
     return square.sum(-1, keepdims=True) - square

@@ -140,20 +140,20 @@ class Model(StructOfArrays):
     box_mass: np.ndarray = array("box", unit="kg")
 
     def digest(self) -> str:
-        """Hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
+        """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
         h = hashlib.blake2b(digest_size=8)
         for name in self.array_fields():
             h.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return h.hexdigest()
 
     def bodies_of(self, tree: int) -> slice:
-        """The bodies of one tree."""
+        """Returns the bodies of one tree."""
         first = int(self.tree_first[tree])
         return slice(first, first + int(self.tree_size[tree]))
 
     def forward_kinematics(self, joint_q: np.ndarray) -> np.ndarray:
-        """Returns world poses [body, 7] for joint rotations [body, 4]. It loops in Python over the depth of the trees,
-        so it is too slow for every step."""
+        """Returns the world poses [body, 7] for joint rotations [body, 4]. The function loops in Python over the depth
+        of the trees, so it is too slow for every step."""
         body_q = np.zeros((len(self.body_mass), 7))
         joint = np.concatenate([self.body_offset, frames.multiply(self.body_rest, joint_q)], -1).astype(float)
         depth = self.depth()
@@ -192,7 +192,7 @@ class Model(StructOfArrays):
     def depth(self) -> np.ndarray:
         """[body] Number of joints between each body and its root.
 
-        :class:`ValueError` if a parent does not come before its child, as in a cycle.
+        Raises :class:`ValueError` if a parent does not come before its child, as in a cycle.
         """
         depth = np.zeros(len(self.body_mass), np.int32)
         if (late := self.body_parent >= np.arange(len(depth))).any():

@@ -216,7 +216,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
             )
 
     def steps(self, duration: float) -> int:
-        """Number of steps in a ``duration`` [s], rounded, at least 1."""
+        """Returns the number of steps in a ``duration`` [s], rounded, at least 1."""
         return max(1, round(duration / self.dt))
 
 

@@ -223,7 +223,7 @@ def load_plant(name: str) -> VineParameters:
 
 
 def load_varieties() -> tuple[Berry, ...]:
-    """The varieties that ship with vinesim, in the order of ``Model.bunch_variety``."""
+    """Returns the varieties that ship with vinesim, in the order of ``Model.bunch_variety``."""
     path = find_data_file("plants", "varieties", ".toml")
     varieties = load_toml(path, Varieties).varieties
     for i, berry in enumerate(varieties):

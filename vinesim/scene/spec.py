@@ -99,7 +99,7 @@ class Sun(_Part, frozen=True, kw_only=True):
     """[rad] Latitude, positive to the north; 41.6 degrees is Aprilia, Italy, where CANOPIES picks."""
 
     def direction(self, time: float = 0.0) -> tuple[float, float, float]:
-        """Unit vector from the ground to the sun, world axes, at simulated ``time`` [s]."""
+        """Returns the unit vector from the ground to the sun, world axes, at simulated ``time`` [s]."""
         if self.hour is not None:
             # Cooper (1969), accurate to 0.4 degrees
             declination = math.radians(23.45) * math.sin(2.0 * math.pi * (284 + self.day) / 365.0)
@@ -109,7 +109,8 @@ class Sun(_Part, frozen=True, kw_only=True):
 
 
 def sun_direction(hour: float, declination: float, latitude: float) -> tuple[float, float, float]:
-    """Unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude [rad]."""
+    """Returns the unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude
+    [rad]."""
     turn = math.radians(15.0) * (hour - 12.0)
     east = -math.cos(declination) * math.sin(turn)
     north = math.cos(latitude) * math.sin(declination) - math.sin(latitude) * math.cos(declination) * math.cos(turn)

@@ -32,12 +32,12 @@ class TrianglesError(ValueError):
 
 
 def digest_of(payload: bytes) -> str:
-    """The digest of encoded triangles: 40 hex digits (BLAKE2b, 160 bits)."""
+    """Returns the digest of encoded triangles: 40 hex digits (BLAKE2b, 160 bits)."""
     return hashlib.blake2b(payload, digest_size=20).hexdigest()
 
 
 def is_digest(text: str) -> bool:
-    """Whether ``text`` has the form of a digest."""
+    """Returns whether ``text`` has the form of a digest."""
     return _DIGEST.fullmatch(text) is not None
 
 
@@ -62,7 +62,7 @@ def decode_triangles(payload: bytes) -> np.ndarray:
 
 
 def to_stl(corners: np.ndarray) -> bytes:
-    """A binary STL file of ``corners`` [face, 3, 3] with zero normals, for programs that read files."""
+    """Returns a binary STL file of ``corners`` [face, 3, 3] with zero normals, for programs that read files."""
     facets = np.zeros(len(corners), np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")]))
     facets["corners"] = corners
     return bytes(80) + struct.pack("<I", len(corners)) + facets.tobytes()

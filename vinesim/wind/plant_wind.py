@@ -53,7 +53,7 @@ class WindOnPlants:
         self._steps = 0
 
     def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
-        """Before a step: apply ``wind`` (None: calm air) at world ``time`` [s].
+        """Apply ``wind`` (None: calm air) at world ``time`` [s] before a step.
 
         Without ``observers`` wind is simulated on all awake trees. A wind given in the first step has full strength at
         once. A wind that begins or ends later fades in or out.
@@ -108,7 +108,7 @@ class WindOnPlants:
                 self._strength = 1.0 if self._steps == 0 else step
 
     def _air(self, trees: np.ndarray) -> np.ndarray:
-        """Velocity [k, 3] m/s of the wind at ``trees`` [k]."""
+        """Returns the velocity [k, 3] m/s of the wind at ``trees`` [k]."""
         assert self._wind is not None
         velocity = self._wind.velocity_at(self._foot[trees], self._time)
         return self._strength * self._share[trees, None] * velocity
@@ -138,7 +138,7 @@ class WindOnPlants:
         plants.wake(some[force > parameters.wind_wake_load * self._weight[some]])
 
     def _near(self, trees: np.ndarray, observers: Observers | None) -> np.ndarray:
-        """The subset of ``trees`` whose foot is near an observer."""
+        """Returns the subset of ``trees`` whose foot is near an observer."""
         if observers is None:
             return trees
         points = np.atleast_2d(np.asarray(observers[0], float))

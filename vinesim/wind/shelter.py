@@ -34,7 +34,8 @@ MIN_DEPTH = 0.3
 
 
 def height_profile(height: np.ndarray, top: float) -> np.ndarray:
-    """Ratio [...] of the mean wind at ``height`` [...] m above ground to the wind at the ``top`` [m] of the canopy."""
+    """Returns the ratio [...] of the mean wind at ``height`` [...] m above ground to the wind at the ``top`` [m] of the
+    canopy."""
     z = np.maximum(np.asarray(height, float) / top, 0.0)
     above = np.log((np.maximum(z, 1.0) - DISPLACEMENT) / ROUGHNESS) / np.log((1.0 - DISPLACEMENT) / ROUGHNESS)
     return np.where(z < 1.0, np.exp(-ATTENUATION * (1.0 - z)), above)
@@ -56,7 +57,7 @@ class TreeDrag:
 
     @classmethod
     def of(cls, model: Model, body_q: np.ndarray) -> TreeDrag:
-        """The drag areas of ``model`` with its bodies at the rest poses ``body_q`` [body, 7]."""
+        """Returns the drag areas of ``model`` with its bodies at the rest poses ``body_q`` [body, 7]."""
         first = model.tree_first
         area = model.body_drag.astype(float)
         point = body_q[:, :3] + frames.rotate(body_q[:, 3:].astype(float), model.body_com.astype(float))
@@ -74,7 +75,7 @@ class TreeDrag:
         return cls(total, centre, profile, max(top - low, MIN_DEPTH))
 
     def air_share(self, mean: np.ndarray) -> np.ndarray:
-        """Ratio [tree] of the air speed at each tree to the undisturbed speed at the top of the canopy.
+        """Returns the ratio [tree] of the air speed at each tree to the undisturbed speed at the top of the canopy.
 
         ``mean`` [3] m/s is the mean wind.
         """

@@ -91,7 +91,8 @@ class Sway:
         return dataclasses.replace(snapshot, body_q=self._body_q, moved_trees=trees)
 
     def _most_urgent(self, drawn: np.ndarray, time: float, eye: np.ndarray) -> np.ndarray:
-        """The :data:`MAX_TREES` trees among ``drawn`` [tree] bool whose picture from ``eye`` is most out of date.
+        """Returns the :data:`MAX_TREES` trees among ``drawn`` [tree] bool whose picture from ``eye`` is most out of
+        date.
 
         The measure is an angle: reach of the tree times age of its pose, divided by distance.
         """
@@ -290,7 +291,8 @@ class _Response:
         return good & (distance < _CONVERGED)
 
     def _residual_turn(self, trees: np.ndarray, velocity: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-        """Remaining rotation [body, 3] rad of each joint, in its own axes, under the drag of a wind ``velocity``."""
+        """Returns the remaining rotation [body, 3] rad of each joint, in its own axes, under the drag of a wind
+        ``velocity``."""
         pressure = self._pressure(velocity)
         self._load(pressure if extra is None else pressure + extra)
         self._finder.residual_motion(trees)
@@ -299,7 +301,8 @@ class _Response:
         return 0.25 * REST_STEP * np.where(self._core[:, None], self.plants.joint_qd_free, 0.0).astype(float)
 
     def _oscillator(self, axis: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angular frequency [tree] rad/s and damping ratio [tree] of the oscillator for wind along a world ``axis``.
+        """Returns the angular frequency [tree] rad/s and damping ratio [tree] of the oscillator for wind along a world
+        ``axis``.
 
         ``turn`` [body, 3] rad: rotations of the joints by that wind, which define the oscillator's shape.
         """
@@ -332,7 +335,7 @@ class _Response:
         return rate, np.where(ok, damping / (2.0 * rate * np.where(ok, modal_mass, 1.0)), 1.0)
 
     def _filtered_gusts(self, rate: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-        """Responses to the gusts: factors [tree, 2 waves, 3] m/s of the cosines and sines of the waves.
+        """Returns the responses to the gusts: factors [tree, 2 waves, 3] m/s of the cosines and sines of the waves.
 
         The oscillators have angular frequencies ``rate`` [tree, 3] rad/s and damping ratios ``ratio`` [tree, 3].
         """

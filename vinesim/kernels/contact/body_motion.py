@@ -7,13 +7,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def to_double(v: wp.vec3):
-    """A vector of single precision in double precision."""
+    """Converts a vector from single to double precision."""
     return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
 
 @wp.func
 def to_single(v: wp.vec3d):
-    """A vector of double precision in single precision."""
+    """Converts a vector from double to single precision."""
     return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 

@@ -39,7 +39,8 @@ vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
 @wp.func
 def cylinder_distance(size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a cylinder along z, in its frame."""
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from a cylinder along z, in the
+    cylinder's frame."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
@@ -60,7 +61,7 @@ def cylinder_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def box_distance(size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a box, in its frame."""
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from a box, in the box's frame."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     q = wp.vec3d(
@@ -81,7 +82,8 @@ def box_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from an ellipsoid, in its frame.
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from an ellipsoid, in the
+    ellipsoid's frame.
 
     Outside, the closest point is q_i = a_i^2 p_i / (a_i^2 + m), where m solves sum (q_i / a_i)^2 = 1 (Eberly,
     Distance from a Point to an Ellipsoid, 2013). The sum falls with m and is convex, so Newton's method approaches the
@@ -118,7 +120,7 @@ def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def round_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
-    """:func:`primitive_distance` of planes, spheres and capsules."""
+    """Returns :func:`primitive_distance` for a plane, sphere or capsule."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
@@ -135,7 +137,8 @@ def round_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a primitive, in the primitive's frame.
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from a primitive, in the
+    primitive's frame.
 
     ``size`` is MuJoCo's ``geom_size``. Inside an ellipsoid the distance is a first-order approximation; all other
     results are exact.
@@ -151,7 +154,8 @@ def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def distance_of(is_round: bool, kind: int, size: wp.vec3d, p: wp.vec3d):
-    """:func:`primitive_distance`; ``is_round``: the kind is known to be one of :func:`round_distance`."""
+    """Returns :func:`primitive_distance`. ``is_round``: ``kind`` is known to be a plane, sphere or capsule, so that
+    less code is compiled."""
     found = wp.vec4d()
     if is_round:
         found = round_distance(kind, size, p)
@@ -246,7 +250,7 @@ def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def closest_to_round(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """:func:`closest_on_segment` of planes, spheres and capsules."""
+    """Returns :func:`closest_on_segment` for a plane, sphere or capsule."""
     t = wp.float64(0.0)
     if kind == PLANE:
         t = closest_to_plane(a, b)

@@ -22,7 +22,7 @@ rounded."""
 
 @wp.func
 def plane_gap(plane: wp.vec4d, p: wp.vec3d):
-    """Signed distance [m] of a point from a plane (outward normal, offset)."""
+    """Returns the signed distance [m] of a point from a plane (outward normal, offset)."""
     return plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] - plane[3]
 
 

@@ -224,11 +224,11 @@ def sweep_rows(
     surface: Surface,
     matrix: wp.array2d(dtype=float),
 ):
-    """One sweep over all contacts.
+    """Take one Gauss-Seidel step of each contact of a tree.
 
     Returns the impulse and the velocity along the row of a thread, the size of the change of its contact's impulse, and
-    the normal impulse [N s]. Every thread computes a step for its own contact, but only the result of the contact whose
-    turn it is is used.
+    the normal impulse [N s]. The contacts take turns. In each turn every thread computes a step for its own contact,
+    but only the result for the contact with this turn is used.
     """
     c = lane // 3
     part = lane % 3

@@ -144,10 +144,10 @@ def common_body_response(
     force: wp.mat33,
     moment: wp.mat33,
 ):
-    """Returns the velocity changes along the rows of contact ``other`` by impulses on body ``at``, an ancestor of the
-    bodies of both contacts.
+    """Returns the velocity changes along the rows of contact ``other`` by the impulses ``force``, ``moment`` on body
+    ``at``, which may be on another branch of the tree.
 
-    Contact ``other`` is on ``body``.
+    ``body``: body of contact ``other``.
     """
     force_other = row_columns(other, 0, jacobian)
     moment_other = row_columns(other, 3, jacobian)

@@ -199,7 +199,7 @@ def find_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """``threads`` threads. :func:`find_contacts_of_pairs` for geoms of any kind."""
+    """``threads`` threads. Find contacts by :func:`find_contacts_of_pairs`, for geoms of any kind."""
     find_contacts_of_pairs(
         wp.tid(),
         False,
@@ -236,7 +236,8 @@ def find_round_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """``threads`` threads. :func:`find_contacts_of_pairs` if all geoms are planes, spheres or capsules."""
+    """``threads`` threads. Find contacts by :func:`find_contacts_of_pairs`, if all geoms are planes, spheres or
+    capsules."""
     find_contacts_of_pairs(
         wp.tid(),
         True,

@@ -85,7 +85,7 @@ def vec3_at(a: wp.array(dtype=float), i: int) -> wp.vec3:
 
 @wp.func_native("const float* const p = a.data + i; return wp::quat(p[0], p[8], p[16], p[24]);")
 def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
-    """A rotation of one lane."""
+    """Returns a rotation of one lane."""
     ...
 
 
@@ -93,7 +93,7 @@ def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
     "const float* const p = a.data + i; wp::vec_t<6, float> v; for (int c = 0; c < 6; ++c) v[c] = p[8 * c]; return v;"
 )
 def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
-    """A spatial vector of one lane."""
+    """Returns a spatial vector of one lane."""
     ...
 
 
@@ -101,7 +101,7 @@ def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
     "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[24], p[32], p[40], p[48], p[56], p[64]);"
 )
 def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
-    """A matrix of one lane."""
+    """Returns a matrix of one lane."""
     ...
 
 

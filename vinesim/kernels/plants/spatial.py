@@ -11,7 +11,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def exponential(v: wp.vec3):
-    """Quaternion of the rotation vector v [rad]."""
+    """Returns the quaternion of the rotation vector v [rad]."""
     square = wp.dot(v, v)
     half_sinc = 0.5 - square * (1.0 / 48.0 - square * (1.0 / 3840.0))
     cosine = 1.0 - square * (1.0 / 8.0 - square * (1.0 / 384.0))
@@ -35,7 +35,7 @@ def half_rotation(q: wp.quat):
 
 @wp.func
 def rotated_diagonal(frame: wp.mat33, v: wp.vec3):
-    """The matrix that is diag(v) in the axes of frame (its columns): frame diag(v) frame^T."""
+    """Returns the matrix that is diag(v) in the axes of frame (its columns): frame diag(v) frame^T."""
     x = wp.vec3(frame[0, 0], frame[1, 0], frame[2, 0])
     y = wp.vec3(frame[0, 1], frame[1, 1], frame[2, 1])
     return v[2] * wp.identity(n=3, dtype=float) + (v[0] - v[2]) * wp.outer(x, x) + (v[1] - v[2]) * wp.outer(y, y)
@@ -49,13 +49,13 @@ def cross_rows(A: wp.mat33, d: wp.vec3):
 
 @wp.func
 def point_mass_inertia(mass: float, lever: wp.vec3):
-    """Moment of inertia about the origin [kg m^2] of a point mass at a lever."""
+    """Returns the moment of inertia about the origin [kg m^2] of a point mass at a lever."""
     return mass * (wp.dot(lever, lever) * wp.identity(n=3, dtype=float) - wp.outer(lever, lever))
 
 
 @wp.func
 def world_inertia(rotation: wp.mat33, moments: wp.vec3, products: wp.vec3):
-    """Inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
+    """Returns the inertia in world axes from its diagonal and its entries yz, zx, xy in the body's axes."""
     inertia = wp.mat33(
         moments[0], products[2], products[1], products[2], moments[1], products[0], products[1], products[0], moments[2]
     )

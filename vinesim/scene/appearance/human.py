@@ -85,7 +85,7 @@ class HumanModel:
 
 
 def outfit_names(name: str = "worker") -> tuple[str, ...]:
-    """Names of the outfits that people can wear."""
+    """Returns the names of the outfits that people can wear."""
     return tuple(_load_file(find_data_file("figures", name, ".toml")).outfits)
 
 

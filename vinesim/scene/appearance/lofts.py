@@ -34,7 +34,7 @@ def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror
 
 
 def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
-    """Meshes through the rings of a loft, one for each paint. If the rings are whole, lids close both ends."""
+    """Returns the meshes through the rings of a loft, one for each paint. Whole rings have lids at both ends."""
     place, rear, front, wide, aside = np.array([(*ring, 0.0)[:5] for ring in spec.rings]).T
     whole = spec.arc[1] - spec.arc[0] >= 360.0
     first, last = (np.radians(arc) for arc in (spec.arc, spec.arc_end or spec.arc))
@@ -87,7 +87,8 @@ CREASE_ANGLE = np.radians(50.0)
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE_ANGLE)) -> np.ndarray:
-    """Unit normals [face, 3, 3] at the corners of a mesh: the area-weighted mean over the faces around each corner.
+    """Returns the unit normals [face, 3, 3] at the corners of a mesh: the area-weighted mean over the faces around each
+    corner.
 
     Args:
         vertices: [vertex, 3] m.

@@ -19,7 +19,7 @@ with this number. Meshes of robots have up to a tenth of it."""
 
 
 def smooth_surface(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> Mesh:
-    """A mesh [m] of ``vertices`` [vertex, 3] and ``faces`` [face, 3], scaled, with smooth normals.
+    """Returns a mesh [m] of ``vertices`` [vertex, 3] and ``faces`` [face, 3], scaled, with smooth normals.
 
     Vertices that are close to each other are merged until the mesh has at most :data:`MAX_SURFACE_FACES` faces.
     """

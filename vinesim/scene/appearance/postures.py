@@ -51,7 +51,7 @@ def _load_postures() -> PostureFile:
 
 
 def posture_names() -> tuple[str, ...]:
-    """Names of the postures of :func:`apply_posture`."""
+    """Returns the names of the postures of :func:`apply_posture`."""
     return tuple(_load_postures().postures)
 
 

@@ -97,7 +97,7 @@ def surface_fields(paint: Paint) -> tuple[tuple[float, float, float, float], str
 def rod_shape(
     start: ArrayLike, end: ArrayLike, radius: tuple[float, float], scale: float, paint: Paint, kind: str = "cone"
 ) -> Shape:
-    """A round cone or a cylinder from one point [3] to another; all lengths [m] are multiplied by ``scale``."""
+    """Returns a round cone or a cylinder from one point [3] to another; all lengths [m] are multiplied by ``scale``."""
     a = scale * np.asarray(start, float)
     b = scale * np.asarray(end, float)
     half = 0.5 * float(np.linalg.norm(b - a))

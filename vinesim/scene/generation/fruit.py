@@ -89,7 +89,7 @@ def sample_fruit(
 
 
 def _fraction(value: np.ndarray, within: Range) -> np.ndarray:
-    """Position of ``value`` between the ends of a range, from 0 to 1."""
+    """Returns the position of ``value`` between the ends of a range, from 0 to 1."""
     low, high = within.value
     return (value - low) / (high - low)
 

@@ -110,7 +110,7 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
 
 
 def _allocate(count: int) -> Bodies:
-    """A table of zeros for ``count`` shoots, with all bodies present."""
+    """Returns a table of zeros for ``count`` shoots, with all bodies present."""
     shape = (count, SLOT_COUNT)
     return Bodies(
         present=np.ones(shape, bool),

@@ -91,8 +91,8 @@ def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarra
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the crossings of pieces, with one coordinate from ``start`` [...] to ``end`` [...], with lines at ``first``
-    + n ``step``.
+    """Find where pieces cross lines. ``start``, ``end`` [...] m: the coordinates of their ends across the lines, which
+    are at ``first`` + n ``step``.
 
     Returns the share [...] of the piece's length at the crossing, and [...] bool whether the piece crosses a line.
     """

@@ -59,7 +59,7 @@ def generate_uncached(scene: Scene) -> Model:
 
 @functools.cache
 def _code_digest() -> str:
-    """Digest of the code that generates models and of the grape varieties."""
+    """Returns the digest of the code that generates models and of the grape varieties."""
     package = pathlib.Path(builder.__file__).parent
     others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))

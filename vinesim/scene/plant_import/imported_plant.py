@@ -63,7 +63,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     wood: Wood
 
     def skeleton(self) -> Skeleton:
-        """The plant's skeleton as arrays."""
+        """Returns the plant's skeleton as arrays."""
         table = np.array(self.nodes, float).reshape(-1, 5)
         bunch = np.zeros(len(table))
         for node, mass in self.bunches:

@@ -32,7 +32,7 @@ class _Entity:
 
 
 def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
-    """The skeleton of the plant in an MTG file.
+    """Returns the skeleton of the plant in an MTG file.
 
     Args:
         path: the file.

@@ -34,7 +34,7 @@ _TYPES = {
 
 
 def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
-    """The skeleton in a PLY file; ``unit`` and ``diameter_unit`` [m] as for
+    """Returns the skeleton in a PLY file; ``unit`` and ``diameter_unit`` [m] as for
     :func:`~vinesim.scene.plant_import.mtg.read_mtg`."""
     elements = _read(path)
     vertex, position = _vertices(path, elements)
@@ -81,7 +81,7 @@ def read_points(path: pathlib.Path) -> np.ndarray:
 
 
 def _vertices(path: pathlib.Path, elements: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The table of vertices, and their positions [vertex, 3] in the file's unit."""
+    """Returns the table of vertices, and their positions [vertex, 3] in the file's unit."""
     vertex = elements.get("vertex")
     if vertex is None or not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
         raise PlantFileError(f"{path}: has no element 'vertex' with x, y and z; give them")
@@ -112,7 +112,7 @@ def _parents(path: pathlib.Path, position: np.ndarray, pairs: np.ndarray) -> np.
 
 
 def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Elements of a PLY file as tables, up to the first element with lists."""
+    """Returns the elements of a PLY file as tables, up to the first element with lists."""
     data = path.read_bytes()
     head, found, body = data.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]

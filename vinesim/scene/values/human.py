@@ -49,7 +49,7 @@ class HumanPose:
         return np.stack([getattr(self, name) for name in POINT_NAMES])
 
     def with_points(self, points: np.ndarray) -> HumanPose:
-        """A copy with the poses ``points`` [7, 7]; the states of hands and fingers stay."""
+        """Returns a copy with the poses ``points`` [7, 7]; the states of hands and fingers stay."""
         return dataclasses.replace(self, **dict(zip(POINT_NAMES, points, strict=True)))
 
 

@@ -53,7 +53,8 @@ class Lights:
     network."""
 
     def shown(self, time: float) -> Color | None:
-        """The colour at world ``time`` [s], :data:`UNLIT` between flashes; None: lights are off, as in the URDF.
+        """Returns the colour at world ``time`` [s], :data:`UNLIT` between flashes; None if the lights are off and keep
+        their colour in the URDF.
 
         All clients show the same flashes, because these depend only on the time.
         """
@@ -62,7 +63,7 @@ class Lights:
         return self.color if time * FREQUENCY[self.pattern] % 1.0 < 0.5 else UNLIT
 
     def tone(self, time: float) -> float:
-        """Frequency [Hz] of the tone at world ``time`` [s]; 0: no tone."""
+        """Returns the frequency [Hz] of the tone at world ``time`` [s]; 0: no tone."""
         return TONE.get(self.pattern, 0.0) if self.has_sound and self.shown(time) != UNLIT else 0.0
 
 
