@@ -198,7 +198,7 @@ class SupportTracker:
         return self._support_name(int(self._support[row])), self._relative(self._poses(at), self._support[at])[0]
 
     def support_state(self, support: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """Returns the pose [7] and velocity [6] of a support; None if it does not exist."""
+        """Returns the pose [7] and velocity [6] of a support; None if the support does not exist."""
         if support == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
         self._update_tables()

@@ -92,7 +92,7 @@ class ElasticSupports:
         )
 
     def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Returns the arrays of the pieces of wire for :func:`kernels.wire_spring`; ``nodes`` are the nodes of wires."""
+        """Returns the arrays of the pieces of wire for :func:`kernels.wire_spring`. ``nodes``: nodes of the wires."""
         model = self._plants.model
         tension = model.fixed_tension.astype(float)
         way = (model.fixed_end - model.fixed_start).astype(float)
