@@ -37,9 +37,9 @@ class PlantCapsules:
     end: np.ndarray
     """[capsule, 3] End of the axis, m, in the body's frame."""
     radius: np.ndarray
-    """[capsule] m"""
+    """[capsule] m, radius."""
     material: np.ndarray
-    """[capsule] :class:`Material`"""
+    """[capsule] :class:`Material` of the surface."""
 
 
 def plant_capsules(model: Model) -> PlantCapsules:

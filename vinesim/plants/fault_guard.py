@@ -30,7 +30,7 @@ class Fault:
     tick: int
     tree: int
     rate: float
-    """[rad/s] Rate that the fastest joint would have had in that tick; NaN if it was not a number."""
+    """[rad/s] Rate that the fastest joint would have had at the end of the tick; may be NaN."""
 
 
 class FaultGuard:

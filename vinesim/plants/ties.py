@@ -54,7 +54,7 @@ class TieTable:
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
         """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
-        """[tie] N s/m damping."""
+        """[tie] N s/m: damping of each tie."""
         self.point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
         """[tie, 3] m, in the body's frame: the point of the body at which the tie acts."""
         ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)

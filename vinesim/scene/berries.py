@@ -65,7 +65,7 @@ class BerryLayout:
     """Berries in the bunch's body frame: origin at the end of the peduncle, +x down the rachis."""
 
     position: np.ndarray
-    """[n, 3] m"""
+    """[n, 3] m, centre of each berry."""
     radius: np.ndarray
     """[n] m, half of the thickness across the axis; half of the length is ``radius * elongation``."""
     axis: np.ndarray

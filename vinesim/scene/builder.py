@@ -21,7 +21,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
-"""[m/s^2], world axes."""
+"""[m/s^2] Gravitational acceleration, world axes."""
 
 
 MAX_CLUSTERS = 8
@@ -35,7 +35,7 @@ class RodMaterial:
     modulus: float
     """Young's modulus E of bending [Pa]."""
     density: float
-    """[kg/m^3]"""
+    """[kg/m^3] Density of the material."""
     damping: float = 0.0
     """Stiffness-proportional damping beta [s]: joint damping = beta * joint stiffness."""
     shear_modulus: float | None = None
@@ -55,7 +55,7 @@ class BunchSegments:
     length: np.ndarray
     """[n] m, length of one segment."""
     mass: np.ndarray
-    """[n, max] kg"""
+    """[n, max] kg, mass of each segment."""
     com: np.ndarray
     """[n, max, 3] m, centre of mass in the segment's frame."""
     inertia: np.ndarray

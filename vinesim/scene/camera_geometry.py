@@ -103,7 +103,7 @@ def measured_points(frame: CameraFrame, step: int = 1) -> np.ndarray:
 MODELS = {5: "plumb_bob", 8: "rational_polynomial"}
 """Names of the models by their number of coefficients."""
 NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
-"""No distortion."""
+"""Coefficients of a lens without distortion."""
 _STEPS = 20
 _TOLERANCE = 1e-9
 """Tolerance of Newton's method for points in the plane at depth 1, in which a pixel is about 1e-3 wide."""

@@ -32,13 +32,13 @@ class CaneBuilder:
     """
 
     length: float = 1.0
-    """[m]"""
+    """[m] Length of the cane."""
     radius: float | tuple[float, float] = 0.004
     """[m] Radius of the rod, or its radii at the base and at the tip."""
     youngs_modulus: float = 5e9
     """[Pa] Young's modulus E of bending; the shear modulus is E / 2.6 (Poisson's ratio 0.3)."""
     density: float = 800.0
-    """[kg/m^3]"""
+    """[kg/m^3] Density of the wood."""
     segments: int = 16
     """Number of rigid bodies of the cane."""
     tip_mass: float = 0.0

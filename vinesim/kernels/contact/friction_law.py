@@ -34,7 +34,7 @@ class Surface:
     stiffness: wp.float64
     """[N/m] Normal stiffness; also the tangential stiffness of the friction anchor."""
     damping: wp.float64
-    """[N s/m]"""
+    """[N s/m] Damping in the normal direction, and of the friction anchor."""
     compliance: wp.float64
     """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), added to the diagonal of the Delassus matrix."""
 

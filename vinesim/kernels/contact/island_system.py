@@ -32,7 +32,7 @@ class IslandSystem:
     free: wp.array(dtype=wp.float64)
     """[row] Velocity without impulses, bias included, m/s."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] Impulse, N s."""
+    """[row] Present impulse along the row, N s."""
     impulse_first: wp.array(dtype=wp.float64)
     """[row] Impulse before the first Newton step, N s."""
     impulse_before: wp.array(dtype=wp.float64)

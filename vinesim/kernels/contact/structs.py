@@ -167,7 +167,7 @@ class Clearances:
     """Distance of each capsule of an awake tree from contact with sleeping trees at their last comparison [capsule]."""
 
     start: wp.array(dtype=wp.vec3)
-    """[m] Start of the capsule's axis at that comparison."""
+    """[m] Start of the capsule's axis at its last comparison with sleeping trees."""
     end: wp.array(dtype=wp.vec3)
     distance: wp.array(dtype=float)
     """[m] Distance that the capsule may move from ``start`` without a new comparison. Negative: compare in every
@@ -236,9 +236,9 @@ class Hulls:
     plane: wp.array(dtype=wp.vec4d)
     """[plane] Outward normal, and distance [m] from the centre."""
     edge_start: wp.array(dtype=wp.vec3d)
-    """[edge] Start, m."""
+    """[edge] m, start of the edge."""
     edge_end: wp.array(dtype=wp.vec3d)
-    """[edge] End, m."""
+    """[edge] m, end of the edge."""
     edge_left: wp.array(dtype=wp.int32)
     """[edge] Index of the plane on one side of the edge."""
     edge_right: wp.array(dtype=wp.int32)
@@ -253,7 +253,7 @@ class GeomStates:
     velocity: wp.array(dtype=wp.vec3d)
     """[m/s] Velocity of the centre."""
     angular_velocity: wp.array(dtype=wp.vec3d)
-    """[rad/s]"""
+    """[rad/s] Angular velocity of the geom."""
     speed: wp.array(dtype=wp.float64)
     """[m/s] Likely upper bound of the speed of all points of the geom in the step."""
     offset: wp.array(dtype=wp.vec3d)
@@ -312,14 +312,14 @@ class RigidFactors:
     """MuJoCo's sparse factors L^T D L of the mass matrix M, and of M^, which is M with the implicit servos added."""
 
     tree_dof: wp.array(dtype=wp.int32)
-    """MuJoCo's tree_dofadr."""
+    """[MuJoCo tree] First degree of freedom of the tree: MuJoCo's tree_dofadr."""
     tree_dof_count: wp.array(dtype=wp.int32)
     row_start: wp.array(dtype=wp.int32)
-    """MuJoCo's M_rowadr."""
+    """[dof] Index of the first entry of the row in sparse matrices: MuJoCo's M_rowadr."""
     row_count: wp.array(dtype=wp.int32)
-    """MuJoCo's M_rownnz."""
+    """[dof] Number of entries of the row in sparse matrices: MuJoCo's M_rownnz."""
     column: wp.array(dtype=wp.int32)
-    """MuJoCo's M_colind."""
+    """[entry] Column of the entry in sparse matrices: MuJoCo's M_colind."""
     implicit: wp.array(dtype=wp.float64)
     """MuJoCo's qH: factor of M^."""
     implicit_inverse: wp.array(dtype=wp.float64)
@@ -327,7 +327,7 @@ class RigidFactors:
     plain: wp.array(dtype=wp.float64)
     """MuJoCo's qLD: factor of M."""
     plain_inverse: wp.array(dtype=wp.float64)
-    """MuJoCo's qLDiagInv."""
+    """[dof] Inverse diagonal of the factor of M: MuJoCo's qLDiagInv."""
 
 
 @wp.struct
@@ -367,7 +367,7 @@ class Contacts:
     feature: wp.array(dtype=wp.int32)
     other: wp.array(dtype=wp.int32)
     body: wp.array(dtype=wp.int32)
-    """[contact] Plant body."""
+    """[contact] Plant body of the capsule."""
     body_slot: wp.array(dtype=wp.int32)
     """[contact] Index of ``body`` in the list of bodies in contact (:class:`TouchedBodies`)."""
     other_body: wp.array(dtype=wp.int32)
@@ -380,7 +380,7 @@ class Contacts:
     spring.
     """
     wire_stiffness: wp.array(dtype=wp.float64)
-    """[N/m] Stiffness of the wire that is the contact's other side; 0 if it is no wire or a rigid one."""
+    """[N/m] Stiffness of the wire on the contact's other side; 0 for a rigid wire or another shape."""
     wire_shift: wp.array(dtype=wp.float64)
     """[m] Gap to the unloaded wire minus the gap to the wire's geom."""
     point: wp.array(dtype=wp.vec3d)
@@ -493,7 +493,7 @@ class Rows:
     bias: wp.array(dtype=wp.float64)
     """[row] Velocity that the solver adds to the residual of the row, m/s."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] Impulse, N s."""
+    """[row] Impulse along the row, N s."""
 
 
 @wp.struct
@@ -507,6 +507,6 @@ class WarmStart:
     other: wp.array(dtype=wp.int32)
     normal_impulse: wp.array(dtype=wp.float64)
     friction_impulse: wp.array(dtype=wp.vec3d)
-    """[N s] In world axes."""
+    """[N s] Friction impulse, world axes."""
     anchor: wp.array(dtype=wp.vec3d)
     """[m] Stretch of the tangential spring since the contact began to stick, world axes."""

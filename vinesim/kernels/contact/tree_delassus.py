@@ -26,11 +26,11 @@ class BodyCompliances:
     """
 
     P: wp.array(dtype=wp.mat33)
-    """[1/kg]"""
+    """[1/kg] Linear velocity change per force impulse."""
     Q: wp.array(dtype=wp.mat33)
-    """[1/(kg m)]"""
+    """[1/(kg m)] Linear velocity change per moment impulse."""
     R: wp.array(dtype=wp.mat33)
-    """[1/(kg m^2)]"""
+    """[1/(kg m^2)] Angular velocity change per moment impulse."""
 
 
 @wp.struct
@@ -39,9 +39,9 @@ class ResponseRows:
     [slot * trees + tree]."""
 
     a: wp.array(dtype=wp.mat33)
-    """[1/kg] linear."""
+    """[1/kg] Linear velocity changes."""
     alpha: wp.array(dtype=wp.mat33)
-    """[1/(kg m)] angular."""
+    """[1/(kg m)] Angular velocity changes."""
 
 
 @wp.kernel

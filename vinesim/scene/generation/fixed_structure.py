@@ -23,9 +23,9 @@ class FixedStructure:
     """[vine] index of the vine's row."""
     rngs: list[np.random.Generator]
     arms: np.ndarray
-    """[vine, arm, point, 3] m"""
+    """[vine, arm, point, 3] m, points along the axis of each arm."""
     trunk: np.ndarray
-    """[vine, point, 3] m"""
+    """[vine, point, 3] m, points along the axis of each trunk."""
     fixed: dict[str, np.ndarray]
 
 

@@ -42,25 +42,25 @@ class Bodies:
     organ: np.ndarray
     """[shoot, slot] :class:`Organ`."""
     origin: np.ndarray
-    """[shoot, slot, 3] m"""
+    """[shoot, slot, 3] m, world position of the body's origin."""
     turn: np.ndarray
-    """[shoot, slot, 4] quaternion."""
+    """[shoot, slot, 4] orientation of the body in the world, quaternion xyzw."""
     length: np.ndarray
-    """[shoot, slot] m"""
+    """[shoot, slot] m, length of the body."""
     radius: np.ndarray
     """[shoot, slot, 2] m, radius of the body at its start and at its end."""
     mass: np.ndarray
-    """[shoot, slot] kg"""
+    """[shoot, slot] kg, mass of the body."""
     com: np.ndarray
     """[shoot, slot, 3] m, in the body's frame."""
     inertia: np.ndarray
-    """[shoot, slot, 3] kg m^2"""
+    """[shoot, slot, 3] kg m^2, principal moments of inertia about the centre of mass."""
     stiffness: np.ndarray
-    """[shoot, slot, 3] N m/rad"""
+    """[shoot, slot, 3] N m/rad, stiffness of the body's joint."""
     half: np.ndarray
     """[shoot, slot, 3] N m/rad, spring of the half of a segment beyond its middle."""
     damping: np.ndarray
-    """[shoot, slot, 3] N m s/rad"""
+    """[shoot, slot, 3] N m s/rad, damping of the body's joint."""
     drag: np.ndarray
     """[shoot, slot] m^2, drag area Cd A."""
     head: dict[str, np.ndarray]

@@ -31,7 +31,7 @@ class Shoots:
     up: np.ndarray
     """[shoot, 3] direction that the bodies' z axes lean to."""
     points: np.ndarray
-    """[shoot, AXIS_SEGMENTS + 1, 3] m, main axis."""
+    """[shoot, AXIS_SEGMENTS + 1, 3] m, points along the main axis."""
     length: np.ndarray
     base: np.ndarray
     """[shoot] radius at the base [m]"""
@@ -40,9 +40,9 @@ class Shoots:
     lateral_at: np.ndarray
     """[shoot] segment of the main axis whose tip carries the lateral"""
     lateral_points: np.ndarray
-    """[shoot, LATERAL_SEGMENTS + 1, 3] m"""
+    """[shoot, LATERAL_SEGMENTS + 1, 3] m, points along the lateral."""
     has_bunch: np.ndarray
-    """[shoot, MAX_BUNCHES] bool"""
+    """[shoot, MAX_BUNCHES] bool: the shoot has this bunch."""
     bunch_at: np.ndarray
     """[shoot, MAX_BUNCHES] segment of the main axis whose tip carries the peduncle"""
     peduncle: np.ndarray

@@ -47,7 +47,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """One plant, its base at the origin and z up."""
 
     source: str
-    """Name and format of the file that it was read from."""
+    """Name and format of the file from which the plant was read."""
     shape: Literal["drawn", "slack"] = "drawn"
     """Shape given by the points: the plant as it hangs under its weight (``drawn``) or without weight (``slack``)."""
     piece: Annotated[float, msgspec.Meta(gt=0.0)] = 0.06

@@ -25,7 +25,7 @@ class Skeleton:
     """The wood of one plant as points joined to their parents; a parent comes before its children."""
 
     position: np.ndarray
-    """[node, 3] m, z up."""
+    """[node, 3] m, position of each node, z up."""
     parent: np.ndarray
     """[node] index of the node below; -1 for the base, which is the first node."""
     diameter: np.ndarray

@@ -100,8 +100,8 @@ class Haptic:
     hand: str
     """``"left"`` or ``"right"``."""
     onset: bool
-    """Whether the contact has just begun; otherwise it lasts."""
+    """Whether the contact has just begun. If not, the command is for a lasting contact."""
     amplitude: float
     """0 to 1, force as a fraction of the hand's largest force; an onset is always strong enough to be felt."""
     duration: float
-    """[s]"""
+    """[s] Duration of the vibration."""

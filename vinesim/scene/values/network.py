@@ -21,9 +21,9 @@ class RobotUpdate:
     base_qd: np.ndarray
     """[6] velocity of the base, world axes."""
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, joint positions."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] rad/s or m/s, joint velocities."""
     lights: Lights = LIGHTS_OFF
 
 
@@ -61,15 +61,15 @@ class TreeUpdate:
     touched: bool
     """Whether the owner of the tree, or an object of the owner, is in contact with the tree."""
     joint_q: np.ndarray
-    """[body of the tree, 4]"""
+    """[body of the tree, 4] joint rotations, quaternions xyzw."""
     joint_qd: np.ndarray
-    """[body of the tree, 3] rad/s"""
+    """[body of the tree, 3] rad/s, joint rates."""
     root: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
     """[k] indices within the tree of the bodies that were cut off their parents, ascending."""
     root_x: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] m, positions of the origins of these bodies in the world."""
+    """[k, 3] m, world positions of the origins of the cut bodies ``root``."""
     root_xd: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] m/s, velocities of these origins."""
+    """[k, 3] m/s, velocities of the origins of the cut bodies ``root``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ class Mesh:
     """Triangles of a surface. A triangle's front is the side from which its corners are in counter-clockwise order."""
 
     corners: np.ndarray
-    """[face, 3, 3] m"""
+    """[face, 3, 3] m, corners of each triangle."""
     normals: np.ndarray
     """[face, 3, 3] unit normals of the smooth surface at each corner."""
 
@@ -31,9 +31,9 @@ class Shape:
     kind: str
     size: tuple[float, ...]
     pose: np.ndarray
-    """[7] m, 1"""
+    """[7] m, xyzw: pose of the shape in the frame of its link or body."""
     rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.6, 1.0)
-    """sRGB"""
+    """Colour (sRGB) and opacity, 0 to 1."""
     file: str = ""
     surface: str = ""
     """Surface, one of :data:`vinesim.scene.appearance.SURFACES`; empty: a default for the kind of object."""
@@ -51,7 +51,7 @@ class RigidBox:
     size: np.ndarray
     """[3] m, outer length, width, height."""
     mass: float
-    """[kg]"""
+    """[kg] Mass of the box."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

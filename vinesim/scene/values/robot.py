@@ -104,9 +104,9 @@ class JointSample:
     time: float
     names: tuple[str, ...]
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, joint positions."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] rad/s or m/s, joint velocities."""
     effort: np.ndarray
     """[joint] N m or N, effort of the drive; at rest it is the gravity load minus J^T f of the contacts."""
     contact: np.ndarray
@@ -118,9 +118,9 @@ class JointReference:
     """References of a robot's controllers for its joints in one step, in the order of joint arrays."""
 
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, joint positions."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] rad/s or m/s, joint velocities."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ class ElasticSample:
     time: float
     names: tuple[str, ...]
     stiffness: np.ndarray
-    """[joint] N m/rad or N/m"""
+    """[joint] N m/rad or N/m, stiffness of the spring."""
     motor: np.ndarray
     """[joint] rad or m, position of the motor after its gear; the link is at ``motor - deflection``."""
     deflection: np.ndarray
@@ -181,9 +181,9 @@ class Imu:
     orientation: np.ndarray
     """[4] orientation of the frame in the world."""
     angular_velocity: np.ndarray
-    """[3] rad/s in the frame."""
+    """[3] rad/s, angular velocity in the axes of the sensor's frame."""
     linear_acceleration: np.ndarray
-    """[3] m/s2 in the frame; at rest it is 9.81 upwards (REP-145)."""
+    """[3] m/s2, acceleration in the axes of the sensor's frame; at rest 9.81 upwards (REP-145)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -142,7 +142,7 @@ class BunchTruth:
     """
 
     bunch: int
-    """Index in the model."""
+    """Index of the bunch in the model."""
     variety: int
     """Index into :data:`vinesim.scene.berries.VARIETIES`."""
     tree: int
@@ -210,7 +210,7 @@ class CameraFrame:
     pose: np.ndarray
     """[7] pose of the optical frame in the world when the picture was taken."""
     rgb: np.ndarray
-    """[height, width, 3] uint8"""
+    """[height, width, 3] uint8, colours in sRGB."""
     depth: np.ndarray
     """[height, width] float32 m along z; NaN: no return, -Inf: too near, +Inf: too far (REP-118)."""
     labels: np.ndarray
@@ -286,13 +286,13 @@ class LidarScan:
     xyz: np.ndarray
     """[point, 3] float32 m, in the lidar's frame (x forward, z up) at the firing of each point."""
     intensity: np.ndarray
-    """[point] float32 0..255"""
+    """[point] float32, intensity of each echo, 0 to 255."""
     ring: np.ndarray
-    """[point] uint16"""
+    """[point] uint16, number of the laser of each point."""
     offset: np.ndarray
     """[point] float32 s, time of each point's firing after ``time``."""
     labels: np.ndarray
-    """[point] int32"""
+    """[point] int32, :func:`vinesim.scene.ids.label` of each point."""
     level: LevelLaser | None = None
     """The laser nearest to the horizontal, None if unknown."""
     returned: np.ndarray | None = None
@@ -316,7 +316,7 @@ class Band:
 
     name: str
     centre: float
-    """[nm]"""
+    """[nm] Wavelength at the maximum of the response."""
     width: float
     """Full width at half maximum of the response [nm]."""
     irradiance: float

@@ -6,7 +6,7 @@ import dataclasses
 import enum
 
 Color = tuple[int, int, int]
-"""sRGB, each 0 to 255."""
+"""Colour: red, green and blue in sRGB, each 0 to 255."""
 
 UNLIT: Color = (0, 0, 0)
 """Colour of a lamp between two flashes."""
@@ -78,9 +78,9 @@ class Intention:
     what: str
     """One of :data:`INTENTIONS`."""
     start: float
-    """[s] World time at which it began."""
+    """[s] World time at which the intention began."""
     end: float | None = None
-    """[s] World time at which it ended; None while it lasts."""
+    """[s] World time at which the intention ended; None while it lasts."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ class WindState:
 
     wind: Wind
     time: float
-    """[s] World time."""
+    """[s] World time of this state."""
     strength: float
     """[1] Strength that rises from 0 to 1 when a wind begins and falls back to 0 when it ends."""
     tree_air: np.ndarray
@@ -42,7 +42,7 @@ class Snapshot:
     it."""
 
     time: float
-    """[s] World time."""
+    """[s] World time of this state."""
     tick: int
     body_q: np.ndarray
     """[body, 7] m, 1, poses of plant bodies."""
@@ -70,7 +70,7 @@ class Contact:
     body: int
     """Index of the plant body in the model."""
     position: np.ndarray
-    """[3] m, world"""
+    """[3] m, contact point in the world."""
     force: np.ndarray
     """[3] N on the rigid body, world axes; the opposite force acts on the plant."""
     distance: float
@@ -88,9 +88,9 @@ class Detachment:
     bunch: int
     """Index of the bunch, -1 for a cane."""
     cause: str
-    """``"pull"`` (too much force), ``"bend"`` (too much moment), ``"blade"`` (a cutter closed on it), ``"command"``."""
+    """``"pull"`` (too large force), ``"bend"`` (too large moment), ``"blade"`` (a cutter) or ``"command"``."""
     actor: str
-    """Actor who caused it; empty if unknown."""
+    """Name of the actor who caused the detachment; empty if unknown."""
     force: np.ndarray
     """[3] N, last force of the joint on the detached part, world axes."""
     moment: np.ndarray
