@@ -235,7 +235,7 @@ class RigidArrays:
 
     @functools.cached_property
     def names(self) -> list[tuple[str, str, int]]:
-        """[geom] Names of the listed geoms. They stay valid when the world is compiled again."""
+        """[geom] Names of the listed geoms, which stay valid when the rigid world is recompiled."""
         return persistent_names(self.listed)
 
     def update(self, rigid: RigidWorld, remote_actors: set[str]) -> np.ndarray:

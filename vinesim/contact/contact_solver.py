@@ -36,7 +36,7 @@ class ContactSolver:
     touch. Static geoms (ground, trellis, wood) wake no tree; they only stop bodies that already move. Shapes that
     overlap in the generated scene are in contact only if they overlap more than there. All numbers come from
     ``rigid.parameters``. If there are more contacts than ``contact_capacity``, the deepest are kept, and
-    ``dropped_contacts`` and ``overflow_message`` report the others.
+    ``dropped_contacts`` and ``overflow_message`` report the contacts left out.
     """
 
     def __init__(

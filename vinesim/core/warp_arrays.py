@@ -18,7 +18,7 @@ class SharedArrays:
     """A NumPy array for each field of a Warp struct, and the attribute ``struct``: the Warp struct over the same
     memory.
 
-    The arrays are attributes of this object and keep their addresses as long as it lives.
+    The arrays are attributes of this object and keep their addresses during its lifetime.
     """
 
     def __init__(self, kind: Any, /, **arrays: np.ndarray) -> None:

@@ -200,7 +200,7 @@ class ArticulationSolver:
         """[tree] phi that the last ``predict()`` of each tree used."""
         self.awake_list = np.zeros(trees, np.int32)
         self.awake_count = np.zeros(1, np.int32)
-        """[1] Number of awake trees: the first so many entries of ``awake_list`` [tree] are in use. Kernels are bound
+        """[1] Number n of awake trees; the first n entries of ``awake_list`` [tree] are these trees. Kernels are bound
         to both arrays."""
         self.tree_rate = np.zeros(trees, np.float32)
         """[tree] sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed b [m/s] of a floating root

@@ -316,7 +316,7 @@ class Rollout:
             if name not in self._stacks:
                 self._stacks[name] = self._zeros(name, dtype, self._slots)
             return self._stacks[name][slot]
-        elif kernel is _INTEGRATE and name in self._stacks:  # what the prediction has written
+        elif kernel is _INTEGRATE and name in self._stacks:  # results of the prediction
             return self._stacks[name][slot]
         if name not in self._arrays:
             self._arrays[name] = self._input(name, dtype)

@@ -28,7 +28,7 @@ _HORIZONTAL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class CaneBuilder:
     """A cane: a tapered round rod of equal segments, joined by elastic ball joints.
 
-    Raises :class:`ValueError` with the field, its value and the remedy if a number is out of range.
+    Raises :class:`ValueError` if a number is out of range; the message names the field, its value and the valid range.
     """
 
     length: float = 1.0

@@ -136,7 +136,7 @@ class Model(StructOfArrays):
     box_pose: np.ndarray = array("box", 7, unit="m, 1", fill=_UNIT_POSE)
     """Start pose of the centre of the crate's bottom (x along the length)."""
     box_size: np.ndarray = array("box", 3, unit="m")
-    """Outer length, width, height."""
+    """Outer length, width and height of the box."""
     box_mass: np.ndarray = array("box", unit="kg")
 
     def digest(self) -> str:

@@ -45,7 +45,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     phi: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.55
     """[1] Implicitness of the integration: 1/2 trapezoidal, 1 backward Euler. TUNED."""
     fast_joint_rate: Positive = 5.0
-    """[rad/s] A tree with a faster joint is integrated with phi = 1, and a body that turns faster feels drag. TUNED."""
+    """[rad/s] A tree with a faster joint is integrated with phi = 1, and a drag slows a body that turns faster.
+    TUNED."""
     max_joint_rate: Positive = 50.0
     """[rad/s] Joint rates are limited to this value. DERIVED: half a radian in a step of 10 ms."""
     fault_joint_rate: Positive = 5000.0

@@ -1,9 +1,9 @@
 """Distances: from points and segments to MuJoCo's primitives, and between two segments.
 
 A plant's capsule is a segment with a radius (a sphere when both ends agree). A rigid geom is one of MuJoCo's
-primitives. :func:`primitive_distance` gives distance and direction from a point to a primitive. For planes, spheres and
-capsules, a formula gives the closest point of a segment. For other primitives a bisection of the slope of the distance
-finds it, since the distance from any of them is convex along a segment.
+primitives. :func:`primitive_distance` returns distance and direction from a point to a primitive. For planes, spheres
+and capsules, the closest point of a segment is computed by a formula. For other primitives a bisection of the slope of
+the distance finds it, since the distance from any of them is convex along a segment.
 """
 
 import warp as wp

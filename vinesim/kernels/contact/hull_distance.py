@@ -2,7 +2,7 @@
 
 If the segment enters the hull, the distance is the distance to the nearest plane, as for MuJoCo's primitives.
 Otherwise, the closest points are at an end of the segment above the inside of a face, or on one of the hull's edges.
-Only edges of faces whose outer side an end of the segment is on can be closest.
+Edges are tested only if an end of the segment is in front of one of their two faces.
 """
 
 import warp as wp

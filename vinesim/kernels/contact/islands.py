@@ -127,7 +127,7 @@ def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
 
 @wp.func
 def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
-    """Find the first and last slot of the touched bodies of each tree."""
+    """Find the first slot, and the slot after the last, of the touched bodies of each tree."""
     for slot in range(count):
         touched_out.last_contact[slot] = -1
         touched_out.tree_start[slot] = slot

@@ -11,7 +11,7 @@ from vinesim.kernels.contact.friction_law import Surface
 
 wp.set_module_options({"enable_backward": False})
 
-# indices into ``counters``; each entry is a count unless its docstring says otherwise
+# indices into ``counters``; each entry is a count, except those whose docstring describes another meaning
 AWAKE_TREES = wp.constant(0)
 CONTACTS = wp.constant(1)
 OVERFLOW = wp.constant(2)
@@ -257,7 +257,7 @@ class GeomStates:
     speed: wp.array(dtype=wp.float64)
     """[m/s] Likely upper bound of the speed of all points of the geom in the step."""
     offset: wp.array(dtype=wp.vec3d)
-    """[m] Displacement of a deflected wire's centre from the position that the scene gives it."""
+    """[m] Displacement of a deflected wire's centre from its position in the scene."""
     low: wp.array(dtype=wp.vec3)
     """[m] Lower corner of the box around the space that the geom can sweep in the step."""
     high: wp.array(dtype=wp.vec3)

@@ -29,10 +29,10 @@ left out: they would take a quarter of the step's time, and the scheme's own dam
 
 A body with parent -1 is a root. It is attached to its tree's fixed pose, or *floats* if it has been cut off.
 ``body_root`` of a body is the floating root whose component contains the body, or -1. A floating root has no spring and
-no lever. The inertia that remains after its rotation is eliminated gives its linear acceleration: ``root_inverse_mass``
-times the remaining force. A floating component that no tie holds *falls* (``body_falls``): its weight causes no
-geometric stiffness, and its momentum is corrected after the step (``floating_components``). Components that hang from a
-tie are integrated like trees with a fixed root.
+no lever. Its linear acceleration is ``root_inverse_mass``, the inverse of the inertia that remains after its rotation
+is eliminated, times the remaining force. A floating component that no tie holds *falls* (``body_falls``): its weight
+causes no geometric stiffness, and its momentum is corrected after the step (``floating_components``). Components that
+hang from a tie are integrated like trees with a fixed root.
 
 Ties and air drag are forces at a point of a body that oppose its velocity. Implicitly they act like an added mass W at
 this point: W = phi dt (phi dt k + c) for a spring of stiffness k with a damper c, and W = dt c for drag with the

@@ -316,7 +316,7 @@ def predict_lean(
     :func:`vinesim.kernels.plants.prediction.predict`.
 
     is_branching: [body] whether a body is the parent of a body other than the next one. Trees with phi = 1/2, which
-    must conserve energy, use the passes of that kernel.
+    must conserve energy, use the passes of :func:`predict`.
     """
     if wp.tid() >= count[0]:
         return

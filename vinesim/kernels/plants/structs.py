@@ -14,7 +14,7 @@ class SolverParameters:
     """Parameters that hold for all trees."""
 
     dt: float  # [s] duration of a step
-    fast_rate: float  # [rad/s] faster joints: phi = 1; faster bodies feel drag
+    fast_rate: float  # [rad/s] a faster joint: phi = 1; a faster body: drag
     max_rate: float  # [rad/s] no joint is integrated faster
     fault_rate: float  # [rad/s] a tree with a faster joint is not integrated
     contact_steps: int  # a larger count of backward Euler steps was not set by a contact

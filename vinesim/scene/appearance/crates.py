@@ -17,7 +17,7 @@ from vinesim.scene.values import Shape
 
 
 class Crate(Table, frozen=True):
-    """Dimensions [m] and paints of a harvest crate; the scene gives its outer size."""
+    """Dimensions [m] and paints of a harvest crate. The scene contains its outer size."""
 
     source: str
     paints: Annotated[tuple[Paint, ...], msgspec.Meta(min_length=1)]

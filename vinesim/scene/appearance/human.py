@@ -122,7 +122,7 @@ def load_human_model(height: float, name: str = "worker", outfit: str = "") -> H
 def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[str]]]:
     """Returns the human model of ``height`` [m], and for each part the paint names of its shapes.
 
-    All outfits share the meshes of this model; :func:`load_human_model` gives them their colours.
+    All outfits share the meshes of this model; :func:`load_human_model` sets the colours.
     """
     file = _load_file(find_data_file("figures", name, ".toml"))
     scale = height / file.height

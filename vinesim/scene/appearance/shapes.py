@@ -70,7 +70,7 @@ class ShapeSpec(Table, frozen=True, kw_only=True):
     sides: int = 20
     """Number of edges of a whole ring."""
     square: float = 2.0
-    """Exponent of the rings: 2 gives an ellipse, a larger one a rounded rectangle."""
+    """Exponent of the rings: 2 for an ellipse, larger for a rounded rectangle."""
 
 
 def check_spec(paints: dict[str, Paint], spec: ShapeSpec, place: str) -> None:

@@ -204,7 +204,7 @@ def _fill_rod(
         points: [shoot, segment + 1, 3] m, ends of the segments.
         radius: [shoot, segment + 1] m, radii at these points.
         modulus: [segment] Pa, Young's modulus.
-        wood: gives density and damping.
+        wood: parameters with density and damping of the wood.
         up: [shoot, 3] direction that the z axes lean to.
         parent: [shoot, segment] slots of the parents.
     """

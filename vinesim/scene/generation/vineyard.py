@@ -33,7 +33,7 @@ from vinesim.scene.spec import Scene, Sun, Wind
 def generate(scene: Scene) -> Model:
     """Returns the model of a scene, from the disk cache (:mod:`vinesim.core.disk_cache`) if the cache contains it.
 
-    The same scene gives the same bits on every machine.
+    The model of a scene has the same bits on every machine.
 
     Raises :class:`~vinesim.core.toml_loader.DataError` if the scene's plant parameters cannot be read.
     """

@@ -328,7 +328,7 @@ def add_leaves(
         nodes: nodes at which leaves grow.
         body: [k] body of each node's piece.
         turn: [k, 4] orientation of that body in the world.
-        scene: gives season and training.
+        scene: its season and training are used.
         leaf: parameters of leaves.
         rng: random numbers for the leaves of this tree.
     """

@@ -306,7 +306,7 @@ class LidarScan:
 
     @property
     def organs(self) -> np.ndarray:
-        """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
+        """[point] :class:`~vinesim.scene.ids.Organ` that each point is on."""
         return self.labels // LABEL_STRIDE
 
 
