@@ -1,11 +1,11 @@
 """The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU, with one thread for each row.
 
 The matrices of trees are small, and their solve is a chain of dependent steps. Each step takes many times longer
-through memory, even shared memory, than through registers and shuffles. The steps, their order and their conditions are
-those of ``tree_solver``. A Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
+through memory, even shared memory, than through registers and shuffles. The algorithm is that of ``tree_solver``. A
+Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
 
-The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It knows nothing
-of contacts. All threads of a warp must call every function that contains native code.
+The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It does not
+depend on contacts. All threads of a warp must call every function that contains native code.
 
 The matrix column of a thread stays in registers as well, which needs loops of constant length. :func:`row_solver`
 therefore makes the functions for a number of rows and of threads.
@@ -32,7 +32,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 def _on_gpu(code: str, elsewhere: str = "0") -> str:
-    """Returns native code for a GPU. A CPU compiles ``elsewhere`` in its place, but never calls it."""
+    """Returns native code for a GPU. On a CPU ``elsewhere`` is compiled instead, but never called."""
     return f"#if defined(__CUDA_ARCH__)\nconstexpr unsigned ALL = 0xffffffffu;\n{code}\n#else\nreturn {elsewhere};\n#endif\n"
 
 
@@ -217,8 +217,9 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         surface: Surface,
         column: Column,
     ):
-        """Returns the impulse along a thread's row that fits the present states of all contacts, projected into its
-        cone, if the thread's tree takes a step.
+        """Returns the impulse along a thread's row. If the thread's tree ``takes_step``, the impulse comes from a Newton
+        step with all contacts in their present states, projected into the contact's friction cone; otherwise it is
+        ``x``.
         """
         if not any_of_warp(takes_step):
             return x

@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.lidar import lidar_raster
 from vinesim.kernels.lidar.lidar_raster import ELEVATION_SLOTS, LidarHead
 from vinesim.kernels.raster import primitives as shapes
@@ -126,7 +127,7 @@ class LidarRasterizer:
         """Returns the kernel struct of the head at ``pose`` [7] for columns ``first`` to ``end`` - 1; ``reach``:
         largest distance of a hit [m]."""
         head = LidarHead()
-        for name in LidarHead.vars:
+        for name in struct_fields(LidarHead):
             setattr(head, name, getattr(self._head, name))
         head.eye = wp.vec3(*map(float, pose[:3]))
         head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))

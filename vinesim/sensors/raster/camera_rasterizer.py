@@ -12,6 +12,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.thread_pool import ThreadPool
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.raster.pinhole import EMPTY_KEY, NEAR_DEPTH, Pinhole
@@ -83,7 +84,7 @@ def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
     for first, end in itertools.pairwise(rows):
         if first < end:
             band = Pinhole()
-            for name in Pinhole.vars:
+            for name in struct_fields(Pinhole):
                 setattr(band, name, getattr(lens, name))
             band.first_row = first
             band.end_row = end
