@@ -1,4 +1,4 @@
-"""A cane with a weight at its tip: released straight and horizontal, it swings and comes to rest where it hangs."""
+"""A cane with a weight at its tip: it is released straight and horizontal, swings, and comes to rest bent downwards."""
 
 import vinesim
 

@@ -1,4 +1,4 @@
-"""One revolution of the lidar of a robot that stands in a vineyard."""
+"""Simulates one revolution of the lidar on a robot that stands in a vineyard."""
 
 import numpy as np
 

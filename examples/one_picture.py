@@ -1,4 +1,4 @@
-"""One picture of a vineyard: colours, measured depth, and what every pixel shows."""
+"""Renders one picture of a vineyard: colour, measured depth, and the label of every pixel."""
 
 import sys
 

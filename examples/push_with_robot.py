@@ -1,4 +1,4 @@
-"""A robot drives against a cane that stands in its way: the cane bends, and both feel the same force."""
+"""A robot drives against an upright cane. The cane bends, and the contact force acts on cane and robot alike."""
 
 import numpy as np
 

@@ -1,4 +1,5 @@
-"""A server and two robots on it, all in one Python program: each sees the other move."""
+"""Runs a server and two clients, each with a robot, in one Python program. Each client receives the other robot's
+motion."""
 
 import numpy as np
 
@@ -6,7 +7,7 @@ import vinesim
 
 scene = vinesim.load_scene("demo")
 with (
-    vinesim.Server("tcp/127.0.0.1:0") as server,  # port 0: any that is free
+    vinesim.Server("tcp/127.0.0.1:0") as server,  # port 0: any free port
     vinesim.Client(scene, name="ada", connect=server.endpoint, pose=(-2.0, 0.0, 0.0)) as ada,
     vinesim.Client(scene, name="bob", connect=server.endpoint, pose=(-2.0, 2.0, 0.0)) as bob,
 ):

@@ -1,4 +1,4 @@
-"""Starts a robot of vinesim, and RViz beside it.
+"""Starts a robot of vinesim, and RViz.
 
 ros2 launch ros/vinebot.launch.py
 ros2 launch ros/vinebot.launch.py scene:=harvest environment:=true rviz:=false
@@ -16,15 +16,16 @@ FOLDER = Path(__file__).resolve().parent
 ARGUMENTS = {
     "scene": ("demo", "A scene file, or demo, harvest, tendone, vsp."),
     "robot": ("vinebot", "A URDF file, or vinebot, logistic."),
-    "namespace": ("", "Prefix of all topics."),
-    "params_file": (str(FOLDER / "parameters.yaml"), "ROS parameters of the robot's nodes."),
+    "namespace": ("", "Namespace of all topics."),
+    "params_file": (str(FOLDER / "parameters.yaml"), "File with ROS parameters of the robot's nodes."),
     "rviz": ("true", "Whether RViz is started."),
     "environment": ("false", "Whether bunches, boxes and people are shown as frames; needs topic_tools."),
 }
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The client publishes robot_description and all frames itself: there is no robot_state_publisher."""
+    """Start vinesim, RViz and the relay of frames. There is no robot_state_publisher, because vinesim publishes all
+    frames."""
     client = ExecuteProcess(
         name="vinesim",
         cmd=[
@@ -40,7 +41,7 @@ def generate_launch_description() -> LaunchDescription:
             *("--namespace", LaunchConfiguration("namespace"), "--params-file", LaunchConfiguration("params_file")),
         ],
         output="screen",
-        on_exit=[EmitEvent(event=Shutdown(reason="the robot has ended"))],
+        on_exit=[EmitEvent(event=Shutdown(reason="vinesim has ended"))],
     )
     rviz = ExecuteProcess(
         cmd=["rviz2", "-d", str(FOLDER / "vinebot.rviz"), "--ros-args", "-p", "use_sim_time:=true"],

@@ -1,8 +1,8 @@
 """The physics of one vineyard and its step: an ordered list of named stages, see :meth:`Physics.step`.
 
-Both solvers predict velocities without the contacts between them, the contacts are solved for both at once, and both
-integrate with the resulting forces. Afterwards the new state decides which bunches and pieces of wood detach, and which
-trees fall asleep.
+The plant solver and the rigid solver each predict velocities without the contacts between plants and rigid bodies. One
+contact solver then computes the forces of these contacts, and the two solvers integrate with these forces. Afterwards
+the new state decides which bunches and pieces of wood detach, and which trees fall asleep.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ from vinesim.wires.wire_segments import WireShapes
 class Physics:
     """A vineyard that moves: plants, rigid bodies, and the contacts, grasps and detachments between them.
 
-    One thread owns it. Other threads read :class:`Snapshot` and other frozen values.
+    Only the thread that steps a world may use its ``Physics``. Other threads read :class:`Snapshot` and other frozen
+    values.
     """
 
     def __init__(
@@ -85,17 +86,19 @@ class Physics:
         self.sleep_monitor = SleepMonitor(self.plants, p)
         self.fault_guard = FaultGuard(self.plants)
         self.wind: Wind | None = None
-        """The wind; None for calm. It may be set at any time between steps; the wind then rises or dies down in two
+        """The wind; None for calm. It may be set between steps; the air then changes to the new wind within two
         seconds."""
         self.wind_time_offset = 0.0
-        """[s] Time of the wind minus :attr:`time`. With it, gusts come at the same time as at other clients."""
+        """[s] Time of the wind minus :attr:`time`. It differs from 0 in a shared world, where all clients have the same
+        gusts at the same time."""
         self.wind_on_plants = WindOnPlants(self.plants, p)
-        """Applies the wind to the trees that feel it."""
+        """Applies the wind to trees near robots and people."""
         self.detachments: tuple[Detachment, ...] = ()
         """Bunches and pieces of wood that left their plants in the last step, or by command before it; sorted by
         body."""
         self.remotely_posed = np.zeros(0, np.int32)
-        """[k] Trees that :meth:`apply_remote_rest` has posed. Whoever reads the snapshots clears this array."""
+        """[k] Trees that :meth:`apply_remote_rest` has posed for the next snapshot. The client empties this array
+        before it applies the messages of the next step."""
         self.tick = 0
         """Number of steps so far."""
         self._detachment = detachment
@@ -103,7 +106,8 @@ class Physics:
         self._body_q: np.ndarray | None = None
         self._kinematics_current = True
         self.stages = self._ordered_stages()
-        """Name and function of each stage of a step; a name begins with the part that does it."""
+        """Name and function of each stage of a step, in order. A name begins with the part of the physics that carries
+        out the stage."""
 
     def _ordered_stages(self) -> tuple[tuple[str, Callable[[], object]], ...]:
         return (
@@ -125,14 +129,15 @@ class Physics:
         )
 
     def step(self) -> None:
-        """Advance by ``dt``. Commands received before the call act in this step."""
+        """Advance the world by :attr:`dt`. Commands given before the call take effect in this step."""
         for _, stage in self.stages:
             stage()
         self.tick += 1
 
     @property
     def faults(self) -> dict[str, int]:
-        """Number of times so far that something was stopped, slowed, dropped, skipped or refused, by kind."""
+        """Number of faults so far, by kind: trees and robots stopped, trees slowed, contacts dropped, geoms skipped,
+        grasps refused."""
         return {
             "trees_stopped": int(self.fault_guard.count.sum()),
             "trees_slowed": self.fault_guard.slowed,
@@ -152,7 +157,7 @@ class Physics:
 
     def _refine_bunches(self) -> None:
         coarsened = self.level_of_detail.update(self.contact_solver.near_trees)
-        if len(coarsened):  # sleeping trees among them collide with other shapes now
+        if len(coarsened):  # the bounding boxes of sleeping trees must follow their new shapes
             self.contact_solver.update_tree_bounds(coarsened)
 
     def _update_elastic_supports(self) -> None:
@@ -198,39 +203,43 @@ class Physics:
 
     @property
     def time(self) -> float:
-        """[s] since the start."""
+        """[s] Simulated time since the start."""
         return self.tick * self.dt
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Contacts with plants in the last step, sorted by (tree, body, shape, geom), then hands that held a plant."""
+        """Contacts with plants in the last step, sorted by (tree, body, shape, geom), followed by one contact for each
+        hand that held a plant."""
         return self.contact_solver.contacts + self.grasp_manager.contacts
 
     @property
     def touched(self) -> tuple[tuple[int, str], ...]:
-        """(tree, actor) for every tree that was pressed or held in the last step, sorted."""
+        """Pairs (tree, actor) for each tree that the actor pressed or held in the last step, sorted."""
         if not self.grasp_manager.contacts:
             return self.contact_solver.touched_trees
         held = ((int(self.model.body_tree[contact.body]), contact.actor) for contact in self.grasp_manager.contacts)
         return tuple(sorted({*self.contact_solver.touched_trees, *held}))
 
     def update_kinematics(self) -> None:
-        """Bring ``state.body_q`` from the start of the last step to its end."""
+        """Compute the body poses ``state.body_q`` at the end of the last step. A step leaves them as they were at its
+        start."""
         if not self._kinematics_current:
             self.plants.forward_kinematics()
             self._kinematics_current = True
 
     def wake(self, trees: np.ndarray) -> None:
-        """Wake trees [k] whose joints were written from outside, between steps, and bring their poses up to date.
+        """Wake trees [k] and compute their poses. Call it between steps, after writing joint rotations of these trees
+        into :attr:`state`.
 
-        :class:`ValueError` if there is no such tree.
+        Raises :class:`ValueError` if there is no such tree.
         """
         self.sleep_monitor.wake(trees)
         self.plants.forward_kinematics(trees)
         self._body_q = None
 
     def snapshot(self) -> Snapshot:
-        """The world after the last step. While no tree is awake, snapshots share one array of plant poses."""
+        """Returns the world after the last step as an immutable value. While no tree is awake, snapshots share one
+        array of plant poses."""
         if self._body_q is None:
             self.update_kinematics()
             self._body_q = self.state.body_q.copy()
@@ -247,7 +256,8 @@ class Physics:
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """All rigid bodies and dormant bunches that have a shape; the same tuple until one is added or removed."""
+        """Returns all rigid bodies and dormant bunches that have a shape. The same tuple is returned until a body or
+        bunch is added or removed."""
         rigid = self.rigid.visuals()
         dormant = self.dormant_bunches.visuals()
         if self._visuals[0] is not rigid or self._visuals[1] is not dormant:
@@ -255,7 +265,7 @@ class Physics:
         return self._visuals[2]
 
     def visual_q(self) -> np.ndarray:
-        """World poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of :meth:`visuals`."""
         rigid = self.rigid.visual_q()
         return np.concatenate([rigid, self.dormant_bunches.visual_q()]) if len(self.dormant_bunches) else rigid
 
@@ -271,26 +281,27 @@ class Physics:
         self._remove_blades_of(name)
 
     def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
-        """See :meth:`RigidWorld.add_human`. A remote person touches only trees whose state that person's client
-        sends."""
+        """See :meth:`RigidWorld.add_human`. A remote person is controlled by another client, and touches only trees
+        whose state that client sends."""
         self.rigid.add_human(spec, is_remote=is_remote)
         if is_remote:
             self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
-        """See :meth:`RigidWorld.remove_human`. The hands release what they held; the person's blades are removed as
-        well."""
+        """See :meth:`RigidWorld.remove_human`. The person's hands release all objects and plants; the person's blades
+        are removed as well."""
         self.rigid.remove_human(name)
         self._remove_blades_of(name)
         self.grasp_manager.remove_ties_of(name)
         self.contact_solver.remote_actors.discard(name)
 
     def move_human(self, name: str, pose: HumanPose) -> None:
-        """Set where a person's tracked points are at the end of the coming step, and which hands are closed."""
+        """Set the poses that a person's tracked points (head, hands, hips, feet) have at the end of the next step, and
+        which hands are closed."""
         self.rigid.move_human(name, pose)
 
     def hand(self, name: str, side: str) -> HandSample:
-        """A person's ``"left"`` or ``"right"`` hand after the last step."""
+        """Returns the state of a person's hand after the last step. ``side``: ``"left"`` or ``"right"``."""
         return self.rigid.hand_sample(name, side)
 
     # ------------------------------------------------------------------ detachment
@@ -316,7 +327,7 @@ class Physics:
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
-        """Put trees into the pose in which they rest at the client that owns them, without waking them.
+        """Put trees into the rest pose that the client that owns them has sent. No tree wakes.
 
         ``joint_q`` has the joint rotations [body of the tree, 4] of each tree. If a tree is named several times, its
         last pose counts.
@@ -336,10 +347,11 @@ class Physics:
         self.level_of_detail.set_focus(points, radius)
 
     def add_blade(self, actor: str, link: str, pose: np.ndarray, half: np.ndarray) -> Blade:
-        """Give a link of an actor a cutter with a box-shaped mouth: ``pose`` [7] in the link, half edges ``half`` [3]
-        m.
+        """Attach a cutter to a link of an actor. Its mouth is a box: ``pose`` [7] in the link's frame, half edges
+        ``half`` [3] m.
 
-        x runs along the blades, y from one to the other. :meth:`Blade.close` cuts what passes through the mouth.
+        The box's x axis runs along the two blades, its y axis from one blade to the other. :meth:`Blade.close` cuts the
+        wood that passes through the mouth.
         """
         self.rigid.link_pose(actor, link)  # raises an error if there is no such link
         blade = Blade(actor, link, np.asarray(pose, float), np.asarray(half, float))

@@ -1,10 +1,10 @@
-"""Lights the signal tower when the battery runs low, and sounds it when it is nearly empty.
+"""Turns on a robot's indicator lights when the battery is low, and also their tone when it is nearly empty.
 
     vinesim client --role robot --name vinebot           # in one terminal
     python examples/ros/battery_light.py                 # in another
     ros2 topic pub -r 1 /battery_state sensor_msgs/BatteryState "{percentage: 0.15}"
 
-A stock ROS 2 node: /battery_state comes from whatever knows the charge; vinesim simulates no battery.
+This is an ordinary ROS 2 node. Another node must publish /battery_state, because vinesim simulates no battery.
 """
 
 import rclpy
@@ -12,10 +12,10 @@ from rclpy.node import Node
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Bool, String
 
-# share of the charge
+# shares of the full charge
 LOW = 0.20
 EMPTY = 0.05
-MARGIN = 0.02  # by which it has to rise before a light goes off again
+MARGIN = 0.02  # by which the charge must rise above a limit before its pattern ends
 
 
 class BatteryLight(Node):
@@ -27,7 +27,7 @@ class BatteryLight(Node):
         self.create_subscription(BatteryState, "/battery_state", self.take, 10)
 
     def take(self, message: BatteryState) -> None:
-        """Choose the pattern by the charge; a charge that is not known (NaN) changes nothing."""
+        """Choose the pattern by the charge. An unknown charge (NaN) changes nothing."""
         charge = message.percentage
         before = self.pattern
         for pattern, limit in (("alarm", EMPTY), ("warning", LOW)):
@@ -37,7 +37,7 @@ class BatteryLight(Node):
         else:
             if charge == charge:
                 self.pattern = "off"
-        # With every message: a robot that has only just started hears it, too.
+        # Published with every message, so that a robot that starts later receives the commands, too.
         self.light.publish(String(data=self.pattern))
         self.sound.publish(Bool(data=self.pattern == "alarm"))
         if self.pattern != before:

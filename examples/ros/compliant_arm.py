@@ -1,9 +1,10 @@
-"""Makes the left arm soft: it gives way when something pushes it, and comes back.
+"""Makes a robot's left arm compliant: the arm gives way when something pushes it, and comes back.
 
     vinesim client --role robot --name vinebot           # in one terminal
     python examples/ros/compliant_arm.py                 # in another
 
-A stock ROS 2 node: it holds the arm where it is with little stiffness, and prints what the joints do.
+This is an ordinary ROS 2 node. It holds the arm at its present pose with low stiffness, and prints when a joint gives
+way.
 """
 
 import rclpy
@@ -11,10 +12,10 @@ from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-# N m/rad, N m s/rad
+# gains of the impedance controller: N m/rad, N m s/rad
 STIFFNESS = 50.0
 DAMPING = 15.0
-# rad
+# deflection of a joint [rad] above which the arm counts as pushed, and below which it is back
 PUSHED = 0.03
 BACK = 0.01
 
@@ -32,7 +33,7 @@ class CompliantArm(Node):
         self.create_subscription(JointState, "/joint_states", self.take, 10)
 
     def take(self, message: JointState) -> None:
-        """Soften the arm at the first message that comes with the controller there; then watch its joints."""
+        """Make the arm compliant once the controller has subscribed; afterwards, watch the joints."""
         places = dict(zip(message.name, message.position, strict=True))
         here = [places[joint] for joint in self.joints]
         if not self.equilibrium:

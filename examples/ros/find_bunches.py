@@ -1,10 +1,10 @@
-"""Finds bunches in a robot's colour and depth pictures, and prints where they are.
+"""Finds bunches in a robot's colour and depth images, and prints their positions.
 
     vinesim client --role robot --scene demo             # in one terminal
     python examples/ros/find_bunches.py                  # in another
 
-A stock ROS 2 node: what has the colour of fruit and hangs together in one place is a bunch. Places are metres in the
-camera's optical frame.
+This is an ordinary ROS 2 node. It takes each connected area with the colour of fruit as a bunch. Positions are in the
+camera's optical frame, in metres.
 """
 
 import cv2
@@ -22,7 +22,7 @@ class BunchFinder(Node):
             self.create_subscription(kind, f"{camera}/{topic}", lambda m, t=topic: self.take(t, m), 5)
 
     def take(self, topic: str, message: Image | CameraInfo) -> None:
-        """Search a picture once its colours, depth and intrinsics are there: all have the same stamp."""
+        """Store a message. Find bunches once colour, depth and intrinsics with the same header stamp have arrived."""
         self.parts = {t: m for t, m in self.parts.items() if m.header.stamp == message.header.stamp} | {topic: message}
         if len(self.parts) == 3:
             rgb, depth, info = (self.parts[t] for t in ("rgb/image_raw", "depth/image_raw", "rgb/camera_info"))
@@ -33,7 +33,10 @@ class BunchFinder(Node):
 
 
 def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndarray]:
-    """Places [3] m of the bunches in a picture [height, width, 3] with depth [height, width] m."""
+    """Returns the positions [3] m of the bunches in an image [height, width, 3] with depth [height, width] m.
+
+    ``k`` [3, 3]: camera matrix.
+    """
     red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
     amber = (abs(red - green) < 0.1 * green) & (blue < 0.65 * green)
     fruit = (amber | ((red > 1.3 * green) & (blue > green - 8))) & (metres > 0.0) & (metres < 3.0)
@@ -46,7 +49,7 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
             z = np.median(metres[rows, columns])
             (near, far) = np.percentile(metres[rows, columns], (10, 90))
             size = np.ptp([columns, rows], axis=1) * z / k[0, 0]
-            if size.max() < 0.3 and far - near < 0.1:  # grass and soil stretch into the distance
+            if size.max() < 0.3 and far - near < 0.1:  # grass and soil extend over a larger range of depths
                 places.append(np.linalg.inv(k) @ [np.median(columns) * z, np.median(rows) * z, z])
     return places
 

@@ -1,9 +1,10 @@
-"""Localises a robot without any truth: turns from the gyroscope, travel from odometry; publishes map to odom on /tf.
+"""Localises a robot without ground truth, from gyroscope and odometry, and publishes the transform map to odom on /tf.
 
     vinesim client --role robot --name vinebot           # in one terminal
     python examples/ros/localise.py vinebot              # in another
 
-A stock ROS 2 node: it tells the robot to keep its true pose to itself. The map begins where the robot stands.
+This is an ordinary ROS 2 node. It integrates the yaw rate of the IMU and the velocity of odometry. It sets a parameter
+so that the robot no longer publishes its true pose. The origin of the map is the pose of the robot at the start.
 """
 
 import math
@@ -32,7 +33,7 @@ class Localiser(Node):
         self.create_subscription(Odometry, "/mobile_base_controller/odom", self.travel, 100)
 
     def turn(self, message: Imu) -> None:
-        """Integrate the turn and the way since the last message."""
+        """Integrate yaw and position since the last IMU message."""
         now = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
         if self.last is not None:
             turn = message.angular_velocity.z * (now - self.last)
@@ -43,7 +44,8 @@ class Localiser(Node):
         self.last = now
 
     def travel(self, message: Odometry) -> None:
-        """Publish where odom lies: there odometry's pose of the base is the integrated one."""
+        """Publish the transform map to odom, so that the pose of the base in odometry becomes the integrated pose in
+        the map."""
         self.speed = message.twist.twist.linear.x
         place = message.pose.pose.position
         q = message.pose.pose.orientation

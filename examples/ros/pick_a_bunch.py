@@ -1,10 +1,10 @@
-"""Picks a bunch and lays it into a box by ROS alone: transforms in; actions and velocities out.
+"""Picks a bunch and puts it into a box. The robot is controlled through ROS only.
 
     vinesim client --role robot --scene harvest          # in one terminal
     python examples/ros/pick_a_bunch.py                  # in another
 
-Bunches and boxes come from /tf_environment, the robot from /tf, /joint_states and /robot_description; it moves by
-follow_joint_trajectory, gripper_cmd and cmd_vel, as the real one does.
+The poses of bunches and boxes come from /tf_environment, the state of the robot from /tf, /joint_states and
+/robot_description. The robot is moved by follow_joint_trajectory, gripper_cmd and cmd_vel, like the real one.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ message_packages.ensure_importable(["control_msgs", "tf2_msgs"])
 from control_msgs.action import FollowJointTrajectory, GripperCommand  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
-DEPTH = 0.06  # m below a bunch's upper end: there the cutter is at its stalk
-# m from the base to the bunch at the pick
+DEPTH = 0.06  # m from a bunch's upper end down to the grasp, at which the cutter is at the stalk
+# m, position of the bunch in the base's frame during the pick
 AHEAD = 0.88
 ASIDE = 0.28
-OPEN = 0.15  # m between the fingers: as wide as they go, since a bunch may be 0.13 m wide
-ALLEY = (1.36, 1.75, 0.8, 6.7)  # m: y and x in which the base may stand and turn
-LANE = 1.06  # m: y of the base beside a box
-DRAWN_IN = (0.45, 0.12, 1.20)  # m: the left hand while the base drives, in the base's frame
+OPEN = 0.15  # m between the fingers: their largest opening, since a bunch may be 0.13 m wide
+ALLEY = (1.36, 1.75, 0.8, 6.7)  # m: ranges of y and x in which the base may stand and turn
+LANE = 1.06  # m: y of the base next to a box
+DRAWN_IN = (0.45, 0.12, 1.20)  # m: position of the left hand while the base drives, in the base's frame
 UP = np.array([0.0, 0.0, 1.0])
 
 
 class Robot:
-    """What the topics say of the robot and its surroundings, and its actions."""
+    """State of the robot and its surroundings from the topics, and the robot's actions."""
 
     def __init__(self) -> None:
         self.node = rclpy.create_node("picker")
         self.joints: dict[str, float] = {}
-        self.frames: dict[str, np.ndarray] = {}  # in the map, or in the parent's frame
+        self.frames: dict[str, np.ndarray] = {}  # pose [7] in the parent's frame, by frame id
         self.environment: dict[str, np.ndarray] = {}
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         texts: list[str] = []
@@ -71,19 +71,19 @@ class Robot:
         self.environment = poses_of(message)
 
     def until(self, done, timeout: float = 60.0) -> None:
-        """Take messages until ``done()``; RuntimeError after ``timeout`` [s]."""
+        """Receive messages until ``done()`` returns True. Raises RuntimeError after ``timeout`` [s]."""
         end = time.monotonic() + timeout
         while not done():
             rclpy.spin_once(self.node, timeout_sec=0.1)
             if time.monotonic() > end:
-                raise RuntimeError("nothing came from the robot")
+                raise RuntimeError("the robot did not answer")
 
     def base(self) -> np.ndarray:
-        """Pose [7] of the base in the map."""
+        """Returns the pose [7] of the base in the map."""
         return frames.compose(self.frames["odom"], self.frames["base_footprint"])
 
     def act(self, *goals) -> list:
-        """Send goals (action, name, goal) at once; their results when all have ended."""
+        """Send goals (action, name, goal) at the same time. Returns their results when all goals have ended."""
         handles = []
         for action, name, goal in goals:
             client = ActionClient(self.node, action, name)
@@ -95,7 +95,7 @@ class Robot:
         return [handle.result().result for handle in handles]
 
     def grip(self, side: str, opening: float, effort: float = 0.0) -> GripperCommand.Result:
-        """Move a gripper to an opening [m] with an effort [N] of each finger at most."""
+        """Move a gripper to an opening [m]. ``effort``: largest effort of each finger [N]; 0: the drive's own limit."""
         goal = GripperCommand.Goal()
         goal.command.position = opening
         goal.command.max_effort = effort
@@ -103,7 +103,7 @@ class Robot:
 
 
 def poses_of(message) -> dict[str, np.ndarray]:
-    """Poses [7] of a TFMessage by child frame."""
+    """Returns the poses [7] in a TFMessage, by child frame id."""
     return {
         t.child_frame_id: np.array(
             [*(getattr(t.transform.translation, a) for a in "xyz"), *(getattr(t.transform.rotation, a) for a in "xyzw")]
@@ -113,7 +113,7 @@ def poses_of(message) -> dict[str, np.ndarray]:
 
 
 class Arm:
-    """One arm and the lift: straight lines of its hand, by damped inverse kinematics on the URDF."""
+    """One arm with the lift. It moves the hand along straight lines, by damped inverse kinematics of the URDF."""
 
     def __init__(self, robot: Robot, side: str) -> None:
         self.robot = robot
@@ -129,13 +129,14 @@ class Arm:
         self.tool = f"gripper_{side}_grasping_link"
 
     def hand(self, q: np.ndarray) -> np.ndarray:
-        """Pose [7] of the hand in the base for joint positions."""
+        """Returns the pose [7] of the hand in the base's frame for joint positions ``q``."""
         every = np.array([self.robot.joints[name] for name in self.robot.description.joints])
         every[self.index] = q
         return self.robot.description.link_poses(every)[self.tool]
 
     def solve(self, goal: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """Joint positions that bring the hand to a pose [7] in the base, from ``q``; near home if it may choose."""
+        """Returns joint positions for a pose [7] of the hand in the base's frame, searched from ``q``. Of several
+        solutions, it is one near the home positions. Raises RuntimeError if the hand cannot reach the pose."""
         for count in range(60):
             here = self.hand(q)
             off = np.r_[goal[:3] - here[:3], frames.log(frames.multiply(goal[3:], frames.conjugate(here[3:])))]
@@ -147,7 +148,7 @@ class Arm:
                 turn = frames.log(frames.multiply(there[3:], frames.conjugate(here[3:])))
                 jacobian[:, i] = np.r_[there[:3] - here[:3], turn] / 1e-4
             damping = 1e-6 + 0.02 * float(off @ off)
-            free = np.ones(len(q))  # a joint that would pass its limit stays there, and the others do its part
+            free = np.ones(len(q))  # 0 for joints at their limits: the other joints do the motion
             for _ in range(3):
                 part = jacobian * free
                 inverse = part.T @ np.linalg.inv(part @ part.T + damping * np.eye(6))
@@ -158,7 +159,7 @@ class Arm:
         raise RuntimeError(f"the hand stays {np.linalg.norm(off[:3]):.3f} m and {np.linalg.norm(off[3:]):.2f} rad off")
 
     def move(self, position, turn: np.ndarray, speed: float = 0.2) -> None:
-        """Move the hand in a straight line to a position [3] m in the base, turned by a quaternion [4]."""
+        """Move the hand in a straight line to a position [3] m and an orientation [4] in the base's frame."""
         q = np.array([self.robot.joints[name] for name in self.names])
         start = self.hand(q)
         away = frames.log(frames.multiply(turn, frames.conjugate(start[3:])))
@@ -192,7 +193,8 @@ class Arm:
 
 
 def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None:
-    """Turn towards a place [2] m, drive there, and turn to a heading [rad]; RuntimeError if something is in the way."""
+    """Turn towards a place [2] m, drive there, and turn to a heading [rad]. Raises RuntimeError if the base is
+    stuck."""
     seen: list[np.ndarray] = []
 
     def command(linear: float, angular: float) -> None:
@@ -222,7 +224,7 @@ def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None
         turn_to(float(np.arctan2(*(place - robot.base()[:2])[::-1])))
         while np.linalg.norm(away := place - robot.base()[:2]) > 0.02:
             error = wrap(float(np.arctan2(away[1], away[0])) - yaw_of(robot.base()))
-            if abs(error) > 1.5:  # past it
+            if abs(error) > 1.5:  # the base has passed the place
                 break
             command(float(min(0.4, 0.8 * np.linalg.norm(away) + 0.03)), float(np.clip(2.0 * error, -0.4, 0.4)))
     if heading is not None:
@@ -240,7 +242,8 @@ def yaw_of(pose: np.ndarray) -> float:
 
 
 def bunches_by_room(robot: Robot) -> list[tuple[str, str, np.ndarray, float]]:
-    """Bunch, side, place [2] and heading of the base for it: those with most room between the other bunches first."""
+    """Returns possible picks: bunch, side, and place [2] m and heading [rad] of the base. Bunches with most room
+    between them and other bunches come first."""
     bunches = {name: pose for name, pose in robot.environment.items() if name.startswith("bunch")}
     axes = {name: frames.rotate(pose[3:], np.array([1.0, 0.0, 0.0])) for name, pose in bunches.items()}
     middles = np.array([pose[:3] + 0.08 * axes[name] for name, pose in bunches.items()])
@@ -264,7 +267,7 @@ def bunches_by_room(robot: Robot) -> list[tuple[str, str, np.ndarray, float]]:
 
 
 def pick(robot: Robot, name: str, side: str, place: np.ndarray, heading: float) -> None:
-    """Pick one bunch; RuntimeError if that fails, with the hand drawn back."""
+    """Pick one bunch. If that fails, draw the hand back and raise RuntimeError."""
     drive(robot, place, heading)
     arm = Arm(robot, side)
     level = np.array([0.0, 0.0, 0.0, 1.0])
@@ -272,7 +275,7 @@ def pick(robot: Robot, name: str, side: str, place: np.ndarray, heading: float) 
     def grasp_point() -> np.ndarray:
         rclpy.spin_once(robot.node, timeout_sec=0.2)
         if name not in robot.environment:
-            raise RuntimeError("it fell")
+            raise RuntimeError("the bunch fell")
         bunch = robot.environment[name]
         axis = frames.rotate(bunch[3:], np.array([1.0, 0.0, 0.0]))
         return frames.compose(frames.inverse(robot.base()), np.r_[bunch[:3] + DEPTH * axis, level])[:3]
@@ -289,7 +292,7 @@ def pick(robot: Robot, name: str, side: str, place: np.ndarray, heading: float) 
             if cut.effort > 0.0:
                 break
         else:
-            raise RuntimeError("the blades met nothing")
+            raise RuntimeError("the blades cut nothing")
         here = arm.hand(np.array([robot.joints[joint] for joint in arm.names]))[:3]
         arm.move(here - back - [0.0, 0.0, 0.03], level, speed=0.15)
         arm.move(np.array(DRAWN_IN) * [1.0, 1.0 if side == "left" else -1.0, 1.0], level)
@@ -302,10 +305,10 @@ def pick(robot: Robot, name: str, side: str, place: np.ndarray, heading: float) 
 
 
 def put_into_box(robot: Robot, side: str) -> None:
-    """Drive beside the nearest box, with it on the hand's side, and lay down what the hand holds."""
+    """Drive next to the nearest box, with the box on the hand's side, and put the held bunch into it."""
     boxes = [pose for name, pose in robot.environment.items() if name.startswith("box")]
     box = min(boxes, key=lambda pose: float(np.linalg.norm(pose[:2] - robot.base()[:2])))
-    ahead = -1.0 if side == "left" else 1.0  # the boxes stand at smaller y: on the left of who looks along -x
+    ahead = -1.0 if side == "left" else 1.0  # the boxes are at smaller y, to the left of a robot that faces -x
     lane = np.array([box[0] - ahead * 0.10, LANE])
     start = np.array([lane[0] - ahead * 0.9, 0.5 * (ALLEY[0] + ALLEY[1])])
     heading = 0.0 if ahead > 0.0 else np.pi

@@ -282,7 +282,7 @@ def test_secured_from_certificate_to_client(tmp_path):
         (["server", "--listen", "tls/0.0.0.0:7447"], ["tls/0.0.0.0:7447", "--tls DIR"]),
         (["server", "--listen", "tcp/0.0.0.0:7447"], ["tcp/0.0.0.0:7447", "--tls DIR", "--insecure"]),
         (["replay", "run.mcap", "--listen", "tcp/192.168.1.5:7447"], ["tcp/192.168.1.5:7447", "--insecure"]),
-        (["server", "--connect", "tcp/127.0.0.1:1", "--state-dir", "kept"], ["only carries", "--state-dir"]),
+        (["server", "--connect", "tcp/127.0.0.1:1", "--state-dir", "kept"], ["only routes", "--state-dir"]),
         (["server", "--status", "xml"], ["xml", "json"]),
         (["server", "--quota", "0", "1"], ["--quota", "above zero"]),
         (

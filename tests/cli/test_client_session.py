@@ -39,8 +39,8 @@ CLIENT = SimpleNamespace(
 
 
 def test_a_gpu_that_fails_under_the_plants_ends_the_client_in_one_line(session, monkeypatch):
-    monkeypatch.setattr(client_session, "device_fault", lambda _: "Warp sees no NVIDIA GPU here")
-    with session._stack, pytest.raises(DeviceLost, match=r"cuda:0 failed after 12\.5 s: Warp sees no NVIDIA GPU"):
+    monkeypatch.setattr(client_session, "device_fault", lambda _: "Warp finds no NVIDIA GPU here")
+    with session._stack, pytest.raises(DeviceLost, match=r"cuda:0 failed after 12\.5 s: Warp finds no NVIDIA GPU"):
         session.run(CLIENT)
     assert DeviceLost.exit_code == 3
 

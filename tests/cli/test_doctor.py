@@ -147,7 +147,7 @@ def test_certificates_that_expire_soon_are_broken_or_missing(tmp_path, monkeypat
     )
     certificates.create(tmp_path / "short", "picker", days=3)
     short = software.certificates([tmp_path / "long", tmp_path / "short"])
-    assert (short.state, "short/picker.pem" in short.found, short.remedy) == (WARNING, True, "make it anew in time")
+    assert (short.state, "short/picker.pem" in short.found, short.remedy) == (WARNING, True, "make a new one in time")
     (tmp_path / "long" / "picker.pem").write_text("no certificate")
     broken = software.certificates([tmp_path / "long"])
     assert (broken.state, bool(broken.remedy)) == (WARNING, True)

@@ -198,10 +198,10 @@ def test_a_module_of_which_compilers_die_costs_the_others_nothing(fake: Fake, ca
     packages = ("rigid.human_kinematics", "robot.inverse_kinematics", "stereo.stereo_input")
     assert compile_kernels(packages) == 2
     assert CompiledModules().missing(module_names(packages)) == ["rigid.human_kinematics"]
-    assert "rigid.human_kinematics was not compiled beforehand: the compiler ended with exit code -9" in caplog.text
+    assert "rigid.human_kinematics was not compiled in advance: the compiler ended with exit code -9" in caplog.text
     assert [name for name, _, _ in fake.rows()].count("rigid.human_kinematics") == compilation.ATTEMPTS
 
 
 def test_a_module_that_cannot_be_compiled_is_logged(fake: Fake, caplog: pytest.LogCaptureFixture) -> None:
     assert compile_kernels(("rigid.joint_servos", "stereo.stereo_input")) == 1
-    assert "rigid.joint_servos was not compiled beforehand: no" in caplog.text
+    assert "rigid.joint_servos was not compiled in advance: no" in caplog.text

@@ -103,5 +103,5 @@ def test_a_launch_of_no_threads_does_nothing() -> None:
 def test_tiers_hold_what_is_asked_for() -> None:
     first, second = range(TIERS[0] + 1), range(TIERS[0] + 1, TIERS[1] + 1)
     assert [tier_of(n) for n in (0, 1, TIERS[0], TIERS[0] + 1)] == [first, first, first, second]
-    with pytest.raises(ValueError, match="4194305 items for one launch: there is room for 4194304"):
+    with pytest.raises(ValueError, match="4194305 items in one launch; the largest number is 4194304"):
         tier_of(TIERS[-1] + 1)

@@ -167,7 +167,7 @@ def test_no_folder_with_the_key_of_the_authority_is_taken(tmp_path):
         lambda: ZenohBus("ada", connect="tls/127.0.0.1:1", certificates=certs),
         lambda: create(certs, "bob"),
     ):
-        with pytest.raises(CertificateError, match=r"ca\.key: who has it.* mv .*certs/ca\.key .*certs-authority/"):
+        with pytest.raises(CertificateError, match=r"ca\.key: whoever has it.* mv .*certs/ca\.key .*certs-authority/"):
             refused()
 
 

@@ -302,7 +302,7 @@ def test_invalid_records_are_dropped_counted_and_logged_once(caplog):
         wait(lambda: server.malformed == 7, "seven to be dropped")
         publisher.put(good)
         assert snapshot(ada, (0, 0), 1) == [box()]
-        assert len([line for line in caplog.messages if "cannot be believed" in line]) == 1
+        assert len([line for line in caplog.messages if "sent an invalid message" in line]) == 1
         for question in ("snap/x/0", "snap/1/1.5"):
             ada.query(question)
         wait(lambda: server.malformed == 9, "two queries without a valid cell")
@@ -502,7 +502,7 @@ def test_a_relay_waits_for_its_hub():
 
 def test_a_relay_refuses_options_of_the_hub(tmp_path):
     with pytest.raises(
-        ValueError, match=r"only carries: give --state-dir, --scene, --max-clients and --real-time-factor to"
+        ValueError, match=r"only routes: give --state-dir, --scene, --max-clients and --real-time-factor to"
     ):
         Server("tcp/127.0.0.1:0", connect=["tcp/127.0.0.1:1"], state_folder=tmp_path)
 

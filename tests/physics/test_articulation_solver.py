@@ -674,7 +674,7 @@ def test_unavailable_devices_are_refused_with_the_reason() -> None:
     with pytest.raises(DeviceUnavailable, match="device 'tpu': give cpu, cuda or cuda:N"):
         ArticulationSolver(model, State.at_rest(model), device="tpu")
     if wp.get_cuda_device_count() == 0:
-        with pytest.raises(DeviceUnavailable, match=r"'cuda': Warp sees no NVIDIA GPU here .* use cpu") as error:
+        with pytest.raises(DeviceUnavailable, match=r"'cuda': Warp finds no NVIDIA GPU here .* use cpu") as error:
             ArticulationSolver(model, State.at_rest(model), device="cuda")
         assert error.value.exit_code == 3
 

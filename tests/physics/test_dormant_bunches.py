@@ -51,7 +51,7 @@ def test_an_activated_bunch_has_the_mass_of_a_picked_one():
     np.testing.assert_allclose(
         physics.support_tracker.object_state(BUNCH(1))[0], frames.pose([1.0, 0.0, 0.05]), atol=1e-9
     )
-    with pytest.raises(ValueError, match="bunch 1 is free already"):
+    with pytest.raises(ValueError, match="bunch 1 is already a free bunch"):
         physics.dormant_bunches.rigid.add_bunch(
             1, physics.rigid._free_bunches[1], frames.pose([0.0, 0, 0]), np.zeros(6)
         )

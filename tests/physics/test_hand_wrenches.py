@@ -50,7 +50,7 @@ def test_the_wrench_of_a_hand_has_the_effect_of_the_hand():
     assert abs(rigid.joint_measurements("probe")[0][0]) < 1e-4
     assert (rigid.joint_measurements("probe")[3] == 0.0).all()
     assert not rigid.mj_data.xfrc_applied.any()
-    with pytest.raises(RobotError, match="a link that it has not"):
+    with pytest.raises(RobotError, match="which is not one of its links"):
         rigid.set_remote_wrenches("probe", {"tail": np.zeros(6)})
 
 

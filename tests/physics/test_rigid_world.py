@@ -584,6 +584,6 @@ def test_the_pool_of_bunches_grows():
     rigid.remove_bunch(4)
     assert 4 not in rigid.free_bunches
     assert [link.name for link in rigid.visuals()] == [f"bunch/{bunch}" for bunch in rigid.free_bunches]
-    with pytest.raises(ValueError, match="shapes; a free one has"):
+    with pytest.raises(ValueError, match="collision shapes; a free bunch can have"):
         rigid.add_bunch(4, free_bunch_of(free_bunch.MAX_GEOMS + 1), frames.pose(np.zeros(3)), np.zeros(6))
     assert 4 not in rigid.free_bunches

@@ -284,10 +284,10 @@ FAULTS = {
     "nameless link": ("<robot name='x'><link/></robot>", "not a URDF"),
     "joint without parent": ("<robot name='x'><link name='a'/><joint name='j' type='fixed'/></robot>", "not a URDF"),
     "no links": ("<robot name='x'></robot>", "no links"),
-    "same name twice": (robot(links="<link name='arm'/>"), "'arm' is there twice"),
+    "same name twice": (robot(links="<link name='arm'/>"), "'arm' appears twice"),
     "unknown link": (
         robot(joints="<joint name='j' type='fixed'><parent link='arm'/><child link='hand'/></joint>"),
-        "'hand' that is not there",
+        "'hand' that does not exist",
     ),
     "two parents": (
         robot(joints="<joint name='j' type='fixed'><parent link='base'/><child link='arm'/></joint>"),
@@ -318,7 +318,7 @@ FAULTS = {
     "endless effort": (robot(arm_joint="<limit lower='0' upper='1' effort='inf' velocity='1'/>"), "is not finite"),
     "flat box": (
         robot(links="<link name='s'><collision><geometry><box size='1 0 1'/></geometry></collision></link>"),
-        "is no size",
+        "is not a size",
     ),
     "unknown shape": (
         robot(links="<link name='s'><collision><geometry><cone radius='1'/></geometry></collision></link>"),
@@ -382,24 +382,24 @@ def test_quality_size_and_rate_of_a_camera_come_from_the_sidecar(tmp_path: pathl
 @pytest.mark.parametrize(
     ("toml", "words"),
     [
-        ("[groups.arm]\njoints = ['elbow']", "'elbow', which no drive moves"),
+        ("[groups.arm]\njoints = ['elbow']", "'elbow', which is no driven joint"),
         ("[groups.arm]\njoints = ['shoulder_joint']\nhome = [0.0, 1.0]", "2 of home for 1 joints"),
-        ("[[cameras]]\nname = 'c'\nframe = 'nose'", "sits in 'nose'"),
+        ("[[cameras]]\nname = 'c'\nframe = 'nose'", "is mounted on 'nose'"),
         ("[[cameras]]\nname = 'c'\nframe = 'arm'\nquality = 'best'", "'best'"),
         ("[[cameras]]\nname = 'c'\nframe = 'arm'\nsize = [640, 0]", "has the size [640, 0]"),
         ("[[cameras]]\nname = 'c'\nframe = 'arm'\nrate = 0.0", "has the rate 0.0"),
         ("[base]\nspeed = 3", "speed"),
         ("[base]\nslip = [1.0, 0.0]", "slip of (1.0, 0.0)"),
-        ("[groups.arm]\njoints = ['shoulder_joint']\nelastic = [1.0]", "only half of its springs"),
+        ("[groups.arm]\njoints = ['shoulder_joint']\nelastic = [1.0]", "only one of elastic and elastic_damping"),
         ("[groups.arm]\njoints = ['shoulder_joint']\nelastic = [-1.0]\nelastic_damping = [0.0]", "below zero"),
         ("[[cutters]]\ngroup = 'hand'\nframe = 'arm'\nhalf = [1, 1, 1]", "belongs to 'hand'"),
         (
             "[groups.arm]\njoints = ['shoulder_joint']\n[[cutters]]\ngroup = 'arm'\nframe = 'claw'\nhalf = [1, 1, 1]",
-            "sits in 'claw'",
+            "is mounted on 'claw'",
         ),
         (
             "[groups.arm]\njoints = ['shoulder_joint']\n[[cutters]]\ngroup = 'arm'\nframe = 'arm'\nhalf = [1, 0, 1]",
-            "a mouth of",
+            "the half edges",
         ),
         ("[base", "Expected"),
     ],

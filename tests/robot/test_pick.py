@@ -113,7 +113,7 @@ def test_a_failed_cut_is_reported_with_the_reason(vinebot: RobotDescription, mon
     monkeypatch.setattr(robot, "command_cutter", lambda group: None)
     pick = run(PickBunch(physics, robot, task))
     assert not pick.picked
-    assert pick.reason.startswith("cut: the blade closed beside the stalk")
+    assert pick.reason.startswith("cut: the blades missed the stalk")
     assert physics.state.bunch_attached.all()
 
 

@@ -131,7 +131,7 @@ def test_image_of_a_strided_array_is_the_same():
 def test_image_of_wrong_size_says_so():
     frame = camera_frame()
     small = CameraFrame(frame.time, "left", INFO, frame.pose, frame.rgb[:10], frame.depth, frame.labels)
-    with pytest.raises(ValueError, match="camera left: rgb8 picture is 64x10, its info says 64x48"):
+    with pytest.raises(ValueError, match="camera left: rgb8 picture is 64x10, its camera info is 64x48"):
         convert.rgb_image(small)
 
 
@@ -422,10 +422,10 @@ def test_joint_trajectory_comes_back():
     [
         (trajectory((0.5, [1.0], [])), "point 0 has 1 positions and 0 velocities for 2 joints"),
         (trajectory((0.5, [1.0, 2.0], [1.0])), "point 0 has 2 positions and 1 velocities"),
-        (trajectory((0.5, [1.0, 2.0], []), (0.5, [1.0, 2.0], [])), "does not rise"),
+        (trajectory((0.5, [1.0, 2.0], []), (0.5, [1.0, 2.0], [])), "does not increase"),
         (trajectory((0.5, [1.0, math.nan], [])), "not finite"),
-        (trajectory((-0.5, [1.0, 2.0], [])), "does not rise from 0 on"),
-        (JointTrajectory(joint_names=["a", "c"]), "a trajectory for a, c; it moves each of a, b once"),
+        (trajectory((-0.5, [1.0, 2.0], [])), "does not increase from 0"),
+        (JointTrajectory(joint_names=["a", "c"]), "a trajectory for a, c; name joints among a, b, each at most once"),
     ],
 )
 def test_bad_trajectories_are_refused_in_words(message, words):

@@ -31,7 +31,7 @@ def test_wheels_beside_a_sourced_ros_are_refused(monkeypatch):
 @wheels_only
 def test_wheels_without_their_library_path_are_refused(monkeypatch):
     monkeypatch.setenv("LD_LIBRARY_PATH", "/usr/lib")
-    assert "did not get to set LD_LIBRARY_PATH" in str(middleware.unavailable_reason())
+    assert "could not set LD_LIBRARY_PATH" in str(middleware.unavailable_reason())
 
 
 @pytest.mark.ros

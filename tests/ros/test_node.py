@@ -437,11 +437,11 @@ def test_a_command_of_another_type_is_told_of_once_with_the_remedy(caplog):
         wait_until(lambda: level() == DiagnosticStatus.WARN)
         peer.node.destroy_publisher(other)
     assert [record.getMessage() for record in caplog.records] == [
-        "/farm/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist, of which nothing arrives; "
-        "publish geometry_msgs/msg/TwistStamped "
+        "/farm/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist, which this robot cannot "
+        "receive; publish geometry_msgs/msg/TwistStamped "
         "(teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)",
-        "/farm/forward_position_controller/commands is published as std_msgs/msg/String, of which nothing arrives; "
-        "publish std_msgs/msg/Float64MultiArray",
+        "/farm/forward_position_controller/commands is published as std_msgs/msg/String, which this robot cannot "
+        "receive; publish std_msgs/msg/Float64MultiArray",
     ]
 
 

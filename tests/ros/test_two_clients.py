@@ -61,7 +61,7 @@ def test_two_robots_under_one_namespace_are_told_of_in_one_line(peer: StockNode,
     told = sorted(record.getMessage() for record in caplog.records)
     assert told == [
         f"{one} and {other} publish /mobile_base_controller/odom: frames, joints and commands of two robots mix; "
-        "give each client a --namespace of its own"
+        "give each client its own --namespace"
         for one, other in (("/one", "/two"), ("/two", "/one"))
     ]
 

@@ -334,7 +334,7 @@ def test_a_lidar_of_64_beams() -> None:
             r"firing_period is 0 s; give 1e-06 to 0\.1",
         ),
         ("rays = { value = 7", "rays = { value = 900", r"rays is 900 1; give 1 to 8"),
-        ("farthest = { value = 100.0", "farthest = { value = 0.2", "which is no range; give nearest < farthest"),
+        ("farthest = { value = 100.0", "farthest = { value = 0.2", "an empty range; give nearest < farthest"),
         ("value = [3.0, 1.5]", "value = [3.0]", "divergence has 1 values; give 2"),
         ('returns = "strongest"', 'returns = "loudest"', "returns is 'loudest'; give one of: dual, last, strongest"),
         ("leaf = { value = 0.50", "leaf = { value = -0.50", r"reflectance\.leaf is -0\.5; give 0 to 10"),

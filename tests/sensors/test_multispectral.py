@@ -187,7 +187,7 @@ def test_a_mount_sets_size_and_name():
     ("old", "new", "message"),
     [
         ('name = "nir"', 'name = "ir"', r"give different names, with red and nir"),
-        ("value = 475", "value = 600", r"give them by wavelength"),
+        ("value = 475", "value = 600", r"give them sorted by wavelength"),
         ('name = "red_edge"', 'name = "red"', r"give different names"),
         (
             "value = [0.043, 0.135, 0.038, 0.282, 0.442]",

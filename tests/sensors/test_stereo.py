@@ -211,7 +211,7 @@ def test_an_ideal_camera_measures_exactly() -> None:
         ("baseline = { value = 0.050", "baseline = { value = 0.0", r"stereo\.baseline is 0 m; give 0\.001 to 2 m"),
         ("noise = { value = 0.08", "noise = { value = 800.0", r"stereo\.noise is 800 px; give 0 to 10 px"),
         ("width = { value = 640", "width = { value = 640000", r"width is 640000 px; give 1 to 8192 px"),
-        ("farthest = { value = 10.0", "farthest = { value = 0.1", "which is no range; give 0 <= nearest < farthest"),
+        ("farthest = { value = 10.0", "farthest = { value = 0.1", "an empty range; give 0 <= nearest < farthest"),
         ('focal = { value = 399.4, unit = "px"', 'focal = { value = 1.9, unit = "mm"', r"stereo\.focal\.unit is 'mm'"),
     ],
 )

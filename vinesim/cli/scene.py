@@ -46,7 +46,7 @@ def show(file: str, seed: int | None, out: pathlib.Path | None) -> int:
     """Print a table of the scene and write its picture. Returns the exit code."""
     scene = with_seed(load_scene(file), seed)
     model = generate(scene)
-    console = Console()
+    console = Console(markup=False)
     table = Table(title=f"scene {scene.name}, seed {scene.seed}", title_justify="left", show_header=False)
     for quantity, value, unit in rows_of(scene, model):
         table.add_row(quantity, value, unit)

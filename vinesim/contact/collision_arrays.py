@@ -10,7 +10,7 @@ import warp as wp
 
 from vinesim.contact.plant_capsules import PlantCapsules
 from vinesim.core import frames
-from vinesim.core.warp_arrays import SharedArrays, share, zeros
+from vinesim.core.warp_arrays import SharedArrays, share, struct_fields, zeros
 from vinesim.kernels.contact import broadphase, structs
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.graph import KernelLaunch
@@ -43,7 +43,7 @@ def material_pairs(p: PhysicsParameters) -> np.ndarray:
     tables["damping"] = p.contact_damping_time * stiffness
     tables["compliance"] = 1.0 / (p.dt * (stiffness * p.dt + tables["damping"]))
     pairs = zeros(Surface, stiffness.shape)
-    for name in Surface.vars:
+    for name in struct_fields(Surface):
         pairs[name] = tables[name]
     return pairs
 
@@ -104,7 +104,7 @@ def _tied_geoms(model: Model) -> tuple[np.ndarray, np.ndarray]:
     """Returns the wires that each body does not collide with [body, k], as MuJoCo geom indices; -1 for no wire.
 
     A body does not collide with the wires to which it, its parent or one of its children is tied. Such a tie is a
-    spring that acts in both directions, and the geom of the wire lies where the straight wire would be.
+    spring that acts in both directions, and the geom of the wire has the position of the straight wire.
 
     Also returns the body [body, k] whose joint connects the body with that parent or child; -1 where the body itself is
     tied.
@@ -133,10 +133,10 @@ _GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if f
 
 
 class RigidArrays:
-    """Geoms and degrees of freedom of the rigid world, from one compilation of the world to the next.
+    """Geoms and degrees of freedom of the rigid world. A new object is made each time the world is compiled.
 
-    The arrays have room for all geoms that the world can list, so they keep their memory when hands open and close and
-    when bunches take bodies. :meth:`update` writes the geoms that are listed now.
+    The arrays have room for all geoms that the world can list. So their memory stays the same when hands open and close
+    and when dormant bunches get bodies. :meth:`update` writes the geoms that are listed at the time of the call.
     """
 
     def __init__(
@@ -164,7 +164,7 @@ class RigidArrays:
         self.wire_of_geom = np.full(self.capacity + 1, -1)
         """[geom] Index of the fixed piece if the geom is a wire that deflects, else -1.
 
-        The last entry, -1, stands for plants.
+        The last entry, -1, is used for contacts between plants, which have no geom.
         """
         self.geom_of_wire = np.full(len(self._is_wire), -1)
         """[fixed piece] Index of the geom if the piece is a wire that deflects, else -1."""
@@ -212,7 +212,7 @@ class RigidArrays:
         )
 
     def _list(self, rigid: RigidWorld, remote_actors: set[str]) -> None:
-        """Write the geoms and actors that are listed now."""
+        """Write the geoms and actors that the rigid world lists at present."""
         listed = self.listed = concatenate(rigid.geoms, rigid.static_geoms)
         count, movable = self.count, self.movable = len(listed.id), len(rigid.geoms.id)
         for name in _GEOM_FIELDS:
@@ -235,7 +235,7 @@ class RigidArrays:
 
     @functools.cached_property
     def names(self) -> list[tuple[str, str, int]]:
-        """[geom] Names of the listed geoms. They stay valid when the world is compiled again."""
+        """[geom] Names of the listed geoms, which stay valid when the rigid world is recompiled."""
         return persistent_names(self.listed)
 
     def update(self, rigid: RigidWorld, remote_actors: set[str]) -> np.ndarray:
@@ -258,8 +258,8 @@ class RigidArrays:
 
     @functools.cached_property
     def take_free_velocities(self) -> KernelLaunch:
-        """Launch that reads each dof's free velocity of the coming step, and by how much plants changed it in the last
-        step.
+        """Launch that reads for each dof its free velocity in this step, and the velocity change that plants caused in
+        the last step.
         """
         return KernelLaunch(
             broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct], threads=self.world.nv

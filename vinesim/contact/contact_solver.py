@@ -1,9 +1,9 @@
 """Contacts of plants with rigid bodies and with each other: one solve a step, shared by plants and rigid bodies.
 
-Plants and rigid bodies both predict their velocities without contacts, and how an impulse changes these velocities.
-The impulses that keep them apart are then found for both at once, so plants and rigid bodies feel equal and opposite
-forces in the same step. Solving the two in turn with penalty springs instead (a *staggered* scheme) is unstable from
-1e4 N/m on.
+The solvers of plants and of rigid bodies each predict velocities without contacts, and the velocity changes by
+impulses. One solve then finds the contact impulses for plants and rigid bodies together, so both get equal and opposite
+forces in the same step. Solving plants and rigid bodies in turn with penalty springs (a *staggered* scheme) is unstable
+from 1e4 N/m on.
 
 Stages: :meth:`ContactSolver.wake_near_trees` (``detection``: broadphase), the prediction of the plants,
 :meth:`ContactSolver.solve` (``detection``: narrowphase; ``impulse_solver``: islands and impulses).
@@ -33,10 +33,10 @@ class ContactSolver:
     ``rigid.integrate()``.
 
     Robots, people, boxes and free bunches wake the trees that they are near to. Awake trees wake the trees that they
-    touch. Static geoms (ground, trellis, wood) wake no tree; they only hold back bodies that already move. Shapes that
-    overlap in the scene as generated are in contact only where they overlap more than that. All numbers come from
+    touch. Static geoms (ground, trellis, wood) wake no tree; they only stop bodies that already move. Shapes that
+    overlap in the generated scene are in contact only if they overlap more than there. All numbers come from
     ``rigid.parameters``. If there are more contacts than ``contact_capacity``, the deepest are kept, and
-    ``dropped_contacts`` and ``overflow_message`` report the others.
+    ``dropped_contacts`` and ``overflow_message`` report the contacts left out.
     """
 
     def __init__(
@@ -55,14 +55,15 @@ class ContactSolver:
         self.dropped_contacts = 0
         """Number of contacts left out since the start because the contact arrays were full."""
         self.overflow_message = ""
-        """Says how many contacts were left out the last time this happened, and the remedy. Empty if none ever was."""
+        """Message with the number of contacts that were last left out, and how to avoid it. Empty if no contact was
+        ever left out."""
         self.skipped_geoms = 0
         """Number of static geoms left out since the start because too many of them were near one tree."""
         self.near_trees = np.zeros(0, np.int32)
-        """[k] Trees whose bounding box a robot or a moving box reaches into. These trees must not fall asleep."""
+        """[k] Trees whose bounding box overlaps that of a robot or a moving box. These trees must not fall asleep."""
         self.remote_actors: set[str] = set()
-        """Robots and people that another client controls. Their contacts are computed by that client: here they touch
-        only remote trees, so that each contact counts once and a distant copy disturbs nothing.
+        """Robots and people that another client controls. That client computes their contacts. In this world they touch
+        only remote trees, so that each contact is solved by one client only.
         """
         self.remote_trees = np.zeros(len(model.tree_first), np.bool_)
         """[tree] Whether another client owns the tree's state. The client writes this array."""
@@ -83,7 +84,7 @@ class ContactSolver:
     # ------------------------------------------------------------------ stages of a step
 
     def wake_near_trees(self) -> None:
-        """Wake the trees that a robot, a person or a moving object is near to. The others cost one comparison."""
+        """Wake the trees that a robot, a person or a moving object is near to. Each other tree takes one comparison."""
         if self._generation != self.rigid.generation:
             self._update_rigid_world()
         if self._awake is not self.plants.awake:
@@ -157,7 +158,7 @@ class ContactSolver:
         """Integrate trees that are about to suffer an impact with phi = 1 from this step on.
 
         The trapezoidal rule moves a body by the mean of its velocities before and after the step. A body hit from rest
-        would therefore give way only half as far as it must, overlap, and be thrown out again.
+        would therefore move only half the required distance, overlap with the other body, and be thrown out.
         """
         impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
         changed = impacted[self.plants.phi_used[impacted] < 1.0]
@@ -166,7 +167,7 @@ class ContactSolver:
             self.plants.predict(changed)
 
     def report_wires(self) -> None:
-        """Pass the forces with which plants pressed on the wires in the last step to the wires."""
+        """Pass the contact forces of plants on wires in the last step to :class:`DeflectedWires`."""
         if self.count:
             self.impulses.report_wires()
 
@@ -226,7 +227,7 @@ class ContactSolver:
 
     @property
     def touched_trees(self) -> tuple[tuple[int, str], ...]:
-        """(tree, actor) for every tree that an actor pressed on in the last step, sorted."""
+        """Pairs (tree, actor) for each tree that the actor pressed on in the last step, sorted."""
         if self._touched is None:
             self._touched = tuple(sorted({(int(self.model.body_tree[c.body]), c.actor) for c in self.contacts}))
         return self._touched
@@ -260,11 +261,12 @@ class ContactSolver:
         self.detection.update_tree_bounds(trees)
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Let a picked bunch pass through the trees that it overlaps: :meth:`ContactDetection.ignore_overlaps`."""
+        """Disable contacts of a picked bunch with the trees that it overlaps; see
+        :meth:`ContactDetection.ignore_overlaps`."""
         self.detection.ignore_overlaps(bunch, low, high)
 
     def _update_rigid_world(self) -> None:
-        """Take over the rigid world after an actor came or went, a hand opened or closed, or a bunch took a body."""
+        """Read the rigid world again after an actor came or left, a hand opened or closed, or a bunch got a body."""
         previous = self._rigid_arrays
         if previous is not None and previous.world is self.rigid.mj_model:
             self._generation = self.rigid.generation

@@ -29,16 +29,18 @@ from vinesim.wires.deflected_wires import DeflectedWires
 
 AABB_BLOCK = int(structs.AABB_BLOCK)
 MAX_PASSING_BUNCHES = 4
-"""Number of picked bunches that can pass through one tree at the same time. A further bunch touches it at once."""
+"""Number of picked bunches that can pass through one tree at the same time. Further bunches collide with the tree at
+once."""
 PAIRS_AT_ONCE = 64
 """Number of capsule-geom pairs of one tree that the narrowphase handles in one pass."""
 MIN_TREE_ROOM = 64
-"""Least number of rows (awake trees) of the candidate arrays. They grow when more trees are awake."""
+"""Smallest capacity [awake trees] of the candidate arrays. The arrays grow when more trees are awake."""
 _NO_TREES = np.zeros(0, np.intp)
 
 
 class ContactDetection:
-    """Finds which trees actors are near, and where awake trees touch rigid geoms, each other and themselves."""
+    """Finds the trees near actors, and the contacts of awake trees with rigid geoms, with each other and with
+    themselves."""
 
     def __init__(
         self,
@@ -70,7 +72,7 @@ class ContactDetection:
         self._room = 0
 
     def set_rigid_world(self, rigid_arrays: RigidArrays) -> None:
-        """Take over the geoms of the rigid world after it was compiled again."""
+        """Use the geoms of a rigid world that was recompiled."""
         self.rigid_arrays = rigid_arrays
         self._static_bounded = False
         self._static_blocks = SharedArrays.zeros(structs.Aabbs, -(-rigid_arrays.static // AABB_BLOCK))
@@ -144,7 +146,7 @@ class ContactDetection:
         ends = np.stack([wires.start[pieces], wires.end[pieces]], 1) + wires.offset[pieces]
         states.offset[geoms] = wires.offset[pieces].mean(1)
         states.center[geoms] = ends.mean(1)
-        # the wire may spring back within the step
+        # the wire may return to its undeflected position within the step
         states.speed[geoms] = np.sqrt((wires.offset[pieces] ** 2).sum(2).max(1)) / self.parameters.dt
         grown = (arrays.geoms.size[geoms, 0] + self.parameters.contact_margin)[:, None]
         states.low[geoms] = ends.min(1) - grown
@@ -171,7 +173,7 @@ class ContactDetection:
     # ------------------------------------------------------------------ narrowphase
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:
-        """Let a picked bunch pass through the trees that it overlaps, until it is clear of them.
+        """Disable the contacts of a picked bunch with the trees that it overlaps, until it no longer overlaps them.
 
         The bunch was picked within the box ``low`` [3] to ``high`` [3] m. While it hung there, its overlap with these
         trees was no contact.
@@ -213,7 +215,7 @@ class ContactDetection:
     # ------------------------------------------------------------------ graphs
 
     def _make_graphs(self) -> None:
-        """Make the graphs of all stages on the arrays that are allocated now."""
+        """Make the graphs of all stages, bound to the present arrays."""
         parameters = self._kernel_parameters
         plants = self.arrays
         rigid = self.rigid_arrays

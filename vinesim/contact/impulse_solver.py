@@ -26,13 +26,13 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.wires.deflected_wires import DeflectedWires, WireContacts
 
 MATRIX_CONTACTS = 16
-"""Number of contacts in a block for which the matrices have room at first. They grow if blocks are larger."""
+"""Initial capacity [contacts in a block] of the matrices. They grow if blocks are larger."""
 REMOVED_GEOM = np.iinfo(np.int32).max
-"""Geom index that a warm start stores for a geom that no longer exists."""
+"""Index that the stored impulses of the last step (warm start) have for a geom that no longer exists."""
 
 
 class ImpulseSolver:
-    """Finds the impulses that keep plants and rigid bodies apart, and their effect on plants and on rigid bodies."""
+    """Finds the contact impulses between plants and rigid bodies, and their effect on both."""
 
     def __init__(
         self,
@@ -114,10 +114,11 @@ class ImpulseSolver:
         self._padded_rows = 0
         """Number of rows of all blocks in the last solve, including the rows that pad the blocks."""
         self.unfinished = 0
-        """How often the solve of an island ended at the largest number of sweeps, perhaps outside its tolerance."""
+        """Number of times that the solve of an island ended at the largest number of sweeps, perhaps outside its
+        tolerance."""
 
     def set_rigid_world(self, rigid_arrays: RigidArrays, previous: RigidArrays | None) -> None:
-        """Take over the rigid world after it was compiled again. The warm start is kept by the names of the geoms."""
+        """Use a rigid world that was recompiled. The warm start is kept; its geoms are matched by name."""
         self.rigid_arrays = rigid_arrays
         if previous is not None:
             at = {name: i for i, name in enumerate(rigid_arrays.names)}
@@ -129,7 +130,8 @@ class ImpulseSolver:
         self.make_graphs()
 
     def renumber_geoms(self, number: np.ndarray) -> None:
-        """Renumber the geoms of the warm start: ``number`` [geom] is a former geom's new index, -1 if it is gone."""
+        """Renumber the geoms of the warm start. ``number`` [geom]: new index of each former geom; -1 for a removed
+        geom."""
         other = self.warm_start.other[: self.warm_start.count[0]]
         of_geoms = (other >= 0) & (other != REMOVED_GEOM)
         now = number[other[of_geoms]]
@@ -192,7 +194,7 @@ class ImpulseSolver:
         return int(self.islands.sweeps[: self.island_count].max(initial=0))
 
     def clear(self) -> None:
-        """Forget the last solve: there is no contact."""
+        """Set the results of a step without contacts."""
         self.bodies = self.touched.body[:0]
         self.wrenches = self._wrench[:0]
         self.rigid_force = None
@@ -233,7 +235,8 @@ class ImpulseSolver:
         self.wrenches = self._wrench[: counters[structs.BODIES]]
 
     def _solve_constrained(self, count: int) -> None:
-        """Solve the contacts when MuJoCo's constraints bind rigid bodies: MuJoCo then computes their response."""
+        """Solve the contacts if MuJoCo's constraints act on rigid bodies in contact. MuJoCo then computes the response
+        of these bodies."""
         self._write_rows(count)
         self._rigid_spans[:count] = 0, self.rigid.mj_model.nv
         self._respond_constrained(by_rows(self.rows.rigid_jacobian[:count]))
@@ -281,7 +284,7 @@ class ImpulseSolver:
         contacts.wire_shift[at] = wires.shift
 
     def report_wires(self) -> None:
-        """Pass the contact forces of the last solve on the wires to the wires."""
+        """Pass the contact forces of the last solve on wires to :class:`DeflectedWires`."""
         wires = self._wires
         at = self._at_wires
         contacts = self.contacts
@@ -293,18 +296,20 @@ class ImpulseSolver:
             wires.add_presses(force, -(force / damping + self.rows.bias[3 * at]))
 
     def _respond_constrained(self, jacobian: np.ndarray) -> np.ndarray:
-        """Take over the response of rigid bodies that MuJoCo's constraints bind, and return it [row, dof]."""
+        """Compute the velocity changes [row, dof] that MuJoCo's constraints allow rigid bodies under unit impulses
+        along the contact rows, store them, and return them."""
         response = self.rigid.impulse_response(jacobian).T
         self.rows.rigid_response[: len(response) // 3] = response.reshape(-1, 3, response.shape[1]).transpose(0, 2, 1)
         return response
 
     def _follow_constraints(self, count: int) -> None:
-        """Solve again until MuJoCo's constraints move the rigid bodies under the impulses as the solve assumed.
+        """Repeat the solve until MuJoCo, with its constraints, moves the rigid bodies under the contact impulses as the
+        solve assumed.
 
         The solve assumes a linear response to impulses, but contacts of a body with its support may open or begin to
-        slide. A light body that is pushed as if its support held it gains energy. Each round is a Newton step from the
-        last impulses, with the tangent stiffness of the constraints under them. The impulses of the round with the
-        least error are kept.
+        slide. A light body gains energy if the solve assumes that its support holds it while it slides or lifts off.
+        Each round is a Newton step from the last impulses, with the tangent stiffness of the constraints under them.
+        The impulses of the round with the least error are kept.
         """
         rows = self.rows
         system = self.system
@@ -347,7 +352,7 @@ class ImpulseSolver:
         return self.rigid_arrays.geoms.body[other[other >= 0]]
 
     def make_graphs(self) -> None:
-        """Make the graphs of all stages on the arrays that are allocated now.
+        """Make the graphs of all stages, bound to the present arrays.
 
         Call this again when the detection has allocated its arrays again.
         """

@@ -37,9 +37,9 @@ class PlantCapsules:
     end: np.ndarray
     """[capsule, 3] End of the axis, m, in the body's frame."""
     radius: np.ndarray
-    """[capsule] m"""
+    """[capsule] m, radius."""
     material: np.ndarray
-    """[capsule] :class:`Material`"""
+    """[capsule] :class:`Material` of the surface."""
 
 
 def plant_capsules(model: Model) -> PlantCapsules:
@@ -69,7 +69,7 @@ def plant_capsules(model: Model) -> PlantCapsules:
             parts.append((b, of_cluster[b], 2, inset, length - inset, thick))
         else:
             parts.append((b, bunch_of[b], 0, 0.0, length, thick))
-    body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also works without bodies
+    body, bunch, level, start, end, radius = np.array(parts, float).reshape(-1, 6).T  # also correct without bodies
     along = np.array([1.0, 0.0, 0.0], np.float32)
     return PlantCapsules(
         tree_start=np.searchsorted(body, np.append(model.tree_first, len(model.body_mass))).astype(np.int32),

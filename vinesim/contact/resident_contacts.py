@@ -1,8 +1,9 @@
-"""Contacts of many independent trees with the static geoms of a scene, solved on the device that holds the trees.
+"""Contacts of many independent trees with the static geoms of a scene, solved on the CPU or GPU that holds the trees'
+arrays.
 
-This is for batches. Every tree is a world of its own: trees do not touch each other, and no geom that they touch moves.
-The contacts of a tree then form one island, no data has to return to the host between steps, and a GPU uses one thread
-for each tree. Detection, rows, Delassus matrix and solve use the functions that
+This is for batches of simulations, in which every tree is a separate world: trees do not touch each other, and no geom
+moves. The contacts of a tree then form one island, no data has to return to the host between steps, and a GPU uses one
+thread for each tree. Detection, rows, Delassus matrix and solve use the functions that
 :class:`vinesim.contact.contact_solver.ContactSolver` launches.
 """
 
@@ -15,7 +16,7 @@ import warp as wp
 
 from vinesim.contact.collision_arrays import PlantArrays, RigidArrays, kernel_parameters, material_pairs
 from vinesim.contact.plant_capsules import plant_capsules
-from vinesim.core.warp_arrays import SharedArrays
+from vinesim.core.warp_arrays import SharedArrays, struct_fields
 from vinesim.kernels.contact import broadphase, structs, tree_delassus, tree_islands, tree_narrowphase
 from vinesim.kernels.contact.distance import CAPSULE, PLANE, SPHERE
 from vinesim.kernels.contact.friction_law import Surface
@@ -33,9 +34,9 @@ FULL_BLOCK = 128
 """CUDA threads in a block, for kernels with several threads for each tree."""
 AABB_BLOCK = int(structs.AABB_BLOCK)
 DEFAULT_SLOTS = 8
-"""Default for the number of contacts that one tree can have at once. They take 10 kB a tree."""
+"""Default for the largest number of contacts of one tree. This many contacts take 10 kB for each tree."""
 PAIRS_PER_SLOT = 4
-"""Room for pairs of capsules and geoms whose boxes overlap: this many for each contact that a tree can have."""
+"""Capacity for pairs of capsules and geoms with overlapping bounding boxes, per contact slot of a tree."""
 FIRST_LANES = 16
 """Number of GPU threads that share a tree with few contacts; each thread solves one row."""
 WARPS = 132 * 32
@@ -45,9 +46,9 @@ WARPS = 132 * 32
 class ResidentContacts:
     """Contacts of all trees of a solver with the static geoms of its model, from step to step on the solver's device.
 
-    ``plants.advance(steps, contacts.solve)`` steps with them. Each tree touches ground, poles, wires and fixed wood as
-    it would in :class:`vinesim.world.Physics`, and no other tree. All trees must be awake and stand on their
-    roots, and their first modes must be slow enough for whole steps.
+    ``plants.advance(steps, contacts.solve)`` takes steps with these contacts. Each tree touches ground, poles, wires
+    and fixed wood as it would in :class:`vinesim.world.Physics`, and no other tree. All trees must be awake, without
+    cut-off parts, and with first modes slow enough for whole steps.
 
     Args:
         plants: trees, on any device.
@@ -101,20 +102,20 @@ class ResidentContacts:
         ``source``.
         """
         made = kind()
-        for name, field in kind.vars.items():
+        for name, field in struct_fields(kind).items():
             given = values.get(name)
             if isinstance(given, np.ndarray):
-                given = wp.array(given, dtype=field.type.dtype, device=self._device)
+                given = wp.array(given, dtype=field.dtype, device=self._device)
             setattr(made, name, wp.clone(getattr(source, name), self._device) if given is None else given)
         return made
 
     def _allocated(self, kind: Any, sizes: dict[str, int], width: dict[str, int]) -> Any:
         """Returns a struct of zeroed arrays, with ``sizes`` by name (default 1) and the ``width`` of 2-D arrays."""
         made = kind()
-        for name, field in kind.vars.items():
+        for name, field in struct_fields(kind).items():
             size = sizes.get(name, 1)
-            shape = size if field.type.ndim == 1 else (size, width.get(name, 1))
-            setattr(made, name, wp.zeros(shape, dtype=field.type.dtype, device=self._device))
+            shape = size if field.ndim == 1 else (size, width.get(name, 1))
+            setattr(made, name, wp.zeros(shape, dtype=field.dtype, device=self._device))
         return made
 
     def _take_over_plants(self, arrays: PlantArrays) -> None:
@@ -127,7 +128,7 @@ class ResidentContacts:
         self._bodies.q, self._bodies.qd, self._bodies.qd_free = rows["body_q"], rows["body_qd"], rows["body_qd_free"]
         self._capsules = self._interleaved(arrays.capsules)
         self._capsule_states = self._allocated(
-            structs.CapsuleStates, dict.fromkeys(structs.CapsuleStates.vars, self._capsule_count), {}
+            structs.CapsuleStates, dict.fromkeys(struct_fields(structs.CapsuleStates), self._capsule_count), {}
         )
 
     def _interleaved(self, capsules: SharedArrays) -> Any:
@@ -141,7 +142,7 @@ class ResidentContacts:
         tree = np.repeat(np.arange(self._trees), np.diff(start))
         at = number * self._trees + tree
         given: dict[str, np.ndarray] = {}
-        for name in structs.Capsules.vars:
+        for name in struct_fields(structs.Capsules):
             source = getattr(capsules, name)
             if len(source) == start[-1]:
                 given[name] = np.zeros((self._capsule_count, *source.shape[1:]), source.dtype)
@@ -163,7 +164,7 @@ class ResidentContacts:
         return wp.zeros(shape, dtype=dtype, device=self._device)
 
     def _take_over_geoms(self, rigid: RigidArrays) -> None:
-        """Copy the static geoms to the device, with boxes around each and around blocks.
+        """Copy the static geoms to the device, with a bounding box of each geom and of each block of geoms.
 
         The ground's box has no lower end.
         """
@@ -188,8 +189,8 @@ class ResidentContacts:
         self._pairs = wp.array(material_pairs(self.parameters), dtype=Surface, device=device)
 
     def _by_slot(self, dtype: Any, columns: int) -> wp.array:
-        """Returns a table [tree, column] of zeros, stored column by column: neighbouring trees are neighbours in
-        memory.
+        """Returns a table [tree, column] of zeros that is stored column by column, so that the entries of consecutive
+        trees are adjacent in memory.
         """
         flat = self._zeros(dtype, self._trees * columns)
         strides = (flat.strides[0], flat.strides[0] * self._trees)
@@ -205,8 +206,8 @@ class ResidentContacts:
         pairs = PAIRS_PER_SLOT * slots
         self.candidates = self._allocated(structs.Candidates, {}, {})
         for name in ("feature", "other", "gap", "end_gap", "normal", "point"):
-            setattr(self.candidates, name, self._by_slot(structs.Candidates.vars[name].type.dtype, 2 * pairs))
-        of_all: dict[str, int] = dict.fromkeys(structs.Contacts.vars, trees * slots)
+            setattr(self.candidates, name, self._by_slot(struct_fields(structs.Candidates)[name].dtype, 2 * pairs))
+        of_all: dict[str, int] = dict.fromkeys(struct_fields(structs.Contacts), trees * slots)
         self.contacts = self._allocated(structs.Contacts, of_all | dict.fromkeys(("island", "block", "place"), 1), {})
         of_rows: dict[str, int] = dict.fromkeys(("plant_jacobian", "velocity_free", "bias", "impulse"), trees * rows)
         self.rows = self._allocated(structs.Rows, of_rows, {"plant_jacobian": 12})
@@ -215,15 +216,17 @@ class ResidentContacts:
         self._system.surface = self.contacts.surface
         self._system.impulse = self.rows.impulse
         searched = trees * rows if self._device.is_cpu else 1  # a GPU searches in registers
-        self._search = self._allocated(TreeSearch, dict.fromkeys(TreeSearch.vars, searched), {"factor": rows + 1})
-        busy_rows = self._groups * rows
-        self._dense = self._allocated(TreeSystem, dict.fromkeys(TreeSystem.vars, busy_rows), {"matrix": rows})
-        self._dense_search = self._allocated(
-            TreeSearch, dict.fromkeys(TreeSearch.vars, busy_rows), {"factor": rows + 1}
+        self._search = self._allocated(
+            TreeSearch, dict.fromkeys(struct_fields(TreeSearch), searched), {"factor": rows + 1}
         )
-        of_all = dict.fromkeys(structs.WarmStart.vars, trees * slots) | {"count": trees}
+        busy_rows = self._groups * rows
+        self._dense = self._allocated(TreeSystem, dict.fromkeys(struct_fields(TreeSystem), busy_rows), {"matrix": rows})
+        self._dense_search = self._allocated(
+            TreeSearch, dict.fromkeys(struct_fields(TreeSearch), busy_rows), {"factor": rows + 1}
+        )
+        of_all = dict.fromkeys(struct_fields(structs.WarmStart), trees * slots) | {"count": trees}
         self._warm_start = self._allocated(structs.WarmStart, of_all, {})
-        of_trees = dict.fromkeys(tree_narrowphase.TreeContacts.vars, trees)
+        of_trees = dict.fromkeys(struct_fields(tree_narrowphase.TreeContacts), trees)
         of_trees |= dict.fromkeys(("near_total", "busy_count"), 1) | {"loaded": trees * slots}
         of_trees |= dict.fromkeys(("near", "near_place", "found"), trees * pairs)
         self._tree_contacts = self._allocated(tree_narrowphase.TreeContacts, of_trees, {})
@@ -419,7 +422,8 @@ class ResidentContacts:
         )
 
     def solve(self) -> None:
-        """Launch the kernels that run between the prediction and the integration of a step. For ``advance()``."""
+        """Launch the kernels of the contacts of one step. An argument of :meth:`ArticulationSolver.advance`, which
+        calls it between prediction and integration."""
         self._before()
         if self._beside is None:
             self._solve_most()

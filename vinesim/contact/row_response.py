@@ -1,11 +1,12 @@
-"""How impulses along the rows of contacts move the plants in contact, computed on the device that holds the plants."""
+"""Velocity changes of plants by impulses along the rows of contacts, computed on the CPU or GPU that holds the plants'
+arrays."""
 
 from __future__ import annotations
 
 import numpy as np
 import warp as wp
 
-from vinesim.core.warp_arrays import SharedArrays
+from vinesim.core.warp_arrays import SharedArrays, struct_fields
 from vinesim.kernels.contact import row_response
 from vinesim.kernels.contact.structs import SideGroups
 from vinesim.kernels.graph import KernelLaunch
@@ -13,9 +14,9 @@ from vinesim.kernels.plants.structs import ArticulationModel, Factors
 from vinesim.plants.articulation_solver import ArticulationSolver
 
 NUMBERS_PER_CONTACT = 256
-"""Number of response values for each contact for which there is room at first. The room grows when more are needed."""
+"""Initial capacity for response values, per contact. It grows when more are needed."""
 ROWS_ON_A_GPU = 256
-"""Number of threads on a GPU: the groups that it works on at the same time."""
+"""Number of GPU threads, each of which computes one group at a time."""
 
 
 class RowResponse:
@@ -33,7 +34,7 @@ class RowResponse:
         self.jacobian = buffers.pinned(np.zeros((3 * contacts, 12)))
         self.body, self.tree_end = (buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for _ in range(2))
         self.body_slot, self.other_slot = (buffers.pinned(np.zeros(contacts, np.int32)) for _ in range(2))
-        lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in SideGroups.vars}
+        lists = {name: buffers.pinned(np.zeros(2 * contacts + 1, np.int32)) for name in struct_fields(SideGroups)}
         self.groups = SharedArrays(SideGroups, **lists)
         self._counters = counters
         self._there = SideGroups()
@@ -80,4 +81,5 @@ class RowResponse:
             [scratch, buffers.reach(self.numbers, wp.float32, "response")],
             threads=threads,
         )
-        """Launch that fills :attr:`numbers` for all groups. All must touch trees of the last prediction."""
+        """Launch that fills :attr:`numbers` for all groups. All bodies must be of trees that were in the last
+        prediction."""

@@ -1,11 +1,12 @@
-"""Settings of glibc's allocator: freed large blocks return to the system at once, freed pages of the heap regularly.
+"""Settings of glibc's allocator: freed large blocks return to the system at once, freed pages of the heap every minute.
 
 glibc allocates a block with mmap if it is larger than a threshold, and otherwise in the heap. By default it raises the
-threshold to the largest block that was ever freed, up to 32 MiB. After the first tables of a vineyard have been freed,
-later ones would therefore lie in the heap, which keeps the gaps between them. A threshold set by mallopt(3) stays.
+threshold to the largest block that was ever freed, up to 32 MiB. After the first large tables of a vineyard have been
+freed, later tables would therefore be allocated in the heap, and the heap keeps the gaps that they leave. glibc does
+not raise a threshold that mallopt(3) has set.
 
-The heap also keeps the gaps between small blocks. On a busy machine messages queue up, and the heap grows whenever the
-queue is longer than ever before. So free pages are given back every minute. Other C libraries are left as they are.
+The heap also keeps the gaps between small blocks. On a busy machine messages queue up, and each new longest queue makes
+the heap grow. So free pages are returned to the system every minute. With other C libraries these functions do nothing.
 """
 
 from __future__ import annotations
@@ -18,13 +19,14 @@ import threading
 import time
 
 BLOCK_SIZE = 4 << 20
-"""Blocks of at least this size [bytes] lie outside the heap: tables of a scene do, arrays of one picture do not."""
+"""Least size [bytes] of a block that is allocated outside the heap. Tables of a scene are larger, arrays of one picture
+are smaller."""
 
 KEPT_SIZE = 64 << 20
-"""Free memory kept at the end of the heap [bytes]; glibc keeps the same amount when it sets the threshold itself."""
+"""Free memory that stays at the end of the heap [bytes]. It is the largest amount that glibc would choose itself."""
 
 TRIM_PERIOD = 60.0
-"""Period at which free pages are given back to the system [s]."""
+"""Period at which free pages are returned to the system [s]."""
 _TRIM_THRESHOLD = -1
 _MMAP_THRESHOLD = -3
 """Parameter numbers of mallopt(3), from glibc's malloc.h."""
@@ -32,7 +34,7 @@ _MMAP_THRESHOLD = -3
 
 @functools.cache
 def _glibc() -> ctypes.CDLL | None:
-    """The C library of this process; None unless it is glibc."""
+    """Returns the C library of this process; None unless it is glibc."""
     if sys.platform != "linux":
         return None
     library = ctypes.CDLL(None)
@@ -40,14 +42,15 @@ def _glibc() -> ctypes.CDLL | None:
 
 
 def keep_large_blocks_apart() -> None:
-    """Let blocks of :data:`BLOCK_SIZE` go back to the system when they are freed. Call it before tables are made."""
+    """Return blocks of at least :data:`BLOCK_SIZE` to the system as soon as they are freed. Call it before large tables
+    are allocated."""
     if (library := _glibc()) is not None:
         library.mallopt(_MMAP_THRESHOLD, BLOCK_SIZE)
         library.mallopt(_TRIM_THRESHOLD, KEPT_SIZE)
 
 
 def trim_regularly(period: float = TRIM_PERIOD) -> None:
-    """Give free pages of the heap back to the system every ``period`` [s] from now on, in a thread of its own."""
+    """Start a thread that returns free pages of the heap to the system every ``period`` [s]."""
     if (library := _glibc()) is not None:
         threading.Thread(target=_trim_for_ever, args=(library, period), name="heap trimmer", daemon=True).start()
 
@@ -59,9 +62,9 @@ def _trim_for_ever(library: ctypes.CDLL, period: float) -> None:
 
 
 def release_free_memory() -> None:
-    """Collect garbage, frozen objects included, and give free pages of the heap back to the system.
+    """Collect garbage, including objects frozen by ``gc.freeze``, and return free pages of the heap to the system.
 
-    It takes up to a second, so call it only after the world was built or rebuilt.
+    This takes up to a second, so call it only after the world was built or rebuilt.
     """
     frozen = gc.get_freeze_count()
     gc.unfreeze()

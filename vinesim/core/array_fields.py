@@ -1,4 +1,4 @@
-"""Array fields written once: name, shape, unit and type in one line.
+"""Dataclasses of arrays: each field declares its name, shape, unit and type in one line.
 
 A struct of arrays declares its fields with :func:`array`; allocation, checks and documentation are
 derived from that one declaration, so a shape is never written twice.
@@ -50,13 +50,13 @@ class StructOfArrays:
 
     @classmethod
     def array_fields(cls) -> dict[str, ArraySpec]:
-        """Every array field with its :class:`ArraySpec`, in order of declaration."""
+        """Returns every array field with its :class:`ArraySpec`, in order of declaration."""
         fields = dataclasses.fields(cls)  # type: ignore[arg-type]
         return {field.name: field.metadata["dim"] for field in fields if "dim" in field.metadata}
 
     @classmethod
     def allocate(cls, **counts: int) -> Self:
-        """All fields filled with their default, for the given count of each named axis."""
+        """Returns a struct with all fields filled with their default values. ``counts``: count of each named axis."""
         fields = {}
         for name, dim in cls.array_fields().items():
             missing = [axis for axis in dim.shape if isinstance(axis, str) and axis not in counts]
@@ -67,7 +67,8 @@ class StructOfArrays:
         return cls(**fields)
 
     def counts(self) -> dict[str, int]:
-        """Count of each named axis, read from the arrays; :class:`ValueError` if two fields disagree."""
+        """Returns the count of each named axis, read from the arrays. Raises :class:`ValueError` if two fields
+        disagree."""
         counts: dict[str, int] = {}
         seen: dict[str, str] = {}
         owner = type(self).__name__
@@ -85,7 +86,8 @@ class StructOfArrays:
         return counts
 
     def check(self) -> Self:
-        """Return ``self``; :class:`ValueError` names the first field of wrong type or shape or with NaN or infinity."""
+        """Check all fields and return ``self``. Raises :class:`ValueError` for the first field with a wrong type or
+        shape, a NaN or an infinity."""
         self.counts()
         for name, dim in self.array_fields().items():
             value = getattr(self, name)
@@ -97,5 +99,5 @@ class StructOfArrays:
         return self
 
     def copy(self) -> Self:
-        """A deep copy of the arrays."""
+        """Returns a deep copy of the arrays."""
         return type(self)(**{name: getattr(self, name).copy() for name in self.array_fields()})

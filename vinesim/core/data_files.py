@@ -6,17 +6,18 @@ import pathlib
 
 
 class DataFileNotFound(FileNotFoundError):
-    """A data file that neither exists nor ships with vinesim; the message lists the known names."""
+    """Raised when a name is neither an existing file nor a data file of vinesim. The message lists the known names."""
 
 
 def data_dir() -> pathlib.Path:
-    """The folder ``data``: inside the installed package, or next to it in a checkout."""
+    """Returns the folder ``data``: inside the installed package, or next to it in a checkout."""
     package = pathlib.Path(__file__).resolve().parent.parent
     return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
 
 
 def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:
-    """The file ``name`` if it exists, else ``data/<kind>/<name><suffix>``; :class:`DataFileNotFound` otherwise."""
+    """Returns the path ``name`` if that file exists, else ``data/<kind>/<name><suffix>``. Raises
+    :class:`DataFileNotFound` if neither exists."""
     given = pathlib.Path(name)
     if given.is_file():
         return given

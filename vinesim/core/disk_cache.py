@@ -1,4 +1,5 @@
-"""Disk cache of arrays that take long to compute. The key is a name and a digest of everything they are computed from.
+"""Disk cache of arrays that take long to compute. The key of an entry is a name and a digest of all inputs of the
+computation, its code included.
 
     arrays = load_or_make("soil", digest, make)
 
@@ -32,9 +33,9 @@ log = logging.getLogger(__name__)
 MAX_SIZE = 1 << 30
 """Largest total size of the entries [bytes]; beyond it the least recently used entries are deleted."""
 LOCK_TIMEOUT = 120.0
-"""Time to wait for another process that is making an entry [s]; after it this process makes the entry too."""
+"""Longest time to wait for another process that is computing an entry [s]; this process then computes the entry too."""
 _LEFTOVER_AGE = 3600.0
-"""A temporary file older than this is taken to be left over from a killed process [s]."""
+"""Age above which a temporary file is treated as left over from a killed process [s]."""
 _POLL_PERIOD = 0.02
 """Time between two attempts to get a lock [s]."""
 
@@ -44,14 +45,14 @@ _warned = threading.Event()
 
 
 def folder() -> pathlib.Path:
-    """The folder of the cache; it need not exist."""
+    """Returns the folder of the cache; it need not exist."""
     if chosen := os.environ.get("VINESIM_CACHE"):
         return pathlib.Path(chosen)
     return user_folder() / "vinesim"
 
 
 def user_folder() -> pathlib.Path:
-    """The folder in which this user's programs keep their caches; it need not exist."""
+    """Returns the folder in which this user's programs keep their caches; it need not exist."""
     if sys.platform == "win32":
         base = os.environ.get("LOCALAPPDATA") or "~/AppData/Local"
     elif sys.platform == "darwin":
@@ -62,7 +63,7 @@ def user_folder() -> pathlib.Path:
 
 
 def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndarray]]) -> Arrays:
-    """The arrays of ``make``, from the cache if they are there.
+    """Returns the arrays that ``make`` computes, from the cache if it has them.
 
     Args:
         name: name of the arrays; part of the file's name.
@@ -86,7 +87,7 @@ def load_or_make(name: str, digest: str, make: Callable[[], Mapping[str, np.ndar
 
 
 def load(name: str, digest: str) -> Arrays | None:
-    """The arrays stored by :func:`keep` or :func:`load_or_make`; None if the file is missing or broken."""
+    """Returns the arrays stored by :func:`keep` or :func:`load_or_make`; None if the file is missing or broken."""
     try:
         return _read(folder() / f"{name}-{digest}.npz")
     except RuntimeError as error:  # no home folder
@@ -103,7 +104,8 @@ def keep(name: str, digest: str, arrays: Mapping[str, np.ndarray]) -> None:
 
 
 def source_digest(*sources: pathlib.Path | str | bytes) -> str:
-    """A digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and bytes.
+    """Returns a digest (16 hex digits) of files, of all ``*.py`` and ``*.toml`` files below folders, of texts and
+    bytes.
 
     The digest includes the version of NumPy, because results may differ in the last bit between versions.
     """
@@ -125,18 +127,18 @@ def _warn(error: Exception) -> None:
     """Warn, once in each process, that the cache cannot be used."""
     if not _warned.is_set():
         _warned.set()
-        log.warning("no cache on disk, so every start computes its tables anew (set VINESIM_CACHE): %s", error)
+        log.warning("no cache on disk, so every start computes its tables again (set VINESIM_CACHE): %s", error)
 
 
 def _read(path: pathlib.Path) -> Arrays | None:
-    """The arrays of a file; None if it is not there or broken."""
+    """Returns the arrays of a file; None if the file is missing or broken."""
     try:
         with np.load(path, allow_pickle=False) as data:
             arrays = {name: data[name] for name in data.files}  # reading checks the checksums
     except FileNotFoundError:
         return None
     except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
-        log.info("%s is made anew: %s", path, error)
+        log.info("%s is broken and will be replaced: %s", path, error)
         return None
     with contextlib.suppress(OSError):
         os.utime(path)  # the time of last use, for _prune
@@ -186,9 +188,9 @@ def _prune(place: pathlib.Path) -> None:
 def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") -> Iterator[bool]:
     """Hold the lock ``name``, which excludes other processes; yields whether this process had to wait for it.
 
-    The system releases the lock when the process ends, in whatever way. The context is entered without the lock if the
-    file system has no locks, and after ``timeout`` [s] (:data:`LOCK_TIMEOUT` unless given). ``waiting_for`` is what
-    the log says after a second of waiting.
+    The operating system releases the lock when the process ends, also after a crash. The context is entered without the
+    lock if the file system has no locks, or if ``timeout`` [s] (default :data:`LOCK_TIMEOUT`) has passed.
+    ``waiting_for``: text for the log after a second of waiting.
     """
     timeout = LOCK_TIMEOUT if timeout is None else timeout
     start = time.monotonic()
@@ -207,7 +209,8 @@ def exclusive(name: str, timeout: float | None = None, waiting_for: str = "") ->
 
 
 def try_exclusive(name: str) -> contextlib.ExitStack | None:
-    """Take the lock of :func:`exclusive`; closing the result releases it. None if another process holds the lock."""
+    """Take the lock that :func:`exclusive` takes, without waiting. Close the result to release it. Returns None if
+    another process holds the lock."""
     lock = contextlib.ExitStack()
     try:
         path = folder() / f"{name}.lock"

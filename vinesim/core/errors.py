@@ -12,14 +12,15 @@ from typing import SupportsIndex
 class UsageError(ValueError):
     """A command or an API was called with arguments that contradict each other or are out of range.
 
-    The message names the argument and gives the remedy, in one line. The command line exits with code 2.
+    The message is one line that names the argument and a valid value. The command line exits with code 2.
     """
 
 
 class WriteError(RuntimeError):
     """Output files of a command could not be written: a full disk, a read-only folder.
 
-    The message names the place, the reason and the remedy, in one line. The command line exits with code 5.
+    The message is one line that names the path, the reason and what the user can do. The command line exits with code
+    5.
     """
 
     exit_code = 5
@@ -27,18 +28,20 @@ class WriteError(RuntimeError):
 
 @contextlib.contextmanager
 def writing(place: str | os.PathLike[str]) -> Iterator[None]:
-    """Context for writing to ``place``: turns an :class:`OSError` into a :class:`WriteError` that names the place."""
+    """Context manager for writing to the path ``place``: turns an :class:`OSError` into a :class:`WriteError` that
+    names the path."""
     try:
         yield
     except BrokenPipeError:
-        raise  # the reader of a pipe is gone; no file is at fault
+        raise  # the reader of a pipe has closed it: not an error of a file
     except OSError as bad:
         reason = bad.strerror or str(bad)
         raise WriteError(f"{place} cannot be written: {reason}; make room there or give another place") from None
 
 
 def checked_index(what: str, index: SupportsIndex, count: int, error: type[ValueError] = ValueError) -> int:
-    """``index`` as an int; ``error`` naming ``what`` unless it is a whole number from 0 to ``count`` - 1."""
+    """Returns ``index`` as an int. Raises ``error``, with a message that names ``what``, unless 0 <= ``index`` <
+    ``count``."""
     try:
         number = operator.index(index)
     except TypeError:

@@ -33,7 +33,7 @@ _MANY = 512
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Cross product of vectors [..., 3], ten times as fast as ``np.cross``."""
+    """Returns the cross product of vectors [..., 3], ten times as fast as ``np.cross``."""
     if a.size + b.size > _MANY:
         result = np.empty(np.broadcast_shapes(a.shape, b.shape), np.result_type(a, b))
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -43,17 +43,17 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def to_wxyz(q: np.ndarray) -> np.ndarray:
-    """Quaternion xyzw to MuJoCo's wxyz."""
+    """Converts quaternions [..., 4] from xyzw to MuJoCo's wxyz."""
     return np.asarray(q).take(_W_FIRST, -1)
 
 
 def from_wxyz(q: np.ndarray) -> np.ndarray:
-    """Quaternion from MuJoCo's wxyz to xyzw."""
+    """Converts quaternions [..., 4] from MuJoCo's wxyz to xyzw."""
     return np.asarray(q).take(_W_LAST, -1)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Quaternion product ``a b`` [..., 4]: rotate by ``b`` first, then by ``a``."""
+    """Returns the quaternion product ``a b`` [..., 4]: the rotation by ``b`` followed by the rotation by ``a``."""
     a = np.asarray(a)
     b = np.asarray(b)
     av = a[..., :3]
@@ -66,13 +66,13 @@ def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def conjugate(q: np.ndarray) -> np.ndarray:
-    """Inverse rotation of a unit quaternion."""
+    """Returns the inverse of unit quaternions [..., 4]."""
     q = np.asarray(q)
     return np.concatenate([-q[..., :3], q[..., 3:]], axis=-1)
 
 
 def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """Vector ``v`` [..., 3] rotated by ``q`` [..., 4]."""
+    """Returns the vectors ``v`` [..., 3] rotated by ``q`` [..., 4]."""
     q = np.asarray(q)
     v = np.asarray(v)
     t = 2.0 * cross(q[..., :3], v)
@@ -80,7 +80,7 @@ def rotate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _length(v: np.ndarray) -> np.ndarray:
-    """Euclidean norm [..., 1] of vectors [..., n]; faster than NumPy's for many short vectors."""
+    """Returns the Euclidean norm [..., 1] of vectors [..., n]; faster than NumPy's for many short vectors."""
     if v.size <= _MANY or v.shape[-1] not in (3, 4) or v.dtype.kind != "f":
         return np.linalg.norm(v, axis=-1, keepdims=True)
     total = v[..., 0] * v[..., 0]
@@ -90,14 +90,14 @@ def _length(v: np.ndarray) -> np.ndarray:
 
 
 def normalize(q: np.ndarray) -> np.ndarray:
-    """Quaternions or vectors [..., n] divided by their norms; zero stays zero."""
+    """Returns quaternions or vectors [..., n] divided by their norms; zero stays zero."""
     q = np.asarray(q)
     length = _length(q)
     return q / np.where(length > 0.0, length, 1.0)
 
 
 def exp(v: np.ndarray) -> np.ndarray:
-    """Rotation vector [..., 3] rad to quaternion [..., 4]."""
+    """Returns the quaternion [..., 4] of a rotation vector [..., 3] rad."""
     v = np.asarray(v, dtype=np.result_type(v, np.float32))
     angle = _length(v)
     scale = np.where(angle > 1e-6, np.sin(0.5 * angle) / np.where(angle > 1e-6, angle, 1.0), 0.5)
@@ -105,7 +105,7 @@ def exp(v: np.ndarray) -> np.ndarray:
 
 
 def log(q: np.ndarray) -> np.ndarray:
-    """Quaternion [..., 4] to the shortest rotation vector [..., 3] rad."""
+    """Returns the shortest rotation vector [..., 3] rad of a quaternion [..., 4]."""
     q = np.asarray(q)
     q = np.where(q[..., 3:] < 0.0, -q, q)
     sine = np.linalg.norm(q[..., :3], axis=-1, keepdims=True)
@@ -114,13 +114,13 @@ def log(q: np.ndarray) -> np.ndarray:
 
 
 def to_matrix(q: np.ndarray) -> np.ndarray:
-    """Rotation matrices [..., 3, 3] of quaternions [..., 4]."""
+    """Returns the rotation matrices [..., 3, 3] of quaternions [..., 4]."""
     q = np.asarray(q)
     return np.swapaxes(rotate(q[..., None, :], np.eye(3, dtype=q.dtype)), -1, -2)
 
 
 def from_matrix(r: np.ndarray) -> np.ndarray:
-    """Quaternions [..., 4] of rotation matrices [..., 3, 3] (the largest component has a positive sign)."""
+    """Returns the quaternions [..., 4] of rotation matrices [..., 3, 3]. Their largest component is positive."""
     r = np.asarray(r, float)
     xx, yy, zz = (r[..., i, i] for i in range(3))
     rows = np.empty((*r.shape[:-2], 4, 4))
@@ -134,20 +134,23 @@ def from_matrix(r: np.ndarray) -> np.ndarray:
 
 
 def from_yaw(angle: float | np.ndarray) -> np.ndarray:
-    """Quaternion [..., 4] of a rotation about z by ``angle`` [...] rad, counter-clockwise seen from above."""
+    """Returns the quaternion [..., 4] of a rotation about z by ``angle`` [...] rad, counter-clockwise seen from
+    above."""
     half = 0.5 * np.asarray(angle, float)
     zero = np.zeros_like(half)
     return np.stack([zero, zero, np.sin(half), np.cos(half)], -1)
 
 
 def to_yaw(q: np.ndarray) -> float:
-    """Yaw angle [rad] of a rotation [4]: the direction of its x axis seen from above. Inverse of :func:`from_yaw`."""
+    """Returns the yaw angle [rad] of a rotation [4]: the direction of its x axis seen from above. Inverse of
+    :func:`from_yaw`."""
     x, y, z, w = q
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
 def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np.ndarray:
-    """Quaternion [..., 4] that turns the x axis to ``x`` [..., 3], with the z axis in the half plane of x and ``up``.
+    """Returns the quaternion [..., 4] of a frame with its x axis along ``x`` [..., 3] and its z axis as close to ``up``
+    as possible.
 
     Where ``x`` and ``up`` are parallel, the z axis leans towards world y.
     """
@@ -160,7 +163,7 @@ def from_x_axis(x: np.ndarray, up: np.ndarray = np.array([0.0, 0.0, 1.0])) -> np
 
 
 def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.ndarray:
-    """Pose [..., 7] from position [..., 3] m and quaternion [..., 4]."""
+    """Returns the pose [..., 7] with a position [..., 3] m and a quaternion [..., 4]."""
     x = np.asarray(position, float)
     q = np.asarray(quaternion, float)
     lead = np.broadcast_shapes(x.shape[:-1], q.shape[:-1])
@@ -168,7 +171,8 @@ def pose(position: npt.ArrayLike, quaternion: npt.ArrayLike = IDENTITY) -> np.nd
 
 
 def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = ValueError) -> np.ndarray:
-    """A pose [7] as an array of floats; ``error`` naming ``what`` unless it is finite with a unit quaternion."""
+    """Returns the pose ``given`` [7] as an array of floats. Raises ``error``, with a message that names ``what``,
+    unless all numbers are finite and the quaternion has length 1."""
     values = np.asarray(given, float)
     if values.shape != (7,) or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 1e-3:
         raise error(
@@ -178,13 +182,14 @@ def checked_pose(what: str, given: npt.ArrayLike, error: type[ValueError] = Valu
 
 
 def compose(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Product of poses [..., 7]: expresses ``b``, which is given in the frame ``a``, in the parent frame of ``a``."""
+    """Returns the product of poses [..., 7]. ``b`` is a pose in the frame ``a``; the result is the same pose in the
+    parent frame of ``a``."""
     a = np.asarray(a)
     b = np.asarray(b)
     return np.concatenate([a[..., :3] + rotate(a[..., 3:], b[..., :3]), multiply(a[..., 3:], b[..., 3:])], axis=-1)
 
 
 def inverse(p: np.ndarray) -> np.ndarray:
-    """Inverse of a pose [..., 7]: the pose of the parent frame in the frame ``p``."""
+    """Returns the inverse of a pose [..., 7]: the pose of the parent frame, expressed in the frame ``p``."""
     back = conjugate(np.asarray(p)[..., 3:])
     return np.concatenate([-rotate(back, np.asarray(p)[..., :3]), back], axis=-1)

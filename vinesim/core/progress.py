@@ -1,4 +1,5 @@
-"""Progress messages of long operations: one line that is updated on a terminal, otherwise a new line now and then."""
+"""Progress messages of long operations: on a terminal one line that is updated, in a log file a new line every few
+seconds."""
 
 from __future__ import annotations
 
@@ -13,7 +14,7 @@ PERIOD = 1.0
 """Least time between two texts of a :class:`ProgressLine` [s]."""
 
 LINE_PERIOD = 5.0
-"""Least time between two lines where a line cannot be updated, as in a log file [s]."""
+"""Least time between two lines in an output where a line cannot be updated, such as a log file [s]."""
 
 _ERASE = "\r\x1b[K"
 """Terminal control sequence: return to the beginning of the line and erase the line."""
@@ -54,7 +55,7 @@ class ProgressHandler(logging.Handler):
         self._next_line = 0.0
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Show the text of a record."""
+        """Write the text of a log record to the stream."""
         text = record.getMessage()
         try:
             if self._is_terminal:
@@ -69,7 +70,7 @@ class ProgressHandler(logging.Handler):
 
 
 def show_on(stream: TextIO) -> None:
-    """Show the progress of this program on a stream from now on, and nowhere else."""
+    """Show the progress messages of this program on ``stream`` only."""
     log.handlers = [ProgressHandler(stream)]
     log.propagate = False
     log.setLevel(logging.INFO)

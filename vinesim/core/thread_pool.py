@@ -27,9 +27,9 @@ class ThreadPool:
         self._executor = ThreadPoolExecutor(size - 1, "thread pool") if size > 1 else None
 
     def share(self, tasks: Sequence[Callable[[], None]]) -> None:
-        """Do ``tasks``, each by the thread that is free next, and return when all are done.
+        """Run ``tasks`` and return when all are done. Each thread takes the next task as soon as it is free.
 
-        An exception of a task ends the tasks that its thread would have taken next, and is raised here.
+        If a task raises an exception, its thread takes no further tasks, and ``share`` raises the exception at the end.
         """
         queue = iter(tasks)  # one iterator of a list serves all threads, because its steps are atomic
 
@@ -42,7 +42,7 @@ class ThreadPool:
         try:
             work()
         finally:
-            # A helper that has not begun, perhaps because all cores are busy, has nothing left to do.
+            # A helper thread that has not begun by now has no task left, so it is cancelled.
             failures = [future.exception() for future in futures if not future.cancel()]
         for failure in filter(None, failures):
             raise failure

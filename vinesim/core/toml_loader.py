@@ -1,4 +1,5 @@
-"""Loads TOML files into frozen structs. An error is one line: file, place, finding, remedy."""
+"""Loads TOML files into frozen structs. An error is one line: the file, the field, what is wrong with it, and how to
+correct it."""
 
 from __future__ import annotations
 
@@ -23,11 +24,12 @@ _KINDS = {
 
 
 class DataError(ValueError):
-    """A data file that cannot be used. The message is one line."""
+    """Raised for a data file that cannot be used. The message is one line."""
 
 
 def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataError) -> T:
-    """The TOML file at ``path`` as a ``kind``; raises ``error`` otherwise."""
+    """Returns the content of the TOML file at ``path`` as an object of the class ``kind``. Raises ``error`` if the file
+    cannot be read or does not fit ``kind``."""
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
     except tomllib.TOMLDecodeError as bad:
@@ -48,7 +50,7 @@ def _one_line(bad: Exception) -> str:
 
 
 def _leaves(data: Any, place: str = "") -> list[tuple[str, Any]]:
-    """Every value of nested tables and lists with its place, ``spawns[0].x``."""
+    """Returns every value in nested tables and lists, with its path, for example ``spawns[0].x``."""
     if isinstance(data, dict):
         return [leaf for key, value in data.items() for leaf in _leaves(value, f"{place}.{key}" if place else key)]
     if isinstance(data, list):
@@ -57,7 +59,8 @@ def _leaves(data: Any, place: str = "") -> list[tuple[str, Any]]:
 
 
 def _explain(message: str, data: Any, kind: Any) -> str:
-    """Place, finding and remedy from msgspec's text, which ends in ``- at `$.a[0].b```."""
+    """Returns the path, the error and its correction in words, from msgspec's ``message``, which ends in ``- at
+    `$.a[0].b```."""
     what, _, where = message.partition(" - at `$")
     place = where.rstrip("`").lstrip(".")
     if "[...]" in place:  # msgspec writes [...] for a key that the file chose
@@ -75,7 +78,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
         return f"{named}{quoted[0]} is not a field; {hint} (known: {', '.join(known)})"
     if "missing required field" in what:
         return f"{named}{quoted[0]} is missing; add it: {quoted[0]} = ..."
-    if place and what.startswith(f"{place}."):  # a check of the struct itself, which names the field
+    if place and what.startswith(f"{place}."):  # the message comes from the struct's own check and names the field
         return what
     place = place or "the file"
     if what.startswith("Invalid enum value"):
@@ -88,7 +91,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
 
 
 def _step_in(kind: Any, steps: list[Any]) -> Any:
-    """The msgspec type at the path ``steps`` inside ``kind``."""
+    """Returns the msgspec type at the path ``steps`` inside ``kind``."""
     at: Any = msgspec.inspect.type_info(kind)
     for step in steps:
         if isinstance(at, msgspec.inspect.StructType):

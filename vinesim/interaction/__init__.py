@@ -1,6 +1,6 @@
 """Actions of actors on plants and objects: holding, picking, cutting and setting down.
 
 ``hand_grasp`` closes and opens people's hands. ``detachment`` detaches bunches and canes that are pulled, bent or cut.
-``dormant_bunches`` are picked bunches that have no body while no actor is near. ``support_tracking`` determines the
-support on which an object rests.
+``dormant_bunches`` stores picked bunches that have no body in the physics while no actor is near. ``support_tracking``
+determines the support on which an object rests.
 """

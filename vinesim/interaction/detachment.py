@@ -32,14 +32,15 @@ STUB_MASS = 1e-3
 
 @dataclasses.dataclass(slots=True)
 class Blade:
-    """The mouth of a cutter: a box fixed to a link. When it closes, it cuts the wood that passes through it."""
+    """The mouth of a cutter: a box fixed to a link. When the blade closes, it cuts the wood that passes through the
+    box."""
 
     actor: str
     link: str
     pose: np.ndarray
     """[7] pose of the mouth's centre in the link: x along the blades, y from blade to blade, z across their plane."""
     half: np.ndarray
-    """[3] m, half edges of the mouth; half[1] is the distance to either side within which wood is caught."""
+    """[3] m, half edges of the mouth. Wood within ``half[1]`` of the centre, in the closing direction, is caught."""
     force: float = np.inf
     """[N] Largest closing force."""
     closing: bool = False
@@ -48,10 +49,11 @@ class Blade:
     detachments: tuple[Detachment, ...] = ()
     """Parts that the blade cut off when it last closed."""
     resistance: float = 0.0
-    """[N] Cutting force of the strongest piece in the mouth at the last closing, cut or not; 0 if it was empty."""
+    """[N] Cutting force of the strongest piece of wood in the mouth at the last closing, whether it was cut or not; 0
+    for an empty mouth."""
 
     def close(self, force: float = np.inf) -> None:
-        """Close with at most ``force`` [N] and open again; cuts the wood in the mouth at the end of the coming step."""
+        """Close with at most ``force`` [N] and open again. The wood in the mouth is cut at the end of the next step."""
         self.closing = True
         self.force = force
 
@@ -66,8 +68,8 @@ class DetachmentMonitor:
         contact_solver: ContactSolver,
         parameters: PhysicsParameters = PhysicsParameters(),
     ) -> None:
-        """``parameters``: uses ``detachment_duration``, after which an overloaded peduncle breaks, and
-        ``cutting_strength``."""
+        """``parameters``: ``detachment_duration`` is the time after which an overloaded peduncle breaks,
+        ``cutting_strength`` the strength of wood."""
         self._overload_limit = parameters.steps(parameters.detachment_duration)
         self._cutting_strength = parameters.cutting_strength
         self.plants = plants
@@ -75,7 +77,7 @@ class DetachmentMonitor:
         self.contact_solver = contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
-        """Hands that hold plants, as contacts. They identify the actor who pulled off a bunch."""
+        """Hands that hold plants, as contacts. They are used to find the actor who pulled off a bunch."""
         model = plants.model
         self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
         self._bunch_of = model.bunch_of_body()
@@ -117,7 +119,8 @@ class DetachmentMonitor:
     # ------------------------------------------------------------------ the tick
 
     def update(self, *, check_load: bool = True) -> tuple[Detachment, ...]:
-        """After a commit: all detachments since the last call, sorted by body. ``check_load`` off: only cuts."""
+        """Detach bunches and canes at the end of a step. Returns all detachments since the last call, sorted by body.
+        ``check_load``: whether overloaded peduncles break; if not, only cuts are made."""
         if check_load:
             self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
@@ -127,7 +130,8 @@ class DetachmentMonitor:
         return told
 
     def _detach_overloaded(self) -> None:
-        """Detach bunches whose peduncles were overloaded for ``detachment_duration``, on trees simulated here."""
+        """Detach bunches whose peduncles were overloaded for ``detachment_duration``, on trees that this client
+        controls."""
         self._list_awake_bunches()
         self._longest[0] = 0
         count = int(self._peduncles.count[0])
@@ -183,17 +187,20 @@ class DetachmentMonitor:
                 blade.detachments = tuple(self._detachments[before:])
 
     def wood_in_mouth(self, blade: Blade) -> list[tuple[int, int]]:
-        """After a step: bodies that a blade would cut if strong enough, each with its bunch, or -1 for a cane."""
+        """Returns the bodies in a blade's mouth after a step, which it would cut with sufficient force. Each body has
+        the index of its bunch, or -1 for a cane."""
         bodies = self._bodies_in_mouth(blade).tolist()
         found = [(body, int(self._bunch_of[body])) for body in bodies]
         return [(body, bunch) for body, bunch in found if bunch < 0 or self.plants.state.bunch_attached[bunch]]
 
     def cutting_force(self, body: int) -> float:
-        """Force [N] to cut a piece of wood: its cross-section at the root end times ``cutting_strength``."""
+        """Returns the force [N] that cuts a piece of wood: its cross-section at the root end times
+        ``cutting_strength``."""
         return self._cutting_strength * math.pi * float(self.plants.model.body_radius[body, 0]) ** 2
 
     def _bodies_in_mouth(self, blade: Blade) -> np.ndarray:
-        """Pieces of wood [k] whose axis passes through a blade's mouth, of each branch the piece nearest the root."""
+        """Returns the pieces of wood [k] whose axis passes through a blade's mouth; of each branch only the piece
+        nearest the root."""
         model = self.plants.model
         body_q = self.plants.state.body_q
         mouth = frames.compose(self.rigid.link_pose(blade.actor, blade.link), blade.pose)
@@ -217,7 +224,8 @@ class DetachmentMonitor:
         return caught[~self._has_marked_ancestor(caught, inside)]
 
     def _has_marked_ancestor(self, bodies: np.ndarray, marked: np.ndarray) -> np.ndarray:
-        """Whether ``bodies`` [k] grow on a body in ``marked`` [body] bool, without a cut in between [k] bool."""
+        """Returns for each of the ``bodies`` [k] whether it descends from a body in ``marked`` [body] bool, without a
+        cut in between."""
         parent = self.plants.model.body_parent
         cut = self.plants.state.body_cut
         below = np.zeros(len(bodies), bool)
@@ -230,9 +238,9 @@ class DetachmentMonitor:
     # ------------------------------------------------------------------ one at a time
 
     def pick(self, bunch: int, cause: str = "command", actor: str = "") -> None:
-        """Detach one bunch, which keeps its pose and velocity. Call it between steps.
+        """Detach one bunch from its vine. The bunch keeps its pose and velocity. Call this between steps.
 
-        :class:`ValueError` if the bunch cannot be detached.
+        Raises :class:`ValueError` if the bunch cannot be detached.
         """
         bunch = checked_index("bunch", bunch, len(self._overloaded_steps))
         if not self.plants.state.bunch_attached[bunch]:
@@ -249,10 +257,11 @@ class DetachmentMonitor:
         plants.forward_kinematics(np.array([tree]))
         shapes = self.contact_solver.capsules
         state = plants.state
-        # the shapes in use so far, with the clusters where they are, so that what holds the bunch feels no difference
+        # keep the present collision shapes and the poses of the clusters, so that a hand or gripper that holds the
+        # bunch keeps its contacts
         here = (shapes.bunch == bunch) & (shapes.level != (1 if state.tree_fine[tree] else 2))
         of = np.flatnonzero(here & (model.body_organ[shapes.body] == int(Organ.BUNCH)))
-        # cut before fusing, so that its vine and its neighbours feel nothing
+        # cut before fusing, so that the vine gets no impulse
         velocity = plants.berry_clusters.fuse(bunch)
         local = frames.compose(frames.inverse(state.body_q[body].astype(float)), state.body_q[shapes.body[of]])
         start, end = (
@@ -279,9 +288,9 @@ class DetachmentMonitor:
         self._record(body, bunch, cause, actor, carried)
 
     def cut(self, body: int, cause: str = "command", actor: str = "") -> None:
-        """Cut a piece of cane off its parent; everything that grows on it falls with it. Call it between steps.
+        """Cut a piece of cane off its parent. All its descendants fall with it. Call this between steps.
 
-        :class:`ValueError` if the piece cannot be cut.
+        Raises :class:`ValueError` if the piece cannot be cut.
         """
         plants = self.plants
         body = checked_index("body", body, len(self._wood))
@@ -300,16 +309,16 @@ class DetachmentMonitor:
         self._record(body, -1, cause, actor, carried)
 
     def apply_remote_pick(self, bunch: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Detach a bunch that another client has detached, and place it at ``pose`` [7] with ``velocity`` [6].
+        """Detach a bunch that another client has detached, and set its ``pose`` [7] and ``velocity`` [6].
 
-        It is not listed in this client's detachments.
+        The bunch is not listed in this client's detachments.
         """
         self._pick(bunch, "told", "", np.zeros(6))
         self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
 
     def apply_remote_cut(self, body: int) -> None:
-        """Cut a body off its parent that another client has cut off."""
+        """Cut off a body that another client has cut off."""
         if not self.plants.state.body_cut[body]:
             tree = int(self.plants.model.body_tree[body])
             self.plants.wake(tree)
@@ -322,7 +331,7 @@ class DetachmentMonitor:
         self._detachments.append(Detachment(self.plants.tick, tree, body, bunch, cause, actor, force, moment))
 
     def _hardest_pressing_actor(self, bunch: int) -> str:
-        """The actor that presses hardest on a bunch; empty if none does."""
+        """Returns the name of the actor that presses hardest on a bunch; empty if no actor does."""
         pushes: dict[str, float] = {}
         for contact in self.contact_solver.contacts + self.hand_contacts:
             if self._bunch_of[contact.body] == bunch and contact.actor not in ("world", "plants"):
@@ -331,6 +340,6 @@ class DetachmentMonitor:
 
 
 def _box_around(bunch: FreeBunch, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper corner [3] m of the world-aligned bounding box of a bunch at ``pose`` [7]."""
+    """Returns the lower and upper corner [3] m of the world-aligned bounding box of a bunch at ``pose`` [7]."""
     ends = pose[:3] + frames.rotate(pose[3:], np.stack([bunch.start, bunch.end]))
     return (ends - bunch.radius[:, None]).min((0, 1)), (ends + bunch.radius[:, None]).max((0, 1))

@@ -33,10 +33,11 @@ class DormantBunches:
         self._support: dict[int, str] = {}
         self._relative: dict[int, np.ndarray] = {}
         self._place: dict[int, np.ndarray] = {}
-        """World pose [7] of each bunch, used while its support does not exist."""
+        """World pose [7] of each bunch, which is used while the bunch's support does not exist."""
         self._visuals: tuple[RigidVisual, ...] | None = ()
         self._groups: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
-        """For each support: name, rows of :meth:`visuals`, poses [k, 7] in its frame, world poses [k, 7] without it."""
+        """For each support: its name, rows [k] of :meth:`visuals` of the bunches on it, their poses [k, 7] in its
+        frame, and their world poses [k, 7] while it does not exist."""
         capsules = contact_solver.capsules
         of_bunches = np.flatnonzero(
             (plants.model.body_organ[capsules.body] == int(Organ.BUNCH)) & (capsules.level != 2)
@@ -53,8 +54,8 @@ class DormantBunches:
     def add(self, bunches: list[int], supports: list[str], poses: np.ndarray, places: np.ndarray | None = None) -> None:
         """Add picked bunches, or move them.
 
-        ``poses`` [k, 7] are in the frames of the ``supports`` (names). ``places`` [k, 7] are world poses for use while
-        a support does not exist (None: ``poses``). Bunches that still hang are removed from their vines, which are not
+        ``poses`` [k, 7]: poses in the frames of the ``supports`` (names). ``places`` [k, 7]: world poses while a
+        support does not exist; default ``poses``. Bunches that still hang are removed from their vines, which are not
         woken.
         """
         plants = self.plants
@@ -84,7 +85,7 @@ class DormantBunches:
         self._visuals = None
 
     def activate(self, bunches: list[int]) -> None:
-        """Give ``bunches`` their bodies, at their present poses and with the velocities of their supports."""
+        """Create MuJoCo bodies for ``bunches``, at their present poses and with the velocities of their supports."""
         if bunches:
             states = {bunch: self._world_state(bunch) for bunch in bunches}
             self.rigid.add_bunches({bunch: (self._bunches.pop(bunch), *states[bunch]) for bunch in bunches})
@@ -93,12 +94,13 @@ class DormantBunches:
             self._visuals = None
 
     def _world_state(self, bunch: int) -> tuple[np.ndarray, np.ndarray]:
-        """World pose [7] and velocity [6] of a dormant bunch."""
+        """Returns the world pose [7] and velocity [6] of a dormant bunch."""
         state = self.supports.to_world(self._support[bunch], self._relative[bunch])
         return (self._place[bunch], np.zeros(6)) if state is None else state
 
     def nearest(self, actors: np.ndarray, most: int) -> list[int]:
-        """At most ``most`` bunches within ``dormant_radius`` of one of the ``actors`` [k, 3] m, the nearest first."""
+        """Returns at most ``most`` bunches within ``dormant_radius`` of one of the ``actors`` [k, 3] m, the nearest
+        first."""
         if not self._bunches or not len(actors):
             return []
         distance = np.linalg.norm(self.visual_q()[:, None, :2] - actors[None, :, :2], axis=-1).min(1)
@@ -107,7 +109,7 @@ class DormantBunches:
         return [visuals[i].index for i in np.argsort(distance, kind="stable")[:most].tolist() if distance[i] < radius]
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """All dormant bunches, as in :meth:`RigidWorld.visuals`."""
+        """Returns all dormant bunches, as in :meth:`RigidWorld.visuals`."""
         if self._visuals is None:
             order = sorted(self._bunches)
             self._visuals = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes) for i in order)
@@ -119,7 +121,7 @@ class DormantBunches:
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
-        """World poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of :meth:`visuals`."""
         pose = np.zeros((len(self.visuals()), 7))
         for support, rows, relative, place in self._groups:
             frame = self.supports.support_state(support)

@@ -1,7 +1,7 @@
 """Grasps of people's hands, which can hold plants, boxes, bunches, robots and static geoms.
 
-A rigid body is welded to the hand. A plant is held by the hand's own spring, between the grasped point and the
-controller. This spring is solved implicitly together with the plant's springs, and the hand is placed on the plant. If
+A rigid body is welded to the hand. A plant is held by a spring between the grasped point and the tracked controller.
+The plant solver solves this spring implicitly with the plant's springs, and the hand's body is placed on the plant. If
 a bunch in a hand is detached from its vine, the hand continues to hold it as a rigid body.
 """
 
@@ -25,11 +25,11 @@ _NO_TREES = np.zeros(0, int)
 
 @dataclasses.dataclass(slots=True)
 class _PlantGrasp:
-    """A plant's body in a hand."""
+    """A body of a plant that a hand holds."""
 
     body: int
     tie: int
-    """Number of the spring, see :meth:`ArticulationSolver.add_tie`."""
+    """Index of the hand's spring, see :meth:`ArticulationSolver.add_tie`."""
     point: np.ndarray
     """[3] m, the grasped point in the body's frame."""
     bunch: int
@@ -46,11 +46,13 @@ class GraspManager:
         self.contacts: tuple[Contact, ...] = ()
         """Hands that held a plant in the last step, as contacts; their ``distance`` is 0."""
         self.refused_grasps = 0
-        """Number of grasps of plants refused since the start: too many bodies were held, or one by too many hands."""
+        """Number of grasps of plants that were refused since the start, because too many bodies were held or one body
+        was held by too many hands."""
         self._grasps: dict[tuple[str, str], _PlantGrasp] = {}
         """Held plants, by person and side."""
         self._steps_to_grasp: dict[tuple[str, str], int] = {}
-        """Number of steps for which a hand that closed on nothing can still grasp, by person and side."""
+        """Number of steps for which a hand that closed without grasping anything can still grasp, by person and
+        side."""
         self._grasp_steps = rigid.parameters.steps(rigid.parameters.grasp_duration)
 
     @property
@@ -63,10 +65,10 @@ class GraspManager:
     # ------------------------------------------------------------------ the step
 
     def begin_step(self) -> None:
-        """Before a step: close and open hands, and pull the held plants."""
+        """Close and open hands before a step, and pull the held plants."""
         for human, hand in self._local_hands():
             key = human.spec.name, hand.side
-            if key in self._grasps and not hand.on_plant:  # the person left and joined again
+            if key in self._grasps and not hand.on_plant:  # the person left the world and joined again
                 self._remove_tie(key)
             if not hand.closed:
                 self._steps_to_grasp[key] = self._grasp_steps
@@ -81,7 +83,8 @@ class GraspManager:
             self.plants.wake(self.held_trees)
 
     def end_step(self, detachments: tuple[Detachment, ...]) -> None:
-        """After a step: place hands on the plants that they hold, and weld detached bunches to their hands."""
+        """Place hands on the plants that they hold after a step, and weld detached bunches to the hands that hold
+        them."""
         detached = {detachment.body: detachment.bunch for detachment in detachments if detachment.bunch >= 0}
         contacts = []
         if self._grasps:
@@ -102,7 +105,7 @@ class GraspManager:
         self.contacts = tuple(contacts)
 
     def release(self, name: str, side: str) -> None:
-        """Open a hand, whatever it holds."""
+        """Open a hand and release the plant or body in it."""
         self._remove_tie((name, side))
         self.rigid.release(name, side)
 
@@ -133,7 +136,7 @@ class GraspManager:
             bunch = np.flatnonzero(self.plants.model.bunch_body == body)
             try:
                 tie = self.plants.add_tie(body, hand.grasp_pose[:3], hand.stiffness, hand.damping)
-            except TieLimitError:  # the hand counts as closed on nothing, and does not try again until it opens
+            except TieLimitError:  # the hand holds nothing and does not try again until it opens
                 self.refused_grasps += 1
                 self._steps_to_grasp[key] = 0
                 return
@@ -143,7 +146,8 @@ class GraspManager:
             self.rigid.grasp(*key, *rigid[1:])
 
     def _pull(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> None:
-        """Set the anchor of the spring, limiting its distance from the plant to what the hand's force allows."""
+        """Set the anchor of the spring. Its distance from the grasped point is limited, so that the spring's force does
+        not exceed the hand's force."""
         at = self._grasped_point(grasp)
         velocity = human.controller_velocity(hand, self.rigid.dt)
         pull = human.controller_pose(hand)[:3] + hand.damping / hand.stiffness * velocity - at
@@ -151,12 +155,13 @@ class GraspManager:
         self.plants.tie_anchor[grasp.tie] = at + pull * min(1.0, most / max(float(np.linalg.norm(pull)), 1e-12))
 
     def _grasped_point(self, grasp: _PlantGrasp) -> np.ndarray:
-        """Position [3] m of the grasped point in the world."""
+        """Returns the position [3] m of the grasped point in the world."""
         pose = self.plants.state.body_q[grasp.body].astype(float)
         return pose[:3] + frames.rotate(pose[3:], grasp.point)
 
     def _place_on_plant(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> Contact:
-        """Place a hand on the plant that it holds and set its force. Returns this force as a contact."""
+        """Place the body of a hand on the plant that the hand holds, and set the force on the hand. Returns this force
+        as a contact."""
         plants = self.plants
         pose = plants.state.body_q[grasp.body].astype(float)
         motion = plants.state.body_qd[grasp.body].astype(float)
@@ -168,7 +173,7 @@ class GraspManager:
         return Contact(human.spec.name, hand.link, grasp.body, at, -hand.force, 0.0)
 
     def _is_bunch_gone(self, grasp: _PlantGrasp) -> bool:
-        """Whether a held bunch was detached by something else, for example by another client."""
+        """Returns whether a held bunch has been detached by another cause, for example by another client."""
         return grasp.bunch >= 0 and not self.plants.state.bunch_attached[grasp.bunch]
 
     def _remove_tie(self, key: tuple[str, str]) -> None:

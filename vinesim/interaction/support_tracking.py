@@ -1,11 +1,12 @@
-"""Support tracking: on which support a box or a free bunch rests, and whether it moves relative to it.
+"""Support tracking: the support on which a box or free bunch rests, and whether the object moves relative to its
+support.
 
 Every object has a *support*: the ground, the box in which it lies, or the link of a robot that carries or grips it. An
-object that has been still in its support's frame for ``support_rest_duration`` is at rest, however the support moves;
-examples are a bunch in a box and a box on a robot. It stays at rest until it leaves a band around its anchor pose. Then
-a new support is chosen among the things that it touches. The ground has priority, because a box pushed along the ground
-is not supported by the pusher. Hands of people are not supports, because their copies on other clients are not exact
-enough. Objects in hands are never at rest.
+object that has been still in its support's frame for ``support_rest_duration`` is at rest, even if the support moves,
+as with a bunch in a carried box. It stays at rest until it leaves a band around its anchor pose. Then a new support is
+chosen among the bodies in contact with it. The ground has priority, because a box pushed along the ground is not
+supported by the pusher. Hands of people are not supports, because their copies on other clients are not exact enough.
+Objects in hands are never at rest.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.ids import ObjectKind, object_id, parse_object_name
 
 STILL_BAND = 0.005, float(np.radians(1.0))
-"""[m, rad] An object that moves and turns less than this in its support's frame is still. TUNED."""
+"""[m, rad] Largest displacement and rotation in its support's frame of an object that is still. TUNED."""
 CARRIED_BAND = 0.015, float(np.radians(5.0))
-"""[m, rad] Band of an object on a robot's link, which shakes it. The object is not sent while it stays in the band.
-TUNED."""
+"""[m, rad] Band of an object on a link of a robot, which shakes the object. While it stays in the band, its pose is not
+sent to other clients. TUNED."""
 SHAKEN_BAND = 0.05, float(np.radians(30.0))
-"""[m, rad] Band of a bunch in a moving box, where it rocks and rolls. In a box at rest :data:`STILL_BAND` applies.
-TUNED."""
+"""[m, rad] Band of a bunch in a moving box, in which the bunch rocks and rolls. In a box at rest :data:`STILL_BAND`
+applies. TUNED."""
 
 GROUND = ""
 """Name of the ground as a support; boxes are ``box/3``, links ``actor/link``."""
@@ -38,28 +39,30 @@ _NO_PAIRS = np.zeros((0, 2), np.int64)
 class SupportTracker:
     """Poses, velocities and supports of all boxes and free bunches, and which of them are at rest.
 
-    Objects have the ids of :func:`vinesim.scene.ids.object_id`. For each object the tracker counts the steps for which
-    it has stayed within its band around an anchor pose in its support's frame.
+    An object is identified by :func:`vinesim.scene.ids.object_id`. For each object the tracker counts the steps for
+    which the object has stayed within its band around an anchor pose in its support's frame.
     """
 
     def __init__(self, rigid: RigidWorld) -> None:
         self.rigid = rigid
         self._rest_steps = rigid.parameters.steps(rigid.parameters.support_rest_duration)
         self.object_ids = np.zeros(0, np.int64)
-        """[object] Ids of boxes, then of free bunches, sorted. The tables below have a row for each object."""
+        """[object] Ids of all objects, sorted: first boxes, then free bunches. The tables of this class have a row for
+        each object."""
         self._generation = -1
         self._support = np.zeros(0, np.int64)
         """[object] MuJoCo body of the support, 0 for the ground."""
         self._anchor_pose = np.zeros((0, 7))
         """[object, 7] Anchor pose in the support's frame, around which the object may move within its band."""
         self._still_steps = self._slow_steps = np.zeros(0, np.int64)
-        """[object] Number of steps for which the object has been within its band, and slower than
-        ``support_move_speed``."""
+        """[object] ``_still_steps``: number of successive steps for which the object has been within its band.
+        ``_slow_steps``: number for which it has been slower than ``support_move_speed``."""
         self._row_of_object: dict[int, int] = {}
         self._touching_pairs = _NO_PAIRS
-        """[k, 2] Row and MuJoCo body of all contacts of the last step."""
+        """[k, 2] Pairs of an object's row and the MuJoCo body in contact with the object in the last step."""
         self._bands_before = self._bands_on_ground = np.zeros((0, 2))
-        """[object, 2] m, rad, bands in the last step; and the bands if all objects rest on the ground."""
+        """[object, 2] m, rad. ``_bands_before``: bands in the last step. ``_bands_on_ground``: bands of objects that
+        rest on the ground."""
         self._touched: list[tuple[int, str]] | None = None
         self._all_sleep = False
         """Whether all objects slept after the last step."""
@@ -68,7 +71,8 @@ class SupportTracker:
     # ------------------------------------------------------------------ the tick
 
     def update(self) -> None:
-        """After a step: determine which objects are still in their support's frame, and the supports of the others."""
+        """Determine after a step which objects are still in their support's frame, and choose new supports for the
+        other objects."""
         self._update_tables()
         d = self.rigid.mj_data
         move_speed = self.rigid.parameters.support_move_speed
@@ -114,7 +118,8 @@ class SupportTracker:
             self._still_steps[restarted] = 0
 
     def _held_rows(self) -> list[int]:
-        """Rows of the objects in hands. If one were at rest, it would stay in place when the hand opens."""
+        """Returns the rows of objects in hands. These must not be at rest: an object at rest would stay in place when
+        the hand opens."""
         held = (hand.held for name in self.rigid.humans for hand in self.rigid.human(name).hands)
         numbers = (parse_object_name(one[0]) for one in held if one is not None)
         return [self._row_of_object[number] for number in numbers if number in self._row_of_object]
@@ -127,14 +132,15 @@ class SupportTracker:
 
     @property
     def touched(self) -> list[tuple[int, str]]:
-        """(object, actor) for every moving object and each robot, person, box (``box/3``) or free bunch touching it."""
+        """Returns pairs (object, name) of each moving object and each robot, person, box (``box/3``) or free bunch that
+        touches the object."""
         self._update_tables()
         if self._touched is None:
             self._touched = self._list_touched()
         return self._touched
 
     def objects_moved_by(self, actor: str) -> set[int]:
-        """Moving objects that ``actor`` touches directly or through other objects."""
+        """Returns the moving objects that ``actor`` touches directly or through other objects."""
         self._update_tables()
         moves = self._still_steps < self._rest_steps
         if not moves.any():
@@ -176,7 +182,8 @@ class SupportTracker:
         return object_id in self._row_of_object
 
     def object_state(self, object_id: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] of an object, and its velocity [6] (linear velocity of the origin, then angular; world axes)."""
+        """Returns the pose [7] of an object, and its velocity [6] (linear velocity of the origin, then angular; world
+        axes)."""
         row = self._row_of(object_id)
         d = self.rigid.mj_data
         pose = self._poses(np.array([row]))[0]
@@ -184,14 +191,14 @@ class SupportTracker:
         return pose, np.concatenate([v[:3], frames.rotate(pose[3:], v[3:])])
 
     def pose_on_support(self, object_id: int) -> tuple[str, np.ndarray]:
-        """Name of an object's support, and pose [7] of the object in the support's frame."""
+        """Returns the name of an object's support, and the pose [7] of the object in the support's frame."""
         row = self._row_of(object_id)
         self.rigid.update_kinematics()
         at = np.array([row])
         return self._support_name(int(self._support[row])), self._relative(self._poses(at), self._support[at])[0]
 
     def support_state(self, support: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """Pose [7] and velocity [6] of a support; None if it does not exist."""
+        """Returns the pose [7] and velocity [6] of a support; None if the support does not exist."""
         if support == GROUND:
             return frames.pose([0.0, 0.0, 0.0]), np.zeros(6)
         self._update_tables()
@@ -210,7 +217,8 @@ class SupportTracker:
         return pose, np.concatenate([twist[3:], twist[:3]])
 
     def to_world(self, support: str, relative: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-        """World poses [..., 7] and velocities [..., 6] of objects that rest on a support at ``relative`` [..., 7].
+        """Returns the world poses [..., 7] and velocities [..., 6] of objects that rest on a support with the poses
+        ``relative`` [..., 7] in its frame.
 
         None if the support does not exist.
         """
@@ -223,11 +231,11 @@ class SupportTracker:
         return pose, velocity
 
     def set_state(self, object_id: int, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Put an object at a pose [7] with a velocity [6] in world axes."""
+        """Set the world pose [7] and the velocity [6] (world axes) of an object."""
         self.set_states([object_id], np.asarray(pose, float)[None], np.asarray(velocity, float)[None])
 
     def set_states(self, object_ids: list[int], pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Put objects [k] at poses [k, 7] with velocities [k, 6] in world axes."""
+        """Set the world poses [k, 7] and the velocities [k, 6] (world axes) of objects [k]."""
         rows = np.array([self._row_of(object_id) for object_id in object_ids])
         d = self.rigid.mj_data
         turn = frames.normalize(pose[:, 3:])
@@ -239,9 +247,10 @@ class SupportTracker:
         self.rigid.invalidate_kinematics()
 
     def blend_towards(self, object_ids: list[int], pose: np.ndarray, velocity: np.ndarray, blend: np.ndarray) -> None:
-        """Move objects [k] by the share ``blend`` [k] towards poses [k, 7], and set their ``velocity`` [k, 6].
+        """Move objects [k] towards ``pose`` [k, 7] by the share ``blend`` [k] of the difference, and set their
+        ``velocity`` [k, 6].
 
-        Objects further away than ``support_snap_distance`` are put there at once.
+        Objects further away than ``support_snap_distance`` get the pose ``pose`` at once.
         """
         here = self._poses(np.array([self._row_of(object_id) for object_id in object_ids]))
         far = np.linalg.norm(pose[:, :3] - here[:, :3], axis=1) > self.rigid.parameters.support_snap_distance
@@ -250,14 +259,15 @@ class SupportTracker:
         self.set_states(object_ids, here + np.where(far, 1.0, blend)[:, None] * (there - here), velocity)
 
     def set_at_rest(self, object_id: int, support: str, relative: np.ndarray) -> None:
-        """Set an object at rest at ``relative`` [7] in a support's frame, on behalf of its owner."""
+        """Set an object at rest with the pose ``relative`` [7] in a support's frame, because the client that owns the
+        object has sent this."""
         row = self._row_of(object_id)
         self._support[row] = self._body_of_support(support)
         self._anchor_pose[row] = relative
         self._still_steps[row] = self._rest_steps
 
     def set_moving(self, object_ids: list[int]) -> None:
-        """Mark objects as moving, on behalf of their owner."""
+        """Mark objects as moving, because the client that owns them has sent this."""
         rows = [self._row_of(object_id) for object_id in object_ids]  # before the tables are used: it may rebuild them
         self._still_steps[rows] = 0
 
@@ -278,7 +288,7 @@ class SupportTracker:
         return pose
 
     def _relative(self, pose: np.ndarray, support: np.ndarray) -> np.ndarray:
-        """World poses ``pose`` [k, 7] expressed in the frames of the MuJoCo bodies ``support`` [k]."""
+        """Returns the world poses ``pose`` [k, 7] expressed in the frames of the MuJoCo bodies ``support`` [k]."""
         moves = np.flatnonzero(support)
         if len(moves) == 0:
             return pose
@@ -286,7 +296,7 @@ class SupportTracker:
         relative = pose.copy()
         frame = np.concatenate([d.xpos[support[moves]], frames.from_wxyz(d.xquat[support[moves]])], -1)
         row = self._row_of_body[support[moves]]
-        free = np.flatnonzero(row >= 0)  # poses of objects are in qpos: no kinematics needed
+        free = np.flatnonzero(row >= 0)  # poses of objects are in qpos and need no forward kinematics
         frame[free] = self._poses(row[free])
         relative[moves] = frames.compose(frames.inverse(frame), pose[moves])
         return relative
@@ -301,7 +311,8 @@ class SupportTracker:
         return np.where(shaken[:, None], SHAKEN_BAND, np.where(carried[:, None], CARRIED_BAND, STILL_BAND))
 
     def _find_touching_pairs(self) -> np.ndarray:
-        """[k, 2] Row and MuJoCo body of all contacts of the last step; contacts of two objects are listed twice."""
+        """Returns the contacts of the last step as pairs [k, 2] of an object's row and the touching MuJoCo body. A
+        contact between two objects is listed twice."""
         m = self.rigid.mj_model
         d = self.rigid.mj_data
         if d.ncon == 0:
@@ -314,7 +325,8 @@ class SupportTracker:
         return np.stack([each // m.nbody, each % m.nbody], -1)
 
     def _find_supports(self, rows: np.ndarray, inside: np.ndarray) -> np.ndarray:
-        """Supports of ``rows`` [k] as MuJoCo bodies [k]; ``inside`` [object]: whether each is still in its band."""
+        """Returns the supports, as MuJoCo bodies [k], of the objects ``rows`` [k]. ``inside`` [object]: whether each
+        object is still in its band."""
         count = len(self.object_ids)
         row, other = self._touching_pairs.T
         kind = self._kind_of_body[other]
@@ -331,7 +343,7 @@ class SupportTracker:
         on_bunch = self._kind_of_body[other] == _BUNCH
         upper = row[on_bunch]
         lower = self._row_of_body[other[on_bunch]]
-        for _ in range(count):  # an object on a bunch has the support of that bunch
+        for _ in range(count):  # an object on a bunch gets the support of that bunch
             supported = (found[upper] == _NONE) & (found[lower] != _NONE) & bunch[upper]
             if not supported.any():
                 break
@@ -343,7 +355,7 @@ class SupportTracker:
         return np.where(keep, self._support, np.where(found == _NONE, 0, found))[rows]
 
     def _rebuild_tables(self) -> None:
-        """Build the tables for MuJoCo's present model, transferring the supports of objects by name."""
+        """Build the tables for MuJoCo's present model. Objects keep their supports, which are matched by name."""
         rigid = self.rigid
         m = rigid.mj_model
         rigid.update_kinematics()
@@ -400,12 +412,12 @@ class SupportTracker:
         return next(name for name, other in self._body_named.items() if other == body)
 
     def _body_of_support(self, support: str) -> int:
-        """The MuJoCo body of a support; the ground's if it does not exist."""
+        """Returns the MuJoCo body of a support; 0 (the ground) if the support does not exist."""
         return self._body_named.get(support, 0)
 
 
 def _is_outside_band(a: np.ndarray, b: np.ndarray, band: np.ndarray) -> np.ndarray:
-    """Whether poses ``a`` and ``b`` [k, 7] differ by more than ``band`` [k, 2] m, rad [k] bool."""
+    """Returns [k] bool: whether poses ``a`` and ``b`` [k, 7] differ by more than ``band`` [k, 2] m, rad."""
     offset = a[:, :3] - b[:, :3]
     chord = np.minimum(np.square(a[:, 3:] - b[:, 3:]).sum(1), np.square(a[:, 3:] + b[:, 3:]).sum(1))
     return (np.square(offset).sum(1) > np.square(band[:, 0])) | (chord > np.square(0.5 * band[:, 1]))

@@ -1,4 +1,4 @@
-"""Warp kernels. Their inputs and outputs are plain arrays; each docstring says what one thread does."""
+"""Warp kernels. Inputs and outputs are plain arrays; the docstring of each kernel states what one thread does."""
 
 import logging
 import os
@@ -8,13 +8,14 @@ import warp as wp
 
 
 def use_temporary_cache(reason: object) -> None:
-    """Keep compiled kernels in a temporary folder, for this process and the processes that it starts.
+    """Store compiled kernels in a temporary folder, for this process and its child processes, and log a warning.
 
-    Logs one warning.
+    ``reason``: why Warp's cache cannot be written, for the log.
     """
     folder = tempfile.mkdtemp(prefix="vinesim-kernels-")
     logging.getLogger(__name__).warning(
-        "compiled kernels are kept in %s for this time, as Warp's cache cannot be written (set WARP_CACHE_PATH): %s",
+        "compiled kernels are stored in %s for this run only, because Warp's cache cannot be written "
+        "(set WARP_CACHE_PATH to a writable folder): %s",
         folder,
         reason,
     )
@@ -24,10 +25,10 @@ def use_temporary_cache(reason: object) -> None:
 
 
 def _start_warp() -> None:
-    """Start Warp without its greeting (standard output belongs to the command) and without its message about a missing
-    GPU.
+    """Initialise Warp without its greeting on standard output and without its warning about a missing GPU.
 
-    A missing GPU is no reason to warn. Everything else that Warp writes to standard error is passed on.
+    Standard output is reserved for the results of commands, and vinesim also runs without a GPU. All other text that
+    Warp writes to standard error is passed on.
     """
     level = max(wp.config.log_level, wp.LOG_WARNING)
     wp.config.log_level = wp.LOG_ERROR
@@ -39,7 +40,7 @@ def _start_warp() -> None:
                 wp.init()
             except OSError as error:  # Warp's cache folder cannot be created
                 use_temporary_cache(error)
-                wp.config.kernel_cache_dir = None  # as the environment has it, in all processes alike
+                wp.config.kernel_cache_dir = None  # then WARP_CACHE_PATH decides, which child processes inherit
                 wp.init()
         finally:
             os.dup2(standard_error, 2)

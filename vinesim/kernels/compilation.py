@@ -1,8 +1,8 @@
-"""Compilation of kernels before they are needed: each module once, by processes on all cores, with progress.
+"""Compilation of kernels before their first launch: each module once, by processes on all cores, with progress.
 
-Warp compiles a module at its first launch and keeps the result on disk. Processes that start together would each
-compile the same modules, in silence and one after the other. With :func:`compile_kernels` the first of them starts
-compilers, and each of them waits only for the modules that it needs.
+Warp compiles a module at its first launch and caches the result on disk. Without this module, processes that start
+together would each compile the same modules one after another, without a message. With :func:`compile_kernels` the
+first process starts compiler processes, and every process waits only for the modules that it needs.
 """
 
 from __future__ import annotations
@@ -45,20 +45,20 @@ PHYSICS_PACKAGES = (
 SENSOR_PACKAGES = ("raster", "lidar", "stereo", "shading")
 """Packages of the kernels of cameras and lidars."""
 TIMEOUT = 600.0
-"""[s] How long other processes may take to compile before this process compiles as well."""
+"""Time [s] to wait for compilers of other processes before this process starts its own."""
 MAX_COMPILERS = 12
-"""Largest number of compilers. More would only wait for the longest module."""
+"""Largest number of compiler processes. More would not be faster, because the longest module takes as long."""
 NICENESS = 10
-"""Niceness of compilers while they compile modules that nothing waits for: loops of running clients come first."""
+"""Niceness of compilers while they compile modules for later, so that running clients have priority."""
 ATTEMPTS = 2
-"""Number of compilers to which a module is given in turn if they die while compiling it."""
+"""Number of attempts to compile a module if the compiler process dies."""
 POLL_PERIOD = 0.05
-"""[s] Time between two checks of what other processes have compiled."""
+"""Time [s] between two checks for modules that other processes have compiled."""
 LEFTOVER_AGE = 3600.0
-"""[s] Age from which a compiler's working folder is taken to be left over from a killed compiler."""
+"""Age [s] from which a compiler's working folder is deleted, as a leftover of a killed compiler."""
 _PREFIX = "vinesim.kernels."
 _KERNEL = re.compile(rb"^@wp\.kernel|_kernel\(__name__,", re.MULTILINE)
-"""Matches the definition of a kernel in a module's source."""
+"""Regular expression that matches the definition of a kernel in a module's source."""
 _CUDA_ONLY = (
     "plants.lean_prediction",
     "contact.tree_delassus",
@@ -81,18 +81,18 @@ _CPU_ONLY = (
     "wires.wire_contacts",
     "wires.wire_shapes",
 )
-"""Modules whose kernels are never launched on a GPU; some have vectors of a CPU in native code."""
+"""Modules whose kernels are never launched on a GPU; some contain native code with CPU vectors."""
 
 
 def compile_kernels(packages: Sequence[str] = (), device: str = "cpu", *, then: Sequence[str] = ()) -> int:
-    """Return when the kernels of some ``packages`` of :mod:`vinesim.kernels` are compiled, of all unless given.
+    """Wait until the kernels of ``packages`` of :mod:`vinesim.kernels` (all by default) are compiled.
 
-    For the CPU always, and for ``device`` (``"cpu"``, ``"cuda"``, ``"cuda:N"``; it must be there). Returns how many
-    modules this process had compiled for the CPU meanwhile: 0 where others compile, and where all are in Warp's cache,
-    which takes a few milliseconds to find. If it starts compilers, those also compile the packages in ``then``, after
-    the others and without being waited for, as long as this process runs.
+    They are compiled for the CPU, and also for ``device`` (``"cpu"``, ``"cuda"``, ``"cuda:N"``), which must exist.
+    Returns the number of modules that compilers of this process compiled for the CPU: 0 if other processes compile
+    them, or if all are in Warp's cache, which takes a few milliseconds to check. Compilers of this process afterwards
+    compile the packages in ``then``, while this process runs on without waiting for them.
 
-    A module that cannot be compiled is logged; Warp tries again at its first launch, and raises what is wrong with it.
+    A module that cannot be compiled is logged; Warp compiles it again at its first launch and raises the error.
     """
     if device != "cpu":
         with disk_cache.exclusive("kernels-cuda", TIMEOUT, waiting_for="another process that compiles kernels"):
@@ -117,7 +117,7 @@ def compile_kernels(packages: Sequence[str] = (), device: str = "cpu", *, then: 
                 if lock is not None:
                     missing = compiled.missing(names)
                     compilers = Compilers(missing, compiled.missing(later), compiled, lock)
-                elif not missing:  # others compile what comes later
+                elif not missing:  # another process compiles the modules for later
                     break
             if compilers is not None and not compilers.awaited(missing):
                 break
@@ -127,8 +127,9 @@ def compile_kernels(packages: Sequence[str] = (), device: str = "cpu", *, then: 
 
 
 class CompiledModules:
-    """Tells which modules of this version of the kernels are in Warp's cache, where each has a file that names its
-    folder.
+    """The list of compiled modules in Warp's cache, for this version of the kernels.
+
+    For each compiled module, the cache contains a small file with the name of the module's folder.
     """
 
     def __init__(self) -> None:
@@ -139,7 +140,7 @@ class CompiledModules:
         self._folder = self._cache / f"vinesim-{h.hexdigest()}"
 
     def missing(self, names: Sequence[str]) -> list[str]:
-        """Returns the modules of ``names`` that are not in the cache, in their order."""
+        """Returns the modules in ``names`` that are not in Warp's cache, in the order of ``names``."""
         return [name for name in names if not self._is_there(name)]
 
     def _is_there(self, name: str) -> bool:
@@ -149,15 +150,15 @@ class CompiledModules:
             return False
 
     def add(self, name: str, folder: str) -> None:
-        """Record that a module is in a ``folder`` of Warp's cache."""
-        with contextlib.suppress(OSError):  # then the next start looks again
+        """Record that module ``name`` is compiled, in ``folder`` of Warp's cache."""
+        with contextlib.suppress(OSError):  # without the record the module is compiled again at the next start
             self._folder.mkdir(exist_ok=True)
             draft = self._folder / f"{name}.{os.getpid()}.part"
             draft.write_text(folder)
             draft.replace(self._folder / name)
 
     def delete_leftovers(self) -> None:
-        """Delete the folders of compilers that were killed while they compiled."""
+        """Delete the working folders of compilers that were killed while they compiled."""
         for folder in self._cache.glob(f"wp_{_PREFIX}*_p[0-9]*_t[0-9]*"):
             with contextlib.suppress(OSError):
                 if time.time() - folder.stat().st_mtime > LEFTOVER_AGE:
@@ -165,14 +166,15 @@ class CompiledModules:
 
 
 class Compilers:
-    """Processes that compile modules, one after the other each, in threads of this process that feed them."""
+    """A pool of compiler processes. Each one is served by a thread of this process and compiles one module at a
+    time."""
 
     def __init__(
         self, names: Sequence[str], later: Sequence[str], compiled: CompiledModules, lock: contextlib.ExitStack
     ) -> None:
-        """Start to compile the modules ``names`` in their order, then those of ``later``, while loops may run already.
+        """Start to compile the modules ``names`` in this order, then the modules ``later`` at low priority.
 
-        The ``lock`` is held until all are done.
+        ``compiled``: records of compiled modules; ``lock``: closed when all modules are compiled.
         """
         self._compiled = compiled
         names = [*names, *later]
@@ -191,23 +193,24 @@ class Compilers:
             threading.Thread(target=self._feed, name=f"compiler {number}", daemon=True).start()
 
     def awaited(self, names: Sequence[str]) -> list[str]:
-        """Returns the modules of ``names`` that are yet to be compiled. The others are compiled or have failed."""
+        """Returns the modules in ``names`` that are still to be compiled. All others are compiled or have failed."""
         with self._state:
             return [name for name in names if name in self._awaited]
 
     def count(self, names: Sequence[str]) -> int:
-        """Returns how many modules of ``names`` were compiled."""
+        """Returns the number of modules in ``names`` that this pool has compiled."""
         with self._state:
             return len(self._done.intersection(names))
 
     def _feed(self) -> None:
-        """Let one process compile the next module until none is left. Start another process if it dies."""
+        """Send modules to one compiler process until none is left; start another process if it dies (one thread
+        each)."""
         process = None
         try:
             while (name := self._next()) is not None:
                 process = process or _start_compiler()
                 if name in self._later and hasattr(os, "setpriority"):
-                    with contextlib.suppress(OSError):  # it has just died
+                    with contextlib.suppress(OSError):  # the process has just died
                         os.setpriority(os.PRIO_PROCESS, process.pid, NICENESS)
                 answer = _ask(process, name)
                 if answer is None:
@@ -220,7 +223,7 @@ class Compilers:
                     self._compiled.add(name, answer["folder"])
                     self._end(name)
         except OSError as error:  # no process could be started
-            log.warning("kernels cannot be compiled beforehand: %s", error)
+            log.warning("kernels cannot be compiled in advance (no compiler process starts): %s", error)
         finally:
             if process is not None:
                 _close(process)
@@ -245,7 +248,7 @@ class Compilers:
 
     def _end(self, name: str, failure: str = "") -> None:
         if failure:
-            log.warning("%s was not compiled beforehand: %s", name, failure)
+            log.warning("kernel module %s was not compiled in advance: %s", name, failure)
         with self._state:
             self._awaited.discard(name)
             if not failure:
@@ -253,9 +256,7 @@ class Compilers:
 
 
 def _start_compiler() -> subprocess.Popen[str]:
-    """Start :mod:`vinesim.kernels.compiler_process` in a process group of its own, so that Ctrl-C reaches this process
-    only.
-    """
+    """Start :mod:`vinesim.kernels.compiler_process` in its own process group, so that Ctrl-C does not reach it."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     return subprocess.Popen(
         [sys.executable, "-P", "-m", "vinesim.kernels.compiler_process"],
@@ -268,7 +269,8 @@ def _start_compiler() -> subprocess.Popen[str]:
 
 
 def _ask(process: subprocess.Popen[str], name: str) -> dict[str, str] | None:
-    """Returns the answer of a compiler for a module; None if the compiler has died."""
+    """Let a compiler process compile module ``name``. Returns its answer (``folder`` or ``failure``); None if it
+    died."""
     assert process.stdin is not None
     assert process.stdout is not None
     try:
@@ -285,9 +287,9 @@ def _close(process: subprocess.Popen[str]) -> None:
 
 
 def _compile_for_gpu(names: Sequence[str], device: str) -> None:
-    """Compile modules on all cores, or load them if they are compiled.
+    """Compile modules for a GPU in threads on all cores, or load them if they are compiled.
 
-    Warp's compiler releases the interpreter lock.
+    Threads suffice, because Warp's CUDA compiler releases Python's interpreter lock.
     """
     modules = [wp.get_module(importlib.import_module(_PREFIX + name).__name__) for name in names]
     with ProgressLine() as line, concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
@@ -298,11 +300,10 @@ def _compile_for_gpu(names: Sequence[str], device: str) -> None:
 
 
 def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ONLY) -> list[str]:
-    """Returns all modules of some packages of :mod:`vinesim.kernels` that define kernels; of all packages by default.
+    """Returns the names of all modules with kernels in ``packages`` of :mod:`vinesim.kernels` (all by default).
 
-    ``packages`` may name single modules, too.
-
-    Long modules roughly come first, so that no core waits for the last one.
+    ``packages`` may also contain names of single modules; modules in ``without`` are left out. Modules are roughly
+    sorted from long to short, so that no core waits for a long last one.
     """
     found = {
         name: len(source)
@@ -316,13 +317,13 @@ def module_names(packages: Sequence[str] = (), without: Sequence[str] = _CUDA_ON
 
 @functools.cache
 def _sources() -> dict[str, bytes]:
-    """Returns the source of each module of the package, by its name relative to the package."""
+    """Returns the source of each module of :mod:`vinesim.kernels`, by its dotted name relative to that package."""
     root = pathlib.Path(vinesim.kernels.__path__[0])
     return {
         ".".join(file.relative_to(root).with_suffix("").parts): file.read_bytes() for file in sorted(root.rglob("*.py"))
     }
 
 
-if __name__ == "__main__":  # all, for tools/setup
+if __name__ == "__main__":  # compile all kernels, for tools/setup
     progress.show_on(sys.stderr)
     compile_kernels()

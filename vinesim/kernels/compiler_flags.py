@@ -3,5 +3,5 @@
 import warp as wp
 
 INLINE_ALL = (wp.config.cpu_compiler_flags or "").replace("-inline-threshold=9000", "-inline-threshold=100000")
-"""Warp's flags, but functions of any size are inlined: loops with calls are not vectorised, and calls copy all structs.
+"""Warp's compiler flags with a higher inlining limit: LLVM does not vectorise loops with calls, and calls copy structs.
 """

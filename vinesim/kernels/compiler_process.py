@@ -1,7 +1,7 @@
-"""A process that compiles kernel modules for the CPU. It reads names of modules from its input, and answers each.
+"""A process that compiles kernel modules for the CPU. It reads module names from standard input and answers each one.
 
-Warp generates code and compiles it under locks, so that threads of one process mostly compile one module at a time. The
-process ends when its input ends, even while it compiles, so it never outlives the process that started it.
+Several processes are used, because Warp compiles under locks, so that threads of one process would mostly compile one
+module at a time. The process exits when its input ends, even while it compiles, so it never outlives its parent.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ import threading
 
 
 def main() -> None:
-    """Answer each line, the name of a module, with a line of JSON: the folder of the compiled module, or the failure."""
+    """Compile the module named by each line of standard input, and print a line of JSON with ``folder`` or
+    ``failure``."""
     answers = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # all other output goes to standard error
     # a folder of its own, so that the compiler's files are deleted however the process ends
@@ -31,12 +32,12 @@ def main() -> None:
             answer = {"folder": _compile(name)}
         except Exception as error:
             answer = {"failure": f"{type(error).__name__}: {' '.join(str(error).split())}"}
-        with contextlib.suppress(BrokenPipeError):  # then the input has ended too
+        with contextlib.suppress(BrokenPipeError):  # the parent has ended; the end of the input ends this process
             print(json.dumps(answer), file=answers, flush=True)
 
 
 def _read(names: queue.SimpleQueue[str]) -> None:
-    """Queue the lines of the input. End the process when the input ends."""
+    """Put the lines of standard input into the queue ``names``; exit the process when the input ends."""
     for line in sys.stdin:
         names.put(line.strip())
     shutil.rmtree(tempfile.gettempdir(), ignore_errors=True)
@@ -44,7 +45,7 @@ def _read(names: queue.SimpleQueue[str]) -> None:
 
 
 def _compile(name: str) -> str:
-    """Compile a module unless it is compiled already. Returns its folder in Warp's cache."""
+    """Compile module ``name`` unless it is compiled already. Returns the module's folder in Warp's cache."""
     import warp as wp
 
     module = wp.get_module(importlib.import_module(name).__name__)

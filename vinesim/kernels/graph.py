@@ -1,7 +1,9 @@
-"""Sequences of kernels on fixed arrays. A sequence is captured once into a Warp graph, then replayed by one call.
+"""Sequences of kernel launches on fixed arrays. A sequence is captured once into a Warp graph, then replayed by one
+call.
 
-``wp.launch`` packs the arguments of a kernel at every launch: 10 us for twenty arguments, longer than most of our
-kernels run. A graph keeps them packed: 0.2 us a kernel, and 1.4 us for the call (docs/decisions/kernel-graphs.md).
+``wp.launch`` packs the arguments of a kernel at every launch: 10 us for twenty arguments, which is longer than most
+kernels of vinesim run. A graph stores packed arguments: 0.2 us a kernel, and 1.4 us for the call
+(docs/decisions/kernel-graphs.md).
 
 The number of threads of a launch is part of its graph. The number of items is therefore stored in an array, ``count``
 [1] int32, which NumPy or an earlier kernel of the sequence writes. A kernel has at least as many threads as items, and
@@ -19,48 +21,48 @@ from typing import Any
 import warp as wp
 
 TIERS = (64, 1024, 16384, 262144, 4194304)
-"""Numbers of threads for which graphs are captured.
+"""Numbers of threads for which a sequence has graphs.
 
-TUNED: capturing a launch takes 0.3 ms, so there should be few; threads without work take a hundredth of the time of the
-others.
+TUNED: capturing a launch takes 0.3 ms, so there should be few numbers; a thread without work takes a hundredth of the
+time of a thread with work.
 """
 THREADS_PER_BLOCK = 32
-"""CUDA threads in a block.
+"""Number of CUDA threads in a block.
 
-One thread is one tree and runs long; small blocks spread few trees over all multiprocessors.
+One thread simulates one tree and runs long; small blocks spread few trees over all multiprocessors.
 """
 
 _capturing = threading.Lock()
-"""Lock: Warp captures one graph at a time.
+"""Lock of graph captures, because Warp can capture only one graph at a time.
 
-No other thread may call ``wp.launch`` during a capture, because it would write to a table that Warp keeps for the
-graph.
+No other thread may call ``wp.launch`` during a capture, because that would write to a table of the captured graph.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class KernelLaunch:
-    """A kernel and its arguments: numbers, structs, and arrays that keep their memory."""
+    """One launch in a sequence: a kernel and its arguments (numbers, structs, and arrays whose addresses never
+    change)."""
 
     kernel: wp.Kernel
     inputs: Sequence[Any]
     outputs: Sequence[Any] = ()
     threads: int | None = None
-    """Number of threads. None: one for each item; the kernel reads the number of items."""
+    """Number of threads; None: one for each item, where the kernel itself reads the number of items from an array."""
     width: int = 1
-    """Threads for each item: the second dimension of ``wp.tid()`` if there are several."""
+    """Number of threads for each item; if above 1, the second dimension of ``wp.tid()``."""
     block: int = THREADS_PER_BLOCK
-    """Threads in a block, on CUDA."""
+    """Number of threads in a CUDA block."""
 
     def launch(self, items: int, device: wp.Device) -> None:
-        """Launch the kernel with room for ``items`` items."""
+        """Launch the kernel with enough threads for ``items`` items."""
         rows = items if self.threads is None else self.threads
         dim = rows if self.width == 1 else (rows, self.width)
         wp.launch(self.kernel, dim, inputs=self.inputs, outputs=self.outputs, device=device, block_dim=self.block)
 
 
 class KernelGraph:
-    """Kernel launches that run one after the other."""
+    """A sequence of kernel launches that one call runs in order, as a captured Warp graph."""
 
     def __init__(self, *launches: KernelLaunch, device: str = "cpu") -> None:
         self._launches = launches
@@ -69,12 +71,13 @@ class KernelGraph:
         self._graphs: dict[int, Any] = {}
         self._graph: Any = None
         self._room = range(0)
-        """The capacities for which the graph of the last call was captured."""
+        """Range of capacities that the graph of the last call can serve."""
 
     def __call__(self, capacity: int = 1) -> None:
-        """Run the launches. No count that their kernels read may be above ``capacity``.
+        """Run the launches in order; the numbers of items that their kernels read must not exceed ``capacity``.
 
-        On CUDA the launches are only queued. Within a capture of the caller they become part of that capture.
+        On CUDA the call returns when the launches are queued. If the caller is capturing a graph, the launches become
+        part of it.
         """
         if self._is_cuda and self._device.is_capturing:
             self._launch(tier_of(capacity).stop - 1)
@@ -98,10 +101,13 @@ class KernelGraph:
 
 
 def tier_of(capacity: int) -> range:
-    """Returns the capacities that share a graph with this one. :class:`ValueError` beyond the last of :data:`TIERS`."""
+    """Returns the range of capacities that share one graph with ``capacity``.
+
+    Raises :class:`ValueError` if ``capacity`` exceeds the last of :data:`TIERS`.
+    """
     least = 0
     for most in TIERS:
         if capacity <= most:
             return range(least, most + 1)
         least = most + 1
-    raise ValueError(f"{capacity} items for one launch: there is room for {TIERS[-1]}")
+    raise ValueError(f"{capacity} items in one launch; the largest number is {TIERS[-1]}")

@@ -1,9 +1,9 @@
-"""Time of a world: it passes as fast as all clients that simulate can follow, and at most in real time; pure.
+"""Clock of a world: its time passes as fast as all clients that simulate can follow, and at most in real time. No I/O.
 
 Clients report the time that their steps have reached, and the largest real-time factor that they could follow. The
-factor of the world falls at once to the smallest of these, and rises slowly. A client that falls behind nevertheless
-slows the clock within half a second of simulated time, so that it need not skip steps. A client that reports nothing
-for :data:`SILENCE` is left behind: it does not slow the others any more, until it has caught up.
+factor of the world falls quickly to the smallest of the reported factors, and rises slowly. If a client falls behind
+nevertheless, the clock slows down within half a second of simulated time, so that the client need not skip steps. A
+client that reports nothing for :data:`SILENCE` is left behind: the world does not wait for it until it has caught up.
 """
 
 from __future__ import annotations
@@ -25,83 +25,86 @@ can only just follow."""
 LEAST_RISE = 0.04
 """Lowest rate at which the factor rises [1/s]."""
 FREE_LAG = 0.15
-"""A client that is less than this behind does not slow the clock [s of the world]: messages take some time."""
+"""Time of the world [s] by which a client may be behind without slowing the clock, because messages take some time."""
 STOP_LAG = 0.5
-"""The factor is :data:`MIN_FACTOR`, so that the clock almost stops, if a client is this far behind [s of the world]."""
+"""Time of the world [s] by which a client is behind when the factor is reduced to :data:`MIN_FACTOR`."""
 OVERDUE = 0.6
-"""A client that has reported nothing for this long is taken to have stopped [s]; it reports five times a second."""
+"""Time without a report after which a client is assumed to have stopped [s]. Clients report five times a second."""
 SILENCE = 3.0
-"""A client that has reported nothing for this long is left behind [s]."""
+"""Time without a report after which a client is left behind: the world does not wait for it any more [s]."""
 STEP = 0.05
-"""Longest real time for which the clock runs at a constant factor [s]."""
+"""Longest real time for which the factor of the world stays constant [s]."""
 
 
 SHOWN_FACTOR = 0.995
-"""A real-time factor of at least this is shown as real time."""
+"""Smallest real-time factor that is shown as real time."""
 
 
 def describe(factor: float, cause: str) -> str:
-    """Text for a status line with a real-time factor and what limits it: "0.43 of real time (picker: sensors)". It is
-    "" for real time."""
+    """Returns the text of a status line with the real-time factor and what limits it: "0.43 of real time (picker:
+    sensors)". The text is empty for real time."""
     if factor >= SHOWN_FACTOR:
         return ""
     return f"{factor:.2f} of real time" + (f" ({cause})" if cause else "")
 
 
 MAX_STEP = 4.0 * STEP
-"""Longest time that two successive calls of :meth:`WorldClock.advance` add to the silence of clients [s]."""
+"""Longest time that one call of :meth:`WorldClock.advance` adds to the silence of clients [s]."""
 
 
 class PaceReport(NamedTuple):
     """Report of one client to the clock of its world."""
 
     time: float
-    """Time of the world that its steps have reached [s]."""
+    """Time of the world that the client's steps have reached [s]."""
     factor: float
-    """Largest real-time factor that the client can follow; may be above 1."""
+    """Largest real-time factor that the client can follow. May be above 1."""
     cause: str = ""
-    """What limits this factor: "steps", "sensors", "ROS messages"."""
+    """What limits the factor: "steps", "sensors" or "ROS messages"."""
 
 
 @dataclasses.dataclass
 class _Client:
+    """The last report of a client, and how far the client is behind the clock of the world."""
+
     report: PaceReport
     arrived: float
-    """Real time of its last report [s]."""
+    """Real time at which the last report arrived [s]."""
     lag: float
-    """How far it is behind [s of the world]."""
+    """Time of the world by which the client is behind [s]."""
     silence: float = 0.0
-    """Time since its last report [s]. Time in which this clock itself got no processor does not count."""
+    """Real time since the last report [s], without times in which the server itself did not run."""
     is_left_behind: bool = False
 
 
 class WorldClock:
-    """The clock of one world. ``now`` is real time, of any monotonic clock [s]."""
+    """The clock of one world. All arguments ``now`` are real time [s] of one monotonic clock."""
 
     def __init__(self, now: float, time: float = 0.0, factor: float | None = None) -> None:
-        """The world begins at ``time`` [s]. ``factor``: a fixed real-time factor; None: as the clients can follow."""
+        """``time``: time of the world at ``now`` [s]. ``factor``: fixed real-time factor; None: as fast as clients can
+        follow."""
         self.is_fixed = factor is not None
         self.factor = 1.0 if factor is None else factor
-        """Present real-time factor of the world: seconds of its time in a second of real time."""
+        """Present real-time factor of the world: seconds of simulated time in a second of real time."""
         self.cause = ""
         """Client that limits the factor, and the cause: "picker: sensors". Empty while nothing limits it."""
         self._time = time
         self._now = now
         self._pace = self.factor
-        """The factor before it is reduced for clients that are behind."""
+        """Real-time factor before it is reduced for clients that are behind."""
         self._clients: dict[str, _Client] = {}
 
     @property
     def left_behind(self) -> list[str]:
-        """Clients that are left behind, sorted."""
+        """Names of the clients for which the world does not wait any more, sorted."""
         return sorted(name for name, one in self._clients.items() if one.is_left_behind)
 
     def time(self, now: float) -> float:
-        """Time of the world at ``now`` [s], not earlier than the last :meth:`advance`."""
+        """Returns the time of the world [s] at ``now`` [s], which is not earlier than the last :meth:`advance`."""
         return self._time + self.factor * (now - self._now)
 
     def report(self, name: str, now: float, report: PaceReport) -> None:
-        """Take a report of a client that arrived at ``now`` [s]."""
+        """Take a report that arrived from the client ``name`` at ``now`` [s]."""
         self.advance(now)
         lag = max(self._time - report.time, 0.0)
         before = self._clients.get(name)
@@ -115,8 +118,8 @@ class WorldClock:
         self._clients.pop(name, None)
 
     def advance(self, now: float) -> None:
-        """Advance to real time ``now`` [s]. Call it several times a second."""
-        for client in self._clients.values():  # a machine that starves the server starves its clients, too
+        """Advance the clock to real time ``now`` [s] and adapt its factor. Must be called several times a second."""
+        for client in self._clients.values():  # if the server does not run, its clients may not either
             client.silence += min(now - self._now, MAX_STEP)
         while self._now < now:
             step = min(STEP, now - self._now)
@@ -128,7 +131,10 @@ class WorldClock:
                 self._adapt(step)
 
     def _watch(self, name: str, client: _Client, step: float) -> None:
-        """Update the lag of a client without a new report, and leave it behind after :data:`SILENCE`."""
+        """Increase the lag of a client that does not report, and leave it behind after :data:`SILENCE`.
+
+        ``step``: real time that has passed [s].
+        """
         if self._now - client.arrived > OVERDUE:
             client.lag += self.factor * step
         if client.silence > SILENCE and not client.is_left_behind:
@@ -136,7 +142,7 @@ class WorldClock:
             log.warning("%s has not answered for %.0f s: the world goes on without waiting for it", name, SILENCE)
 
     def _adapt(self, step: float) -> None:
-        """Choose the factor for the next time step, and note its cause."""
+        """Choose the real-time factor after ``step`` [s] of real time, and note what limits it."""
         limit = 1.0
         brake = 1.0
         limited_by = braked_by = ""

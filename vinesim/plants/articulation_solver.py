@@ -1,16 +1,17 @@
 """Articulation solver: all plants of a vineyard as trees of bodies on ball joints, stepped with implicit springs.
 
-One step of the plants alone is ``predict()`` then ``integrate()``. A contact solver works in between: it reads
-``state.body_q`` and ``velocity_free``, asks for the ``impulse_response()`` of the bodies in contact, and integrates
-with the wrenches that it found. Trees that sleep cost nothing.
+One step of the plants alone is ``predict()`` then ``integrate()``. Between the two calls a contact solver reads
+``state.body_q`` and ``velocity_free``, and computes contact wrenches with the ``impulse_response()`` of the bodies in
+contact. It passes these wrenches to ``integrate()``. Sleeping trees take no time.
 
-A tree with berry clusters is *coarse* (each bunch one compound, its clusters riding on it) until ``refine()`` lets them
-move and ``coarsen()`` locks them again. ``cut()`` makes a body the floating root of what grows on it. All three are
-called between steps, after ``integrate()`` and before the next ``predict()``.
+A tree with berry clusters is *coarse* or *fine*. In a coarse tree each bunch is one compound body, to which its
+clusters are locked. In a fine tree the clusters move. ``refine()`` makes a tree fine, ``coarsen()`` makes it coarse
+again. ``cut()`` detaches a body from its parent; the body becomes a floating root that carries its descendants. All
+three are called between steps, after ``integrate()`` and before the next ``predict()``.
 
 The scheme (:mod:`vinesim.kernels.plants`) damps as if every joint's beta (damping / stiffness) were larger by
-``(2 phi - 1) dt``, so the solver subtracts that amount from the model's damping, down to zero: trees then show the
-damping that the model asks for.
+``(2 phi - 1) dt``, so the solver subtracts that amount from the model's damping, down to zero. The total damping is
+then the model's.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.errors import checked_index
-from vinesim.core.warp_arrays import share
+from vinesim.core.warp_arrays import share, struct_fields
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants import first_mode, structs
 from vinesim.kernels.plants.eight_trees import LANES, RECORD, predict_groups
@@ -67,7 +68,8 @@ _DIVIDED_FLOATING = 6
 _NEXT_LEVEL = 7
 _LEVELS = 8
 _COUNTS = 9
-"""Number of counts. :data:`_NEXT_LEVEL` holds the substep that is next, :data:`_LEVELS` the number of substeps."""
+"""Length of the array of counts. The entry :data:`_NEXT_LEVEL` is the number of the next substep, the entry
+:data:`_LEVELS` the number of substeps of the step."""
 
 _NO_TREES = np.zeros(0, np.int32)
 _NO_WRENCHES = np.zeros((0, 6), np.float32)
@@ -76,26 +78,28 @@ _NO_WRENCHES = np.zeros((0, 6), np.float32)
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
-    ``predict()`` chooses each tree's phi. It is 1 while a joint turns faster than ``fast_rate``; if a joint turned
-    faster than a tenth of ``max_rate``, it stays 1 until all joints have been slower than 0.06 ``max_rate`` for a
-    second. It is 1 for a while after contact began (``contact_onset_duration``), and ``phi`` otherwise.
-    ``impulse_response()`` and ``integrate()`` belong to the ``predict()`` before them.
+    ``predict()`` chooses each tree's phi (the implicitness of the step). phi is 1 while a joint turns faster than
+    ``fast_rate``. After a joint turned faster than a tenth of ``max_rate``, phi stays 1 until all joints have been
+    slower than 0.06 ``max_rate`` for a second. phi is also 1 for the time ``contact_onset_duration`` after contact
+    began. Otherwise it is the argument ``phi``. ``impulse_response()`` and ``integrate()`` use the results of the last
+    ``predict()``.
 
     Args:
-        model: constants; :class:`ValueError` in words if a tree cannot be simulated.
+        model: constants. Raises :class:`ValueError` if a tree cannot be simulated.
         state: its arrays are read and written in place.
         parameters: numbers of the scheme; the arguments that follow replace single numbers and may be infinite.
         dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
-        device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by ones that it can reach: take
-            them from ``state`` after this. Results agree with the CPU's to rounding, not to the bit.
+        device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by arrays that the GPU can
+        reach, so read them from ``state`` after this call. Results agree with the CPU's to rounding, not to the bit.
         fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
             ``PhysicsParameters``, and :mod:`vinesim.plants.fault_guard`.
-        geometric_stiffness: include in the implicit solve the stiffness that weight and pull give to hanging bodies.
+        geometric_stiffness: include in the implicit solve the geometric stiffness of hanging bodies, due to weight and
+        pull.
             Without it a heavy bunch on a soft peduncle gains energy every step. Switch it off only to compare with
             solvers without it.
         substeps: divide the step of trees whose first mode is too fast for it. Switch it off only to compare with other
             solvers.
-        buffers: memory in which arrays live; chosen by ``device`` unless given."""
+        buffers: memory for the arrays; by default chosen for ``device``."""
 
     def __init__(
         self,
@@ -128,7 +132,7 @@ class ArticulationSolver:
         self.max_rate = p.max_joint_rate if max_rate is None else max_rate
         self.fault_rate = p.fault_joint_rate if fault_rate is None else fault_rate
         self.buffers = buffers
-        """The memory in which arrays live, for NumPy and for kernels."""
+        """The solver's arrays, for NumPy and for kernels."""
         self.tick = 0
         """Number of integrations so far."""
         self.ties = TieTable(model, p.max_held_bodies, p.max_hands_per_body)
@@ -139,7 +143,7 @@ class ArticulationSolver:
         numbers = kernel_parameters(p, dt, self.fast_rate, self.max_rate, self.fault_rate, geometric_stiffness)
         self.onset_steps = numbers["contact_steps"] - 1  # steps with phi = 1 after contact began
         self.launches = KernelLaunches(self, numbers, MAX_SUBSTEPS if substeps else 1)
-        """The solver's kernels, with these arrays as arguments."""
+        """The solver's kernels, bound to its arrays."""
         self._runner = StepRunner(
             buffers,
             self.launches,
@@ -175,11 +179,11 @@ class ArticulationSolver:
         self._list_awake()
         self._detach_joints(self.bodies_of(np.unique(model.body_tree[state.body_cut])))
         self.berry_clusters = BerryClusters(self)
-        """Locks and unlocks berry clusters. :class:`DetachmentMonitor` handles bunches that leave their tree."""
+        """Locks and unlocks berry clusters. :class:`DetachmentMonitor` also uses it for bunches that it detaches."""
 
     @property
     def dt(self) -> float:
-        """[s] Duration of a step. It is fixed: kernels, damping and counts of steps are derived from it at the
+        """[s] Duration of a step. It is fixed, because kernels, damping and counts of steps are derived from it at the
         start."""
         return self._dt
 
@@ -190,19 +194,20 @@ class ArticulationSolver:
         trees = len(self.model.tree_first)
         bodies = len(self.model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """[tree] phi asked for each tree; callers may set it. It is 1 where a tie is stiff (``stiff_tie_mass``)."""
+        """[tree] Requested phi of each tree; callers may change it. Trees with a stiff tie (``stiff_tie_mass``) have
+        1."""
         self.phi_used = np.zeros(trees, np.float32)
-        """phi of each tree's last ``predict()`` [tree]."""
+        """[tree] phi that the last ``predict()`` of each tree used."""
         self.awake_list = np.zeros(trees, np.int32)
         self.awake_count = np.zeros(1, np.int32)
-        """[1] Number of entries of ``awake_list`` [tree] that are in use; they are :attr:`awake`. Kernels stay bound to
-        both."""
+        """[1] Number n of awake trees; the first n entries of ``awake_list`` [tree] are these trees. Kernels are bound
+        to both arrays."""
         self.tree_rate = np.zeros(trees, np.float32)
-        """[tree] Length of (fastest joint rate [rad/s], fastest speed of a floating root [m/s]) in the last step. NaN
-        or above ``fault_rate``: the tree was stopped."""
+        """[tree] sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed b [m/s] of a floating root
+        in the last step. If it is NaN or above ``fault_rate``, the tree was stopped."""
         self._fastest = np.zeros(1, np.float32)
         self.tree_substeps = np.ones(trees, np.int32)
-        """[tree] Number of substeps into which the step of each awake tree is divided while nothing holds the tree."""
+        """[tree] Number of substeps into which the step of each awake tree is divided while the tree has no contact."""
         self.tree_budget = np.zeros(trees, np.int32)
         """[tree] How closely the energy of each awake tree is watched: see
         :mod:`vinesim.kernels.plants.energy_budget`."""
@@ -212,16 +217,16 @@ class ArticulationSolver:
         """[body, 6] Wrenches that last until they are changed (wind, a rope): force [N] and moment about the body's
         origin [N m], world axes."""
         self.velocity_free = np.zeros((bodies, 6), np.float32)
-        """Velocity of each body of an awake tree at the end of the step if nothing touches it [body, 6]."""
+        """[body, 6] m/s, rad/s: velocity of each body of an awake tree at the end of the step, without contacts."""
         self.acceleration = np.zeros((bodies, 6), np.float32)
         """Acceleration over the last step [body, 6] m/s^2, rad/s^2, world axes."""
         self.body_mass = model.body_mass.copy()
         self.body_com = model.body_com.copy()
         self.body_inertia = model.body_inertia.copy()
         self.body_drag = model.body_drag.copy()
-        """``body_mass`` to ``body_drag``: mass, centre of mass, inertia and drag of what moves now, in the model's
-        units. The body of a bunch stands for the whole compound while its tree is coarse, and for the bunch's head
-        while the tree is fine; a picked bunch is a stub."""
+        """The arrays from ``body_mass`` to ``body_drag`` are mass, centre of mass, inertia and drag of the bodies as
+        they are now, in the model's units. The body of a bunch has the values of the whole compound while its tree is
+        coarse, and those of the bunch's head while the tree is fine. The body of a picked bunch is a stub."""
         self.body_product = np.zeros((bodies, 3), np.float32)
         """[body, 3] kg m^2: entries yz, zx, xy of the inertia in the body's axes. The inertia of a compound is not
         diagonal."""
@@ -232,12 +237,13 @@ class ArticulationSolver:
         self.tree_moving = np.where(state.tree_fine, model.tree_size, model.tree_core).astype(np.int32)
         """[tree] Number of bodies of each tree that move: all bodies, or all except the berry clusters."""
         self.body_impulse = np.zeros((bodies, 6), np.float32)
-        """[body, 6] N s, N m s: impulses of a plastic impact while it is solved."""
+        """[body, 6] N s, N m s: scratch for the impulses of a plastic impact."""
         self.joint_xd_free = np.zeros((bodies, 3), np.float32)
         self.joint_qd_free = np.zeros((bodies, 3), np.float32)
-        """[body, 3] rad/s: predicted rates of joints; ``joint_xd_free`` [body, 3] m/s: of floating roots."""
+        """[body, 3] rad/s: predicted rates of joints. ``joint_xd_free`` [body, 3] m/s: predicted velocities of floating
+        roots."""
         self._place_in_tree = (np.arange(bodies) - model.tree_first[model.body_tree]).astype(np.int32)
-        # the trees as the kernels see them: a cut-off body has no parent and no lever
+        # the trees as the kernels use them: a cut-off body has no parent and no lever
         self._parent = model.body_parent.copy()
         self._root = np.full(bodies, -1, np.int32)
         self._offset = model.body_offset.copy()
@@ -261,7 +267,7 @@ class ArticulationSolver:
                     setattr(owner, name, self.buffers.pinned(value))
 
     def kernel_arrays(self) -> dict[Any, dict[str, np.ndarray]]:
-        """All arrays that kernels read or write, by element type and name."""
+        """Returns all arrays that kernels read or write, by element type and name."""
         model = self.model
         state = self.state
         ties = self.ties
@@ -338,14 +344,14 @@ class ArticulationSolver:
         return self._awake
 
     def wake(self, trees: np.ndarray | int) -> None:
-        """Let trees move from the next ``predict()`` on; :class:`ValueError` if there is no such tree."""
+        """Wake trees; they move from the next ``predict()`` on. Raises :class:`ValueError` if there is no such tree."""
         trees = checked_trees(trees, len(self.state.tree_awake))
         if not self.state.tree_awake[trees].all():
             self.state.tree_awake[trees] = True
             self._list_awake()
 
     def put_to_sleep(self, trees: np.ndarray | int) -> None:
-        """Put trees to sleep where they are, with zero rates; their poses are brought up to date.
+        """Put trees to sleep in their present pose with zero rates, and update ``body_q`` and ``body_qd``.
 
         :class:`ValueError` if there is no such tree.
         """
@@ -367,40 +373,39 @@ class ArticulationSolver:
         self.awake_list[: len(self._awake)] = self._awake
 
     def awake_trees(self) -> list[wp.array]:
-        """Number of awake trees [1] and their list [tree], for kernels on a CPU, which stay bound to both arrays."""
+        """Returns the number of awake trees [1] and the list of awake trees [tree], as Warp arrays for kernels on a
+        CPU."""
         return [share(self.awake_count, wp.int32), share(self.awake_list, wp.int32)]
 
     def bodies_of(self, trees: np.ndarray) -> np.ndarray:
-        """All bodies of some trees, tree by tree [k]."""
+        """Returns the indices [k] of all bodies of ``trees``, tree by tree."""
         return spans(self.model.tree_first[trees], self.model.tree_size[trees])
 
     # ------------------------------------------------------------------ topology and mass
 
     def refine(self, trees: np.ndarray | int) -> None:
-        """Let the clusters of these trees' bunches move. They start where they are, as fast as the bunch that carries
-        them.
+        """Unlock the berry clusters of these trees' bunches. Each cluster starts with the pose and velocity that it has
+        as part of its bunch.
 
-        Pose, velocity and momentum are continuous. Trees that are fine or have no clusters stay as they are. No tree
+        Pose, velocity and momentum are continuous. Trees that are fine or have no clusters do not change. No tree
         wakes. :class:`ValueError` if there is no such tree.
         """
         self.berry_clusters.refine(trees)
 
     def coarsen(self, trees: np.ndarray | int) -> None:
-        """Lock the clusters of these trees' bunches where they are: each bunch becomes one compound.
+        """Lock the berry clusters of these trees' bunches in their present pose: each bunch becomes one compound body.
 
         No pose changes. The clusters' motion against their bunch ends in a plastic impact that lasts a step. A bunch
-        keeps its angular momentum about its origin. The impulse that its joint must take sets the rest of the tree
-        moving, against springs as in any step (without the springs a light peduncle would be flung about). A floating
-        tree keeps all momentum. Kinetic energy does not grow, measured as the scheme does: the squared rates weighted
-        with the metric.
+        keeps its angular momentum about its origin. The impulse on its joint moves the rest of the tree, and springs
+        resist as in any step (without springs a light peduncle would be flung about). A floating tree keeps all
+        momentum. Kinetic energy does not grow if it is measured with the scheme's implicit inertia.
         """
         self.berry_clusters.coarsen(trees)
 
     def cut(self, body: int) -> None:
-        """Cut a body off its parent: it and what grows on it fall, from where they are and as fast as they are.
+        """Cut a body off its parent. The body and its descendants fall, with their present poses and velocities.
 
-        Its tree wakes; the rest of the tree goes on as before. Indices of bodies never change. :class:`ValueError` if
-        the body cannot be cut.
+        The tree wakes. Indices of bodies never change. Raises :class:`ValueError` if the body cannot be cut.
         """
         model = self.model
         state = self.state
@@ -420,7 +425,7 @@ class ArticulationSolver:
         self.wake(tree)
 
     def _detach_joints(self, bodies: np.ndarray) -> None:
-        """Update which bodies of some whole trees are cut off, from the state."""
+        """Read from the state which bodies are cut off. ``bodies``: all bodies of some trees."""
         cut = bodies[self.state.body_cut[bodies]]
         self._parent[cut] = -1
         self._offset[cut] = 0.0
@@ -434,8 +439,8 @@ class ArticulationSolver:
         self._find_falling(bodies)
 
     def _find_falling(self, bodies: np.ndarray) -> None:
-        """Note which floating components of some whole trees no tie holds; where ties hold one, they damp its
-        rotation."""
+        """Find the floating components that no tie holds, and set the damping with which ties resist the rotation of
+        the held ones. ``bodies``: all bodies of some trees."""
         root = self._root[bodies]
         is_cut = self.state.body_cut[bodies]
         tied = np.isin(bodies, self.ties.tied_bodies)
@@ -447,10 +452,11 @@ class ArticulationSolver:
         self.launches.changed = True
 
     def set_mass(self, body: int, mass: float) -> None:
-        """Give one body another mass [kg] (a picked bunch, a pruned leaf); its inertia scales along.
+        """Set the mass [kg] of one body, for example of a picked bunch or a pruned leaf. The body's inertia scales with
+        the mass.
 
-        For a bunch with clusters ``mass`` is that of the whole bunch, fine or coarse: head and clusters keep their
-        shares.
+        For a bunch with clusters ``mass`` is the mass of the whole bunch, also in a fine tree. Head and clusters keep
+        their shares of it.
         """
         if not 0.0 < mass < math.inf:
             raise ValueError(f"body {body}: mass {mass} kg; leave a stub of a gram")
@@ -459,7 +465,8 @@ class ArticulationSolver:
     # ------------------------------------------------------------------ one step
 
     def predict(self, trees: np.ndarray | None = None) -> None:
-        """Bring ``body_q`` and ``body_qd`` to the start of the step and solve the motion without contacts.
+        """Update ``body_q`` and ``body_qd`` to the start of the step, and compute the motion over the step without
+        contacts.
 
         ``trees`` [k]: predict only these trees, which were woken or given another phi after all trees were predicted.
         """
@@ -477,7 +484,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
-        """How a unit impulse wrench on one body moves another: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
+        """Returns the velocity changes of bodies by unit impulse wrenches: [n, 6, n, 6] in 1/kg, 1/(kg m), 1/(kg m^2).
 
         ``impulse_response[u, :, t, :] @ impulse`` is the velocity that an impulse wrench (N s, N m s, at the origin of
         body ``t``) adds to body ``u`` of ``bodies`` [n]. Symmetric; zero between different trees.
@@ -486,7 +493,8 @@ class ArticulationSolver:
         return self.launches.dense_impulse_response(bodies)
 
     def integrate(self, bodies: np.ndarray | None = None, wrenches: np.ndarray | None = None) -> None:
-        """End the step: wrenches (N, N m, world, at the bodies' origins) act over it, joints move.
+        """End the step: integrate the joints with ``wrenches`` [N, N m] that act over the step, at the bodies' origins,
+        in world axes.
 
         ``bodies`` [n] may name one body several times; ``wrenches`` has the shape [n, 6].
         """
@@ -504,14 +512,15 @@ class ArticulationSolver:
         self.tick += 1
 
     def fastest_rate(self) -> float:
-        """The largest entry of :attr:`tree_rate` of the last ``integrate()``, or an upper bound of it; infinite if an
-        entry is not a number."""
+        """Returns the largest entry of :attr:`tree_rate` after the last ``integrate()``, or an upper bound of that
+        entry; infinity if an entry is NaN."""
         if self.buffers.has_copies:
             return float(np.nan_to_num(self.tree_rate[self._awake], nan=math.inf).max(initial=0.0))
         return float(self._fastest[0])
 
     def _load(self, bodies: np.ndarray, wrenches: np.ndarray) -> np.ndarray:
-        """Replace the wrenches of the last step by ``wrenches`` [n, 6] on bodies [n]; returns the trees touched [k]."""
+        """Replace the contact wrenches of the last step by ``wrenches`` [n, 6] on ``bodies`` [n]. Returns the trees [k]
+        of these bodies."""
         touched = self._loads.replace(bodies, wrenches, self.tick)
         if self.buffers.has_copies:
             self.launches.upload_wrenches(len(self._runner.stepped))
@@ -519,7 +528,8 @@ class ArticulationSolver:
         return touched
 
     def _floating_roots(self) -> tuple[np.ndarray, np.ndarray]:
-        """The floating roots that move in this step: their places in the kernels' arrays, and their trees."""
+        """Returns the floating roots that move in this step: their places in the kernels' arrays [k], and their trees
+        [k]."""
         if len(self._falling_roots) == 0:
             return _NO_TREES, _NO_TREES
         tree = self.model.body_tree[self._falling_roots]
@@ -527,15 +537,17 @@ class ArticulationSolver:
         return self.buffers.slots[roots], self.model.body_tree[roots]
 
     def advance(self, steps: int, between: Callable[[], None] | None = None) -> None:
-        """Take many steps of the awake trees, without sleep, fault guard, or contacts other than ``between`` launches.
+        """Take many steps of the awake trees without sleep and fault guard. ``between`` launches the kernels that run
+        between prediction and integration, such as contacts.
 
-        A GPU works on its own copies meanwhile: call :meth:`upload` before and :meth:`download` after; in between
-        nothing crosses the bus. Afterwards ``velocity_free`` and ``acceleration`` are those of the last step. A tree
-        whose motion became invalid stays where it was (``tree_rate`` NaN or above ``fault_rate``).
+        A GPU works on its own copies of all arrays: call :meth:`upload` before and :meth:`download` after. During the
+        steps nothing is copied between host and GPU. Afterwards ``velocity_free`` and ``acceleration`` hold the values
+        of the last step. A tree whose motion became invalid (``tree_rate`` NaN or above ``fault_rate``) keeps its last
+        valid pose.
         """
         self._runner.list_trees(self._awake)
         floating = self._floating_roots()
-        if len(self._loads) and steps > 0:  # the next prediction still knows the last contacts
+        if len(self._loads) and steps > 0:  # the next prediction still has the last contacts
             self._runner.predict()
             self._load(_NO_TREES, _NO_WRENCHES)
             self._runner.integrate(_NO_TREES, *floating)
@@ -563,7 +575,7 @@ class ArticulationSolver:
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self.onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
-        """Update ``body_q`` and ``body_qd`` of trees (of the awake ones unless given) from their joints, without a
+        """Compute ``body_q`` and ``body_qd`` of ``trees`` (default: the awake trees) from their joints, without a
         step."""
         trees = self._awake if trees is None else np.atleast_1d(trees)
         self.list_subset(trees)
@@ -574,24 +586,24 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def list_subset(self, trees: np.ndarray) -> None:
-        """List trees [k] for the kernels that do not work on all awake ones."""
+        """Set the list of trees [k] for kernels that work on a subset of the trees."""
         self._subset[: len(trees)] = trees
         self._counts[_SUBSET] = len(trees)
 
     def require_stepped(self, bodies: np.ndarray) -> None:
-        """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
+        """Raises :class:`ValueError` unless all ``bodies`` [k] can move and their trees were in the last prediction."""
         self._loads.require_stepped(np.asarray(bodies))
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
-        """Move one tree towards the state that it has elsewhere: rotations [k, 4] by the share ``blend`` of the
-        difference, rates [k, 3] completely."""
+        """Move one tree towards the state that another client has sent: joint rotations by the share ``blend`` (0 to 1)
+        of the way to ``joint_q`` [k, 4]; joint rates are set to ``joint_qd`` [k, 3]."""
         blend_towards(self, tree, joint_q, joint_qd, blend)
 
     # ------------------------------------------------------------------ ties, wrenches, damping
 
     @property
     def tie_anchor(self) -> np.ndarray:
-        """[tie, 3] m, in the world: the points at which ties are held; callers may move them. See :meth:`add_tie`."""
+        """[tie, 3] m, in the world: the fixed end of each tie; callers may move it. See :meth:`add_tie`."""
         return self.ties.anchor
 
     @property
@@ -613,8 +625,8 @@ class ArticulationSolver:
         """Hold a body at ``point`` [3] m, in its own frame, by a spring [N/m] and damper [N s/m]; returns the tie.
 
         The spring pulls the point to the tie's ``tie_anchor``, which starts at the point; callers may move it.
-        :class:`TieLimitError` if too many bodies are held, or this body in too many places; :class:`ValueError` for a
-        berry cluster and for numbers that are not finite.
+        Raises :class:`TieLimitError` if too many bodies are held, or this body in too many places, and
+        :class:`ValueError` for a berry cluster and for numbers that are not finite.
         """
         body = checked_index("body", body, len(self.model.body_mass))
         if body - self.model.tree_first[tree := self.model.body_tree[body]] >= self.model.tree_core[tree]:
@@ -625,32 +637,33 @@ class ArticulationSolver:
         return tie
 
     def remove_tie(self, body: int, tie: int) -> None:
-        """Undo a tie of :meth:`add_tie`."""
+        """Remove a tie that :meth:`add_tie` added."""
         self.ties.remove(body, tie)
         self._find_falling(self.bodies_of(self.model.body_tree[[body]]))
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
-        """Force [N] and moment [N m, about the body's origin, world axes] on bodies from their parents [n, 6].
+        """Returns the wrench [n, 6] that each body's joint carried in the last step: force [N] and moment [N m] from
+        the parent on the body, about the body's origin, world axes.
 
-        They are those of the last step, and valid only for bodies of trees that were awake in it. At rest a joint
-        carries the weight of what hangs below.
+        The result is valid only for bodies of trees that were awake in the last step. At rest a joint carries the
+        weight of the bodies beyond it.
         """
         return self.launches.joint_wrench(bodies)
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
-        """Least damping ratio that a first mode of this frequency [Hz] can have: pi f (2 phi - 1) dt / substeps."""
+        """Returns the least damping ratio that a first mode of this frequency f [Hz] can have: pi f (2 phi - 1) dt /
+        substeps."""
         phi = float(self.phi.max(initial=0.5)) if phi is None else phi
         return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)
 
 
-# Berry clusters: bunches whose clusters move, or ride locked on their bunch as one compound body.
-#
-# Locking ends the clusters' motion against their bunch in a plastic impact that lasts no time: the joints take its
-# impulse through the factors of inertia and springs alone.
+# Berry clusters: in a fine tree they move, in a coarse tree they are locked to their bunch as one compound body.
+# Locking ends the clusters' motion relative to their bunch in an instantaneous plastic impact. The joints respond to
+# its impulse through the factors of inertia and springs alone.
 
 
 def spans(first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """The numbers ``first[i] ... first[i] + count[i] - 1``, one span after the other [sum of count]."""
+    """Returns the numbers ``first[i] ... first[i] + count[i] - 1`` of each span i, concatenated [sum of count]."""
     end = np.cumsum(count)
     return np.repeat(first - (end - count), count) + np.arange(end[-1] if len(end) else 0)
 
@@ -666,28 +679,30 @@ class BerryClusters:
         order = np.argsort(tree, kind="stable")
         self.bunches = clustered[order]
         self._bunch_tree = tree[order]
-        """[k] Tree of each of :attr:`bunches` [k], which are the bunches that have clusters, sorted by tree."""
+        """[k] Tree of each entry of ``bunches`` [k], the list of bunches that have clusters, sorted by tree."""
         self.head_mass = model.bunch_head_mass.copy()
         self.head_inertia = model.bunch_head_inertia.copy()
-        """[bunch, 3] kg m^2 (``head_mass``: [bunch] kg) of the head, the part of a bunch that belongs to no cluster."""
+        """[bunch, 3] kg m^2: moments of inertia of each bunch's head, the part of the bunch that belongs to no cluster.
+        ``head_mass`` [bunch] kg: its mass."""
         fine = solver.state.tree_fine[self._bunch_tree]
         self.lock(self.bunches[~fine])
         self.unlock(self.bunches[fine])
 
     def clustered_trees(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
-        """The trees among ``trees`` that have clusters and whose state is ``fine`` or not, as asked [k], sorted."""
+        """Returns the trees among ``trees`` that have clusters and are fine (``fine`` true) or coarse (``fine`` false)
+        [k], sorted."""
         model = self._solver.model
         trees = np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
         return trees[(self._solver.state.tree_fine[trees] == fine) & (model.tree_core[trees] < model.tree_size[trees])]
 
     def clusters_of(self, trees: np.ndarray) -> np.ndarray:
-        """Bodies of the clusters of some trees [k]."""
+        """Returns the bodies [k] of the berry clusters of ``trees``."""
         model = self._solver.model
         core = model.tree_core[trees]
         return spans(model.tree_first[trees] + core, model.tree_size[trees] - core)
 
     def bunches_of(self, trees: np.ndarray) -> np.ndarray:
-        """The bunches of some trees that have clusters [k]."""
+        """Returns the bunches [k] of ``trees`` that have berry clusters."""
         start, end = (np.searchsorted(self._bunch_tree, trees, side=side) for side in ("left", "right"))
         return self.bunches[spans(start, end - start)]
 
@@ -773,11 +788,11 @@ class BerryClusters:
         solver.launches.changed = True
 
     def fuse(self, bunch: int) -> np.ndarray:
-        """Give one bunch's body the mass of the compound that head and clusters are now, and return the velocity [6]
-        m/s, rad/s of its frame, in world axes, with which that compound has the momentum of its parts.
+        """Give one bunch's body the mass of its head and clusters together. Returns the velocity [6] m/s, rad/s of the
+        body's frame, in world axes, with which this compound has the momentum of its parts.
 
-        The state stays as it is. Call it for a bunch that leaves its tree, see :meth:`release`. The bunch's poses and
-        velocities must be current.
+        The state does not change. Call it for a bunch that is detached from its tree, before :meth:`release`. The
+        bunch's poses and velocities must be up to date.
         """
         solver = self._solver
         body = int(self._solver.model.bunch_body[bunch])
@@ -795,7 +810,7 @@ class BerryClusters:
         return velocity + frames.rotate(pose[3:], change).ravel()
 
     def release(self, bunch: int) -> None:
-        """Let the clusters of one bunch of a fine tree move again after :meth:`fuse`."""
+        """Undo :meth:`fuse` for one bunch of a fine tree: its clusters move again."""
         self.unlock(np.array([bunch] if self._solver.model.bunch_clusters[bunch] else [], np.int64))
 
     def unlock(self, bunches: np.ndarray) -> None:
@@ -811,7 +826,7 @@ class BerryClusters:
         solver.launches.changed = True
 
     def lock(self, bunches: np.ndarray) -> np.ndarray:
-        """Make each bunch's body a compound of head and clusters as they are.
+        """Make each bunch's body a compound of its head and clusters, in their present poses.
 
         Returns the momentum [bunch, 6] of the clusters' motion relative to the body: N s, and N m s about the body's
         origin, in its axes.
@@ -832,7 +847,7 @@ class BerryClusters:
         mass[:, 0] = self.head_mass[bunches]
         com[:, 0] = model.bunch_head_com[bunches]
         inertia[:, 0] = self.head_inertia[bunches]
-        for number in range(most):  # over the clusters of one bunch, a handful
+        for number in range(most):  # over the 4 to 8 clusters of one bunch
             has = np.flatnonzero(model.bunch_clusters[bunches] > number)
             body = model.bunch_cluster[bunches[has]] + number
             parent = model.body_parent[body]
@@ -906,7 +921,7 @@ DEVICE_RESULTS = (
     "body_qd_free",
     "body_impulse",
 )
-"""Per-body arrays that kernels write, or that are copied only when they are needed."""
+"""Per-body arrays that kernels write, or that are copied to the device only when needed."""
 TREE_INPUTS = (
     "stepping",
     "divided",
@@ -929,9 +944,10 @@ TREE_INPUTS = (
     "tie_anchor",
     "tie_anchor_velocity",
 )
-"""Lists, and arrays of trees and ties, that the kernels of a step read."""
+"""Arrays that the kernels of a step read and that do not have a row for each body: lists, arrays of trees and of
+ties."""
 TREE_RESULTS = ("tree_euler_steps", "phi_used", "tree_rate")
-"""Arrays of trees that the kernels of a step write."""
+"""Arrays with one element for each tree that the kernels of a step write."""
 SCRATCH = {
     wp.vec3: ("lever", "tension", "Du"),
     wp.quat: ("axes",),
@@ -953,7 +969,7 @@ SCRATCH = {
 def kernel_parameters(
     p: PhysicsParameters, dt: float, fast_rate: float, max_rate: float, fault_rate: float, geometric_stiffness: bool
 ) -> dict[str, Any]:
-    """Fields of :class:`vinesim.kernels.plants.structs.SolverParameters`."""
+    """Returns the values of the fields of :class:`vinesim.kernels.plants.structs.SolverParameters`, by name."""
     return {
         "dt": dt,
         "fast_rate": fast_rate,
@@ -966,10 +982,10 @@ def kernel_parameters(
 
 
 BUDGET_PERIOD = 8
-"""While no tree is watched closely, energy is checked in one step out of this number of steps."""
+"""Period [steps] of the energy check while no tree is watched closely."""
 
 MIN_CAPACITY = 16
-"""Least number of bodies for which a list of bodies has room."""
+"""Smallest capacity of a list of bodies."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -1002,12 +1018,13 @@ class Step:
 class KernelLaunches:
     """Launches of the articulation kernels on the arrays of one solver.
 
-    Arrays of the model are constants. A GPU keeps a copy of every array that has a row for each body (see
-    :mod:`vinesim.plants.device_buffers`): :data:`STEP_INPUTS`, :data:`DEVICE_RESULTS`, and all others, which
-    :meth:`upload_changed` copies when :attr:`changed` is set. A GPU reads all other arrays in the host's memory. In a
-    sequence of many steps (:meth:`ArticulationSolver.advance`) that would cost more than the steps themselves. So such
-    a sequence has copies of :data:`TREE_INPUTS` as well, and launches of its own (:attr:`resident`); it begins with
-    :meth:`upload_trees` and ends with :meth:`download_trees`.
+    A GPU has a copy of every array with a row for each body (see :mod:`vinesim.plants.device_buffers`).
+    :data:`STEP_INPUTS` are copied to the GPU before each prediction, :data:`DEVICE_RESULTS` to the host where it needs
+    them. The model's rows are copied by :meth:`upload_changed` when :attr:`changed` is set. A GPU reads all other
+    arrays in the host's memory. In a sequence of many steps (:meth:`ArticulationSolver.advance`) these reads would take
+    longer than the steps. So for such a sequence the GPU also has copies of :data:`TREE_INPUTS`, and separate launches
+    that use them (:attr:`resident`). The sequence begins with :meth:`upload_trees` and ends with
+    :meth:`download_trees`.
     """
 
     def __init__(self, solver: ArticulationSolver, parameters: dict[str, float], max_substeps: int) -> None:
@@ -1030,9 +1047,10 @@ class KernelLaunches:
         self.parameters = self.fill(structs.SolverParameters, **parameters)
         self._record_step(self.parameters)
         self.shared = self._record_step_kernels(self.parameters)
-        """The kernels of a step, on the arrays that NumPy sees."""
+        """The kernels of a step, bound to the arrays that NumPy also uses."""
         self.resident = self.shared
-        """The kernels of steps between which nothing comes back to the host; on a GPU they have arrays of their own."""
+        """The kernels for a sequence of steps without transfers to the host. On a GPU they are bound to separate
+        arrays."""
         self.resident_arrays = self.buffers.arrays
         """The arrays that the kernels of :attr:`resident` read and write."""
         if self.buffers.has_copies:
@@ -1041,7 +1059,7 @@ class KernelLaunches:
             self.fill(structs.SolverParameters, **(parameters | {"fast_rate": math.inf, "geometric_stiffness": 0.0}))
         )
         self.response_capacity = 0
-        self._make_room_for_joints(1)  # or the first bunch that is picked would wait for it
+        self._make_room_for_joints(1)  # otherwise the first picked bunch would wait for the allocation
 
     # ------------------------------------------------------------------ arrays
 
@@ -1063,24 +1081,24 @@ class KernelLaunches:
         buffers.add_constant("body_branches", self._branching(model.body_parent), wp.bool)
         trees = len(model.tree_first)
         self.budget = structs.EnergyBudget()
-        for name, field in structs.fields(structs.EnergyBudget).items():
+        for name, field in struct_fields(structs.EnergyBudget).items():
             count = buffers.slot_count if name == "start_q" else trees
-            setattr(self.budget, name, wp.zeros(count, dtype=field.type.dtype, device=buffers.device))
+            setattr(self.budget, name, wp.zeros(count, dtype=field.dtype, device=buffers.device))
         self.budget.limit.fill_(NO_LIMIT)
         rows = (self.budget.limit, self.budget.watch)
         self._budget_rows = [array.numpy() for array in rows] if buffers.device.is_cpu else []
         buffers.arrays["impact_phi"] = wp.empty(trees, dtype=float, device=buffers.device)
 
     def _branching(self, parent: np.ndarray) -> np.ndarray:
-        """[place] Whether the body at this place in the kernels' arrays has a child other than the body that follows
-        it."""
+        """Returns for each place [place] in the kernels' arrays whether the body there has a child other than the next
+        body."""
         places = np.zeros(self.buffers.slot_count, np.bool_)
         apart = (parent >= 0) & (parent != np.arange(len(parent)) - 1)
         places[self.buffers.slots[parent[apart]]] = True
         return places
 
     def upload_changed(self) -> None:
-        """Bring a device's copies of the model rows up to date, if :attr:`changed`."""
+        """Copy the model's rows (parents, masses, springs) to the device, if :attr:`changed`."""
         if self.changed:
             self.buffers.upload(self._seldom)
             self.budget.limit.fill_(NO_LIMIT)
@@ -1089,40 +1107,42 @@ class KernelLaunches:
             self.substeps_due = True
 
     def fill(self, struct: Any, **values: Any) -> Any:
-        """A kernel argument struct. A field that ``values`` names gets that value (a string there names an array); any
-        other field gets the array of its own name."""
+        """Returns a filled kernel argument of the Warp struct type ``struct``. A field named in ``values`` gets that
+        value, or the array that the value names if it is a string. Any other field gets the array with the field's
+        name."""
         return self._filled(struct, self._arrays, values)
 
     def fill_resident(self, struct: Any, **values: Any) -> Any:
-        """As :meth:`fill`, with the arrays of :attr:`resident`."""
+        """Returns a filled kernel argument like :meth:`fill`, with the arrays of the :attr:`resident` kernels."""
         return self._filled(struct, self.resident_arrays, values)
 
     def _filled(self, struct: Any, arrays: dict[str, wp.array], values: dict[str, Any]) -> Any:
         filled = struct()
         values = {"pitch": self.buffers.pitch} | values
-        for field in structs.fields(struct):
+        for field in struct_fields(struct):
             value = values.get(field, field)
             setattr(filled, field, arrays[value] if isinstance(value, str) else value)
         return filled
 
     def launch(self, kernel: Any, *arguments: object, **options: Any) -> KernelLaunch:
-        """The launch of a kernel with its arguments; a string among the arguments names an array."""
+        """Returns the launch of a kernel with its arguments. A string among the arguments is replaced by the array of
+        that name."""
         return KernelLaunch(kernel, self._named(arguments), **options)
 
     def graph(self, *launches: KernelLaunch) -> KernelGraph:
-        """A graph of launches that follow each other on the device."""
+        """Returns a graph of launches that follow each other on the device."""
         return KernelGraph(*launches, device=str(self.buffers.device))
 
     def _named(self, arguments: Sequence[object]) -> list[Any]:
         return [self._arrays[value] if isinstance(value, str) else value for value in arguments]
 
     def count(self, place: int) -> wp.array:
-        """[1] One entry of the array of counts, by its place there."""
+        """Returns one entry of the array of counts as a Warp array [1]. ``place``: index of the entry."""
         return self._arrays["counts"][place : place + 1]
 
     @property
     def subset(self) -> tuple[wp.array, wp.array]:
-        """Number [1] and list [tree] of the trees that :meth:`ArticulationSolver.list_subset` has listed."""
+        """Number [1] and list [tree] of the trees that :meth:`ArticulationSolver.list_subset` set."""
         return self.count(_SUBSET), self._arrays["subset"]
 
     # ------------------------------------------------------------------ transfers of the listed trees' rows
@@ -1191,7 +1211,7 @@ class KernelLaunches:
         """Counts the substeps of the listed trees, and chooses how closely the energy of each is watched."""
 
     def _record_step_kernels(self, parameters: Any) -> Step:
-        """The kernels of a step, on the present ``_arrays``."""
+        """Returns the kernels of a step, bound to the arrays in ``self._arrays``."""
         in_groups = not self.buffers.has_copies
         predict = self._predict_groups(parameters) if in_groups else self._predict(parameters, _GROUPS, "stepping")
         begin = self.launch(
@@ -1234,7 +1254,7 @@ class KernelLaunches:
         )
 
     def _predict_groups(self, parameters: Any) -> KernelLaunch:
-        """The launch that predicts trees in groups of up to eight."""
+        """Returns the launch that predicts trees in groups of up to eight."""
         size = LANES * RECORD * (self.buffers.max_tree_size + 2)
         return self.launch(
             predict_groups,
@@ -1259,8 +1279,8 @@ class KernelLaunches:
     def _integrate(
         self, parameters: Any, count: int, trees: str, root_count: int, roots: str
     ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
-        """Launches of an integration. Key: whether energy budgets are kept around it, whether floating roots follow
-        it."""
+        """Returns the launches of an integration. Key: whether energy budgets are kept, whether there are floating
+        roots."""
         fill = self.fill
         s = structs
         model, forces, joints, prediction = (
@@ -1355,28 +1375,27 @@ class KernelLaunches:
         self._arrays = shared
 
     def upload_trees(self) -> None:
-        """Copy the arrays that NumPy sees to those of :attr:`resident`."""
+        """Copy the arrays that NumPy uses to the arrays of the :attr:`resident` kernels."""
         for name in TREE_INPUTS if self.buffers.has_copies else ():
             wp.copy(self.resident_arrays[name], self.buffers.host_array(name))
 
     def download_trees(self) -> None:
-        """Copy what the kernels of :attr:`resident` wrote to the arrays that NumPy sees."""
+        """Copy the results of the :attr:`resident` kernels to the arrays that NumPy uses."""
         for name in TREE_RESULTS if self.buffers.has_copies else ():
             wp.copy(self.buffers.host_array(name), self.resident_arrays[name])
 
     def list_budgets(self, trees: np.ndarray) -> None:
-        """Keep energy budgets (:mod:`vinesim.kernels.plants.energy_budget`) of these trees [k] and of no others."""
+        """Keep energy budgets (:mod:`vinesim.kernels.plants.energy_budget`) of only these trees [k]."""
         self._budgeted = trees
         self._budget_phase = -1
         kind, phi = (self.buffers.host[name][trees] for name in ("tree_budget", "tree_phi"))
         self._watches_closely = bool(((kind == CLOSELY) | (phi < MIN_PHI)).any())
 
     def keeps_budgets(self, steps: int = 1) -> bool:
-        """Whether the next step, or the next ``steps`` steps, keep energy budgets. Call it once before their
-        integrations.
+        """Returns whether the next ``steps`` steps keep energy budgets. Call it once before their integrations.
 
-        They always do on a GPU, and when there are many steps. Otherwise one step of eight does, and also the seven
-        that follow if a tree is watched closely after it.
+        On a GPU, and with more than one step, all steps keep budgets. Otherwise one step of :data:`BUDGET_PERIOD` does,
+        and so do the steps until the next one if a tree is watched closely after it.
         """
         self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
         if self._budget_phase == 0 or self.buffers.device.is_cuda:
@@ -1387,8 +1406,8 @@ class KernelLaunches:
         return self._keeps_budgets
 
     def _record_impact(self, parameters: Any) -> None:
-        """Record the kernels of a plastic impact that lasts no time: factors of inertia and springs alone, impulses as
-        wrenches."""
+        """Record the kernels of an instantaneous plastic impact. They use the factors of inertia and springs alone, and
+        take impulses as wrenches."""
         fill = self.fill
         s = structs
         joints = fill(s.JointState)
@@ -1427,8 +1446,9 @@ class KernelLaunches:
         )
 
     def impulse_response(self, bodies: np.ndarray) -> np.ndarray:
-        """Response [n, 6, m, 6] of some bodies [n] to unit impulses on the listed bodies of the same tree (neighbours
-        in the list, at most m); a view, good until the next call."""
+        """Returns the velocity changes [n, 6, m, 6] of ``bodies`` [n] by unit impulse wrenches on the bodies of the
+        same tree in this list, which must be adjacent and at most m. The result is a view that the next call
+        overwrites."""
         n = len(bodies)
         buffers = self.buffers
         if n > self.response_capacity or self.response_capacity == 0:
@@ -1440,8 +1460,8 @@ class KernelLaunches:
         return self._response[:n]
 
     def dense_impulse_response(self, bodies: np.ndarray) -> np.ndarray:
-        """Response [n, 6, n, 6] of bodies in any order to unit impulses on them; zero between bodies of different
-        trees."""
+        """Returns the velocity changes [n, 6, n, 6] of ``bodies``, in any order, by unit impulse wrenches on them.
+        Entries between different trees are zero."""
         bodies = np.asarray(bodies)
         order = np.argsort(bodies, kind="stable")
         _, tree_start, tree = np.unique(self._body_tree[bodies[order]], return_index=True, return_inverse=True)
@@ -1466,7 +1486,7 @@ class KernelLaunches:
         matrix: Any = wp.mat33
         columns = {
             name: wp.empty(capacity * stride, dtype=matrix, device=buffers.device)
-            for name in structs.fields(structs.ResponseColumns)
+            for name in struct_fields(structs.ResponseColumns)
         }
         self._respond = self.graph(
             self.launch(
@@ -1482,7 +1502,7 @@ class KernelLaunches:
         )
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
-        """Wrench [n, 6] N, N m that the joints of some bodies [n] carried in the last step."""
+        """Returns the wrench [n, 6] N, N m that the joint of each of the ``bodies`` [n] carried in the last step."""
         if len(bodies) > len(self._joint_wrenches.places):
             self._make_room_for_joints(2 * len(bodies))
         wrenches = self._joint_wrenches
@@ -1497,7 +1517,7 @@ class KernelLaunches:
         self._carry = self.graph(self._joint_wrenches.launch)
 
     def joint_wrenches(self, capacity: int) -> JointWrenches:
-        """The arrays and the launch that compute the wrenches of up to ``capacity`` joints in the last step."""
+        """Returns the arrays and the launch that compute the wrenches of up to ``capacity`` joints in the last step."""
         buffers = self.buffers
         places = buffers.pinned(np.zeros(capacity, np.int32))
         count = buffers.pinned(np.zeros(1, np.int32))
@@ -1519,29 +1539,28 @@ class KernelLaunches:
 
 
 # Launches over the awake trees: in groups of one topology on a CPU, captured into a graph on a GPU.
-#
-# A tree whose first mode is too fast for the step takes substeps instead; all other parts see only their sum.
+# A tree whose first mode is too fast for the step takes substeps instead; all other parts use only their sum.
 # :mod:`vinesim.kernels.plants.first_mode` computes the number of substeps. While contacts act on such a tree, it takes
 # the whole step for which they were solved. A tree that is tied to wires always takes whole steps: wires move once a
 # step.
 
 
 Levels = tuple[int, ...]
-"""Number of entries of a list that take a first, a second, a third substep, and so on."""
+"""Entry i is the number of entries of a list that take at least i + 1 substeps."""
 
 
 class StepRunner:
     """Runs predictions and integrations of the listed trees.
 
-    The list that the kernels read begins with the trees that take one step. The others follow, those with most substeps
-    first. On a CPU trees of one topology are neighbours within that order, and are predicted in groups of up to eight;
-    on a GPU each tree is a group.
+    The list that the kernels read begins with the trees that take one whole step. The trees with substeps follow,
+    sorted by falling number of substeps. On a CPU, trees of one topology with equal numbers of substeps are adjacent
+    and are predicted in groups of up to eight. On a GPU each tree is a group.
 
     Args:
         buffers: the solver's memory.
         launches: the solver's kernels.
         tree_substeps: [tree] number of substeps into which each tree's step is to be divided.
-        tree_steps: [tree] number of substeps into which it is divided now; the kernels read it.
+        tree_steps: [tree] number of substeps of the present step, which is 1 for trees in contact; the kernels read it.
         tree_budget: [tree] how closely each tree's energy is watched.
         whole: [tree] bool, trees on wires, whose steps are never divided.
         tree_rate: [tree] each tree's fastest rate, which the kernels write.
@@ -1591,19 +1610,19 @@ class StepRunner:
         self._roots = 0
         self._root_levels: Levels = ()
         self._divided = np.zeros(0, np.int32)
-        """[k] Number of substeps of each tree of ``fast`` when the list was last put in order."""
+        """[k] Number of substeps of each tree of :attr:`fast` when the list was last sorted."""
         self._graph: wp.Graph | None = None
         self._graph_of: tuple = ()
         self._topologies = topologies
         self._starts = np.zeros(1, np.int32)
-        """Place in the list at which each group begins, and as last entry the end of the list."""
+        """Index in the list at which each group begins; the last entry is the length of the list."""
         self._whole_groups = 0
-        """Number of groups of trees that take whole steps; these groups come first."""
+        """Number of groups of trees that take whole steps. These groups come first in the list."""
 
     # ------------------------------------------------------------------ which trees, in which order
 
     def list_trees(self, trees: np.ndarray) -> None:
-        """Step these trees [k] from now on, as the model is now. Counts their substeps if the trees or the model have
+        """Set the trees [k] that the following steps integrate. Counts their substeps if the trees or the model have
         changed."""
         self._launches.upload_changed()
         if self.stepped is trees and not self._launches.substeps_due:
@@ -1616,7 +1635,7 @@ class StepRunner:
         self._counts[_STEPPING] = len(trees)
         self._launches.count_substeps(len(trees))
         self._buffers.synchronize()
-        self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a wire that moves does work on them
+        self._budget_kind[trees[self._is_whole[trees]]] = NO_BUDGET  # a moving wire does work on these trees
         self._launches.list_budgets(trees[self._budget_kind[trees] != NO_BUDGET])
         self.fast = trees[(self._substeps[trees] > 1) & ~self._is_whole[trees]]
         self._steps_of[trees] = 1
@@ -1624,7 +1643,7 @@ class StepRunner:
         self._order()
 
     def _order(self) -> None:
-        """List the trees by the number of substeps that ``_steps_of`` gives each."""
+        """Sort the list of trees by the number of substeps of each tree in ``_steps_of``."""
         trees = self.stepped
         on_cpu = self._buffers.device.is_cpu
         topologies = self._topologies.of(trees)
@@ -1645,7 +1664,7 @@ class StepRunner:
         self._whole_groups = int(np.searchsorted(self._starts, self._whole))
 
     def _divide(self, touched: np.ndarray) -> None:
-        """Divide the coming step of all fast trees except those that are ``touched`` [k]."""
+        """Divide the next step of all fast trees into substeps, except for trees that are ``touched`` [k]."""
         if len(self.fast) == 0:
             return
         steps = self._substeps[self.fast]
@@ -1658,7 +1677,8 @@ class StepRunner:
             self._order()
 
     def _list_roots(self, roots: np.ndarray, trees: np.ndarray) -> None:
-        """List floating roots [k] (places of bodies) in the order of substeps of their trees [k]."""
+        """Write the list of floating roots, sorted by the substeps of their trees. ``roots`` [k]: places of the roots
+        in the kernels' arrays; ``trees`` [k]: their trees."""
         if len(roots) == 0:
             self._roots = 0
             self._root_levels = ()
@@ -1669,7 +1689,7 @@ class StepRunner:
         self._lists["divided_floating"][: len(roots) - self._roots] = roots[self._roots :]
 
     def _count(self, steps: int = 1) -> None:
-        """Tell the kernels of integrations how many entries of each list to take."""
+        """Write the number of entries of each list that the kernels of the integrations process."""
         counts = self._counts
         self._kind = (self._launches.keeps_budgets(steps), self._roots + len(self._root_levels) > 0)
         self._room = max(len(self.stepped), self._roots + sum(self._root_levels[:1]))
@@ -1716,8 +1736,8 @@ class StepRunner:
     def advance(
         self, steps: int, roots: np.ndarray, root_trees: np.ndarray, between: Callable[[], None] | None = None
     ) -> None:
-        """Predict and integrate ``steps`` times without coming back to the host. ``between`` launches what runs between
-        a prediction and its integration."""
+        """Predict and integrate ``steps`` times without transfers to the host. ``between`` launches kernels between
+        each prediction and its integration."""
         self._divide(np.zeros(0, np.int32))
         self._list_roots(roots, root_trees)
         if len(self.stepped) == 0:
@@ -1748,13 +1768,13 @@ class StepRunner:
 
 
 def _levels(steps: np.ndarray) -> Levels:
-    """How many of the numbers ``steps`` [k] are above 0, how many above 1, and so on."""
+    """Returns how many of the numbers ``steps`` [k] are above 0, how many are above 1, and so on."""
     return tuple(int(np.count_nonzero(steps > level)) for level in range(int(steps.max(initial=0))))
 
 
 def _by_substeps(items: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, int, Levels]:
-    """Sort items [k] by their numbers of substeps ``steps`` [k]: items of one step first, the others by falling number.
-    Returns them, the count of items of one step, and :data:`Levels` of the others."""
+    """Sort items [k] by their numbers of substeps ``steps`` [k]: first the items with 1, then the other items by
+    falling number. Returns the sorted items, the number of items with 1, and the :data:`Levels` of the other items."""
     whole = steps == 1
     rest = items[~whole][np.argsort(-steps[~whole], kind="stable")]
     return np.concatenate([items[whole], rest]), int(np.count_nonzero(whole)), _levels(steps[~whole])
@@ -1764,12 +1784,11 @@ def _by_substeps(items: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, int,
 
 
 class Topologies:
-    """Gives each tree the number of its topology. It is equal for trees whose bodies have the same parents.
+    """Numbers the topologies of trees. Two trees have the same number if their bodies have the same parents.
 
     Args:
         model: the model whose trees are numbered.
-        body_cut: [body] bool, whether a body has been cut off; a tree with a cut-off body shares its topology with
-            none.
+        body_cut: [body] bool, whether a body has been cut off; a tree with a cut-off body has a topology of its own.
         tree_moving: [tree] number of bodies that move: all bodies of a tree, or all except its berry clusters.
     """
 
@@ -1788,7 +1807,7 @@ class Topologies:
         self._coarse, self._fine = (np.array([*map(number, first, size)], np.int64) for size in sizes)
 
     def of(self, trees: np.ndarray) -> np.ndarray:
-        """[k] Number of the present topology of each of the ``trees`` [k]."""
+        """Returns the number of the present topology of each of the ``trees`` [k]."""
         is_fine = self._moving[trees] == self._model.tree_size[trees]
         cut = self._model.body_tree[np.flatnonzero(self._body_cut)]
         alone = -1 - trees.astype(np.int64)
@@ -1796,9 +1815,10 @@ class Topologies:
 
 
 def group_starts(topologies: np.ndarray, whole: int) -> np.ndarray:
-    """Places in a list at which groups of up to eight trees begin, and the end of the list as last entry.
+    """Returns the indices in a list at which groups of up to eight trees begin, followed by the length of the list.
 
-    Neighbours of one topology [k] form a group. A group never mixes the first ``whole`` trees with the others.
+    ``topologies`` [k]: topology of each tree in the list. Adjacent trees of one topology form a group. The first
+    ``whole`` trees are never in a group with later trees.
     """
     place = np.arange(len(topologies))
     differs = np.ones(len(topologies), bool)

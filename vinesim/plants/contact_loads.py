@@ -1,4 +1,4 @@
-"""Contact loads: wrenches that act on some bodies of the plants over one step, and the trees that they touch."""
+"""Contact loads: wrenches that act on bodies of plants over one step, and the list of trees that have such loads."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants import contact_loads as kernels
 
 LEAST_ROOM = 64
-"""Least number of bodies for which the arrays have room."""
+"""Smallest capacity of the arrays [bodies]."""
 
 
 class ContactLoads:
-    """Sums the wrenches that act in a step, body by body."""
+    """Sums for each body the wrenches that act on it in a step."""
 
     def __init__(
         self,
@@ -33,12 +33,12 @@ class ContactLoads:
         then: Sequence[KernelLaunch],
     ) -> None:
         """Args:
-        body_tree, place_in_tree: [body] tree of each, and its number there.
+        body_tree, place_in_tree: [body] tree of each body, and the body's index within that tree.
         is_stepped, tree_moving: [tree] whether a tree was in the last prediction, and how many of its bodies move.
         body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
         touched, touched_count: [tree] list of the touched trees, [1] number of its entries.
         euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
-        then: launches that follow at once; they let the summed wrenches act on the touched trees.
+        then: launches that follow the sum; they apply the summed wrenches to the touched trees.
         """
         self._then = then
         self._touched_count = touched_count
@@ -80,15 +80,15 @@ class ContactLoads:
         self._load = KernelGraph(load, *self._then)
 
     def __len__(self) -> int:
-        """Number of loads; a body that was given several times counts several times."""
+        """Returns the number of wrenches of the present step. A body with several wrenches counts several times."""
         return int(self._numbers[kernels.LOADED])
 
     def replace(self, bodies: np.ndarray, wrenches: np.ndarray, tick: int) -> np.ndarray:
-        """Replace the wrenches of the last call by ``wrenches`` [k, 6] on ``bodies`` [k] in step ``tick``, and let them
-        act.
+        """Replace the wrenches of the last call by ``wrenches`` [k, 6] on ``bodies`` [k] in step ``tick``, and apply
+        them.
 
-        A body may be given several times. Returns the trees touched [j], a view of the list. If a body was not in
-        the last prediction, raises :class:`ValueError` and changes nothing.
+        A body may occur several times. Returns the trees [j] of the bodies, as a view that the next call overwrites. If
+        a body was not in the last prediction, raises :class:`ValueError` and changes nothing.
         """
         count = len(bodies)
         if count > len(self._body):
@@ -102,7 +102,7 @@ class ContactLoads:
         return self._touched[: self._touched_count[0]]
 
     def require_stepped(self, bodies: np.ndarray) -> None:
-        """:class:`ValueError` unless ``bodies`` [k] move, and their trees were in the last prediction."""
+        """Raises :class:`ValueError` unless all ``bodies`` [k] can move and their trees were in the last prediction."""
         trees = self._body_tree[bodies]
         if not (is_stepped := self._is_stepped[trees]).all():
             late = int(np.argmin(is_stepped))

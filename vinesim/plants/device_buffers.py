@@ -1,4 +1,4 @@
-"""Device buffers: arrays that NumPy and kernels both use, once on a CPU, twice with a GPU.
+"""Device buffers: arrays that NumPy and kernels both use. On a CPU they share memory, with a GPU there are two copies.
 
 A kernel walks a tree from parent to child and back. If its arrays were in the host's memory, every step would wait for
 the bus. So with a GPU the host keeps its arrays in pinned memory that the device can reach, and the device has a copy
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
+from vinesim.core.warp_arrays import host_element
 from vinesim.kernels.graph import KernelGraph, KernelLaunch
 from vinesim.kernels.plants.gather_scatter import copy_rows
 
@@ -25,24 +26,25 @@ WARP_SIZE = 32
 
 
 class DeviceUnavailable(ValueError):
-    """There is no such device; the text says which device, and what to do."""
+    """Raised if a device does not exist. The message names the device and a solution."""
 
     exit_code = 3
 
 
 class DeviceLost(RuntimeError):
-    """A device failed while it computed; the text says which, how, and what to do."""
+    """Raised if a device failed during a computation. The message names the device, the failure and a solution."""
 
     exit_code = 3
 
 
 def find_device(name: str) -> wp.Device:
-    """The Warp device called ``cpu``, ``cuda`` or ``cuda:N``; :class:`DeviceUnavailable` in words if there is none."""
+    """Returns the Warp device with the name ``cpu``, ``cuda`` or ``cuda:N``. Raises :class:`DeviceUnavailable` if it
+    does not exist."""
     if name != "cpu" and name.partition(":")[0] != "cuda":
         raise DeviceUnavailable(f"device {name!r}: give cpu, cuda or cuda:N")
     if name != "cpu" and wp.get_cuda_device_count() == 0:
         raise DeviceUnavailable(
-            f"device {name!r}: Warp sees no NVIDIA GPU here (none, or no driver for it); use cpu, which needs none"
+            f"device {name!r}: Warp finds no NVIDIA GPU here (none, or no driver for it); use cpu, which needs none"
         )
     try:
         return wp.get_device(name)
@@ -53,8 +55,7 @@ def find_device(name: str) -> wp.Device:
 
 
 def device_fault(name: str) -> str | None:
-    """Test a device: the reason, in words, why it cannot be used now, or None if a number that was written there can be
-    read back."""
+    """Test a device by writing and reading back a number. Returns None if the device works, else the reason why not."""
     try:
         find_device(name)
         wp.ones(1, dtype=float, device=name).numpy()
@@ -76,9 +77,9 @@ class DeviceBuffers:
         self.device = find_device(device)
         interleave = (WARP_SIZE if self.device.is_cuda else 0) if interleave is None else interleave
         self.has_copies = interleave > 0
-        """Whether kernels work on copies of their own."""
+        """Whether kernels work on copies of the host's arrays."""
         self.pitch = max(interleave, 1)
-        """Distance from one body of a tree to the next in the kernels' arrays [places]."""
+        """Distance between consecutive bodies of a tree in the kernels' arrays [places]."""
         self.arrays: dict[str, wp.array] = {}
         """The arrays that kernels work on, by name."""
         self.host: dict[str, np.ndarray] = {}
@@ -115,8 +116,8 @@ class DeviceBuffers:
         return (self._largest - 1) * self.pitch + 1
 
     def pinned(self, data: np.ndarray) -> np.ndarray:
-        """``data`` itself if the device can reach it, else a copy that it can reach. Use the returned array from now
-        on."""
+        """Returns ``data`` if the device can reach it, else a copy that the device can reach. Use the returned array
+        instead of ``data``."""
         if self.device.is_cpu or data.size == 0:
             return data
         dtype = wp.dtype_from_numpy(data.dtype)
@@ -136,18 +137,18 @@ class DeviceBuffers:
         self.host[name] = data
 
     def reach(self, data: np.ndarray, dtype: Any, name: str) -> wp.array:
-        """A Warp array on the memory of ``data``; with a GPU ``data`` must come from :meth:`pinned`. ``name`` is for
-        messages."""
+        """Returns a Warp array over the memory of ``data``. With a GPU, ``data`` must come from :meth:`pinned`.
+        ``name`` is used in error messages."""
         if self.device.is_cpu:
             shared = wp.array(data, dtype=dtype, device="cpu", copy=False)
             if data.size and shared.ptr != data.ctypes.data:
                 raise ValueError(f"{name} cannot be shared with Warp; give a C-contiguous array of its own")
             return shared
-        shape = data.shape[: data.ndim - len(getattr(dtype, "_shape_", ()))]
+        shape = data.shape[: data.ndim - host_element(dtype).ndim]
         return wp.array(ptr=data.ctypes.data, shape=shape, dtype=dtype, device=self.device)
 
     def host_array(self, name: str) -> wp.array:
-        """A shared array as a Warp array of the host, to be copied from or to."""
+        """Returns a shared array as a Warp array on the CPU, for use with ``wp.copy``."""
         shared = self.arrays[name]
         data = self.host[name]
         if self.device.is_cpu or data.size == 0:
@@ -155,7 +156,7 @@ class DeviceBuffers:
         return wp.array(ptr=data.ctypes.data, shape=shared.shape, dtype=shared.dtype, device="cpu", pinned=True)
 
     def add_body_rows(self, name: str, data: np.ndarray, dtype: type, *, body_indices: bool = False) -> None:
-        """Add an array with a row of four-byte numbers for each body, which host and kernels write.
+        """Add an array with a row of four-byte numbers for each body. Host and kernels may both write to it.
 
         See :meth:`row_copier` and :meth:`upload`. ``body_indices``: the numbers are indices of bodies, or negative.
         """
@@ -169,11 +170,11 @@ class DeviceBuffers:
         self.upload([name])
 
     def add_scratch(self, name: str, dtype: type) -> None:
-        """Add an array with a row for each body that only kernels see."""
+        """Add an array with a row for each body that only kernels use."""
         self.arrays[name] = wp.empty(self.slot_count, dtype=dtype, device=self.device)
 
     def upload(self, names: list[str]) -> None:
-        """Copy whole arrays of rows to the device. Not for every tick."""
+        """Copy all rows of some arrays to the device. This is too slow for every tick."""
         for name in names if self.has_copies else []:
             data = self.host[name]
             there = np.zeros((self.slot_count, *data.shape[1:]), data.dtype)
@@ -183,10 +184,11 @@ class DeviceBuffers:
     def row_copier(
         self, names: tuple[str, ...], trees: str, count: wp.array, *, to_host: bool = False
     ) -> Callable[[int], None]:
-        """A function that copies the rows of the first ``count`` [1] trees of a list to the device, or to the host
-        (``to_host``).
+        """Returns a function that copies the rows of the first ``count`` [1] trees of the list ``trees`` to the device,
+        or to the host (``to_host``).
 
-        Its argument is an upper bound of the count. It does nothing where host and kernels share their memory.
+        The argument of that function is an upper bound of the count. The function does nothing where host and kernels
+        share memory.
         """
         if not self.has_copies:
             return lambda capacity: None

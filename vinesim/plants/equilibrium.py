@@ -1,4 +1,4 @@
-"""Equilibrium of single trees: measures how far trees are from it, and moves them there."""
+"""Equilibrium of single trees: measures how far trees are from equilibrium, and moves trees into it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.plants import structs
 from vinesim.kernels.plants.residual_motion import REST_STEP, residual_motion
 from vinesim.plants.articulation_solver import ArticulationSolver
@@ -43,12 +44,12 @@ class EquilibriumFinder:
         self._record(plants)
 
     def _record(self, plants: ArticulationSolver) -> None:
-        """Bind the kernel. Its scratch, factors and predicted rates are those of a step, which are unused between
-        steps."""
+        """Bind the kernel to its arguments. For scratch, factors and predicted rates it uses the arrays of a step,
+        which are free between steps."""
         launches = plants.launches
         s = structs
         fill = launches.fill
-        numbers = {name: getattr(launches.parameters, name) for name in s.fields(s.SolverParameters)}
+        numbers = {name: getattr(launches.parameters, name) for name in struct_fields(s.SolverParameters)}
         prediction = fill(s.Prediction, body_acceleration="impact_acceleration", body_qd_free="impact_velocity")
         measure = launches.launch(
             residual_motion,
@@ -75,9 +76,9 @@ class EquilibriumFinder:
         self._measure = launches.graph(measure)
 
     def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Speed [k] m/s of the fastest point of each tree [k], distance [k] m of the point that is furthest from its
-        rest position, and [k] bool whether :meth:`move_to_rest` can move the tree there. Call it after
-        ``integrate()``."""
+        """Returns for each of the ``trees`` [k]: speed [k] m/s of the fastest point; distance [k] m from its rest
+        position of the point that is furthest from it; whether :meth:`move_to_rest` can move the tree [k] bool. Call it
+        after ``integrate()``."""
         plants = self._plants
         plants.list_subset(trees)
         plants.launches.upload_changed()
@@ -87,8 +88,8 @@ class EquilibriumFinder:
         return self._speed[trees], self._distance[trees], self._is_free[trees]
 
     def move_to_rest(self, trees: np.ndarray) -> None:
-        """Turn the joints of trees [k] to equilibrium by one Newton step: by the displacement that
-        :meth:`residual_motion` has just found. Only for trees that nothing touches and that stand."""
+        """Turn the joints of trees [k] to equilibrium by one Newton step, which the last :meth:`residual_motion` has
+        computed. Call it only for trees without contacts and without floating roots."""
         plants = self._plants
         plants.list_subset(trees)
         plants.launches.download_impact_rates(len(trees))

@@ -1,8 +1,9 @@
-"""Faults: a tree whose motion is not finite or too fast is stopped, put to sleep and reported; the others go on.
+"""Faults: a tree whose motion is not finite or too fast is stopped, put to sleep and reported. All other trees
+continue.
 
-``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or beyond
-``ArticulationSolver.fault_rate``: the tree's joints stay where they were when the tick began, in the last valid state.
-This module finds such trees after the integration.
+``ArticulationSolver.integrate()`` does not integrate a tree in which a rate is not finite or above
+``ArticulationSolver.fault_rate``. The joints of this tree keep their state at the start of the tick, which is the last
+valid one. This module finds such trees after the integration.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 log = logging.getLogger(__name__)
 
 MAX_PENDING_FAULTS = 1000
-"""Most faults that are kept for the log between two reports; :attr:`FaultGuard.count` goes on counting."""
+"""Largest number of faults that are stored for the log between two reports. :attr:`FaultGuard.count` counts all
+faults."""
 _NO_TREES = np.zeros(0, np.int32)
 
 
@@ -28,24 +30,24 @@ class Fault:
     tick: int
     tree: int
     rate: float
-    """[rad/s] Rate that the fastest joint would have had in that tick; NaN if it was not a number."""
+    """[rad/s] Rate that the fastest joint would have had at the end of the tick; may be NaN."""
 
 
 class FaultGuard:
-    """Finds trees that the solver refused to integrate and puts them to sleep in their last sound pose."""
+    """Finds trees that the solver refused to integrate, and puts them to sleep in their last valid pose."""
 
     def __init__(self, plants: ArticulationSolver) -> None:
         self.plants = plants
         self.count = np.zeros(len(plants.model.tree_first), np.int32)
         """[tree] Number of faults of each tree so far."""
         self.slowed = 0
-        """Number of times that a tree moved beyond ``max_rate`` and was slowed below it, which takes energy from the
-        tree."""
+        """Number of times that a tree moved faster than ``max_rate`` and was slowed to it, which removes energy from
+        the tree."""
         self._faults: list[Fault] = []
 
     def stop_faulty_trees(self) -> np.ndarray:
-        """Put the trees to sleep that the last integration has stopped, and return them [k]. Writes no log: see
-        :meth:`report`."""
+        """Put the trees to sleep that the last integration has stopped, and return them [k]. :meth:`report` writes the
+        log."""
         plants = self.plants
         state = self.plants.state
         awake = plants.awake
@@ -76,7 +78,7 @@ class FaultGuard:
         return stopped
 
     def report(self) -> list[Fault]:
-        """Log the faults since the last report and return them. Call it outside the tick."""
+        """Log the faults since the last report and return them. Call it outside a step."""
         faults = self._faults
         self._faults = []
         for fault in faults:

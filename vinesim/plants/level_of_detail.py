@@ -1,7 +1,7 @@
-"""Level of detail of bunches: berries move in clusters where an actor is near or watches, as one compound elsewhere.
+"""Level of detail of bunches: berries move in clusters near actors and watched points, and as one compound elsewhere.
 
 Switching changes no pose and no momentum (:meth:`ArticulationSolver.refine`, :meth:`ArticulationSolver.coarsen`), so
-it may happen in any step. Refining is never late: it happens in the step in which an actor's box reaches into the
+it may happen in any step. A tree is refined in the step in which the bounding box of an actor first overlaps the
 tree's. Coarsening waits until no actor has been near for a while and the clusters have come to rest on their bunch.
 """
 
@@ -17,15 +17,15 @@ class LevelOfDetail:
     """Refines the trees that an actor is near to or watches, and coarsens them when no actor is near or watches."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` say when a tree is
+        """``parameters``: ``detail_duration``, ``detail_rate`` and ``detail_rest_duration`` determine when a tree is
         coarsened."""
         p = parameters
         self.plants = plants
         self.rest_rate = p.detail_rate
         self.fine_steps = p.steps(p.detail_duration)
         self.rest_steps = p.steps(p.detail_rest_duration)
-        """Number of successive steps for which the clusters of a tree must have been at rest before it is coarsened.
-        ``fine_steps`` is the number of steps that a tree stays fine with no actor near."""
+        """Number of successive steps for which the clusters of a tree must have been at rest before the tree is
+        coarsened. ``fine_steps`` is the number of steps for which a tree stays fine after the last actor has left."""
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)
@@ -39,12 +39,12 @@ class LevelOfDetail:
         self._attached = -1
         self._worth = np.zeros(trees, bool)
         self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
-        """Trees of the last call of :meth:`_rate`, the clusters of all these trees, and where the clusters of each tree
-        begin."""
+        """Trees of the last call of :meth:`_rate`, the bodies of all their clusters, and for each tree the index of its
+        first cluster in this list."""
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:
-        """Refine what hangs within ``radius`` [m] of ``points`` [n, 3], until the next call. No points: nothing is
-        watched."""
+        """Watch ``points`` [n, 3] m until the next call: trees with a bunch within ``radius`` [m] of a point are
+        refined."""
         self._points = np.asarray(points, float).reshape(-1, 3)
         self._radius = float(radius)
 
@@ -54,8 +54,8 @@ class LevelOfDetail:
         return self.plants.state.tree_fine.nonzero()[0]
 
     def update(self, near: np.ndarray) -> np.ndarray:
-        """Refine and coarsen trees; call it before ``predict()``. ``near`` [k] are the awake trees that an actor
-        reaches into. Returns the trees [k] that were coarsened."""
+        """Refine and coarsen trees; call it before ``predict()``. ``near`` [k]: awake trees whose bounding box an
+        actor's overlaps. Returns the trees [k] that were coarsened."""
         coarsened = near[:0]
         if len(self._clustered) == 0:
             return coarsened
@@ -84,7 +84,7 @@ class LevelOfDetail:
         return coarsened
 
     def _left_alone(self, wanted: np.ndarray) -> np.ndarray:
-        """Fine trees [k] that are not ``wanted``."""
+        """Returns the fine trees [k] that are not in ``wanted``."""
         fine = self.fine_trees
         if len(fine) == 0:
             return fine
@@ -94,7 +94,7 @@ class LevelOfDetail:
         return left
 
     def _seen(self) -> np.ndarray:
-        """Awake trees [k] with a bunch near a watched point, by the poses at the start of the last tick."""
+        """Returns the awake trees [k] with a bunch near a watched point, from poses at the start of the last tick."""
         state = self.plants.state
         here = np.flatnonzero(state.tree_awake[self._tree] & state.bunch_attached[self._clustered])
         apart = state.body_q[self._bodies[here], None, :3] - self._points
@@ -102,7 +102,7 @@ class LevelOfDetail:
         return np.unique(self._tree[here[close]])
 
     def _rate(self, trees: np.ndarray) -> np.ndarray:
-        """[k] rad/s Rate of the fastest cluster of each tree, relative to the body on which it hangs."""
+        """Returns for each tree the rate [k] rad/s of its fastest cluster relative to the cluster's parent."""
         if not np.array_equal(trees, self._rated_trees):
             model = self.plants.model
             self._rated_trees = trees

@@ -3,14 +3,13 @@
 The kernels are those that :class:`vinesim.plants.articulation_solver.ArticulationSolver` launches, compiled once more
 with their adjoints. Each tick has arrays of its own, so that the backward pass finds the values of the forward pass.
 Checkpoints bound the memory: the forward pass keeps only the joints, every ``checkpoint`` ticks; the backward pass
-runs each segment forward once more before its adjoint. You compute the loss, in NumPy, PyTorch or by hand:
-:meth:`Rollout.run` gives poses and velocities, :meth:`Rollout.gradient` takes the loss's derivatives with respect
-to them.
-docs/gradients.md shows it at work.
+runs each segment forward once more before its adjoint. The caller computes the loss, in NumPy, in PyTorch or by hand.
+:meth:`Rollout.run` returns poses and velocities, and :meth:`Rollout.gradient` takes the loss's derivatives with respect
+to these poses and velocities. docs/gradients.md has examples.
 
 A rollout always takes whole steps, while the solver divides the steps of trees that swing above 5 Hz: use a shorter
 ``dt`` for such trees.
-It keeps no energy budget (:mod:`vinesim.kernels.plants.energy_budget`).
+A rollout keeps no energy budget (:mod:`vinesim.kernels.plants.energy_budget`).
 
 The gradient is that of the numerical scheme, so it is exact where the scheme is smooth. The scheme is not smooth at the
 tick in which a joint passes ``fast_rate`` (phi becomes 1). Damping below ``(2 phi - 1) dt`` times stiffness has no
@@ -28,6 +27,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.plants import integration, kinematics, prediction, structs
 from vinesim.plants.articulation_solver import ArticulationSolver, kernel_parameters
 from vinesim.plants.device_buffers import DeviceBuffers, find_device
@@ -36,16 +36,16 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
 
 _PREDICT, _INTEGRATE, _FORWARD_KINEMATICS = (
-    wp.kernel(kernel.func, module="vinesim.plants.rollout", enable_backward=True)
+    wp.kernel(inspect.unwrap(kernel), module="vinesim.plants.rollout", enable_backward=True)
     for kernel in (prediction.predict, integration.integrate, kinematics.forward_kinematics)
 )
 _STRUCT = type(structs.JointState)
 _DEFAULTS = PhysicsParameters()
 _ZERO_INPUTS = ("body_load", "body_wrench")
-"""Input arrays that are zero unless :meth:`Rollout.run` is given them."""
+"""Input arrays that are zero unless they are arguments of :meth:`Rollout.run`."""
 _COUNTER = "tree_euler_steps"
-"""State array that counts the Euler steps still to be taken. It has no gradient, and each tick continues counting from
-its present value."""
+"""State array with the number of backward Euler steps (phi = 1) that each tree still has to take. It has no
+gradient."""
 _PARAMETERS = ("joint_stiffness", "joint_damping", "body_mass", "body_inertia", "body_product", "body_load")
 
 
@@ -63,7 +63,7 @@ class Trajectory:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Gradient:
-    """Derivative of a loss with respect to the inputs of a rollout. Units: the unit of the loss over that of the
+    """Derivative of a loss with respect to the inputs of a rollout. Units: unit of the loss divided by unit of the
     input."""
 
     stiffness: np.ndarray
@@ -71,25 +71,25 @@ class Gradient:
     damping: np.ndarray
     """[body, 3] With respect to ``joint_damping``."""
     mass: np.ndarray
-    """[body] With respect to ``body_mass``; the moments of inertia scale along with the mass."""
+    """[body] With respect to ``body_mass``; the moments of inertia scale with the mass."""
     load: np.ndarray
     """[body, 6] With respect to ``load``."""
     rotation: np.ndarray
-    """[body, 3] With respect to a small rotation vector [rad] in joint-frame axes that is put in front of the first
-    ``joint_q``."""
+    """[body, 3] With respect to a small rotation vector v [rad] in the axes of the joint frame: the first ``joint_q``
+    is replaced by exp(v) ``joint_q``."""
     joint_qd: np.ndarray
     """[body, 3] With respect to the first ``joint_qd``."""
 
 
 class RolloutDiverged(ValueError):
-    """A tree left the range that can be simulated; the text says which tree, and when."""
+    """Raised if a tree turns faster than ``fault_rate``. The message names the tree and the tick."""
 
 
 class Rollout:
     """A number of ticks of all trees of a model without contacts, and their adjoint.
 
     Args:
-        model: constants, and the values of inputs that :meth:`run` is not given. It is not written.
+        model: constants, and default values for the inputs of :meth:`run`. It is not modified.
         ticks: number of ticks.
         watched: bodies [k] whose motion the loss depends on; all moving bodies unless given.
         fine: let the berry clusters of bunches move.
@@ -149,12 +149,12 @@ class Rollout:
             "tree_awake": wp.array(np.ones(trees), dtype=wp.bool, device=self.device),
         }
         self._stacks: dict[str, wp.array] = {}
-        """Arrays with one entry for each tick of a segment [slot, tree or body]; arrays of states have one slot
-        more."""
+        """Arrays with one entry for each tick of a segment [slot, tree or body], by name. Arrays of states have one
+        slot more."""
         self._record()
         self._checkpoints: list[dict[str, np.ndarray]] = []
         self._at = -1
-        """Number of the segment whose values are in the stacks; -1 for none."""
+        """Number of the segment whose values ``_stacks`` holds; -1 for none."""
 
     # forward
 
@@ -168,12 +168,12 @@ class Rollout:
         joint_q: np.ndarray | None = None,
         joint_qd: np.ndarray | None = None,
     ) -> Trajectory:
-        """Roll out and return the motion of the watched bodies.
+        """Simulate all ticks, and return the motion of the watched bodies.
 
         Args:
             stiffness: [body, 3] N m/rad, replaces ``joint_stiffness``.
             damping: [body, 3] N m s/rad, replaces ``joint_damping``.
-            mass: [body] kg, replaces ``body_mass``; moments of inertia scale along.
+            mass: [body] kg, replaces ``body_mass``; moments of inertia scale with it.
             load: [body, 6] N, N m: a steady wrench at each body's origin, world axes; none unless given.
             joint_q: [body, 4] joint rotations at the start; the authored shape unless given.
             joint_qd: [body, 3] rad/s joint rates at the start; at rest unless given.
@@ -214,7 +214,7 @@ class Rollout:
     # backward
 
     def gradient(self, by_q: np.ndarray | None = None, by_qd: np.ndarray | None = None) -> Gradient:
-        """The gradient of a loss, from the loss's derivatives with respect to the last run's trajectory.
+        """Returns the gradient of a loss, from the loss's derivatives with respect to the last run's trajectory.
 
         Args:
             by_q: [tick + 1, watched, 7] derivative with respect to ``body_q``; the four numbers of a quaternion count
@@ -264,17 +264,18 @@ class Rollout:
     def _record(self) -> None:
         """Allocate arrays for every step of a segment, and record the forward and adjoint launches that work on
         them."""
-        self._states = tuple(structs.fields(structs.JointState))
-        for name, field in structs.fields(structs.JointState).items():
-            self._stacks[name] = self._zeros(name, field.type.dtype, self._slots + 1)
+        self._states = tuple(struct_fields(structs.JointState))
+        for name, field in struct_fields(structs.JointState).items():
+            self._stacks[name] = self._zeros(name, field.dtype, self._slots + 1)
         self._stacks[_COUNTER] = self._zeros(_COUNTER, wp.int32, self._slots + 1)
         self._steps = [(self._launch(_PREDICT, slot), self._launch(_INTEGRATE, slot)) for slot in range(self._slots)]
         self._ends = [self._launch(_FORWARD_KINEMATICS, slot + 1, end=True) for slot in range(self._slots)]
         self._last = (self._arrays["end body_q"], self._arrays["end body_qd"])
 
     def _launch(self, kernel: Any, slot: int, end: bool = False) -> tuple[Any, Any]:
-        """The forward launch of one kernel in one step, and its adjoint launch."""
-        types = inspect.get_annotations(kernel.func)
+        """Returns the forward launch and the adjoint launch of one kernel in one step. ``slot``: index of the step in
+        its segment. ``end``: the kernel runs once after the last step."""
+        types = inspect.get_annotations(kernel)
         values = [self._argument(kernel, name, kind, slot, end) for name, kind in types.items()]
         adjoints = [self._adjoint(kind, value) for kind, value in zip(types.values(), values, strict=True)]
         common: dict[str, Any] = {"dim": len(self.model.tree_first), "inputs": values, "device": self.device}
@@ -282,24 +283,26 @@ class Rollout:
         return wp.launch(kernel, **common), wp.launch(kernel, adj_inputs=adjoints, adjoint=True, **common)
 
     def _argument(self, kernel: Any, name: str, kind: Any, slot: int, end: bool) -> Any:
-        """The value of a kernel argument in one step: a struct filled field by field, an array, or a number."""
+        """Returns the value of the kernel argument ``name`` in one step: a filled struct, an array or a number.
+        ``kind``: annotated type of the argument."""
         written = name.endswith("_out")
         if not isinstance(kind, _STRUCT):
             return self._value(kernel, name.removesuffix("_out"), kind, written, slot, end)
         filled = kind()
-        for field, var in structs.fields(kind).items():
-            setattr(filled, field, self._value(kernel, field, var.type, written, slot, end))
+        for field, field_type in struct_fields(kind).items():
+            setattr(filled, field, self._value(kernel, field, field_type, written, slot, end))
         return filled
 
     def _adjoint(self, kind: Any, value: Any) -> Any:
-        """The array of an argument's derivatives. A struct needs none: its arrays have their own."""
+        """Returns the adjoint argument for one kernel argument: the gradient array of an array, or an empty struct for
+        a struct, because its arrays carry their own gradients."""
         if isinstance(kind, _STRUCT):
             return kind()
         return value.grad if isinstance(value, wp.array) else None
 
     def _value(self, kernel: Any, name: str, kind: Any, written: bool, slot: int, end: bool) -> Any:
-        """The value of an argument or field of this name in one step. Values that no step changes come from the
-        solver's arrays."""
+        """Returns the value in one step of the kernel argument or struct field ``name``. Values that no step changes
+        come from the solver's arrays."""
         if name in self._given:
             return self._given[name]
         dtype = kind.dtype
@@ -313,7 +316,7 @@ class Rollout:
             if name not in self._stacks:
                 self._stacks[name] = self._zeros(name, dtype, self._slots)
             return self._stacks[name][slot]
-        elif kernel is _INTEGRATE and name in self._stacks:  # what the prediction has written
+        elif kernel is _INTEGRATE and name in self._stacks:  # results of the prediction
             return self._stacks[name][slot]
         if name not in self._arrays:
             self._arrays[name] = self._input(name, dtype)
@@ -330,7 +333,7 @@ class Rollout:
         return wp.zeros(shape, dtype=dtype, device=self.device, requires_grad=dtype not in (wp.int32, wp.bool))
 
     def _segments(self) -> list[tuple[int, int, int]]:
-        """Number, first tick and length of each segment."""
+        """Returns index, first tick and number of ticks of each segment."""
         starts = range(0, self.ticks, self._slots)
         return [(i, start, min(self._slots, self.ticks - start)) for i, start in enumerate(starts)]
 
@@ -347,8 +350,8 @@ class Rollout:
         self._at = segment
 
     def _seed(self, grad: wp.array, rows: np.ndarray) -> None:
-        """Write the loss's derivatives with respect to the watched bodies in some ticks; they are zero for all other
-        bodies."""
+        """Write the loss's derivatives ``rows`` with respect to the watched bodies into ``grad``, and zero for all
+        other bodies."""
         seed = np.zeros((*grad.shape, rows.shape[-1]), np.float32)
         rows_of: Any = (slice(0, len(rows)), self.watched)
         np.add.at(seed.reshape(-1, *seed.shape[-2:]), rows_of, rows)
@@ -379,5 +382,5 @@ class Rollout:
 
 
 def _fill(array: wp.array, data: np.ndarray) -> None:
-    """Copy numbers into an array or a part of one."""
+    """Copy NumPy numbers into a Warp array, or into a slice of one."""
     array.assign(np.ascontiguousarray(data, np.float32))

@@ -1,12 +1,11 @@
 """Sleep of trees: a tree at rest is put to sleep, together with all trees that it touches.
 
 A tree is at rest when no point of it is faster than ``sleep_speed``, or further than ``sleep_distance`` from its rest
-position. The tree is then moved into its rest pose, and so sleeps in the pose in which it would have come to rest. The
-motion is smaller than a camera can see, and the tree sleeps seconds earlier. A tree in contact is not moved, since that
-would change the forces: it must come much nearer to rest by itself. All this is computed
-(:mod:`vinesim.plants.equilibrium`) only for trees all of whose joints have been slower than ``sleep_rate`` for
-``sleep_duration``. Trees in contact sleep together (an *island*), and
-only if nothing keeps one of them awake.
+position. The tree is then moved into its rest pose. So it sleeps in the pose in which it would have come to rest, but
+seconds earlier. A camera cannot resolve this motion. A tree in contact is not moved, since that would change the
+contact forces: it falls asleep only much nearer to its rest pose. The distance from rest
+(:mod:`vinesim.plants.equilibrium`) is computed only for trees in which all joints have been slower than ``sleep_rate``
+for ``sleep_duration``. Trees in contact sleep together (an *island*), and only if nothing keeps one of them awake.
 """
 
 from __future__ import annotations
@@ -22,18 +21,18 @@ from vinesim.plants.equilibrium import EquilibriumFinder
 from vinesim.scene.physics_parameters import PhysicsParameters
 
 CHECK_PERIOD = 0.05
-"""[s] Trees are measured and put to sleep at this period, all in the same step: a measurement costs as much as the
-prediction of a step. TUNED."""
+"""[s] Period at which trees are measured and put to sleep. All trees are measured in the same step, because a
+measurement costs as much as the prediction of a step. TUNED."""
 
 CONTACT_SHARE = 0.05
-"""[1] Trees in contact and cut-off parts are not moved to their rest pose when they fall asleep. So they must be within
-this share of ``sleep_distance`` of it. TUNED: 0.01 mm, a thousandth of a travel of 1 cm."""
+"""[1] Share of ``sleep_distance`` within which a tree in contact, or a cut-off part, must be of its rest pose to fall
+asleep. It is small because these are not moved to their rest pose. TUNED: 0.01 mm, a thousandth of a travel of 1 cm."""
 
 STILL_DURATION = 5.0
-"""[s] A tree in contact, or a cut-off part, also counts as at rest if none of its bodies has moved by more than this
-share of ``sleep_distance`` for this long. The tangent stiffness does not contain the contacts that support it, so its
-distance from rest may be overestimated. A tree that creeps with a time constant of five times this duration falls
-asleep 0.05 mm from its rest. TUNED."""
+"""[s] Duration after which a tree in contact, or a cut-off part, counts as at rest if none of its bodies has moved by
+more than :data:`CONTACT_SHARE` of ``sleep_distance``. This rule is needed because the tangent stiffness does not
+contain the supporting contacts, so the distance from rest may be overestimated. A tree that creeps with a time constant
+of five times this duration falls asleep 0.05 mm from its rest. TUNED."""
 
 _NO_PAIRS = np.zeros((0, 2), np.int32)
 
@@ -42,7 +41,7 @@ class SleepMonitor:
     """Finds the awake trees that are at rest, and puts to sleep those that nothing keeps awake."""
 
     def __init__(self, plants: ArticulationSolver, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``parameters``: those whose names begin with ``sleep_`` define when a tree is at rest."""
+        """``parameters``: the fields ``sleep_...`` define when a tree is at rest."""
         self.plants = plants
         self.rate = parameters.sleep_rate
         self.speed = parameters.sleep_speed
@@ -53,17 +52,16 @@ class SleepMonitor:
         self._check_steps = parameters.steps(CHECK_PERIOD)
         trees = len(plants.model.tree_first)
         self.quiet_steps = np.zeros(trees, np.int32)
-        """[tree] Number of successive steps for which the joints of each awake tree have been slow."""
+        """[tree] Number of successive steps in which all joints of each awake tree were slower than ``sleep_rate``."""
         self._is_at_rest = np.zeros(trees, bool)
         self._still_steps = parameters.steps(STILL_DURATION)
         self._seen_tick = np.full(trees, -1, np.int64)
         """[tree] Tick in which the positions of each tree were stored in :attr:`_seen_x`; -1 if none are stored."""
         self._seen_x = np.zeros((len(plants.model.body_mass), 3), np.float32)
-        """[body, 3] m Positions of bodies at that tick."""
+        """[body, 3] m Positions of bodies at the tick in ``_seen_tick``."""
         self._limit = np.zeros(1, np.float32)
         self._longest = np.zeros(1, np.int32)
-        """[1] Number of steps for which the joints of the quietest awake tree have been slow. ``_limit`` [1] is
-        :attr:`rate`."""
+        """[1] Largest entry of :attr:`quiet_steps` of an awake tree. ``_limit`` [1] is :attr:`rate`."""
         self._count_quiet_steps = KernelGraph(
             KernelLaunch(
                 count_quiet_steps,
@@ -79,19 +77,19 @@ class SleepMonitor:
 
     @property
     def restless(self) -> np.ndarray:
-        """Awake trees that are not at rest, whose state is still changing, sorted [k]."""
+        """Awake trees [k] that are not at rest, sorted."""
         awake = self.plants.awake
         return awake[~self._is_at_rest[awake]]
 
     def wake(self, trees: np.ndarray) -> None:
-        """Wake trees, or keep them awake, for at least ``patience`` steps from now. :class:`ValueError` as in
-        :meth:`ArticulationSolver.wake`."""
+        """Wake trees, or keep them awake, for at least :attr:`patience` more steps. Raises :class:`ValueError` if there
+        is no such tree."""
         trees = np.atleast_1d(trees)
         self.plants.wake(trees)
         self._forget(trees)
 
     def wake_unbalanced(self) -> None:
-        """Wake the sleeping trees that would not stay in their present pose."""
+        """Wake the sleeping trees that are not in equilibrium in their present pose."""
         asleep = np.flatnonzero(~self.plants.state.tree_awake).astype(np.int32)
         _, distance, _ = self._equilibrium.residual_motion(asleep)
         self.wake(asleep[distance > CONTACT_SHARE * self.distance])
@@ -104,14 +102,16 @@ class SleepMonitor:
     ) -> np.ndarray:
         """Call :meth:`watch`, and :meth:`check` if it is due. Returns the trees that have been put to sleep [k].
 
-        ``keep_awake`` [tree] bool: trees that an actor is near to, holds or owns. ``contact_pairs`` [n, 2]: awake trees
-        that touch each other. ``is_coupled`` [tree] bool: awake trees that wires join to others. Coupled trees are not
-        moved to their rest poses, since these depend on the other trees.
+        ``keep_awake`` [tree] bool: trees that must not fall asleep, because an actor is near, holds or owns them.
+        ``contact_pairs`` [n, 2]: awake trees that touch each other. ``is_coupled`` [tree] bool: awake trees that share
+        a wire or an arm with another awake tree. Coupled trees are not moved to their rest poses, since these poses
+        depend on the other trees.
         """
         return self.check(keep_awake, contact_pairs, is_coupled) if self.watch() else self.plants.awake[:0]
 
     def watch(self) -> bool:
-        """Note which trees were slow in the last integration. Returns whether some are due for :meth:`check`."""
+        """Count for each tree the successive steps in which its joints were slow. Returns whether some trees are due
+        for :meth:`check`."""
         plants = self.plants
         self._limit[0] = self.rate
         self._longest[0] = 0
@@ -151,7 +151,7 @@ class SleepMonitor:
         return asleep
 
     def _find_still(self, trees: np.ndarray) -> None:
-        """Mark those of some slow trees [k] as at rest that have not moved for :data:`STILL_DURATION`."""
+        """Mark trees [k] as at rest if they have not moved for :data:`STILL_DURATION`."""
         plants = self.plants
         now = self.plants.tick
         due = trees[(self._seen_tick[trees] >= 0) & (now - self._seen_tick[trees] >= self._still_steps)]
@@ -167,7 +167,7 @@ class SleepMonitor:
             self._seen_tick[late] = now
 
     def _forget(self, trees: np.ndarray) -> None:
-        """Begin to watch trees from the start."""
+        """Restart the counts of slow steps and the stored positions of trees."""
         self.quiet_steps[trees] = 0
         self._is_at_rest[trees] = False
         self._seen_tick[trees] = -1

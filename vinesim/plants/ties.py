@@ -1,9 +1,9 @@
-"""Ties: springs and dampers that hold bodies at points of the world, both the model's ties and those of hands; and the
-rest poses of roots.
+"""Ties: springs and dampers between bodies and points of the world, which are wires of the model or people's hands.
+Also the rest poses of root springs.
 
-The ties of a body are adjacent in the kernels' arrays. So behind the model's ties there are spans of equal length for
-bodies that hands hold. Each held body gets one span: its own ties are copied to the front, and the hands that hold it
-take the places behind them.
+The kernels need the ties of a body to be adjacent. So after the model's ties the arrays have spans of equal length for
+bodies that hands hold. Each held body gets one span: a copy of its model ties, followed by the ties of the hands that
+hold it.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from vinesim.core import frames
 from vinesim.scene.model import Model
 
 TURNING_TIME = 0.05
-"""[s] A tie grips the wood that it holds: it resists rotation. The damping is this time, multiplied by the stiffness
-that weight gives to the swing. GUESSED: a damping ratio of 0.1 for a swing of 1.5 s."""
+"""[s] Ratio of a tie's rotational damping to the stiffness of the swing due to weight. A tie grips the wood and so
+damps its rotation. GUESSED: a damping ratio of 0.1 for a swing of 1.5 s."""
 
 
 class TieLimitError(ValueError):
-    """Too many bodies are held, or one of them in too many places."""
+    """Raised if too many bodies are held, or one body in too many places."""
 
 
 class TieTable:
-    """All ties of a solver.
+    """The table of all ties of a solver, with one row for each tie.
 
     Args:
         model: its ties come first in the table, sorted by body.
@@ -43,18 +43,18 @@ class TieTable:
         self._span_size = self._max_model_ties + max_hands
         room = max_bodies * self._span_size
         self.anchor = np.append(model.tie_anchor, np.zeros((room, 3), np.float32), 0)
-        """[tie, 3] m, in the world: the points at which ties are held."""
+        """[tie, 3] m, in the world: the fixed end of each tie."""
         self.anchor_velocity = np.zeros_like(self.anchor)
         """[tie, 3] m/s: velocity of the anchor."""
         self.axis = np.zeros_like(self.anchor)
-        """[tie, 3] Direction of the wire that a tie is bound to; 0 for a tie that is not bound to a wire."""
+        """[tie, 3] Unit vector along the wire that the tie is bound to; 0 for a tie that is not bound to a wire."""
         self.softening = np.zeros(len(self.anchor), np.float32)
-        """[tie] N/m by which tie and wire in series are less stiff across the wire than the tie alone, when all awake
-        trees of the wire move as one. Only the sleep of trees uses it."""
+        """[tie] N/m: stiffness of the tie minus stiffness of tie and wire in series, across the wire, when all awake
+        trees on the wire move together. Only the sleep of trees uses it."""
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
         """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
-        """[tie] N s/m damping."""
+        """[tie] N s/m: damping of each tie."""
         self.point = np.append(model.tie_point, np.zeros((room, 3), np.float32), 0)
         """[tie, 3] m, in the body's frame: the point of the body at which the tie acts."""
         ends = np.searchsorted(model.tie_body, np.arange(bodies + 1)).astype(np.int32)
@@ -68,7 +68,7 @@ class TieTable:
 
     @property
     def held_bodies(self) -> list[int]:
-        """Bodies with ties of :meth:`add`."""
+        """Bodies that have ties of :meth:`add`."""
         return list(self._slot_of)
 
     @property
@@ -77,9 +77,10 @@ class TieTable:
         return np.append(self._model_body, np.array(self.held_bodies, np.int32))
 
     def add(self, body: int, point: np.ndarray, pose: np.ndarray, stiffness: float, damping: float) -> int:
-        """Tie a body to the place where ``point`` [3] m of its frame is at its world pose [7]. Returns the tie's index.
+        """Tie the point ``point`` [3] m of a body's frame to its present place in the world. ``pose`` [7]: world pose
+        of the body. Returns the tie's index.
 
-        :class:`TieLimitError` if too many bodies are held, or this body in too many places.
+        Raises :class:`TieLimitError` if too many bodies are held, or this body in too many places.
         """
         if not (np.isfinite(point).all() and 0.0 < stiffness < math.inf and 0.0 <= damping < math.inf):
             raise ValueError(
@@ -100,7 +101,7 @@ class TieTable:
         return tie
 
     def remove(self, body: int, tie: int) -> None:
-        """Undo a tie of :meth:`add`."""
+        """Remove a tie that :meth:`add` added."""
         self.stiffness[tie] = self.damping[tie] = 0.0
         start = self._hands_start(body)
         if not self.stiffness[start : start + self._max_hands].any():
@@ -143,17 +144,18 @@ class RootRests:
         self.rate = np.zeros((trees, 3), np.float32)
         """[tree, 3] rad/s: rate of this rotation, in joint axes."""
         self.softening = np.zeros((trees, 3), np.float32)
-        """[tree, 3] (N m/rad)^(1/2), in joint axes. The outer product of this vector with itself is the stiffness by
-        which spring and arm in series are less stiff than the spring alone, when all awake trees of the arm move as
-        one. Only the sleep of trees uses it."""
+        """[tree, 3] (N m/rad)^(1/2), in joint axes. The outer product of this vector with itself is the stiffness of
+        the root spring minus the stiffness of spring and arm in series, when all awake trees on the arm move together.
+        Only the sleep of trees uses it."""
 
 
 def turning_damping(model: Model, bodies: np.ndarray, root: np.ndarray, tied: np.ndarray, gravity: float) -> np.ndarray:
-    """Damping [k] N m s/rad by which ties resist the rotation of floating components: given at each root, 0 elsewhere.
+    """Returns the damping [k] N m s/rad by which ties resist the rotation of floating components. It is 0 for bodies
+    that are not floating roots.
 
-    It is :data:`TURNING_TIME` times the stiffness that weight gives to the component's swing if it hangs straight down:
-    the sum of weights times lengths along the wood to the nearest tie. It depends on the model, the cuts and the ties
-    alone, so it is the same for a client that joins later.
+    The damping is :data:`TURNING_TIME` times the stiffness of the component's swing due to weight if the component
+    hangs straight down: the sum of weights times lengths along the wood to the nearest tie. It depends on the model,
+    the cuts and the ties alone, so a client that joins later computes the same value.
 
     Args:
         model: model of the trees.

@@ -1,4 +1,4 @@
-"""Checks of a model and its state before they are simulated: errors, and their remedies."""
+"""Checks of a model and its state before the simulation. Each error message names the fault and its correction."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ _log = logging.getLogger(__name__)
 
 
 def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
-    """Tree indices [k] as an array; :class:`ValueError` naming the first that is not from 0 to ``count`` - 1."""
+    """Returns tree indices [k] as an array. Raises :class:`ValueError` for the first index that is not from 0 to
+    ``count`` - 1."""
     trees = np.atleast_1d(trees)
     if len(trees) and (trees.dtype.kind not in "iu" or trees.min() < 0 or trees.max() >= count):
         for tree in trees.tolist():
@@ -23,7 +24,7 @@ def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
 
 
 def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
-    """Log one warning if springs ask for less damping than the scheme has at ``dt`` [s] and ``phi``."""
+    """Log one warning if joints have less damping in the model than the scheme adds at ``dt`` [s] and ``phi``."""
     floor = (2.0 * phi - 1.0) * dt
     stiffness = model.joint_stiffness.astype(float)
     raised = ((stiffness > 0.0) & (model.joint_damping < (1.0 - 1e-3) * floor * stiffness)).any(1)
@@ -40,7 +41,8 @@ def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
 
 
 def validate(model: Model, state: State) -> None:
-    """Raise :class:`ValueError` naming the first tree or body that cannot be simulated, and the remedy."""
+    """Raise :class:`ValueError` for the first tree or body that cannot be simulated. The message says how to correct
+    it."""
     model.check()
     state.check()
     if len(state.joint_q) != len(model.body_mass) or len(state.tree_awake) != len(model.tree_first):
@@ -83,8 +85,8 @@ def validate(model: Model, state: State) -> None:
 
 
 def _validate_clusters(model: Model) -> None:
-    """Check that the bodies behind a tree's core are exactly its clusters, and that each run of clusters is on one
-    bunch."""
+    """Check that the bodies after a tree's core are exactly its berry clusters, and that each cluster hangs on its
+    bunch or on another cluster of that bunch."""
     core = model.tree_core
     size = model.tree_size
     if (bad := (core < 1) | (core > size)).any():
@@ -130,7 +132,7 @@ def _validate_clusters(model: Model) -> None:
 
 
 def _validate_ties(model: Model) -> None:
-    """Check that ties are sorted, are on existing bodies that always move, and pull back."""
+    """Check that ties are sorted, are on existing bodies that always move, and have positive stiffness."""
     body = model.tie_body
     count = len(model.body_mass)
 

@@ -1,4 +1,4 @@
-"""Rigid geoms that plants collide with: MuJoCo's geoms, each with its actor and link."""
+"""Geoms of the rigid world that plants can collide with, and convex hulls of their meshes."""
 
 from __future__ import annotations
 
@@ -17,33 +17,33 @@ _PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
     for name in ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
 )
 PLANE_HALF_SIZE = 1e6
-"""[m] Half edge of the bounding box of the ground."""
+"""Half edge [m] of the bounding box of the ground plane."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RigidGeoms:
-    """Rigid geoms that plants can touch, sorted by MuJoCo geom."""
+    """Arrays of the rigid geoms that plants can collide with, sorted by MuJoCo's geom index."""
 
     id: np.ndarray
     """[geom] index in MuJoCo's geom arrays."""
     body: np.ndarray
-    """[geom] MuJoCo body."""
+    """[geom] index of the geom's MuJoCo body."""
     kind: np.ndarray
     """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
     replaced by its bounding box."""
     hull: np.ndarray
-    """[geom] number of the convex hull in :func:`hull_arrays`; -1 if the geom is not a mesh."""
+    """[geom] index of the convex hull in :func:`hull_arrays`; -1 if the geom has none."""
     size: np.ndarray
     """[geom, 3] size as in MuJoCo's ``geom_size``; for a mesh, half edges of its bounding box."""
     half: np.ndarray
-    """[geom, 3] half edges of the bounding box in the geom's axes; for a plane, :data:`PLANE_HALF_SIZE` and no
-    height."""
+    """[geom, 3] m, half edges of the bounding box in the geom's axes; for a plane, :data:`PLANE_HALF_SIZE` twice and
+    height 0."""
     center: np.ndarray
     """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
-    """[geom] radius of the bounding sphere around the centre."""
+    """[geom] m, radius of the bounding sphere around ``center``."""
     material: np.ndarray
-    """[geom] :class:`Material`"""
+    """[geom] contact material, a number of :class:`Material`."""
     friction: np.ndarray
     """[geom] the geom's own Coulomb coefficient; 0: the coefficient depends on the two materials in contact."""
     dof: np.ndarray
@@ -55,13 +55,14 @@ class RigidGeoms:
 
 
 def owned_geoms(m: mujoco.MjModel, owner: dict[int, tuple[str, str]]) -> RigidGeoms:
-    """All geoms of the MuJoCo bodies in ``owner``, which maps body numbers to actor and link."""
+    """Returns all geoms of the MuJoCo bodies in ``owner``, which maps a body's index to its actor and link."""
     ids = np.flatnonzero(np.isin(m.geom_bodyid, list(owner)))
     return _of(m, ids, [owner[body] for body in m.geom_bodyid[ids].tolist()])
 
 
 def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
-    """The subset of ``geoms`` that collides now. It changes when a hand grasps or releases something."""
+    """Returns the subset of ``geoms`` whose collisions are enabled; the hands of people disable theirs while they hold
+    something."""
     rows = np.flatnonzero(m.geom_contype[geoms.id] != 0)
     names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
     arrays: dict[str, Any] = {name: getattr(geoms, name)[rows] for name in names}
@@ -70,13 +71,13 @@ def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
 
 
 def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
-    """Geoms of ground, trellis and old wood. They are MuJoCo's first geoms and do not depend on the actors."""
+    """Returns the geoms of ground, trellis and old wood, which are MuJoCo's first geoms, whichever actors exist."""
     ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
 def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> RigidGeoms:
-    """The properties of the geoms ``ids`` [k]; ``names``: actor and link of each geom."""
+    """Returns the properties of the MuJoCo geoms ``ids`` [k]; ``names`` [k]: actor and link of each geom."""
     moved_by = m.body_weldid  # a body without joints moves with the body to which it is welded
     last = np.where(m.body_dofnum > 0, m.body_dofadr + m.body_dofnum - 1, -1)[moved_by]
     body = m.geom_bodyid[ids]
@@ -115,14 +116,15 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
 
 
 def concatenate(first: RigidGeoms, second: RigidGeoms) -> RigidGeoms:
-    """The geoms of one list, then those of another."""
+    """Returns one list with the geoms of ``first``, followed by the geoms of ``second``."""
     names = [field.name for field in dataclasses.fields(RigidGeoms) if field.name not in ("actor", "link")]
     arrays: dict[str, Any] = {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in names}
     return RigidGeoms(actor=first.actor + second.actor, link=first.link + second.link, **arrays)
 
 
 def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:
-    """[geom] Name that stays valid after a recompilation: actor, link and the geom's number on that link."""
+    """Returns for each geom a name that stays valid when MuJoCo's world is recompiled: actor, link, number on the
+    link."""
     seen: dict[tuple[str, str], int] = {}
     names = []
     for actor, link in zip(geoms.actor, geoms.link, strict=True):
@@ -131,22 +133,23 @@ def persistent_names(geoms: RigidGeoms) -> list[tuple[str, str, int]]:
     return names
 
 
-# Convex hulls of meshes for contacts with plants: planes and edges of the hull that MuJoCo computed for each mesh.
+# Convex hulls of meshes, for contacts with plants: planes and edges of the hull that MuJoCo computed for each mesh.
 
 
 COPLANAR_COSINE = 1.0 - 1e-9
-"""[1] Triangles form one face if the cosine between their normals is larger than this."""
+"""Least cosine between the normals of triangles that form one face of a hull."""
 
 
 def hull_numbers(m: mujoco.MjModel, ids: np.ndarray) -> np.ndarray:
-    """[geom] Number of the hull of each geom in ``ids``, which is its mesh; -1 for other kinds and for flat meshes."""
+    """Returns the index of the convex hull of each geom in ``ids`` [geom]: the index of its mesh; -1 for geoms that are
+    not meshes and for flat meshes."""
     mesh = np.where(m.geom_type[ids] == _MESH, m.geom_dataid[ids], -1)
     has_hull = np.append(m.mesh_graphadr >= 0, False)
     return np.where(has_hull[mesh], mesh, -1).astype(np.int32)
 
 
 def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
-    """Hulls of all meshes of a world; meshes without a hull have an empty one."""
+    """Returns the convex hulls of all meshes of a world; a mesh without a hull has an empty entry."""
     planes = [np.zeros((0, 4))]
     edges = [np.zeros((0, 2, 3))]
     sides = [np.zeros((0, 2), int)]
@@ -179,7 +182,8 @@ def hull_arrays(m: mujoco.MjModel) -> SharedArrays:
 
 
 def _graph(m: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices [vertex, 3] m of a mesh's hull, and its triangles [triangle, 3] as indices of vertices.
+    """Returns the vertices [vertex, 3] m of the hull of ``mesh``, and its triangles [triangle, 3] as indices of
+    vertices.
 
     MuJoCo's ``mesh_graph`` contains the numbers of vertices and triangles, two lists with an entry for each vertex (the
     second one is its index in the mesh), the neighbours (vertices + 3 triangles entries), and the triangles as indices
@@ -196,12 +200,13 @@ def _graph(m: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, np.ndarray]:
 
 @functools.lru_cache(1024)  # the world is recompiled whenever an actor joins
 def _cached_hull(vertices: bytes, triangles: bytes) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """:func:`faces_and_edges` for arrays given as bytes, which can be hashed."""
+    """Returns :func:`faces_and_edges` of arrays that are given as bytes, because a cache needs hashable arguments."""
     return faces_and_edges(np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(triangles, int).reshape(-1, 3))
 
 
 def faces_and_edges(vertices: np.ndarray, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Planes [plane, 4] (outward normal, offset), edges [edge, 2, 3] m and the two planes of each edge [edge, 2].
+    """Returns planes [plane, 4] (outward normal, offset), edges [edge, 2, 3] m and the two planes of each edge [edge,
+    2].
 
     ``vertices`` [vertex, 3] m and ``triangles`` [triangle, 3] (indices of vertices) describe a hull. Triangles in one
     plane form one face without edges between them.

@@ -1,4 +1,4 @@
-"""Effective mass of the rigid world within one step, from MuJoCo's sparse arrays: inertia, servos and constraints."""
+"""Effective mass of the rigid bodies within one step (inertia, implicit servos, constraints), from MuJoCo's arrays."""
 
 from __future__ import annotations
 
@@ -10,11 +10,12 @@ _CONE = int(mujoco.mjtConstraintState.mjCNSTRSTATE_CONE)
 
 
 class EffectiveMass:
-    """H = M^ + Jc^T D Jc: mass with implicit servos, plus the tangent stiffness of MuJoCo's active constraints.
+    """The effective mass H = M^ + Jc^T D Jc of a MuJoCo world in one step.
 
-    The constraints are joint limits, mimic joints and contacts between rigid bodies. D belongs to the acceleration that
-    MuJoCo computed last; for sliding contacts it is the Hessian of the friction cone. Only the kinematic trees
-    concerned are factored.
+    M^ is the mass matrix with implicit damping and servos; Jc^T D Jc is the tangent stiffness of MuJoCo's active
+    constraints: joint limits, mimic joints and contacts between rigid bodies. D is evaluated at the acceleration that
+    MuJoCo computed last; for a sliding contact it is the Hessian of the friction cone. Only kinematic trees that an
+    impulse can move are factored.
     """
 
     def __init__(self, world: mujoco.MjModel) -> None:
@@ -23,7 +24,7 @@ class EffectiveMass:
         self._each = np.arange(world.ntree, dtype=np.int32)
 
     def impulse_response(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
+        """Returns the change of velocity [dof, k] by unit impulses along the rows of ``J`` [k, dof]: H^-1 J^T.
 
         Raises numpy.linalg.LinAlgError if H is singular.
         """
@@ -36,16 +37,17 @@ class EffectiveMass:
         return change
 
     def island_labels(self, d: mujoco.MjData) -> np.ndarray:
-        """[MuJoCo kinematic tree] Labels; trees have equal labels if a force on one may move the other in this step."""
+        """Returns a label [MuJoCo kinematic tree] of each tree's island: a force on a tree can move only trees with an
+        equal label within this step."""
         m = self._world
         if d.nefc == 0:
             return self._each
         return np.where(d.tree_island >= 0, m.ntree + d.tree_island, self._each) if d.nisland else 0 * self._each
 
     def is_constrained(self, d: mujoco.MjData, bodies: np.ndarray) -> bool:
-        """Whether active constraints of MuJoCo act on one of the MuJoCo ``bodies`` [k].
+        """Returns whether an active constraint of MuJoCo acts on one of the MuJoCo ``bodies`` [k].
 
-        Otherwise the effective mass is M^, and MuJoCo has its sparse factor L^T D L in ``qH``.
+        If none does, their effective mass is M^, for which MuJoCo already has the sparse factor L^T D L in ``qH``.
         """
         if d.nefc == 0:
             return False
@@ -53,7 +55,8 @@ class EffectiveMass:
         return d.nisland == 0 or bool((d.tree_island[tree[tree >= 0]] >= 0).any())
 
     def _coupled(self, d: mujoco.MjData, J: np.ndarray) -> np.ndarray:
-        """Degrees of freedom [k] moved by an impulse along ``J``: of its trees and of trees constrained to them."""
+        """Returns the degrees of freedom [k] that an impulse along a row of ``J`` can move, directly or by
+        constraints."""
         m = self._world
         touched = np.zeros(m.ntree, bool)
         touched[m.dof_treeid[J.any(axis=0)]] = True
@@ -67,7 +70,7 @@ class EffectiveMass:
 
 
 class _Block:
-    """The effective mass of some degrees of freedom, as a dense matrix."""
+    """Builds the effective mass of a fixed set of degrees of freedom as a dense matrix, in every step."""
 
     def __init__(self, world: mujoco.MjModel, dofs: np.ndarray) -> None:
         self.count = len(dofs)
@@ -81,14 +84,14 @@ class _Block:
         self.column = self.at[column[self.entry]]
 
     def hessian(self, d: mujoco.MjData) -> np.ndarray:
-        """Matrix [k, k]: M^ plus the tangent stiffness of the active constraints."""
+        """Returns the effective mass [k, k]: M^ plus the tangent stiffness of the active constraints."""
         H = np.zeros((self.count, self.count))
         diagonal = d.qHDiagInv[self.dofs]
         if diagonal.all():
             H[self.row, self.column] = d.qH[self.entry]
             H.ravel()[:: self.count + 1] = 1.0  # the diagonal
             H = H.T @ (H / diagonal[:, None])
-        else:  # nothing in the world is implicit: MuJoCo leaves the factor unset, and M^ is M
+        else:  # no joint is implicit: M^ is M, and MuJoCo does not compute the factor
             H[self.row, self.column] = H[self.column, self.row] = d.M[self.entry]
         if d.nefc:
             state = d.efc_state

@@ -1,7 +1,8 @@
 """Picked bunches as free bodies of MuJoCo: spheres and capsules on a body from a pool.
 
-Compiling a MuJoCo world takes about 10 ms, so each world has a pool of sleeping bodies that collide with nothing. A
-bunch that leaves its vine gets one of them, with all constants that MuJoCo derives from its mass and shapes.
+Recompiling a MuJoCo world takes about 10 ms. Therefore each world contains a pool of sleeping bodies without
+collisions. When a bunch leaves its vine, one of these bodies gets the bunch's mass and shapes, with all constants that
+MuJoCo derives from them.
 """
 
 from __future__ import annotations
@@ -19,14 +20,15 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import Shape
 
 MAX_GEOMS = 12
-"""Largest number of shapes of a body of the pool."""
+"""Largest number of collision shapes of a free bunch, and number of geoms of each body in the pool."""
 PARKING_HEIGHT = -100.0
-"""[m] Height of unused bodies of the pool, below the ground."""
+"""Height z [m] at which unused bodies of the pool are placed, below the ground."""
 CONAFFINITY = ALL_BITS & ~CRATE_FLOOR
 """Collision bits with which the shapes of a free bunch collide."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2]
-"""MuJoCo's constraint impedance. TUNED: with harder contacts a bunch is held with a penetration of a few micrometres,
-and a moving hand loses contact for a step. Fingers that hold with 25 N then move by 3 mm, and the bunch falls."""
+"""Constraint impedance (MuJoCo's ``solimp``) of contacts of free bunches. TUNED: with harder contacts a bunch is held
+with a penetration of a few micrometres, and a moving hand loses contact for a step. Fingers that hold with 25 N then
+move by 3 mm, and the bunch falls."""
 
 BODY_ARRAYS = (
     "body_mass",
@@ -39,7 +41,7 @@ BODY_ARRAYS = (
     "body_contype",
     "body_conaffinity",
 )
-"""Arrays of constants that MuJoCo derives for a body from its mass and shapes."""
+"""Names of the arrays of ``MjModel`` with constants that MuJoCo derives for a body from its mass and shapes."""
 GEOM_ARRAYS = (
     "geom_type",
     "geom_contype",
@@ -56,7 +58,7 @@ GEOM_ARRAYS = (
     "geom_solimp",
     "geom_solref",
 )
-"""Arrays of properties and derived constants of a geom."""
+"""Names of the arrays of ``MjModel`` with properties and derived constants of a geom."""
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
@@ -65,7 +67,7 @@ class FreeBunch:
     """Mass and shapes of a picked bunch, in the frame of its former plant body."""
 
     mass: float
-    """[kg]"""
+    """Mass [kg]."""
     com: np.ndarray
     """[3] m, centre of mass."""
     inertia: np.ndarray
@@ -77,7 +79,7 @@ class FreeBunch:
     end: np.ndarray
     """[shape, 3] m, end of a capsule's axis."""
     radius: np.ndarray
-    """[shape] m"""
+    """[shape] m, radius of each sphere or capsule."""
 
     @functools.cached_property
     def shapes(self) -> tuple[Shape, ...]:
@@ -96,12 +98,13 @@ class FreeBunch:
 
 
 def slot_name(slot: int) -> str:
-    """MuJoCo's name of a body of the pool, and of its joint."""
+    """Returns MuJoCo's name of the body with index ``slot`` in the pool, and of its joint."""
     return f"free_bunch/{slot}"
 
 
 def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
-    """Add a sleeping body with placeholder values to the pool; after compilation call :func:`disable_collision`."""
+    """Add body ``slot`` of the pool, asleep and with placeholder values; call :func:`disable_collision` after
+    compiling."""
     body = spec.worldbody.add_body(
         name=slot_name(slot),
         pos=_parking_pose(slot)[:3],
@@ -125,12 +128,15 @@ def add_slot(spec: mujoco.MjSpec, slot: int) -> None:
 
 
 def _parking_pose(slot: int) -> np.ndarray:
-    """Pose [7] (wxyz) of an unused body."""
+    """Returns the pose [7] (m, wxyz) of body ``slot`` of the pool while it is unused."""
     return np.array([float(slot), 0.0, PARKING_HEIGHT, 1.0, 0.0, 0.0, 0.0])
 
 
 def compile_alone(bunch: FreeBunch, parameters: PhysicsParameters) -> mujoco.MjModel:
-    """Compile a bunch in its own world; ``ValueError`` if it has too many shapes or none."""
+    """Compile a MuJoCo model that contains only ``bunch``, for the constants that MuJoCo derives.
+
+    Raises ``ValueError`` if the bunch has too many shapes or none.
+    """
     spec = mujoco.MjSpec()
     add_free_bunch(spec, bunch, parameters)
     return spec.compile()
@@ -139,7 +145,7 @@ def compile_alone(bunch: FreeBunch, parameters: PhysicsParameters) -> mujoco.MjM
 def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsParameters) -> None:
     """Add a bunch to a world as a free body; ``ValueError`` if it has too many shapes or none."""
     if not 0 < len(bunch.radius) <= MAX_GEOMS:
-        raise ValueError(f"a bunch of {len(bunch.radius)} shapes; a free one has 1 to {MAX_GEOMS}")
+        raise ValueError(f"a bunch has {len(bunch.radius)} collision shapes; a free bunch can have 1 to {MAX_GEOMS}")
     friction = contact_friction(parameters.friction, parameters.bunch_rolling_arm)
     softness = [parameters.bunch_contact_time, parameters.bunch_contact_damping_ratio]
     yz, zx, xy = bunch.product
@@ -178,10 +184,10 @@ def add_free_bunch(spec: mujoco.MjSpec, bunch: FreeBunch, parameters: PhysicsPar
 
 
 def activate(world: mujoco.MjModel, slot: int, bunch: FreeBunch, derived: mujoco.MjModel) -> None:
-    """Give a body of the pool the mass and shapes of a bunch, with all constants that MuJoCo derives from them.
+    """Set mass, shapes and derived constants of body ``slot`` of the pool to those of ``bunch``.
 
-    ``mj_setConst`` would derive some of them, but not bounding volumes and the collision bits of whole bodies. So all
-    are copied from ``derived``, the model of :func:`compile_alone`.
+    All constants are copied from ``derived``, the model of :func:`compile_alone`, because ``mj_setConst`` would compute
+    neither bounding volumes nor the collision bits of bodies.
     """
     body = world.body(slot_name(slot)).id
     for name in BODY_ARRAYS:

@@ -4,9 +4,9 @@ A hand is a free body. It follows its controller until it touches something. The
 so that its force depends on the distance from the controller: 100 N/m up to 100 N by default (CANOPIES D6.4, section
 3.1.1). It holds rigid objects by a weld, so a lifted object hangs from this spring. Gravity does not act on the hand.
 
-Head, trunk and legs are kinematic: the tracked points determine their poses, whatever pushes them
-(``docs/decisions/hands.md``). Those parts of a remote person stop a robot, but push with a bounded force while they
-move. They pass through rigid bodies while messages make them jump or push harder than the bound.
+Head, trunk and legs are kinematic: the tracked points determine their poses, and forces do not move them
+(``docs/decisions/hands.md``). The kinematic parts of a remote person stop a robot, but push with a bounded force while
+they move. They pass through rigid bodies while messages make them jump or push harder than the bound.
 """
 
 from __future__ import annotations
@@ -29,24 +29,27 @@ from vinesim.scene.values import POINT_NAMES, HandSample, HumanPose, HumanSpec, 
 
 # Body parts of a remote person: how hard they push, and when they pass through other bodies.
 #
-# Kinematic parts do not yield, so a part that a message moves against a robot would push it with unlimited force. A
-# moving part is therefore light, and becomes heavy again when it stands still and touches nothing, so a standing person
-# stops a robot. A part that jumps, or pushes too hard while it moves, passes through rigid bodies until it overlaps no
-# robot.
+# Kinematic parts do not yield, so a part that a message moves against a robot would push the robot with unlimited
+# force. Therefore a moving part is light. It becomes heavy again when it stands still and touches nothing, so that a
+# standing person stops a robot. A part that jumps, or pushes too hard while it moves, passes through rigid bodies until
+# it overlaps no robot.
 
 
 HEAVY_PART_MASS = 1e4
-"""[kg] Mass of a heavy part, whose motion no force changes within a step."""
+"""Mass [kg] of a heavy body part of a person: so large that no force changes its motion within a step."""
 LIGHT_PART_MASS = 0.3
-"""[kg] Mass of a light part. A contact can slow it down within a step, but not move it. So its force on a robot is
-bounded by its speed v and its depth, m (v 2/tau + depth/tau^2) with MuJoCo's time constant tau of contacts (20 ms),
-however heavy the robot is. DERIVED: two legs that walk at 1.5 m/s push with 80 N, half of :data:`MAX_REMOTE_FORCE`."""
+"""Mass m [kg] of a light body part of a remote person, which bounds its force on a robot.
+
+Its pose is prescribed at every step; within a step a contact only slows it down. So its force on a robot of any mass is
+at most m (v 2/tau + depth/tau^2), with its speed v, penetration depth and MuJoCo's time constant tau of contacts (20
+ms). DERIVED: two legs that walk at 1.5 m/s push with 80 N, half of :data:`MAX_REMOTE_FORCE`.
+"""
 STILL_SPEED = 0.05
-"""[m/s] A slower part stands still. TUNED: more than the noise of tracked points."""
+"""Speed [m/s] below which a body part counts as standing still. TUNED: more than the noise of tracked points."""
 
 
 class YieldingParts:
-    """The parts [k] of one remote person that are light, and those that pass through other bodies."""
+    """Decides which body parts [k] of one remote person are light, and which pass through other bodies."""
 
     def __init__(self, count: int) -> None:
         self.is_passing = np.zeros(count, bool)
@@ -55,7 +58,7 @@ class YieldingParts:
         self._bits = np.zeros((count, 2), int)
 
     def find_indices(self, m: mujoco.MjModel, bodies: np.ndarray) -> None:
-        """Find the geoms of the parts' ``bodies`` [k], and the geoms of robots, in a recompiled world."""
+        """Look up the geoms of the parts' MuJoCo ``bodies`` [k], and the geoms of robots, in a recompiled world."""
         self._bodies = bodies
         self._geoms = m.body_geomadr[bodies]
         self._bits = np.stack([m.geom_contype[self._geoms], m.geom_conaffinity[self._geoms]], 1)
@@ -79,7 +82,7 @@ class YieldingParts:
             places: [k, 3] m, origins of the parts at the end of this step.
             speed: [k] m/s, speeds of the parts.
             force: [k] N, forces on the parts in the last step.
-            released: [k] bool, parts that pass through other bodies from now on, until they overlap no robot.
+            released: [k] bool, parts that shall pass through other bodies until they overlap no robot.
         """
         passing = released | self.is_passing
         if passing.any():
@@ -91,7 +94,8 @@ class YieldingParts:
             self._apply(m)
 
     def _overlaps(self, m: mujoco.MjModel, d: mujoco.MjData, places: np.ndarray) -> np.ndarray:
-        """[k] Whether the bounding sphere of a part, in any orientation, meets the bounding box of a robot's geom."""
+        """Returns [k] whether the bounding sphere of each part (in any orientation) overlaps a robot geom's bounding
+        box."""
         reach = m.geom_rbound[self._geoms] + np.linalg.norm(m.geom_pos[self._geoms], axis=1)
         others = self._obstacles
         axes = d.geom_xmat[others].reshape(-1, 3, 3)
@@ -110,14 +114,16 @@ class YieldingParts:
 
 
 KINEMATIC_MASS = HEAVY_PART_MASS
-"""[kg, kg m^2] Mass and inertia of the kinematic parts. They are free bodies, because bodies without joints have no
-velocity in MuJoCo, and a leg would sink centimetres into an object that it kicks. No force changes the motion of such
-a heavy body within a step, and each step starts from the prescribed poses. Parts of a remote person are lighter while
-they move, see :class:`YieldingParts`."""
+"""Mass [kg] and inertia [kg m^2] of the kinematic parts of people.
+
+The parts are free bodies, because bodies without joints have no velocity in MuJoCo, so that a leg would sink
+centimetres into an object that it kicks. No force changes the motion of such a heavy body within a step, and each step
+starts from the prescribed poses. Parts of a remote person are lighter while they move, see :class:`YieldingParts`.
+"""
 MAX_REMOTE_FORCE = 150.0
-"""[N] Largest total force of a remote person's moving parts; if they push harder, they pass through from the next step
-on. READ: ISO/TS 15066, table A.2, allows 110 to 160 N between robots and trunk, arms and hands for lasting contacts,
-and twice that for short ones."""
+"""Largest total force [N] of a remote person's moving parts; parts that push harder pass through other bodies from the
+next step. READ: ISO/TS 15066, table A.2, allows 110 to 160 N between robots and trunk, arms and hands for lasting
+contacts, and twice that for short ones."""
 _SOLIMP = [0.99, 0.999, 0.001, 0.5, 2.0]
 _KINDS = {
     "sphere": mujoco.mjtGeom.mjGEOM_SPHERE,
@@ -128,11 +134,11 @@ _KINDS = {
 
 
 class HumanError(ValueError):
-    """A person that cannot be added or moved as requested."""
+    """Error: a person cannot be added or moved as requested."""
 
 
 class HumanBody:
-    """One person: poses of the kinematic parts, both hands, and their indices in MuJoCo's arrays."""
+    """One person in a MuJoCo world: poses of the kinematic parts, both hands, and their indices in MuJoCo's arrays."""
 
     def __init__(
         self,
@@ -142,7 +148,8 @@ class HumanBody:
         *,
         is_remote: bool = False,
     ) -> None:
-        """``code``: one of :data:`HUMAN_CODES`. ``is_remote``: another client moves the person and computes its grasps.
+        """``code``: collision code, one of :data:`HUMAN_CODES`; ``is_remote``: another client moves the person and
+        computes its grasps.
 
         Raises :class:`HumanError` for invalid numbers, :class:`vinesim.scene.appearance.AppearanceError` for an unknown
         outfit.
@@ -159,7 +166,7 @@ class HumanBody:
         self.hands = tuple(HandBody(side, stiffness, force, parameters) for side in SIDES)
         self.bodies: dict[str, int] = {}
         self.part_bodies = np.zeros(0, int)
-        """[part] MuJoCo bodies of :data:`BODY_PARTS`."""
+        """[part] Indices of the MuJoCo bodies of :data:`BODY_PARTS`."""
         self.part_dofs = np.zeros((0, 6), int)
         """[part, 6] MuJoCo's degrees of freedom of :data:`BODY_PARTS`."""
         self._part_q = self._hand_q = np.zeros((0, 7), int)
@@ -169,7 +176,7 @@ class HumanBody:
         self._posture = PostureSolver(spec.height)
         outfit = spec.outfit or appearance.outfit_of(spec.name)
         self.looks = appearance.load_human_model(spec.height, outfit=outfit)
-        """The person's visible shapes in its outfit."""
+        """Visible shapes of the person in the colours of the outfit."""
         self._shears = appearance.load_shears()
         self.set_pose(spec.pose)
         self._last_poses = self._poses
@@ -184,12 +191,15 @@ class HumanBody:
         return self._poses[len(BODY_PARTS) + self.hands.index(hand)]
 
     def controller_velocity(self, hand: HandBody, dt: float) -> np.ndarray:
-        """Velocity [3] m/s of a hand's controller in this step of ``dt`` [s]."""
+        """Returns the velocity [3] m/s of a hand's controller in this step of ``dt`` [s]."""
         at = len(BODY_PARTS) + self.hands.index(hand)
         return (self._poses[at, :3] - self._last_poses[at, :3]) / dt
 
     def set_pose(self, pose: HumanPose) -> None:
-        """Set the tracked points. The body moves there at once, the hands are pulled. Raises :class:`HumanError`."""
+        """Set the tracked points: the body moves there at once, the hands are pulled there by their springs.
+
+        Raises :class:`HumanError` for numbers that are not finite or no unit quaternions.
+        """
         points = [getattr(pose, name) for name in POINT_NAMES]
         square = np.array([np.nan if np.shape(at) != (7,) else 0.0 * at[:3].sum() + at[3:] @ at[3:] for at in points])
         if not (abs(square - 1.0) < 1e-3).all():
@@ -214,7 +224,8 @@ class HumanBody:
         return tuple(f"{hand.side}_{part}" for hand in self.hands if hand.has_shears for part in SHEARS_PARTS)
 
     def visual_poses(self, hands: np.ndarray) -> np.ndarray:
-        """Poses [part, 7] of :data:`VISUAL_PARTS`, then of :attr:`shears_parts`, for palms at ``hands`` [2, 7]."""
+        """Returns the poses [part, 7] of :data:`VISUAL_PARTS`, then of :attr:`shears_parts`, for palms at ``hands`` [2,
+        7]."""
         chest = self.part_poses[BODY_PARTS.index("chest")]
         head = self.part_poses[BODY_PARTS.index("head")]
         poses = [self._posture.visual_parts(chest, head, hands, self._fingers)]
@@ -225,13 +236,13 @@ class HumanBody:
         return np.concatenate(poses)
 
     def hand(self, side: str) -> HandBody:
-        """The left or the right hand; :class:`HumanError` for any other ``side``."""
+        """Returns the left or the right hand; :class:`HumanError` for any other ``side``."""
         if side not in SIDES:
             raise HumanError(f"human {self.spec.name!r} has no {side!r} hand; it has: {', '.join(SIDES)}")
         return self.hands[SIDES.index(side)]
 
     def hand_sample(self, hand: HandBody, d: mujoco.MjData) -> HandSample:
-        """State of a hand after the last step."""
+        """Returns the state of a hand after the last step."""
         return hand.sample(d, self.controller_pose(hand))
 
     # ------------------------------------------------------------------ in MuJoCo
@@ -285,7 +296,7 @@ class HumanBody:
             )
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames) -> None:
-        """Find the person's bodies and joints in a recompiled world."""
+        """Look up the indices of the person's bodies and joints in a recompiled world."""
         name = self.spec.name
         self.part_bodies = np.array([names.body[f"{name}/{part}"] for part in BODY_PARTS], int)
         joints = [names.joint[f"{name}/{part}"] for part in BODY_PARTS]
@@ -301,7 +312,7 @@ class HumanBody:
         self.update_hand_collisions(m)
 
     def update_hand_collisions(self, m: mujoco.MjModel) -> None:
-        """Enable collisions of empty hands, except hands that their own client reports as busy."""
+        """Enable collisions of empty hands, except hands that the person's own client reports as busy."""
         for hand in self.hands:
             if hand.held is None:
                 hand.set_collision(m, enabled=not hand.busy)
@@ -309,7 +320,7 @@ class HumanBody:
     # ------------------------------------------------------------------ the step
 
     def apply_controls(self, m: mujoco.MjModel, d: mujoco.MjData, dt: float) -> None:
-        """Before a step: set poses and velocities of the kinematic parts at its start, and drive both hands."""
+        """Before a step of ``dt`` [s]: set poses and velocities of the kinematic parts, and drive both hands."""
         p = self.parameters
         has_teleported = self._last_poses is not self._poses and self._has_teleported()
         if has_teleported:
@@ -339,7 +350,7 @@ class HumanBody:
             hand.apply_control(m, d, at[i], error, motion)
 
     def measure(self, d: mujoco.MjData) -> None:
-        """After a step: set the poses of the kinematic parts at its end, and read the forces of the hands."""
+        """After a step: set the prescribed poses of the kinematic parts, and read the forces of the hands."""
         self._last_poses = self._poses
         if self.is_remote:
             force = d.qfrc_constraint[self.part_dofs[:, :3]]
@@ -354,7 +365,7 @@ class HumanBody:
         return float(moved @ moved) > self.parameters.teleport_distance * self.parameters.teleport_distance
 
     def _teleport(self, d: mujoco.MjData) -> None:
-        """Place the whole person without velocity. Hands that hold something stay where they are."""
+        """Place the whole person at the tracked points, at rest, except hands that hold something."""
         self._last_poses = self._poses
         for hand in self.hands:
             if hand.held is None:
@@ -367,7 +378,7 @@ class HumanBody:
 
 
 def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], friction: float, material: Material) -> None:
-    """Add a collision shape; ``bits``: contype and conaffinity."""
+    """Add a collision shape to a MuJoCo ``body``; ``bits``: contype and conaffinity."""
     size = [*shape.size, 0.0, 0.0][:3]
     body.add_geom(
         type=_KINDS[shape.kind],
@@ -390,8 +401,8 @@ def _add_geom(body: mujoco.MjsBody, shape: Shape, bits: tuple[int, int], frictio
 class HandBody:
     """State of one hand and its indices in MuJoCo's arrays.
 
-    A hand follows its controller until it touches something. From then on a spring pulls it to its controller, until
-    it has touched nothing for ``hand_contact_duration``. A hand that holds something does not collide.
+    A free hand follows its controller. When it touches something, a spring pulls it to its controller
+    instead, until it has touched nothing for ``hand_contact_duration``. A hand that holds something does not collide.
     """
 
     def __init__(self, side: str, stiffness: float, max_force: float, parameters: PhysicsParameters) -> None:
@@ -406,7 +417,7 @@ class HandBody:
         """[N m s/rad] Critical damping of the torsional spring."""
         self.contact_steps = p.steps(p.hand_contact_duration)
         self.closed = False
-        """Whether the hand shall grasp objects near it."""
+        """Whether the hand is commanded to grasp objects near it."""
         self.has_shears = self.is_squeezed = False
         """Whether the hand has shears, and whether it is closed around shears or an object; both only affect looks."""
         self.busy = False
@@ -419,7 +430,7 @@ class HandBody:
         self.grasp_pose = np.zeros(7)
         """[7] pose of the hand in the frame of the object that it holds."""
         self.on_plant = False
-        """Whether the hand holds a plant and is placed on it, see :mod:`vinesim.interaction.hand_grasp`."""
+        """Whether the hand holds a plant and moves with it, see :mod:`vinesim.interaction.hand_grasp`."""
         self.collision_bits: tuple[int, int] = (0, 0)
         """MuJoCo's contype and conaffinity while the hand can touch something."""
         self.body = self.weld = -1
@@ -436,7 +447,7 @@ class HandBody:
         return self.steps_since_contact < self.contact_steps
 
     def find_indices(self, m: mujoco.MjModel, names: WorldNames, actor: str) -> None:
-        """Find the hand of ``actor`` in a recompiled world."""
+        """Look up the MuJoCo indices of the hand of ``actor`` in a recompiled world."""
         name = f"{actor}/{self.link}"
         joint = names.joint[name]
         self.body = names.body[name]
@@ -512,7 +523,8 @@ class HandBody:
         d.xfrc_applied[self.body] = 0.0
 
     def _clip_to_obstacle(self, m: mujoco.MjModel, d: mujoco.MjData, at: np.ndarray, step: np.ndarray) -> np.ndarray:
-        """The translation ``step`` [3] m of a fast free hand, shortened if an obstacle is in its way."""
+        """Returns the translation ``step`` [3] m of a fast free hand at ``at`` [3] m, shortened if an obstacle is in
+        its way."""
         length = float(np.linalg.norm(step))
         if length < HAND_HALF_THICKNESS or self.busy:
             return step
@@ -541,14 +553,14 @@ class HandBody:
             self.steps_since_contact = 0 if self.held is not None or reaction.any() else self.steps_since_contact + 1
 
     def sample(self, d: mujoco.MjData, controller: np.ndarray) -> HandSample:
-        """State of the hand after the last step; ``controller`` [7] is the pose of its controller."""
+        """Returns the state of the hand after the last step; ``controller`` [7] is the pose of its controller."""
         pose = np.concatenate([d.qpos[self.qpos][:3], frames.from_wxyz(d.qpos[self.qpos][3:])])
         return HandSample(pose, controller.copy(), self.force.copy(), self.steps_since_contact == 0, self.held)
 
     # ------------------------------------------------------------------ holding
 
     def weld_to(self, m: mujoco.MjModel, d: mujoco.MjData, body: int | None) -> None:
-        """Weld the hand to a MuJoCo body at ``grasp_pose``; None: the hand holds a plant and is placed on it."""
+        """Weld the hand to a MuJoCo ``body`` at ``grasp_pose``; None: the hand holds a plant and moves with it."""
         self.on_plant = body is None
         self.steps_since_contact = 0
         d.eq_active[self.weld] = body is not None
@@ -579,7 +591,7 @@ class HandBody:
 
 
 def _limited(limit: float, vector: np.ndarray) -> np.ndarray:
-    """A vector [3], shortened to the length ``limit`` if it is longer."""
+    """Returns a vector [3], shortened to the length ``limit`` if it is longer."""
     length = float(np.linalg.norm(vector))
     return vector * (limit / length) if length > limit else vector
 
@@ -590,9 +602,10 @@ def _limited(limit: float, vector: np.ndarray) -> np.ndarray:
 def hand_wrenches(
     m: mujoco.MjModel, d: mujoco.MjData, human: HumanBody, links: Mapping[int, tuple[str, str]]
 ) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
-    """Wrenches in the last step by robot and link, and whether the left and the right hand applied one.
+    """Returns a person's wrenches on robots in the last step, by robot and link, and whether each hand (left, right)
+    exerted one.
 
-    ``links`` gives robot and link of the MuJoCo bodies of robots. A wrench [6] is a force [N] and a moment about the
+    ``links``: robot and link by MuJoCo body. A wrench [6] is a force [N] and a moment about the
     link's centre of mass [N m], in world axes, at the poses at the start of the step.
     """
     wrenches: dict[str, dict[str, np.ndarray]] = {}

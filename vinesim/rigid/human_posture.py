@@ -1,4 +1,4 @@
-"""Collision shapes, proportions and inverse kinematics of people: one shape for each body part, three for each hand."""
+"""Collision shapes, proportions and inverse kinematics of people. A body part has one shape, a hand has three."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ BODY_PARTS = (
     "right_shank",
     "right_foot",
 )
-"""Kinematic bodies of a person, in the order of :meth:`PostureSolver.body_parts`."""
+"""Names of a person's kinematic bodies, in the order of the poses from :meth:`PostureSolver.body_parts`."""
 
 # lengths as fractions of a person's height; READ: Winter 2009, after Drillis and Contini
 THIGH_LENGTH = 0.245
@@ -36,15 +36,16 @@ HIP_HALF_WIDTH = 0.095
 TRUNK_LENGTH = 0.288
 
 EYES_TO_HEAD_BACK = 0.09
-"""[m] Backward distance from the point between the eyes to the middle of the head. GUESSED."""
+"""Backward distance [m] from the point between the eyes to the middle of the head. GUESSED."""
 EYES_TO_HEAD_DOWN = 0.02
-"""[m] Downward distance from the point between the eyes to the middle of the head. GUESSED."""
+"""Downward distance [m] from the point between the eyes to the middle of the head. GUESSED."""
 HAND_HALF_THICKNESS = 0.012
-"""[m] Half of the thickness of a palm. GUESSED."""
+"""Half of the thickness of a palm [m]. GUESSED."""
 PALM_TO_FINGERTIP = 0.13
-"""[m] Distance from the middle of the palm to the fingertips. GUESSED."""
+"""Distance [m] from the middle of the palm to the fingertips. GUESSED."""
 GRASP_POINTS = np.array([[0.0, 0.0, 0.0], [0.085, 0.0, 0.0]])
-"""[2, 3] m, middle of the palm and of the fingers, in the palm's frame."""
+"""Points [2, 3] m of a hand from which grasps are searched: middle of the palm and of the fingers, in the palm's frame.
+"""
 SKIN_COLOR = (0.85, 0.62, 0.5, 1.0)
 CLOTH_COLOR = (0.98, 0.47, 0.16, 1.0)
 _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
@@ -52,7 +53,7 @@ _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 @functools.cache
 def body_shapes(height: float) -> tuple[Shape, ...]:
-    """One shape for each of :data:`BODY_PARTS` of a person of ``height`` [m], in the part's frame.
+    """Returns one collision shape for each of :data:`BODY_PARTS` of a person of ``height`` [m], in the part's frame.
 
     The x axis runs along a limb; the origin is at the beginning of the limb.
     """
@@ -82,7 +83,7 @@ def body_shapes(height: float) -> tuple[Shape, ...]:
 
 @functools.cache
 def hand_shapes(side: str) -> tuple[Shape, ...]:
-    """Shapes of palm, fingers and thumb in the frame of the palm."""
+    """Returns the shapes of palm, fingers and thumb in the frame of the palm."""
     thumb = np.array([0.02, 0.05 if side == "right" else -0.05, -0.006])
     # boxes, because two parallel capsules touch in only one point in MuJoCo and would rock
     return (
@@ -103,17 +104,18 @@ VISUAL_PARTS = (
     "right_forearm",
     *(f"{side}_{finger}_{k + 1}" for side in SIDES for finger in appearance.FINGERS for k in range(PHALANGES)),
 )
-"""Visible parts without collisions, which connect head, chest and hands, and the fingers."""
+"""Names of a person's visible parts without collisions: neck and arms, which connect head, chest and hands; fingers."""
 EYE_HEIGHT = 0.939
-"""[1] Height of the eyes of a standing person, as a fraction of the person's height. READ: Winter 2009."""
+"""Height of the eyes of a standing person, as a fraction of the person's height. READ: Winter 2009."""
 HIP_HEIGHT = 0.53
-"""[1] Height of the hips of a standing person, as a fraction of the person's height. READ: Winter 2009."""
+"""Height of the hips of a standing person, as a fraction of the person's height. READ: Winter 2009."""
 NECK_BELOW_EYES = -0.2
-"""[m] Height of the neck relative to the eyes. GUESSED."""
+"""Height of the neck relative to the eyes [m]. GUESSED."""
 
 
 def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
-    """Tracked points of a person of ``height`` [m] who stands at ``root`` [7], hands before the hips, palms down."""
+    """Returns the tracked points of a person of ``height`` [m] who stands at ``root`` [7], with the hands in front of
+    the hips and the palms down."""
 
     def at(x: float, y: float, z: float) -> np.ndarray:
         return frames.compose(root, frames.pose(np.array([x, y, z])))
@@ -132,12 +134,13 @@ def standing_pose(root: np.ndarray, height: float = 1.75) -> HumanPose:
 
 
 def body_posture(height: float, pose: HumanPose) -> np.ndarray:
-    """Poses [part, 7] of :data:`BODY_PARTS` of a person of ``height`` [m]; see :meth:`PostureSolver.body_parts`."""
+    """Returns the poses [part, 7] of :data:`BODY_PARTS` of a person of ``height`` [m]; see
+    :meth:`PostureSolver.body_parts`."""
     return PostureSolver(height).body_parts(pose)
 
 
 class PostureSolver:
-    """Inverse kinematics of one person, computed by kernels that are bound to the person's arrays."""
+    """Inverse kinematics of one person, computed by kernel graphs on arrays that are allocated once."""
 
     def __init__(self, height: float) -> None:
         """``height`` [m]: height of the person."""
@@ -191,7 +194,8 @@ class PostureSolver:
         self._pose_arms_and_fingers = KernelGraph(pose_arms_and_fingers)
 
     def body_parts(self, pose: HumanPose) -> np.ndarray:
-        """Poses [part, 7] of :data:`BODY_PARTS`. Knees bend forward as required by hips and ankles."""
+        """Returns the poses [part, 7] of :data:`BODY_PARTS` for tracked points; knees bend forward to connect hips and
+        ankles."""
         self._tracked[:] = pose.head, pose.hips, pose.left_foot, pose.right_foot
         self._pose_torso_and_legs()
         return self._parts.copy()
@@ -199,7 +203,7 @@ class PostureSolver:
     def visual_parts(
         self, chest: np.ndarray, head: np.ndarray, hands: np.ndarray, closed: tuple[float, ...]
     ) -> np.ndarray:
-        """Poses [part, 7] of :data:`VISUAL_PARTS`.
+        """Returns the poses [part, 7] of :data:`VISUAL_PARTS`.
 
         Args:
             chest: pose [7] of the chest.
@@ -212,10 +216,10 @@ class PostureSolver:
         return self._visual_parts.copy()
 
     def difference(self, start: tuple[np.ndarray, ...], goal: tuple[np.ndarray, ...]) -> np.ndarray:
-        """Motions [3, k, 3] from poses ``start`` to poses ``goal`` [k, 7].
+        """Returns the motions [3, k, 3] from poses ``start`` to poses ``goal`` [k, 7].
 
-        Rows are translation [m], rotation vector [rad] in world axes, and rotation vector in the axes of ``start``.
-        The arrays in each tuple are concatenated. The next call overwrites the result.
+        The first index selects translation [m], rotation vector [rad] in world axes, or rotation vector [rad] in the
+        axes of ``start``. The arrays in each tuple are concatenated. The next call overwrites the result.
         """
         np.concatenate(start, out=self._start)
         np.concatenate(goal, out=self._goal)

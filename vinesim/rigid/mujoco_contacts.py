@@ -1,4 +1,4 @@
-"""Contacts between rigid bodies in MuJoCo: collision pairs, friction, thin walls, and compliant wires."""
+"""Contacts between rigid bodies in MuJoCo: collision pairs, friction, fast crates with thin walls, compliant wires."""
 
 from __future__ import annotations
 
@@ -18,26 +18,30 @@ from vinesim.scene.values import RobotSpec
 from vinesim.wires.deflected_wires import MAX_DEFLECTION, NO_TREE, DeflectedWires, WireContacts
 from vinesim.wires.elastic_supports import WIRE_DAMPING_TIME
 
-# Friction between two rigid bodies depends on both materials; MuJoCo alone would use a coefficient of one of the geoms.
+# Friction between two rigid bodies depends on both materials; MuJoCo alone would use the coefficient of one geom.
 
 
 class PairFriction:
-    """Sets friction coefficients from ``data/materials`` in MuJoCo's contacts, between the two halves of a step."""
+    """Sets the friction of MuJoCo's contacts from the pairs of materials in ``data/materials``, within each step."""
 
     def __init__(self, parameters: PhysicsParameters) -> None:
         self._table = pair_table("friction", parameters.friction)
         self._is_listed = self._table != parameters.friction
         self._material = np.zeros(0, np.int32)
-        """[geom] material; UNKNOWN if the geom has its own coefficient, which MuJoCo then uses."""
+        """[geom] Material of each geom; UNKNOWN for a geom with its own friction coefficient, which MuJoCo then uses.
+        """
 
     def find_materials(self, m: mujoco.MjModel) -> None:
-        """Find the materials of all geoms of a recompiled world."""
+        """Look up the materials of all geoms of a recompiled world."""
         material = m.geom_user[:, 0]
         has_own = m.geom_user[:, 1] > 0.0
         self._material = np.where(has_own, int(Material.UNKNOWN), material).astype(np.int32)
 
     def apply(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After ``mj_step1``: write the coefficients of listed pairs and, if there are any, rebuild the constraints."""
+        """After ``mj_step1``: write the friction coefficients of contacts between listed pairs of materials.
+
+        If there are such contacts, MuJoCo's constraints are rebuilt.
+        """
         if d.ncon == 0:
             return
         first, second = self._material[d.contact.geom].T
@@ -59,14 +63,16 @@ class PairFriction:
 
 
 HOME_CLEARANCE = 1e-3
-"""[m] Links that are nearer than this to each other, or to the ground, in the home pose count as overlapping. GUESSED:
-the accuracy of collision shapes and of servos that hold the pose."""
+"""Distance [m] between two links, or a link and the ground, below which they count as overlapping in the home pose.
+
+GUESSED: the accuracy of collision shapes and of servos that hold the pose."""
 
 
 def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> None:
-    """Let the links of a ``parsed`` robot collide with each other and the ground; ``code``: its collision code.
+    """Enable collisions of a ``parsed`` robot's links with each other and with the ground.
 
-    Shapes fixed to the base do not collide with the ground, because the base moves in a plane at its own height.
+    ``given``: the robot's settings; ``code``: its collision code. Shapes that are fixed to the base do not collide with
+    the ground, because the base moves in a plane at constant height.
     """
     alone = parsed.copy()
     for number, geom in enumerate(alone.geoms):
@@ -96,13 +102,14 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> Non
 
 
 def disabled_pairs(urdf: str) -> list[tuple[str, str]]:
-    """Pairs of links in the ``disable_collisions`` elements of a URDF; loading inserts those of the SRDF there."""
+    """Returns the pairs of links in the ``disable_collisions`` elements of a URDF, into which loading has copied the
+    elements of the SRDF."""
     root = ElementTree.fromstring(urdf)
     return [(pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")]
 
 
 def _touching_at_home(m: mujoco.MjModel, given: RobotSpec) -> np.ndarray:
-    """Pairs of geoms [pair, 2] that touch in the home pose; ``m``: the robot alone, with its base fixed."""
+    """Returns the pairs of geoms [pair, 2] that touch in the home pose; ``m``: the robot alone, with its base fixed."""
     d = mujoco.MjData(m)
     for drive, position in zip(given.drives, given.home, strict=True):
         d.joint(drive.joint).qpos[0] = position
@@ -115,31 +122,31 @@ def _touching_at_home(m: mujoco.MjModel, given: RobotSpec) -> np.ndarray:
     return d.contact.geom.reshape(-1, 2).copy()
 
 
-# Contacts of crates that are about to close within the step, so that thin walls do not end up inside each other.
+# Speculative contacts of fast crates, so that thin walls do not end up inside each other.
 #
 # A crate that has fallen half a metre moves 31 mm in a step, but its walls are 12 mm thick. If contacts were found only
 # after overlap, crates would be pushed apart sideways or not at all. So a fast crate that approaches another one gets a
-# margin as large as its motion in a step. A contact within the margin lets the gap close, but no further (a
-# *speculative contact*).
+# contact margin as large as its motion in a step. A contact within the margin allows the gap to close, but prevents
+# overlap (a *speculative contact*).
 
 
 MAX_STEP = CRATE_WALL / 4.0
-"""[m] A crate that moves less than this in a step has no margin. TUNED."""
+"""Motion of a crate in a step [m] below which the crate has no contact margin. TUNED."""
 MAX_MARGIN = 0.1
-"""[m] Largest margin, the motion of a crate at 10 m/s."""
+"""Largest contact margin of a crate [m]: its motion in a step at 10 m/s."""
 
 PASSING = 0.1
-"""[1] Two crates pass each other if the share of their relative velocity along the line between them is below this.
-TUNED."""
+"""Cosine between the relative velocity of two crates and the line between them, below which the crates are taken to
+pass each other. TUNED."""
 STIFFNESS = 100.0
-"""[1] Stiffness of a speculative contact in units of effective mass / dt^2; an overlap of about 1 / STIFFNESS of the
-excess motion remains."""
+"""Stiffness of a speculative contact [effective mass / dt^2]. An overlap of about 1 / STIFFNESS of the motion beyond
+the gap remains."""
 NEVER_REACHED = 1e4
-"""[m] Gap larger than any motion in a step."""
+"""Gap [m] that is larger than any motion in a step, to disable a contact."""
 
 
 class SpeculativeContacts:
-    """Margins of fast crates, and the accelerations that close the gaps within them."""
+    """Contact margins of fast crates, and contact parameters that stop the crates where their gap closes."""
 
     def __init__(self) -> None:
         self._bodies = self._geoms = self._crate_of_geom = np.zeros(0, int)
@@ -148,7 +155,7 @@ class SpeculativeContacts:
         self._has_margins = False
 
     def find_crates(self, m: mujoco.MjModel, numbers: Iterable[int]) -> None:
-        """Find the bodies and geoms of the boxes with these ``numbers`` in a recompiled world."""
+        """Look up the bodies and geoms of the boxes with these ``numbers`` in a recompiled world."""
         self._bodies = bodies = np.array(sorted(m.body(f"box/{number}").id for number in numbers), int)
         self._dof = m.body_dofadr[bodies][:, None] + np.arange(6)
         self._geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies))
@@ -158,7 +165,7 @@ class SpeculativeContacts:
         np.maximum.at(self._radius, self._crate_of_geom, corner)
 
     def set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> bool:
-        """Before ``mj_step1``: set the margin of each crate. Returns whether any crate has a margin."""
+        """Before ``mj_step1``: set the contact margin of each crate. Returns whether any margin is not zero."""
         if len(self._bodies) == 0:
             return False
         velocity = d.qvel[self._dof]
@@ -177,7 +184,10 @@ class SpeculativeContacts:
         return self._has_margins
 
     def _is_approaching(self, crate: int, velocity: np.ndarray, step: np.ndarray, position: np.ndarray) -> bool:
-        """Whether a crate comes near another one in the next step and is not just passing it."""
+        """Returns whether crate ``crate`` comes near another crate in the next step and does not merely pass it.
+
+        velocity: [crate, 3] m/s; step: [crate] m, motion in a step; position: [crate, 3] m.
+        """
         offset = position - position[crate]
         relative = velocity - velocity[crate]
         distance = np.linalg.norm(offset, axis=1)
@@ -186,7 +196,8 @@ class SpeculativeContacts:
         return bool((is_met & (distance < self._radius + self._radius[crate] + step + step[crate])).any())
 
     def limit_closing(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After the constraints are made: let open contacts close within the step, but no further.
+        """After MuJoCo has made the constraints: let contacts with a gap close the gap within the step, without
+        overlap.
 
         Contacts that do not close at the present speed are disabled, because MuJoCo's friction would push a body away
         from the body along which it slides. MuJoCo recomputes stiffness and damping from ``solref`` in every solve.
@@ -210,10 +221,10 @@ class SpeculativeContacts:
 
 
 WIRE_MASS = 0.02
-"""[kg] Effective mass of a piece of wire at the point of largest motion. DERIVED: a third of 2 m of steel wire, 2.8 mm
-thick, weighs 0.03 kg."""
+"""Effective mass [kg] of a piece of wire between posts, at the point of largest motion. DERIVED: a third of 2 m of
+steel wire, 2.8 mm thick, weighs 0.03 kg."""
 MARGIN_LEVELS = (0.005, 0.02, 0.05, 0.1)
-"""[m] Margins of contacts with wires; the smallest one that is enough for the fastest body is used."""
+"""Margins [m] of contacts with wires, of which the smallest is used that exceeds the motion of the fastest body."""
 # MuJoCo's mjMINIMP, mjMAXIMP
 _LEAST_IMPEDANCE = 1e-4
 _MOST_IMPEDANCE = 0.9999
@@ -224,12 +235,12 @@ _POWER = 2.0
 
 
 class SoftWires:
-    """Makes wires compliant in a MuJoCo world."""
+    """Makes contacts with wires in a MuJoCo world as soft as the wires, and moves the wires' geoms."""
 
     def __init__(self, wires: DeflectedWires) -> None:
         self._wires = wires
         self._geoms = np.append(np.zeros(FIRST_FIXED_GEOM, bool), wires.is_compliant)
-        """[MuJoCo geom, up to the last fixed piece] Whether the geom is a compliant wire."""
+        """[MuJoCo geom] Whether the geom is a compliant wire; the array ends with the last fixed piece."""
         self._numbers = np.flatnonzero(self._geoms)
         self._contacts = WireContacts(wires)
         self._at = self._row = np.zeros(0, int)
@@ -239,7 +250,7 @@ class SoftWires:
         self._world: mujoco.MjModel | None = None
 
     def use_world(self, m: mujoco.MjModel) -> None:
-        """Take over a recompiled world, in which all wires are straight."""
+        """Use a recompiled world, in which all wires are still straight."""
         self._margin = m.geom_margin[: len(self._geoms)].copy()
         self._body_margin = float(m.body_margin[0])
         self._level = 0.0
@@ -254,7 +265,8 @@ class SoftWires:
         _widen_boxes(m, self._geoms)
 
     def _renumber(self, key: int, before: mujoco.MjModel | None) -> tuple[int, int]:
-        """Present key and tree of a pair of wire and geom that had ``key`` in the world ``before``."""
+        """Returns key and kinematic tree, in the present world, of the pair of wire and geom that had ``key`` in the
+        world ``before``."""
         m = self._world
         if before is None or m is None or key >= 0:
             return 0, NO_TREE
@@ -280,9 +292,11 @@ class SoftWires:
         self._set_margins(m, d)
 
     def _set_margins(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """Set margins so that all contacts of the step are found, also when a deflected wire springs back.
+        """Set contact margins so large that all contacts of the step are found, also when a deflected wire springs
+        back.
 
-        If the axis of a wire were inside a box, MuJoCo would push the box along the wire.
+        A contact that is missed may end with the axis of the wire inside a box, and MuJoCo would then push the box
+        along the wire.
         """
         rates = d.cvel
         reach = m.opt.timestep * max(float(rates.max()), -float(rates.min()))
@@ -296,7 +310,8 @@ class SoftWires:
             m.body_margin[0] = max(self._body_margin, level)
 
     def soften(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After the constraints are made: give contacts with wires the stiffness of the wires' springs."""
+        """After MuJoCo has made the constraints: set the stiffness of contacts with wires to that of the wires'
+        springs."""
         self._at = self._at[:0]
         if d.ncon == 0:
             return
@@ -332,7 +347,7 @@ class SoftWires:
             self._write(d)
 
     def _write(self, d: mujoco.MjData) -> None:
-        """Write impedance and reference of the contacts to MuJoCo."""
+        """Write impedance and reference (``solimp``, ``solref``) of the contacts with wires to MuJoCo."""
         share = self._mobility * WIRE_MASS
         self._impedance = impedance = np.clip(share / (1.0 + share), _LEAST_IMPEDANCE, _MOST_IMPEDANCE)
         mass = impedance / ((1.0 - impedance) * self._mobility)
@@ -343,16 +358,16 @@ class SoftWires:
         d.contact.solref[self._at, 1] = -impedance * self._damping_time * self._rate
 
     def _measure(self, d: mujoco.MjData, dt: float) -> None:
-        """Compute the effective masses of the implicit step with which MuJoCo scaled the contacts.
+        """Compute the effective masses by which MuJoCo scaled the contacts in this step of ``dt`` [s].
 
-        MuJoCo does not report them. They change little from step to step.
+        MuJoCo does not report these masses. They change little from step to step, so the next step uses them.
         """
         implicit = 1.0 + (self._damping_time + dt) * dt * self._rate
         self._mobility = d.efc_R[self._row] * implicit * self._impedance / (1.0 - self._impedance)
         self._measured = dict(zip(self._contacts.key.tolist(), self._mobility.tolist(), strict=True))
 
     def report(self, d: mujoco.MjData, dt: float) -> None:
-        """After the second half of a step: pass the contact forces to the wires."""
+        """After the second half of a step: report the contact forces and velocities to the model of the wires."""
         if len(self._at):
             self._measure(d, dt)
             force = d.efc_force[self._row]
@@ -363,7 +378,8 @@ class SoftWires:
 
 
 def _turn(before: np.ndarray, after: np.ndarray) -> np.ndarray:
-    """Shortest rotation [4] (wxyz) from the direction of ``before`` [3] to the direction of ``after`` [3]."""
+    """Returns the shortest rotation [4] (wxyz) from the direction of ``before`` [3] to the direction of ``after``
+    [3]."""
     size = math.sqrt((before @ before) * (after @ after))
     return frames.to_wxyz(frames.normalize(np.append(frames.cross(before, after), size + before @ after)))
 

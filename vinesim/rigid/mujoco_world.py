@@ -35,28 +35,29 @@ _log = logging.getLogger(__name__)
 
 @dataclasses.dataclass(frozen=True)
 class CompiledWorld:
-    """A compiled MuJoCo model that is not in use yet."""
+    """A compiled MuJoCo model, with its bodies' names and owners, that is not in use yet."""
 
     robots: tuple[RobotBody, ...]
     humans: tuple[HumanBody, ...]
     boxes: tuple[int, ...]
     """Numbers of the boxes in the world."""
     bunch_slots: int
-    """Number of bodies for free bunches."""
+    """Number of bodies in the pool for free bunches."""
     mj_model: mujoco.MjModel
     names: WorldNames
     bunches: dict[int, tuple[int, FreeBunch]]
     """Free bunches that already have bodies in the world, each with its slot."""
     hulls: SharedArrays
-    """See :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
+    """Convex hulls of all meshes, see :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
     removed: tuple[RobotBody | HumanBody, ...] = ()
-    """Actors of the present world that are missing in this one."""
+    """Actors of the present world that do not exist in the compiled one."""
 
 
 def _log_mujoco_warnings() -> None:
     """Send MuJoCo's warnings to the log, unless the program has set its own handler.
 
-    Otherwise MuJoCo writes a file ``MUJOCO_LOG.TXT`` into the working folder. It gives each kind of warning once.
+    Otherwise MuJoCo would write a file ``MUJOCO_LOG.TXT`` into the working folder. MuJoCo reports each kind of warning
+    once.
     """
     if mujoco.get_mju_user_warning() is None:
         mujoco.set_mju_user_warning(_log.warning)
@@ -73,11 +74,13 @@ class MujocoWorld:
         self._boxes = static_world.boxes_of(model)
         self._free_bunches: dict[int, FreeBunch] = {}
         self._bunch_slot: dict[int, int] = {}
-        """Number of the body in the pool, by free bunch."""
+        """Index in the pool of each free bunch's body, by number of the bunch."""
         self._passing_bunches: set[int] = set()
-        """Free bunches that do not collide with fixed pieces, because they overlap one since they were picked."""
+        """Free bunches that do not collide with fixed pieces, because they have overlapped one ever since they were
+        picked."""
         self._derived: weakref.WeakKeyDictionary[FreeBunch, mujoco.MjModel] = weakref.WeakKeyDictionary()
-        """Constants that MuJoCo derives from the mass and shapes of each free bunch."""
+        """Models of single free bunches (:func:`compile_alone`), with the constants that MuJoCo derives for each bunch.
+        """
         self._pool_size = 0
         self._static_spec = static_world.build_static_world(model, parameters)
         self._compile_lock = threading.Lock()
@@ -99,7 +102,7 @@ class MujocoWorld:
 
     @property
     def dt(self) -> float:
-        """[s] Duration of a step, which is constant."""
+        """Duration of a step [s], which is constant."""
         return self.parameters.dt
 
     # ------------------------------------------------------------------ actors
@@ -130,21 +133,21 @@ class MujocoWorld:
         return (*self._robots, *self._humans)
 
     def robot(self, name: str) -> RobotBody:
-        """The body of a robot; ``ValueError`` if no robot has this name."""
+        """Returns the body of a robot; ``ValueError`` if no robot has this name."""
         try:
             return self._robots[name]
         except KeyError:
             raise ValueError(f"no robot {name!r} here; there are: {', '.join(self._robots) or 'none'}") from None
 
     def human(self, name: str) -> HumanBody:
-        """The body of a person; :class:`HumanError` if no person has this name."""
+        """Returns the body of a person; :class:`HumanError` if no person has this name."""
         try:
             return self._humans[name]
         except KeyError:
             raise HumanError(f"no human {name!r} here; there are: {', '.join(self._humans) or 'none'}") from None
 
     def _link_body(self, name: str, link: str) -> int:
-        """MuJoCo body of a robot's link; ``ValueError`` if no link has this name."""
+        """Returns the MuJoCo body of a robot's link; ``ValueError`` if no link has this name."""
         robot = self.robot(name)
         try:
             return robot.bodies[link]
@@ -152,7 +155,8 @@ class MujocoWorld:
             raise ValueError(f"robot {name!r} has no link {link!r}; it has: {', '.join(robot.bodies)}") from None
 
     def _body_of_object(self, actor: str, link: str) -> int:
-        """MuJoCo body of an actor's link, of a box (``box/3``), of a free bunch (``bunch/7``) or of the ``world``."""
+        """Returns the MuJoCo body of an actor's link, of a box (``box/3``), of a free bunch (``bunch/7``) or of the
+        ``world``."""
         if actor in self._humans:
             return self._humans[actor].bodies[link]
         if actor in self._robots:
@@ -165,7 +169,8 @@ class MujocoWorld:
     # ------------------------------------------------------------------ kinematics
 
     def update_kinematics(self) -> None:
-        """Compute MuJoCo's poses from the present state; after a step they are still the poses of its start."""
+        """Compute MuJoCo's poses (``xpos`` etc.) from the present state, because after a step they are still those at
+        the step's start."""
         if not self._kinematics_current:
             mujoco.mj_kinematics(self.mj_model, self.mj_data)
             mujoco.mj_comPos(self.mj_model, self.mj_data)
@@ -176,7 +181,7 @@ class MujocoWorld:
         self._kinematics_current = False
 
     def link_pose(self, name: str, link: str) -> np.ndarray:
-        """World pose [7] of a link of a robot (including links fixed to their parents) or of a person.
+        """Returns the world pose [7] of a link of a robot (including links fixed to their parents) or of a person.
 
         ``ValueError`` if no link has this name.
         """
@@ -192,11 +197,11 @@ class MujocoWorld:
         return np.array([*self.mj_data.xpos[body].tolist(), x, y, z, w])  # Python floats take half the time
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """All rigid bodies with visible shapes; the same tuple object until one is added or removed."""
+        """Returns all rigid bodies with visible shapes; the same tuple object until one is added or removed."""
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
-        """World poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of :meth:`visuals`."""
         self.update_kinematics()
         d = self.mj_data
         body = self._visual_body
@@ -215,7 +220,7 @@ class MujocoWorld:
 
     def _compile_world(self, robots: tuple[RobotBody, ...], humans: tuple[HumanBody, ...]) -> CompiledWorld:
         """Compile a world with these actors and a pool of bodies for free bunches. The world in use does not change."""
-        # a copy, because steps may go on meanwhile
+        # a copy, because another thread may step the world meanwhile
         slot_of = dict(self._bunch_slot)
         bodies = dict(self._free_bunches)
         slots = max(slot_of.values(), default=-1) + 1 + self.parameters.bunch_pool_size
@@ -230,7 +235,7 @@ class MujocoWorld:
             for slot in range(slots):
                 free_bunch.add_slot(spec, slot)
             mj_model = recompile.compile_without_contacts(spec)
-        # MuJoCo's solver tolerance is relative to it, so an actor that joins would change the results of all others
+        # MuJoCo's solver tolerance is relative to this number, so an actor that joins would change all other results
         mj_model.stat.meaninertia = 1.0
         for slot in range(slots):
             free_bunch.disable_collision(mj_model, slot)
@@ -241,7 +246,8 @@ class MujocoWorld:
         )
 
     def _derive(self, body: FreeBunch) -> mujoco.MjModel:
-        """Constants of a free bunch; ``ValueError`` if it has too many shapes or none."""
+        """Returns MuJoCo's constants of a free bunch, computed once; ``ValueError`` if it has too many shapes or
+        none."""
         derived = self._derived.get(body)
         if derived is None:
             derived = self._derived[body] = free_bunch.compile_alone(body, self.parameters)
@@ -309,9 +315,9 @@ class MujocoWorld:
         self._update_geoms()
 
     def _list_visuals(self) -> dict[int, int]:
-        """Update the list of visible bodies after bodies were added or removed, or a hand took or put away shears.
+        """Update the list of visible bodies, after bodies were added or removed, or a hand took or put away shears.
 
-        Returns the MuJoCo body of every free bunch.
+        Returns the MuJoCo body of every free bunch, by number of the bunch.
         """
         bunch_body = {i: self._names.body[free_bunch.slot_name(slot)] for i, slot in self._bunch_slot.items()}
         bunches = {i: (body, bunch_body[i]) for i, body in self._free_bunches.items()}
@@ -348,9 +354,10 @@ def list_visuals(
     humans: Mapping[str, HumanBody],
     bunches: Mapping[int, tuple[FreeBunch, int]],
 ) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
-    """All rigid bodies with visible shapes, and their MuJoCo bodies [visual]; 0 for parts that the posture places.
+    """Returns all rigid bodies with visible shapes, and the MuJoCo body of each [visual].
 
-    ``bunches`` gives the shapes and the MuJoCo body of every free bunch.
+    The MuJoCo body is 0 for arms and fingers of people, whose poses :class:`PostureSolver` computes. ``bunches``:
+    shapes and MuJoCo body of every free bunch.
     """
     visuals = []
     bodies = []
@@ -384,7 +391,7 @@ def list_owners(
     humans: Mapping[str, HumanBody],
     bunch_body: Mapping[int, int],
 ) -> dict[int, tuple[str, str]]:
-    """Actor and link of every MuJoCo body that can be added, removed or moved."""
+    """Returns the actor and link of every MuJoCo body that can be added, removed or moved."""
     owners = {names.body[f"box/{i}"]: (f"box/{i}", "box") for i in boxes}
     actors: dict[str, RobotBody | HumanBody] = {**robots, **humans}
     for name, actor in actors.items():
@@ -393,19 +400,22 @@ def list_owners(
     return owners
 
 
-# Sensors in links of robots: wrench on the parent and acceleration, measured in every step for all sensors at once.
+# Force-torque sensors and accelerometers in links of robots, measured in every step for all sensors at once.
 
 
 class LinkSensors:
-    """Measurements of all sensors in the last step, in frames at the start of the step. One row for each sensor."""
+    """Measurements of all sensors in links of robots (wrench on the parent link, acceleration) in the last step.
+
+    Arrays have one row for each sensor. Frames are those at the start of the step.
+    """
 
     def __init__(self) -> None:
         self._row: dict[tuple[str, str], int] = {}
         """Row of a sensor, by robot and link."""
         self._body = self._root = np.zeros(0, int)
-        """[sensor] MuJoCo body of the link, and of the root of its robot."""
+        """[sensor] Index of the MuJoCo body of the link, and of the root of its robot."""
         self._wrench = np.zeros((0, 6))
-        """[sensor, 6] N m, N, moment about ``_com`` and force of the parent on the link, world axes."""
+        """[sensor, 6] N m, N, moment about ``_com`` and force that the parent link exerts on the link, world axes."""
         self._com = np.zeros((0, 3))
         """[sensor, 3] m, centre of mass of the robot in the world."""
         self._position = np.zeros((0, 3))
@@ -413,10 +423,10 @@ class LinkSensors:
         self._rotation = np.zeros((0, 9))
         """[sensor, 9] rotation matrix of the link in the world, row by row."""
         self._acceleration = np.zeros((0, 6))
-        """[sensor, 6] rad/s^2, m/s^2, see :meth:`acceleration`."""
+        """[sensor, 6] rad/s^2, m/s^2, result of :meth:`acceleration`."""
 
     def find_indices(self, m: mujoco.MjModel, robots: Mapping[str, RobotBody]) -> None:
-        """Find the links with sensors in a recompiled world. Measurements are kept."""
+        """Look up the links with sensors in a recompiled world. Measurements of the last step are kept."""
         keys = [(name, link) for name, robot in robots.items() for link in robot.sensor_links]
         kept = np.array([self._row.get(key, -1) for key in keys], int)
         for name in ("_wrench", "_com", "_position", "_rotation", "_acceleration"):
@@ -443,7 +453,8 @@ class LinkSensors:
             mujoco.mj_objectAcceleration(m, d, mujoco.mjtObj.mjOBJ_XBODY, link, self._acceleration[row], 1)
 
     def wrench(self, robot: str, link: str) -> np.ndarray:
-        """Wrench [6] of a link on its parent: force [N], moment [N m] about the link's origin, in the link's axes."""
+        """Returns the wrench [6] that a link exerts on its parent link: force [N], and moment [N m] about the link's
+        origin, in the link's axes."""
         row = self._find(robot, link)
         (x, y, z) = (self._com[row] - self._position[row]).tolist()
         (u, v, w) = self._wrench[row, 3:].tolist()
@@ -452,7 +463,8 @@ class LinkSensors:
         return -np.concatenate([self._wrench[row, 3:] @ rotation, moment @ rotation])
 
     def acceleration(self, robot: str, link: str) -> np.ndarray:
-        """Angular and proper linear acceleration [6] rad/s^2, m/s^2 of a link's origin, in the link's axes."""
+        """Returns angular acceleration [rad/s^2] and proper linear acceleration [m/s^2] of a link's origin [6], in the
+        link's axes. Proper acceleration includes gravity, as an accelerometer measures it."""
         return self._acceleration[self._find(robot, link)].copy()
 
     def _find(self, robot: str, link: str) -> int:

@@ -8,14 +8,15 @@ import mujoco
 import numpy as np
 
 AWAKE_COUNTER = -1 - mujoco.mjMINAWAKE
-"""[step] Value of ``tree_asleep`` for a tree that was just woken; MuJoCo counts up to -1, then the tree may sleep."""
+"""Value of MuJoCo's ``tree_asleep`` [steps] for a tree that was just woken; MuJoCo counts up to -1, then the tree may
+sleep."""
 
 
 def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
-    """Wake the kinematic tree of a body. MuJoCo wakes it because ``tree_awake`` and ``tree_asleep`` disagree.
+    """Wake the kinematic tree of a MuJoCo ``body``, or restart the sleep counter of an awake tree.
 
-    The counter of an awake tree is restarted. Otherwise an object at rest in a hand would fall asleep in the step in
-    which it is released.
+    MuJoCo wakes the tree because ``tree_awake`` and ``tree_asleep`` then disagree. Without the restart, an object at
+    rest in a hand would fall asleep in the step in which it is released.
     """
     tree = m.body_treeid[body]
     if tree >= 0:
@@ -25,14 +26,15 @@ def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
 
 
 def keep_touching_awake(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:
-    """Restart the sleep counters of all trees that touch the tree of a body, because they may lose their support."""
+    """Restart the sleep counters of all kinematic trees that touch the tree of ``body``, because they may lose their
+    support."""
     island = d.tree_island[m.body_treeid[body]]
     touching = (d.tree_island == island) & (d.tree_asleep < 0)
     if island >= 0:
         d.tree_asleep[touching] = AWAKE_COUNTER
 
 
-# Recompiles a MuJoCo world and transfers the state of all bodies that stay, bit by bit.
+# Recompiles a MuJoCo world and copies the state of all bodies that stay, exactly.
 
 
 _FREE = int(mujoco.mjtJoint.mjJNT_FREE)
@@ -50,11 +52,13 @@ DOF_ARRAYS = (
     "qfrc_gravcomp",
     "qfrc_actuator",
 )
-"""Arrays of MuJoCo's data with one entry for each degree of freedom whose values last from step to step."""
+"""Names of the arrays of ``MjData`` with one entry for each degree of freedom, whose values persist from step to step.
+"""
 
 
 def compile_without_contacts(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Compile without contacts, because MuJoCo's compiler tries a step in which all robots overlap at the origin."""
+    """Compile ``spec`` with contacts disabled, because MuJoCo's compiler computes a step in which all robots overlap at
+    the origin."""
     spec.option.disableflags |= _CONSTRAINT
     world = spec.compile()
     world.opt.disableflags &= ~_CONSTRAINT
@@ -63,7 +67,7 @@ def compile_without_contacts(spec: mujoco.MjSpec) -> mujoco.MjModel:
 
 @dataclasses.dataclass(frozen=True)
 class WorldNames:
-    """Numbers of a compiled world's objects by name. MuJoCo's own look-up takes 80 us for each name."""
+    """Indices of a compiled world's objects by name, in dictionaries, because MuJoCo's look-up takes 80 us a name."""
 
     joints: list[str]
     bodies: list[str]
@@ -74,13 +78,14 @@ class WorldNames:
 
     @classmethod
     def of(cls, m: mujoco.MjModel) -> WorldNames:
-        """The names of a compiled world."""
+        """Returns the names and indices of all objects of a compiled world."""
         lists = [object_names(m, at) for at in (m.name_jntadr, m.name_bodyadr, m.name_actuatoradr, m.name_eqadr)]
         return cls(lists[0], lists[1], *({name: i for i, name in enumerate(names)} for names in lists))
 
 
 def object_names(m: mujoco.MjModel, address: np.ndarray) -> list[str]:
-    """Names of all joints, bodies or other objects; ``address``: MuJoCo's ``name_jntadr``, ``name_bodyadr`` etc."""
+    """Returns the names of all joints, bodies or other objects; ``address``: MuJoCo's ``name_jntadr``, ``name_bodyadr``
+    etc."""
     text = m.names
     return [text[at : text.index(b"\0", at)].decode() for at in address.tolist()]
 
@@ -94,7 +99,10 @@ def transfer_state(
     new_names: WorldNames,
     unused: set[str],
 ) -> tuple[mujoco.MjData, np.ndarray]:
-    """State and contact forces [dof] of a new world, taken from the joints and bodies of the old one, including sleep.
+    """Returns the state of a new world and its contact forces [dof], copied by name from joints and bodies of the old
+    one.
+
+    Sleeping trees stay asleep.
 
     Args:
         old: the old model.
@@ -145,18 +153,18 @@ def transfer_state(
 
 
 def _pairs(new: list[str], old: list[str], unused: set[str]) -> list[tuple[int, int]]:
-    """(index in the new world, index in the old world) of every name that exists in both."""
+    """Returns (index in the new world, index in the old world) of every name that exists in both, except ``unused``."""
     was = {name: number for number, name in enumerate(old)}
     return [(number, was[name]) for number, name in enumerate(new) if name in was and name not in unused]
 
 
 def _ranges(first: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Concatenated ranges: ``count`` [k] consecutive numbers from each ``first`` [k]."""
+    """Returns concatenated ranges of integers: ``count[i]`` consecutive numbers from ``first[i]``, for each i."""
     return np.repeat(first - (np.cumsum(count) - count), count) + np.arange(count.sum())
 
 
 def _trees_touching_removed(old: mujoco.MjModel, old_data: mujoco.MjData, staying: np.ndarray) -> set[int]:
-    """Trees of the old world that touched or were held by a removed tree. They must not sleep at once."""
+    """Returns trees of the old world that a removed tree touched or held, and which therefore must not stay asleep."""
     gone = np.setdiff1d(np.arange(old.ntree), old.dof_treeid[old.jnt_dofadr[staying]])
     islands = np.unique(old_data.tree_island[gone])
     return set(np.flatnonzero(np.isin(old_data.tree_island, islands[islands >= 0])).tolist())
@@ -165,9 +173,10 @@ def _trees_touching_removed(old: mujoco.MjModel, old_data: mujoco.MjData, stayin
 def _sleeping_trees(
     old: mujoco.MjModel, old_data: mujoco.MjData, new: mujoco.MjModel, pairs: list[tuple[int, int]]
 ) -> dict[int, int]:
-    """Sleeping trees of the new world, each with the next tree of its cycle; the trees of a cycle wake together.
+    """Returns the sleeping trees of the new world, each with the next tree of its cycle (MuJoCo's ``tree_asleep``).
 
-    Trees that slept in a cycle with a removed tree, or were just woken, are left out.
+    The trees of a cycle wake together. Trees that slept in a cycle with a removed tree, or were just woken, are left
+    out.
     """
     now = {int(old.dof_treeid[old.jnt_dofadr[j]]): int(new.dof_treeid[new.jnt_dofadr[i]]) for i, j in pairs}
     following = old_data.tree_asleep.tolist()

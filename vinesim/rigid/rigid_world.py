@@ -41,7 +41,7 @@ _CONTACT = int(mujoco.mjtConstraint.mjCNSTR_CONTACT_FRICTIONLESS)
 _HIPS = BODY_PARTS.index("hips")
 
 MAX_RATE = 1e4
-"""[m/s, rad/s] A body that moves faster shows that the simulation has become unstable."""
+"""Rate [m/s, rad/s] of a degree of freedom above which the simulation counts as unstable."""
 
 
 class RigidWorld(MujocoWorld):
@@ -50,22 +50,23 @@ class RigidWorld(MujocoWorld):
     def __init__(self, model: Model, *, parameters: PhysicsParameters = PhysicsParameters()) -> None:
         super().__init__(model, parameters=parameters)
         self.faults = 0
-        """Number of kinematic trees that were stopped because of a non-finite number or too high a rate."""
+        """Number of times a kinematic tree was stopped because of a non-finite number or a rate above
+        :data:`MAX_RATE`."""
         self.last_fault = ""
-        """Time and names of the trees that were stopped last; empty if none was."""
+        """Time and names of the kinematic trees that were stopped last; empty if none was stopped."""
 
     # ------------------------------------------------------------------ actors
 
     def add_robot(self, spec: RobotSpec) -> None:
-        """Add a robot at ``spec.pose`` and ``spec.home``; the states of all other bodies are unchanged to the bit.
+        """Add a robot at ``spec.pose`` and ``spec.home``; the states of all other bodies do not change.
 
-        Raises :class:`RobotError` and leaves the world as it was if the URDF does not compile.
+        Raises :class:`RobotError` if the URDF does not compile; then the world does not change.
         """
         while not self.adopt(self.compile_with(spec)):
             pass
 
     def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
-        """Add a person at ``spec.pose``; the states of all other bodies are unchanged. Raises :class:`HumanError`.
+        """Add a person at ``spec.pose``; the states of all other bodies do not change. Raises :class:`HumanError`.
 
         ``is_remote``: another client moves the person. The hands of the copy hold nothing and do not touch robots.
         """
@@ -73,7 +74,7 @@ class RigidWorld(MujocoWorld):
             pass
 
     def remove_robot(self, name: str) -> None:
-        """Remove a robot; the states of all other bodies are unchanged to the bit."""
+        """Remove a robot; the states of all other bodies do not change."""
         self.robot(name)
         del self._robots[name]
         self._recompile()
@@ -91,10 +92,11 @@ class RigidWorld(MujocoWorld):
         replaces: bool = False,
         without: Collection[str] = (),
     ) -> CompiledWorld:
-        """Compile a world with additional actors ``specs``, for :meth:`adopt`. Its pool for free bunches is full.
+        """Compile a world with additional actors ``specs``, for :meth:`adopt`; its pool for free bunches has all
+        bodies.
 
-        Any thread may call this while steps go on. Raises :class:`RobotError` if a URDF does not compile; if there are
-        several robots, it does not say which one.
+        Any thread may call this while another thread steps the world. Raises :class:`RobotError` if a URDF does not
+        compile; with several robots, the error does not name the robot.
 
         Args:
             specs: actors to add.
@@ -127,9 +129,10 @@ class RigidWorld(MujocoWorld):
             raise build_error(added[-1], error) from error
 
     def adopt(self, compiled: CompiledWorld) -> bool:
-        """Use a world from :meth:`compile_with`. Call it between steps.
+        """Use a world from :meth:`compile_with`; call this between steps.
 
-        Returns False and changes nothing if actors or boxes were added or removed meanwhile; then compile again.
+        Returns False and changes nothing if actors or boxes were added or removed since the compilation; then the
+        caller must compile again.
         """
         present = tuple(
             actor for actor in (*self._robots.values(), *self._humans.values()) if actor not in compiled.removed
@@ -161,11 +164,11 @@ class RigidWorld(MujocoWorld):
         return True
 
     def actor_position(self, name: str) -> np.ndarray:
-        """Position [3] m of a robot's base or of a person's hips."""
+        """Returns the position [3] m of a robot's base or of a person's hips."""
         return self.human(name).part_poses[_HIPS, :3] if name in self._humans else self.base_state(name)[0][:3]
 
     def penetrations(self) -> list[tuple[str, str, float]]:
-        """Pairs of actors or objects that overlapped at the start of the last step, with the depth [m]."""
+        """Returns the pairs of actors or objects that overlapped at the start of the last step, with the depth [m]."""
         m = self.mj_model
         d = self.mj_data
         found = []
@@ -179,14 +182,15 @@ class RigidWorld(MujocoWorld):
         return found
 
     def use_compliant_wires(self, wires: DeflectedWires) -> None:
-        """Make wires compliant from now on; before this call they are rigid."""
+        """Make contacts with wires compliant; without this call wires are rigid."""
         self._soft_wires = SoftWires(wires)
         self._soft_wires.use_world(self.mj_model)
 
     # ------------------------------------------------------------------ the step, in two halves
 
     def predict(self) -> None:
-        """First half: poses, contacts of rigid bodies, and the velocity at the end of the step without plants."""
+        """First half of a step: compute poses, contacts of rigid bodies, and the velocity at the end of the step
+        without contacts with plants."""
         m = self.mj_model
         d = self.mj_data
         self.apply_controls()
@@ -212,13 +216,14 @@ class RigidWorld(MujocoWorld):
         mujoco.mj_forwardSkip(m, d, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
     def apply_controls(self) -> None:
-        """Turn the targets of all robots into MuJoCo's controls."""
+        """Compute MuJoCo's controls from the targets of all robots."""
         for robot in self._robots.values():
             robot.apply_controls(self.mj_data, self.dt)
 
     @property
     def velocity_free(self) -> np.ndarray:
-        """[dof] Velocity from :meth:`predict`; zero for sleeping trees, whose ``qacc`` MuJoCo does not update."""
+        """Velocity [dof] at the end of the step as :meth:`predict` computes it; zero for sleeping trees, whose ``qacc``
+        MuJoCo does not update."""
         m = self.mj_model
         d = self.mj_data
         velocity = d.qvel + self.dt * d.qacc
@@ -228,7 +233,10 @@ class RigidWorld(MujocoWorld):
 
     @property
     def dof_names(self) -> list[tuple[str, int]]:
-        """[dof] Name of the joint (or free bunch) and index within it; both stay the same after a recompilation."""
+        """Returns for each degree of freedom the name of its joint (or free bunch) and the index within that joint.
+
+        Names and indices stay valid after a recompilation.
+        """
         m = self.mj_model
         bunch_in = {free_bunch.slot_name(slot): f"bunch/{bunch}" for bunch, slot in self._bunch_slot.items()}
         of = [bunch_in.get(name, name) for name in self._names.joints]
@@ -236,28 +244,29 @@ class RigidWorld(MujocoWorld):
 
     @property
     def islands(self) -> np.ndarray:
-        """Island labels, see :meth:`EffectiveMass.island_labels`."""
+        """Returns a label of the island of each kinematic tree, see :meth:`EffectiveMass.island_labels`."""
         return self._effective_mass.island_labels(self.mj_data)
 
     def is_constrained(self, bodies: np.ndarray) -> bool:
-        """Whether constraints act on ``bodies``, see :meth:`EffectiveMass.is_constrained`."""
+        """Returns whether active constraints act on the MuJoCo ``bodies`` [k], see
+        :meth:`EffectiveMass.is_constrained`."""
         return self._effective_mass.is_constrained(self.mj_data, bodies)
 
     def impulse_response(self, J: np.ndarray) -> np.ndarray:
-        """Change of velocity [dof, k] for unit impulses along the rows of ``J`` [k, dof]; see
+        """Returns the change of velocity [dof, k] by unit impulses along the rows of ``J`` [k, dof]; see
         :class:`EffectiveMass`."""
         return self._effective_mass.impulse_response(self.mj_data, J)
 
     def predict_with(self, force: np.ndarray) -> None:
-        """Predict again with the generalised contact forces of plants, ``force`` [dof] N or N m.
+        """Repeat :meth:`predict` with the generalised contact forces of plants, ``force`` [dof] N or N m.
 
-        The forces may change which of MuJoCo's constraints hold, slide or open.
+        With these forces, other constraints of MuJoCo may hold, slide or open.
         """
         np.add(force, 0.0, out=self.mj_data.qfrc_applied)  # turns -0 into +0, because -0 would keep boxes awake
         mujoco.mj_forwardSkip(self.mj_model, self.mj_data, mujoco.mjtStage.mjSTAGE_VEL, 1)
 
     def integrate(self, force: np.ndarray | None = None) -> None:
-        """Second half: integrate with generalised contact forces of plants, ``force`` [dof] N or N m."""
+        """Second half of a step: integrate with the generalised contact forces of plants, ``force`` [dof] N or N m."""
         m = self.mj_model
         d = self.mj_data
         if force is not None:
@@ -283,7 +292,7 @@ class RigidWorld(MujocoWorld):
         self._kinematics_current = False
 
     def rebind(self, mj_model: mujoco.MjModel, mj_data: mujoco.MjData) -> None:
-        """Use another MuJoCo world in which the robots' joints and bodies have the same names."""
+        """Use another MuJoCo model and data, in which the joints and bodies have equal names."""
         self.mj_model = mj_model
         self.mj_data = mj_data
         self.contact_force = np.zeros(mj_model.nv)
@@ -296,7 +305,7 @@ class RigidWorld(MujocoWorld):
         self._speculative_contacts.find_crates(mj_model, self._boxes)
 
     def _is_faulty(self) -> bool:
-        """Whether a number is not finite, or a rate beyond :data:`MAX_RATE`."""
+        """Returns whether a number of the state is not finite, or a rate exceeds :data:`MAX_RATE`."""
         rate = self.mj_data.qvel
         position = self.mj_data.qpos
         if rate.dot(rate) < MAX_RATE**2 and position.dot(position) < np.inf:  # a cheap sufficient test
@@ -304,8 +313,11 @@ class RigidWorld(MujocoWorld):
         return not (rate.min() > -MAX_RATE and rate.max() < MAX_RATE and np.isfinite(position).all())
 
     def _stop_faulty_trees(self) -> None:
-        """Stop kinematic trees with a non-finite number or a rate beyond :data:`MAX_RATE`, at their poses before the
-        step. All other trees go on."""
+        """Stop kinematic trees with a non-finite number or a rate above :data:`MAX_RATE` at their poses before the
+        step.
+
+        All other trees keep their states.
+        """
         m = self.mj_model
         d = self.mj_data
         joint_tree = m.dof_treeid[m.jnt_dofadr]
@@ -333,7 +345,7 @@ class RigidWorld(MujocoWorld):
     # that are not finite or have the wrong shape.
 
     def place_robot(self, name: str, pose: np.ndarray, position: np.ndarray) -> None:
-        """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest; these become its targets."""
+        """Put a robot at base ``pose`` [7] and joint ``position`` [joint], at rest, and make these its targets."""
         self._check_joints(name, position=position)
         _check_finite(name, "pose", pose, 7)
         self.robot(name).place(self.mj_model, self.mj_data, np.asarray(pose, float), position)
@@ -371,7 +383,7 @@ class RigidWorld(MujocoWorld):
             damping: N m s/rad or N s/m.
             effort: N m or N, added within ``limit``.
             limit: N m or N, effort limit of the servos; by default the limit of the drive, which it cannot exceed.
-            exact: bool, joints that swing with exactly this damping. The other joints are damped as if ``damping`` were
+            exact: bool, joints that are damped by exactly ``damping``. MuJoCo damps other joints as if ``damping`` were
                 larger by dt times stiffness, which suits stiff servos.
         """
         self._check_joints(name, stiffness=stiffness, damping=damping, effort=effort)
@@ -387,9 +399,11 @@ class RigidWorld(MujocoWorld):
     def follow_remote(
         self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> None:
-        """Pull the copy of a remote robot to its received state. It stays dynamic, so a vine can hold it back.
+        """Let the servos pull the copy of a remote robot to the received state; the copy stays dynamic, so that a vine
+        can hold it back.
 
-        ``base_q`` [7], ``base_qd`` [6] world axes, ``position`` and ``velocity`` [joint].
+        ``base_q``: [7] pose of the base; ``base_qd``: [6] its velocity, world axes; ``position``, ``velocity``:
+        [joint].
         """
         self._check_joints(name, position=position, velocity=velocity)
         _check_finite(name, "base pose", base_q, 7)
@@ -427,26 +441,28 @@ class RigidWorld(MujocoWorld):
     # joints and base
 
     def joint_measurements(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Position, velocity, effort and contact effort of the drives, each [joint] in the order of ``spec.drives``.
+        """Returns position, velocity, effort and contact effort of the drives, each [joint] in the order of
+        ``spec.drives``.
 
-        The effort is the drive's effort in the last step, from servo and gravity compensation. The contact effort is
-        J^T f of the contacts with plants and rigid bodies. At rest both together balance the robot's weight.
+        The effort is that of servo and gravity compensation in the last step. The contact effort is J^T f of the
+        contacts with plants and rigid bodies. At rest, effort and contact effort together balance the robot's weight.
         """
         robot = self.robot(name)
         d = self.mj_data
         return d.qpos[robot.q], d.qvel[robot.v], robot.transmitted_effort(d), self.contact_force[robot.v]
 
     def joint_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Position and velocity [joint] of the drives alone, as in :meth:`joint_measurements`."""
+        """Returns position [rad or m] and velocity of the drives [joint], in the order of ``spec.drives``."""
         robot = self.robot(name)
         return self.mj_data.qpos[robot.q], self.mj_data.qvel[robot.v]
 
     def gravity_effort(self, name: str) -> np.ndarray:
-        """Part of the drives' effort that carries the robot's own weight, [joint] N m or N."""
+        """Returns the effort [joint] N m or N of the drives that balances the robot's own weight."""
         return self.mj_data.qfrc_gravcomp[self.robot(name).v]
 
     def joint_inertia(self, name: str) -> np.ndarray:
-        """Inertia seen by each drive in the present pose while the other joints stand still, [joint] kg m^2 or kg.
+        """Returns the inertia [joint] kg m^2 or kg that each drive moves in the present pose while all other joints are
+        fixed.
 
         It includes the armature.
         """
@@ -465,11 +481,13 @@ class RigidWorld(MujocoWorld):
     # links
 
     def link_centre(self, name: str, link: str) -> np.ndarray:
-        """Centre of mass [3] m of a link at the start of the last step; ``ValueError`` for an unknown name."""
+        """Returns the centre of mass [3] m of a link at the start of the last step; ``ValueError`` for an unknown
+        name."""
         return self.mj_data.xipos[self._link_body(name, link)].copy()
 
     def jacobian(self, name: str, link: str, point: np.ndarray) -> np.ndarray:
-        """Jacobian [6, joint] of the velocity of a link at the world ``point`` [3], and of its angular velocity."""
+        """Returns the Jacobian [6, joint] of a link: rows 0 to 2 for the velocity of its point at ``point`` [3] m
+        (world), rows 3 to 5 for its angular velocity."""
         robot = self.robot(name)
         body = self._link_body(name, link)
         self.update_kinematics()
@@ -478,26 +496,29 @@ class RigidWorld(MujocoWorld):
         return jacobian[:, robot.v]
 
     def add_link_sensor(self, name: str, link: str) -> None:
-        """From the next step on, measure :meth:`link_wrench` and :meth:`link_acceleration` at a link."""
+        """Add a sensor to a link, so that :meth:`link_wrench` and :meth:`link_acceleration` are measured from the next
+        step on."""
         self._link_body(name, link)
         if link not in self.robot(name).sensor_links:
             self.robot(name).sensor_links.append(link)
             self._link_sensors.find_indices(self.mj_model, self._robots)
 
     def link_wrench(self, name: str, link: str) -> np.ndarray:
-        """Wrench [6] N, N m about the link's origin, of the link and everything beyond it on the link's parent.
+        """Returns the wrench [6] that a link and all links beyond it exert on the link's parent: force [N], moment [N
+        m].
 
-        It is the mean over the last step, in the link's axes. Weight, inertia, pushes and contacts with rigid bodies
-        are included. Contacts with plants are not included; they are in ``Physics.contacts``.
+        The wrench is the mean over the last step, about the link's origin and in the link's axes. It includes weight,
+        inertia, pushes and contacts with rigid bodies, but not contacts with plants, which are in ``Physics.contacts``.
         """
         return self._link_sensors.wrench(name, link)
 
     def link_acceleration(self, name: str, link: str) -> np.ndarray:
-        """Angular and proper acceleration [6] rad/s^2, m/s^2 of a link's origin in its axes; at rest 9.81 upwards."""
+        """Returns angular acceleration [rad/s^2] and proper acceleration [m/s^2] of a link's origin [6], in the link's
+        axes. The proper acceleration of a link at rest is 9.81 m/s^2 upwards."""
         return self._link_sensors.acceleration(name, link)
 
     def link_angular_velocity(self, name: str, link: str) -> np.ndarray:
-        """Angular velocity [3] rad/s of a link, in its axes."""
+        """Returns the angular velocity [3] rad/s of a link, in its axes."""
         body = self._link_body(name, link)
         self.update_kinematics()
         jacobian = np.zeros((3, self.mj_model.nv))
@@ -508,7 +529,8 @@ class RigidWorld(MujocoWorld):
     # Every method raises :class:`HumanError` if no person or hand has the given name.
 
     def move_human(self, name: str, pose: HumanPose) -> None:
-        """Set a person's tracked points at the end of the coming step, and whether hands are closed or have shears."""
+        """Set the tracked points that a person reaches at the end of the next step, and the state of hands and
+        shears."""
         human = self.human(name)
         busy = [hand.busy for hand in human.hands]
         shears = human.shears_parts
@@ -520,12 +542,12 @@ class RigidWorld(MujocoWorld):
             self._update_geoms()
 
     def hand_sample(self, name: str, side: str) -> HandSample:
-        """State of a person's ``"left"`` or ``"right"`` hand after the last step."""
+        """Returns the state of a person's ``"left"`` or ``"right"`` hand after the last step."""
         human = self.human(name)
         return human.hand_sample(human.hand(side), self.mj_data)
 
     def hand_wrenches(self, name: str) -> tuple[dict[str, dict[str, np.ndarray]], tuple[bool, bool]]:
-        """Wrenches of a person's hands on robots in the last step; see :mod:`vinesim.rigid.human_body`."""
+        """Returns the wrenches of a person's hands on robots in the last step; see :mod:`vinesim.rigid.human_body`."""
         robots = self._robots.items()
         links = {body: (robot, link) for robot, found in robots for link, body in found.bodies.items()}
         return hand_wrenches(self.mj_model, self.mj_data, self.human(name), links)
@@ -533,7 +555,10 @@ class RigidWorld(MujocoWorld):
     # grasps
 
     def grasp(self, name: str, side: str, actor: str, link: str) -> None:
-        """Weld a hand to a link of an actor, a box or a bunch at its present pose; names are as in ``RigidGeoms``."""
+        """Weld a person's hand to an object at the object's present pose.
+
+        The object is a ``link`` of an ``actor``, a box or a bunch; names are as in ``RigidGeoms``.
+        """
         hand = self.human(name).hand(side)
         body = self._body_of_object(actor, link)
         self.update_kinematics()
@@ -552,17 +577,18 @@ class RigidWorld(MujocoWorld):
         self._update_geoms()
 
     def place_hand(self, name: str, side: str, pose: np.ndarray) -> None:
-        """Put a hand at ``pose`` [7], at rest."""
+        """Put a person's hand at ``pose`` [7], at rest."""
         self.human(name).hand(side).place(self.mj_data, pose)
         self._kinematics_current = False
 
     def release(self, name: str, side: str) -> None:
-        """Open a hand."""
+        """Open a person's hand, so that it releases the object that it holds."""
         self.human(name).hand(side).release(self.mj_model, self.mj_data)
         self._update_geoms()
 
     def nearest_to_hand(self, name: str, side: str, reach: float) -> tuple[float, str, str] | None:
-        """Gap [m], actor and link of the rigid body nearest to a hand; None if none is nearer than ``reach`` [m].
+        """Returns gap [m], actor and link of the rigid body nearest to a hand; None if no body is nearer than ``reach``
+        [m].
 
         The ground and the person's own body are ignored.
         """
@@ -589,13 +615,13 @@ class RigidWorld(MujocoWorld):
         return self._pool_size - 1 - max(self._bunch_slot.values(), default=-1)
 
     def add_bunch(self, bunch: int, body: FreeBunch, pose: np.ndarray, velocity: np.ndarray) -> None:
-        """Add a bunch at ``pose`` [7] with ``velocity`` [6] (linear of its origin, then angular; world axes)."""
+        """Add a free bunch at ``pose`` [7] with ``velocity`` [6]: linear of its origin, then angular, in world axes."""
         self.add_bunches({bunch: (body, pose, velocity)})
 
     def add_bunches(self, bunches: dict[int, tuple[FreeBunch, np.ndarray, np.ndarray]]) -> None:
         """Add several bunches, each with its pose [7] and velocity [6]; ``ValueError`` if one exists already."""
         if known := sorted(bunches.keys() & self._free_bunches.keys()):
-            raise ValueError(f"bunch {known[0]} is free already")
+            raise ValueError(f"bunch {known[0]} is already a free bunch")
         derived = {bunch: self._derive(body) for bunch, (body, _, _) in bunches.items()}
         unused = iter(sorted(set(range(self._pool_size + len(bunches))) - set(self._bunch_slot.values())))
         for bunch, (body, _, _) in bunches.items():
@@ -630,20 +656,23 @@ class RigidWorld(MujocoWorld):
     def ignore_overlaps(self, bunch: int) -> None:
         """Let a bunch that was just picked pass through fixed pieces (wood, wires, poles) while it overlaps one.
 
-        Such an overlap was not a contact while the bunch hung there.
+        While the bunch hung on its vine, such an overlap was not a contact.
         """
         self.update_kinematics()
         self._passing_bunches.add(bunch)
         self._end_passing()
 
     def _end_passing(self) -> None:
-        """Let passing bunches without overlap collide with fixed pieces again; MuJoCo's poses must be current."""
+        """Enable collisions with fixed pieces for bunches that passed through one and no longer overlap any.
+
+        MuJoCo's poses must be current.
+        """
         clear = {bunch for bunch in self._passing_bunches if not self._overlaps_fixed_piece(bunch)}
         self._passing_bunches -= clear
         self._set_passing(clear, False)
 
     def _set_passing(self, bunches: set[int], passing: bool) -> None:
-        """Set whether free bunches pass through fixed pieces."""
+        """Set whether free ``bunches`` pass through fixed pieces (wood, wires, poles) or collide with them."""
         m = self.mj_model
         bits = free_bunch.CONAFFINITY & ~FIXED if passing else free_bunch.CONAFFINITY
         for bunch in bunches:
@@ -665,12 +694,12 @@ class RigidWorld(MujocoWorld):
         return any(mujoco.mj_geomDistance(m, d, geom, piece, 0.0, None) < 0.0 for geom, piece in pairs)
 
     def _geoms_of_bunch(self, bunch: int) -> range:
-        """MuJoCo's numbers of the shapes of a free bunch."""
+        """Returns the indices of MuJoCo's geoms of a free bunch."""
         first = int(self.mj_model.body_geomadr[self._body_of_object(f"bunch/{bunch}", "bunch")])
         return range(first, first + len(self._free_bunches[bunch].radius))
 
     def bunch_pose(self, bunch: int) -> np.ndarray:
-        """World pose [7] of a free bunch."""
+        """Returns the world pose [7] of a free bunch."""
         qpos = self._bunch_joint(bunch).qpos
         return np.concatenate([qpos[:3], frames.from_wxyz(qpos[3:])])
 
@@ -681,15 +710,15 @@ class RigidWorld(MujocoWorld):
     # Boxes of the scene have the numbers of its model.
 
     def add_box(self, number: int, box: RigidBox) -> None:
-        """Add a box at rest; all other states are unchanged. ``ValueError`` if the number is taken."""
+        """Add a box at rest; all other states do not change. ``ValueError`` if a box has this number already."""
         if number in self._boxes:
-            raise ValueError(f"box {number} is here already")
+            raise ValueError(f"a box with number {number} exists already; give another number")
         self._use_boxes(self._boxes | {number: box})
 
     def remove_box(self, number: int) -> None:
-        """Remove a box; what lay in it or on it falls. ``ValueError`` if no box has this number."""
+        """Remove a box; objects in it or on it fall. ``ValueError`` if no box has this number."""
         if number not in self._boxes:
-            raise ValueError(f"no box {number} here")
+            raise ValueError(f"no box has the number {number}")
         self._use_boxes({other: box for other, box in self._boxes.items() if other != number})
 
     def _use_boxes(self, boxes: dict[int, RigidBox]) -> None:
@@ -717,11 +746,12 @@ def _free_code(
     others: Sequence[RobotBody | HumanBody],
     error: type[ValueError],
 ) -> int:
-    """A collision code that no actor of this kind has; ``error`` if no code is free or the name is taken."""
+    """Returns a collision code that no actor of this ``kind`` has; raises ``error`` if no code is free or ``name`` is
+    taken."""
     if any(name == actor.spec.name for actor in (*actors, *others)):
         raise error(f"{kind} {name!r} is already here; give the newcomer another name")
     if "/" in name or not name:
-        raise error(f"{kind} name {name!r} must not be empty nor contain '/', which parts actor and link")
+        raise error(f"{kind} name {name!r} must not be empty nor contain '/', which separates actor and link")
     used = {actor.code for actor in actors}
     free = next((code for code in codes if code not in used), None)
     if free is None:

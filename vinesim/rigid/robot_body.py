@@ -1,7 +1,8 @@
 """One robot in MuJoCo's world: a planar base on servos, driven joints, sensors in links.
 
-MuJoCo's integrator damps a servo as if its damping D were larger by dt K. This keeps stiff servos and their loads from
-oscillating. A compliant joint must swing with exactly its own damping; :func:`split_damping` removes the surplus.
+MuJoCo's integrator damps a servo of stiffness K as if its damping D were larger by dt K. This keeps stiff servos and
+their loads from oscillating. A compliant joint, however, must swing with exactly the damping D; for such a joint
+:func:`split_damping` removes the additional damping.
 """
 
 from __future__ import annotations
@@ -26,16 +27,16 @@ from vinesim.scene.values import RobotSpec, Shape
 from vinesim.scene.values.signals import UNLIT, Color
 
 MIN_FRICTION = 1e-5
-"""[1] Smallest friction coefficient of a link, which is the smallest that MuJoCo accepts."""
+"""Smallest friction coefficient of a link, which is the smallest that MuJoCo accepts."""
 MAX_FRICTION = 10.0
-"""[1] Largest friction coefficient of a link, which practically prevents slip; files give up to 1e14."""
+"""Largest friction coefficient of a link, which practically prevents slip; URDF files contain values up to 1e14."""
 MAX_HULL_VERTICES = 64
 """Largest number of vertices of a mesh's convex hull, which bounds the cost of contacts. TUNED."""
 CONTACT_IMPEDANCE = (0.95, 0.99)
-"""[1] Smallest and largest impedance of a link's contacts (MuJoCo's solimp). TUNED: with MuJoCo's 0.9 and 0.95 an arm
+"""Smallest and largest impedance of a link's contacts (MuJoCo's ``solimp``). TUNED: with MuJoCo's 0.9 and 0.95 an arm
 that pushes against its own torso at full effort penetrates by 3 mm, with these by less than 1 mm."""
 COPY_EFFORT_SHARE = 0.999
-"""[1] Largest fraction of its effort limit that the servo of a copy uses."""
+"""Largest fraction of its effort limit that a servo of a remote robot's copy uses."""
 _PLANAR = ("x", "y", "yaw")
 
 
@@ -43,7 +44,8 @@ class RobotBody:
     """One robot: targets and gains of its drives, and its indices in MuJoCo's arrays."""
 
     def __init__(self, spec: RobotSpec, code: int, parameters: PhysicsParameters = PhysicsParameters()) -> None:
-        """``code``: one of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the URDF."""
+        """``code``: collision code, one of :data:`ROBOT_CODES`. Raises :class:`RobotError` if MuJoCo cannot read the
+        URDF."""
         check(spec)
         joints = len(spec.drives)
         pose = np.asarray(spec.pose, float)
@@ -68,9 +70,10 @@ class RobotBody:
         """[joint] rad or m, target position of the servos."""
         self.target_velocity = np.zeros(joints)
         self.feedforward = np.zeros(joints)
-        """[joint] N m or N, effort added to the servos'."""
+        """[joint] N m or N, effort that is added to the effort of the servos."""
         self.control = np.zeros(joints)
-        """[joint] N m or N, MuJoCo's control in the last step; minus K q and D v it is the effort of the servo."""
+        """[joint] N m or N, MuJoCo's control in the last step; the servo's effort is the control minus K q minus D v.
+        """
         self.base_target = np.array([pose[0], pose[1], frames.to_yaw(pose[3:])])
         """[3] x, y, yaw (m, m, rad), target of the base's servos; it moves with ``base_velocity``."""
         self.base_height = float(pose[2])
@@ -81,7 +84,7 @@ class RobotBody:
         """Stiffness and damping [3] of the base's servos along x, y and about z."""
         self._base_slip = np.array([parameters.base_slip])
         self.has_exact_damping = np.zeros(joints, bool)
-        """[joint] bool, whether the joint has exactly its own damping; see :func:`split_damping`."""
+        """[joint] bool, whether the joint is damped by exactly the set damping; see :func:`split_damping`."""
         self.damping_at_start = np.zeros(joints)
         """[joint] N m s/rad, part of the damping that acts on the velocity at the start of the step."""
         self.damping_at_end = np.zeros(joints)
@@ -101,7 +104,7 @@ class RobotBody:
 
     @property
     def base_slip(self) -> float:
-        """[m or rad] Offset from the target at which the base's servos give their full effort."""
+        """Largest distance [m or rad] between the base and its target, at which the base's servos have full effort."""
         return float(self._base_slip[0])
 
     @base_slip.setter
@@ -110,7 +113,8 @@ class RobotBody:
 
     @property
     def shown_shapes(self) -> dict[str, tuple[Shape, ...]]:
-        """Visible shapes by link with the indicator lights in their present colour; same objects for equal colours."""
+        """Returns the visible shapes by link with indicator lights in their present colour; equal colours return the
+        same objects."""
         color = self.indicator_color
         if color not in self._shown_shapes:
             kept = {None: self.shapes, UNLIT: self._shown_shapes.get(UNLIT, _with_lamps(self.shapes, UNLIT))}
@@ -138,7 +142,7 @@ class RobotBody:
             _add_servo(spec, f"{name}:{axis}", stiffness[i], damping[i], given.base_effort[i // 2])
 
     def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames) -> None:
-        """Find the robot's bodies and joints in a recompiled world."""
+        """Look up the MuJoCo indices of the robot's bodies and joints in a recompiled world."""
         name = self.spec.name
         driven = [f"{name}/{drive.joint}" for drive in self.spec.drives]
         planar = [f"{name}:{axis}" for axis in _PLANAR]
@@ -156,7 +160,7 @@ class RobotBody:
         self._controls_of = None
 
     def place(self, m: mujoco.MjModel, d: mujoco.MjData, pose: np.ndarray, position: np.ndarray) -> None:
-        """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest; these become its targets."""
+        """Put the robot at base ``pose`` [7] and ``position`` [joint], at rest, and make these its targets."""
         self.target[:] = d.qpos[self.q] = position
         self.base_target[:] = d.qpos[self.base_q] = pose[0], pose[1], frames.to_yaw(pose[3:])
         d.qvel[self.v] = d.qvel[self.base_v] = 0.0
@@ -167,13 +171,14 @@ class RobotBody:
             d.joint(joint).qpos[0] = polynomial(d.joint(source).qpos[0])
 
     def apply_controls(self, d: mujoco.MjData, dt: float) -> None:
-        """Before a step: turn the targets into MuJoCo's controls."""
+        """Before a step of ``dt`` [s]: compute MuJoCo's controls from the targets."""
         if self._controls_of is not d:
             self._bind_controls(d, dt)
         self._apply_controls()
 
     def _bind_controls(self, d: mujoco.MjData, dt: float) -> None:
-        """Bind the kernel that writes MuJoCo's controls: one call instead of twenty NumPy calls on short arrays."""
+        """Capture the kernel that writes MuJoCo's controls on the arrays of ``d``, which replaces twenty NumPy
+        calls."""
         self._controls_of = d
         (stiffness, damping) = self.base_gains
         drives = SharedArrays(
@@ -205,7 +210,7 @@ class RobotBody:
         self._apply_controls = KernelGraph(apply)
 
     def transmitted_effort(self, d: mujoco.MjData) -> np.ndarray:
-        """[joint] N m or N, effort of the drives in the last step: servo plus gravity compensation."""
+        """Returns the effort [joint] N m or N of the drives in the last step: servo plus gravity compensation."""
         # the servos are implicit: their force over the step is the force at the end of the step
         servo = self.control - self.stiffness * d.qpos[self.q] - self.damping_at_end * d.qvel[self.v]
         servo = np.minimum(np.maximum(servo, -self.servo_limit), self.servo_limit)  # three times as fast as np.clip
@@ -242,10 +247,11 @@ class RobotBody:
     def follow_remote(
         self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> None:
-        """Pull a copy to its received state; see :meth:`RigidWorld.follow_remote`."""
+        """Let the servos pull the copy of a remote robot to its received state; see
+        :meth:`RigidWorld.follow_remote`."""
         self.command(position, velocity)
-        # MuJoCo treats a servo at its limit at the start of the step as explicit; a light joint that catches up would
-        # then be thrown past its target
+        # MuJoCo treats a servo that is at its effort limit at the start of the step as explicit; a light joint that
+        # catches up would then overshoot its target
         servo = self.servo_limit
         most = self.effort_limit
         weight = d.qfrc_gravcomp[self.v]
@@ -270,9 +276,9 @@ class RobotBody:
         limit: np.ndarray | None,
         exact: np.ndarray | None,
     ) -> None:
-        """Set ``gains``: stiffness, damping, feedforward; see :meth:`RigidWorld.set_gains`.
+        """Set ``gains`` (stiffness, damping, feedforward) of the servos; see :meth:`RigidWorld.set_gains`.
 
-        The measured effort of the last step does not change.
+        :meth:`transmitted_effort` of the last step does not change.
         """
         before = self.stiffness.copy()
         self.stiffness[:], self.damping[:], self.feedforward[:] = gains
@@ -289,7 +295,7 @@ class RobotBody:
     def set_remote_wrenches(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
         """Set the wrenches [6] of remote people by link; :class:`RobotError` if a link does not exist."""
         if unknown := sorted(wrenches.keys() - self.bodies.keys()):
-            raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, a link that it has not")
+            raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, which is not one of its links")
         for link in self.remote_wrenches.keys() - wrenches.keys():
             d.xfrc_applied[self.bodies[link]] = 0.0
         for link, wrench in wrenches.items():
@@ -297,7 +303,7 @@ class RobotBody:
         self.remote_wrenches = wrenches
 
     def remote_effort(self, m: mujoco.MjModel, d: mujoco.MjData) -> np.ndarray:
-        """[dof] Generalised force of the wrenches of remote people."""
+        """Returns the generalised force [dof] N or N m of the wrenches that remote people exert on the robot."""
         total = np.zeros(m.nv)
         for link, wrench in self.remote_wrenches.items():
             body = self.bodies[link]
@@ -307,7 +313,7 @@ class RobotBody:
     # ------------------------------------------------------------------ inside
 
     def _set_gains(self, m: mujoco.MjModel) -> None:
-        """Write gains and limits into MuJoCo's model."""
+        """Write the servos' gains and effort limits into MuJoCo's model."""
         dt = m.opt.timestep
         at_end, at_start = split_damping(
             self.stiffness, self.damping, m.dof_damping[self.v], m.dof_armature[self.v], dt
@@ -320,7 +326,8 @@ class RobotBody:
         m.actuator_forcerange[self.actuator, 1] = self.servo_limit
 
     def _mimics(self, m: mujoco.MjModel) -> dict[str, tuple[str, np.ndarray]]:
-        """Mimic joints by name: name of the source joint, and coefficients of the polynomial [5]."""
+        """Returns the robot's mimic joints by name, each with the name of its source joint and MuJoCo's polynomial
+        [5]."""
         joints = {}
         for e in np.flatnonzero(m.eq_type == int(mujoco.mjtEq.mjEQ_JOINT)):
             joint = m.joint(m.eq_obj1id[e]).name
@@ -331,7 +338,7 @@ class RobotBody:
 
 
 def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
-    """A robot from its URDF, without base and servos; its shapes have the collision ``code``."""
+    """Returns a robot parsed from its URDF, without base and servos; its shapes have the collision ``code``."""
     text = collision_urdf(given.urdf, frozenset(drive.joint for drive in given.drives))
     child = mujoco.MjSpec.from_string(text, assets={name: to_stl(corners) for name, corners in given.meshes.items()})
     own_friction = link_friction(given.urdf)
@@ -364,16 +371,16 @@ def _parse(given: RobotSpec, code: int, friction: float) -> mujoco.MjSpec:
 
 
 def _base_gains(spec: RobotSpec, parameters: PhysicsParameters) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness and damping [3] of the base's servos along x, y and about z."""
+    """Returns the stiffness and damping [3] of the base's servos along x, y and about z."""
     force, moment = spec.base_effort
     stiffness = np.array([force, force, moment]) / parameters.base_slip
     return stiffness, parameters.base_damping_time * stiffness
 
 
 def _add_servo(spec: mujoco.MjSpec, joint: str, stiffness: float, damping: float, effort: float) -> None:
-    """Add a servo with effort = control - stiffness q - damping v, limited to ``effort``.
+    """Add a servo to ``joint`` with effort = control - stiffness q - damping v, limited to ``effort`` [N m or N].
 
-    The control contains the targets of position and velocity.
+    The control is stiffness times target position plus damping times target velocity.
     """
     bias = np.zeros(10)
     bias[1:3] = -stiffness, -damping
@@ -398,10 +405,10 @@ def split_damping(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Split a servo's damping into parts [joint] for the end and the start of the step, so that its decay is exact.
 
-    The spring acts at the end of the step, at q + dt v, which damps as if D were larger by dt K. So dt K is subtracted
-    from the part at the end, which makes this share of the spring explicit. Half of the damping (including ``friction``
-    of the joint) acts on the velocity at the start. This is the trapezoidal rule, whose decay is exact to third order
-    in dt D / M.
+    MuJoCo evaluates the spring at the end of the step, at q + dt v, which damps as if D were larger by dt K. So dt K is
+    subtracted from the part at the end, which makes this share of the spring explicit. Half of the damping (including
+    ``friction`` of the joint) acts on the velocity at the start. This is the trapezoidal rule, whose decay is exact to
+    third order in dt D / M.
 
     The scheme is not stable for every inertia M. With A and B the parts at the end (before dt K is subtracted) and at
     the start, stability needs A - B >= dt K / 2 - 2 M / dt, where M is at least ``armature``. So B is reduced, and if
@@ -414,14 +421,14 @@ def split_damping(
 
 
 def build_error(spec: RobotSpec, error: ValueError) -> RobotError:
-    """MuJoCo's error about a robot, in one line."""
+    """Returns a :class:`RobotError` with MuJoCo's error about a robot, in one line."""
     return RobotError(f"robot {spec.name!r}: MuJoCo cannot build it from its URDF: {' '.join(str(error).split())}")
 
 
 def _with_lamps(shapes: dict[str, tuple[Shape, ...]], color: Color | None) -> dict[str, tuple[Shape, ...]]:
-    """Shapes by link with indicator lights in ``color``, lit unless it is :data:`UNLIT`.
+    """Returns the shapes by link with all indicator lights in ``color``; they emit light unless it is :data:`UNLIT`.
 
-    Links without indicator lights keep their tuples.
+    For links without indicator lights the tuples are the same objects.
     """
     if color is None:
         return shapes

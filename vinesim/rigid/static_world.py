@@ -1,4 +1,4 @@
-"""The static world for MuJoCo: ground, trellis, wood and crates; and the collision bits of all rigid bodies."""
+"""MuJoCo's world without actors (ground, trellis, wood and crates), and the collision bits of all rigid bodies."""
 
 from __future__ import annotations
 
@@ -15,13 +15,14 @@ from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.values import RigidBox, Shape
 
 CRATE_WALL = 0.012
-"""[m] Thickness of a crate's bottom and walls. GUESSED."""
+"""Thickness [m] of a crate's bottom and walls. GUESSED."""
 MIN_STATIC_RADIUS = 0.006
-"""[m] Smallest radius of pieces in contacts with rigid bodies; thinner pieces are treated as this thick. TUNED: a body
-at 0.5 m/s moves 5 mm in a step. If the axis of a wire were inside a box, MuJoCo would push the box along the wire."""
+"""Smallest radius [m] of fixed pieces in contacts with rigid bodies; thinner pieces are treated as this thick. TUNED: a
+body at 0.5 m/s moves 5 mm in a step. If the axis of a wire were inside a box, MuJoCo would push the box along the wire.
+"""
 CRATE_BED_DEPTH = 0.08
-"""[m] Thickness of a crate's bottom for free bunches alone. DERIVED: a bunch that has fallen a metre moves 4 cm in a
-step; a bottom of the visible thickness would push it out below."""
+"""Thickness [m] of a crate's bottom in contacts with free bunches. DERIVED: a bunch that has fallen a metre moves 4 cm
+in a step; a bottom of the visible thickness would push it out below."""
 CRATE_COLOR = (0.75, 0.15, 0.12, 1.0)
 
 FIRST_FIXED_GEOM = 1
@@ -33,9 +34,9 @@ not collide with hands of remote people, because the person's own client compute
 _ROBOT_BITS = range(6, 18)
 _HUMAN_BITS = range(18, 31)
 ROBOTS = sum(1 << bit for bit in _ROBOT_BITS)
-"""Collision bits of which the codes of robots consist."""
+"""Mask of all collision bits that are used in the codes of robots (:data:`ROBOT_CODES`)."""
 HUMANS = sum(1 << bit for bit in _HUMAN_BITS)
-"""Collision bits of which the codes of people consist."""
+"""Mask of all collision bits that are used in the codes of people (:data:`HUMAN_CODES`)."""
 ALL_BITS = (1 << (_HUMAN_BITS[-1] + 1)) - 1
 _CODE_WEIGHT = 6
 
@@ -45,8 +46,8 @@ def _codes(bits: range) -> tuple[int, ...]:
 
 
 ROBOT_CODES = _codes(_ROBOT_BITS)
-"""Collision codes of robots. Each actor has its own code, so it collides with all other actors, and with itself only if
-wanted.
+"""Collision codes of robots. Each actor has its own code, so that it collides with all other actors, and with itself
+only if requested.
 
 MuJoCo lets two geoms collide if ``contype`` of one and ``conaffinity`` of the other share a bit. An actor has its code
 as ``contype`` and all other bits in ``conaffinity``; a robot that collides with itself has its code there, too. All
@@ -58,17 +59,18 @@ HUMAN_CODES = _codes(_HUMAN_BITS)
 
 
 def contact_friction(coefficient: float, rolling_arm: float = 0.0001) -> list[float]:
-    """Friction of a geom for MuJoCo: sliding [1], torsional [m] (needs condim 4) and rolling [m] (needs condim 6)."""
+    """Returns MuJoCo's friction of a geom: sliding [1], torsional [m] (used from condim 4), rolling [m] (condim 6)."""
     return [coefficient, 0.005, rolling_arm]
 
 
 def geom_user(material: int, *, has_own_friction: bool = False) -> list[float]:
-    """User data of a geom: its :class:`Material`, and whether it uses its own friction coefficient in all contacts."""
+    """Returns the user data of a geom: its :class:`Material`, and whether it uses its own friction coefficient in all
+    contacts."""
     return [float(material), float(has_own_friction)]
 
 
 def boxes_of(model: Model) -> dict[int, RigidBox]:
-    """The boxes of a generated scene, by number."""
+    """Returns the boxes of a generated scene, by number."""
     rows = zip(model.box_pose.astype(float), model.box_size.astype(float), model.box_mass.tolist(), strict=True)
     return {number: RigidBox(*row) for number, row in enumerate(rows)}
 
@@ -76,7 +78,7 @@ def boxes_of(model: Model) -> dict[int, RigidBox]:
 def build_static_world(
     model: Model, parameters: PhysicsParameters, boxes: Mapping[int, RigidBox] | None = None
 ) -> mujoco.MjSpec:
-    """A world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options.
+    """Returns the specification of a world with ground, poles, wires, trunks, arms and crates, and MuJoCo's options.
 
     ``boxes``: the crates by number; by default those of the model.
     """
@@ -159,7 +161,8 @@ def _add_crate(body: mujoco.MjsBody, size: np.ndarray, mass: float, friction: li
 
 
 def crate_shapes(size: np.ndarray) -> tuple[Shape, ...]:
-    """Bottom and four walls of an open box of outer ``size`` [3] m; the origin is in the middle of the underside."""
+    """Returns the bottom and four walls of an open box of outer ``size`` [3] m; the origin is in the middle of the
+    underside."""
     length, width, height = (float(s) / 2 for s in size)
     t = CRATE_WALL / 2
     walls = [

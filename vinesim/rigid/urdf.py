@@ -1,4 +1,4 @@
-"""URDF for the rigid world: checks, the text that MuJoCo compiles, and visible shapes."""
+"""URDFs of robots: checks, the URDF that MuJoCo compiles, friction, materials and visible shapes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from vinesim.scene.values import Mesh, RobotSpec, Shape
 
 
 class RobotError(ValueError):
-    """A robot that cannot be added; the message gives its name, the finding and a remedy."""
+    """Error: a robot cannot be added or commanded. The message contains the robot's name, the fault and a remedy."""
 
 
 def check(spec: RobotSpec) -> None:
@@ -32,11 +32,13 @@ def check(spec: RobotSpec) -> None:
     joints = {joint.get("name", ""): joint for joint in root.findall("joint")}
     roots = links - {child.get("link", "") for joint in joints.values() for child in joint.findall("child")}
     if roots != {spec.base}:
-        raise RobotError(f"robot {spec.name!r}: base {spec.base!r} must be its URDF's root, which is {sorted(roots)}")
+        raise RobotError(
+            f"robot {spec.name!r}: base {spec.base!r} must be the root of its URDF, which is {sorted(roots)}"
+        )
     for drive in spec.drives:
         if drive.joint not in joints:
             raise RobotError(
-                f"robot {spec.name!r} drives {drive.joint!r}, which its URDF lacks, having {sorted(joints)}"
+                f"robot {spec.name!r} drives {drive.joint!r}, which its URDF lacks; the URDF has {sorted(joints)}"
             )
         if joints[drive.joint].get("type") not in ("revolute", "continuous", "prismatic"):
             kind = joints[drive.joint].get("type")
@@ -47,7 +49,8 @@ def check(spec: RobotSpec) -> None:
 
 @functools.lru_cache(16)  # shared by robots of one kind
 def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
-    """The URDF for MuJoCo: without visuals, and with all joints fixed that are neither ``driven`` nor mimic joints."""
+    """Returns the URDF for MuJoCo: without visual shapes, and with all joints fixed except ``driven`` and mimic
+    joints."""
     root = ElementTree.fromstring(urdf)
     for link in root.iter("link"):
         for visual in link.findall("visual"):
@@ -66,7 +69,8 @@ def collision_urdf(urdf: str, driven: frozenset[str]) -> str:
 
 @functools.lru_cache(16)
 def link_friction(urdf: str) -> dict[str, float]:
-    """Coulomb coefficient [1] by link, where the URDF gives one: Gazebo's ``mu1`` or Bullet's ``lateral_friction``."""
+    """Returns the Coulomb friction coefficient [1] by link, where the URDF gives one: Gazebo's ``mu1`` or Bullet's
+    ``lateral_friction``."""
     root = ElementTree.fromstring(urdf)
     found = {}
     for link in root.findall("link"):
@@ -79,12 +83,12 @@ def link_friction(urdf: str) -> dict[str, float]:
 
 
 _MATERIALS = {"rubber": Material.RUBBER, "plastic": Material.PLASTIC, "metal": Material.STEEL}
-"""Contact material by visible surface."""
+"""Contact material of a shape, by the name of its visible surface."""
 
 
 @functools.lru_cache(16)
 def collision_materials(urdf: str) -> dict[str, tuple[Material, ...]]:
-    """Materials of the collision shapes of each link, in the order of the URDF.
+    """Returns the materials of the collision shapes of each link, in the order of the URDF.
 
     A URDF gives materials only for visual shapes. A collision shape has the material of the visual shape of equal pose
     and size, or else the material that all visual shapes of its link share.
@@ -115,7 +119,8 @@ def _is_same_solid(one: Shape, other: Shape) -> bool:
 
 @functools.lru_cache(16)
 def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
-    """Shapes of each link of a URDF for sensors: its visual shapes, or its collision shapes if it has none."""
+    """Returns the shapes of each link of a URDF for sensors: its visual shapes, or its collision shapes if it has
+    none."""
     root = ElementTree.fromstring(urdf)
     paints = {m.get("name"): m for m in root.findall("material")}
     shapes = {}
@@ -126,9 +131,10 @@ def shapes_of(urdf: str) -> dict[str, tuple[Shape, ...]]:
 
 
 def shapes_of_robot(spec: RobotSpec) -> dict[str, tuple[Shape, ...]]:
-    """Shapes of each link of a robot, as :func:`shapes_of`, also for meshes that were received instead of read.
+    """Returns the visible shapes of each link of a robot, as :func:`shapes_of` does.
 
-    Raises :class:`RobotError` for triangles that cannot be shown.
+    Meshes may also be given as triangles in ``spec``, received over the network. Raises :class:`RobotError` for a mesh
+    that cannot be shown.
     """
     shapes = shapes_of(spec.urdf)
     if not spec.meshes:
@@ -150,7 +156,8 @@ def shapes_of_robot(spec: RobotSpec) -> dict[str, tuple[Shape, ...]]:
 
 
 _SURFACES = {name: name for name in SURFACES} | {"steel": "metal", "aluminium": "metal", "lens": "glass"}
-"""Surface by a word in the name of a URDF material, such as ``rubber``, ``dark_rubber`` or ``lamp_green``."""
+"""Visible surface of a shape, by a word in the name of its URDF material (``rubber``, ``dark_rubber``, ``lamp_green``).
+"""
 
 
 def _numbers(element: ElementTree.Element | None, key: str, default: str) -> np.ndarray:

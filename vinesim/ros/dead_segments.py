@@ -1,9 +1,10 @@
-"""Removes shared memory of Fast DDS whose process was killed. Otherwise 24 MiB of each sensor process stay until boot.
+"""Removes shared-memory segments of Fast DDS whose process was killed. Otherwise 24 MiB of each killed sensor process
+would stay until the machine restarts.
 
-Fast DDS keeps a lock (flock) on ``NAME_el`` while the owner of segment ``NAME`` lives; its own ``fastdds shm clean``
-goes by the same lock. Readers that still have a removed segment mapped keep it until they unmap it.
+Fast DDS keeps a lock (flock) on the file ``NAME_el`` while the owner of segment ``NAME`` lives. Its own tool ``fastdds
+shm clean`` tests the same lock. A reader that has a removed segment mapped can use the segment until it unmaps it.
 
-The port files of Fast DDS are left: they take 52 KB each, and the next node with that number uses them again.
+Port files of Fast DDS are not removed: they take 52 KB each, and the next participant with that port uses them again.
 """
 
 from __future__ import annotations
@@ -19,21 +20,22 @@ log = logging.getLogger(__name__)
 
 FOLDER = pathlib.Path("/dev/shm")
 SMALLEST = 4 << 20
-"""The smallest segment of vinesim's profiles [B]. Smaller ones, such as the 0.5 MiB of Fast DDS itself, are left."""
+"""Size of the smallest segment that is removed [B]. Segments of vinesim's profiles are larger, those of Fast DDS's
+own default (0.5 MiB) are smaller."""
 YOUNGEST = 60.0
-"""A segment younger than this may belong to a process that is about to lock it [s]."""
+"""Age below which a segment is not removed [s], because it may belong to a process that is about to lock it."""
 
 
 def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path, pathlib.Path]]:
-    """Large segments of this user whose owner is dead, each with its lock file. The file stays locked until the next
-    segment is taken."""
+    """Yield each large segment of this user whose owner is dead, with its lock file. The lock file stays locked
+    until the iterator goes on."""
     try:
         import fcntl
     except ImportError:
-        return  # no such system has Fast DDS's locks
+        return  # systems without fcntl have no locks of Fast DDS
     for path in (*folder.glob("fastrtps_*"), *folder.glob("fastdds_*")):
         lock = path.with_name(f"{path.name}_el")
-        with contextlib.suppress(OSError):  # gone, locked, or of another user: not ours to remove
+        with contextlib.suppress(OSError):  # removed meanwhile, locked, or of another user
             status = path.stat()
             is_ours = status.st_size >= SMALLEST and status.st_uid == os.getuid()
             if not is_ours or time.time() - status.st_mtime < YOUNGEST:
@@ -44,11 +46,11 @@ def dead_segments(folder: pathlib.Path = FOLDER) -> Iterator[tuple[pathlib.Path,
 
 
 def remove_dead_segments(folder: pathlib.Path = FOLDER) -> int:
-    """Remove large segments of this user whose owner is dead. Returns their number. The log has their number and
-    size."""
+    """Remove the large segments of this user whose owner is dead, and log their number and size. Returns their
+    number."""
     removed = size = 0
     for path, lock in dead_segments(folder):
-        with contextlib.suppress(OSError):  # another process removes them as well
+        with contextlib.suppress(OSError):  # another process may remove the same segment
             length = path.stat().st_size
             path.unlink()
             lock.unlink()

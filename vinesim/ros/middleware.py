@@ -1,8 +1,8 @@
 """Whether ROS 2 can be used in this process, and the settings of its middleware.
 
-ROS 2 comes from wheels (``pip install 'vinesim[ros]'``) or from a sourced installation, never from both: the wheels
-start Python a second time to put their libraries on ``LD_LIBRARY_PATH``, in no particular order; beside a sourced
-/opt/ros it would be undefined which library is loaded.
+ROS 2 comes from wheels (``pip install 'vinesim[ros]'``) or from a sourced installation, never from both. The wheels
+start Python a second time to put their libraries on ``LD_LIBRARY_PATH``, in no particular order. If /opt/ros were
+sourced as well, it would be undefined which library is loaded.
 """
 
 from __future__ import annotations
@@ -18,15 +18,18 @@ from vinesim.ros.dead_segments import remove_dead_segments
 FOLDER = pathlib.Path(__file__).resolve().parent
 
 PROFILE_VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
+"""Environment variable with the path of the Fast DDS profile."""
 RANGE_VARIABLE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
+"""Environment variable with the discovery range of ROS 2."""
 LOCALHOST_VARIABLE = "ROS_LOCALHOST_ONLY"
-"""Older variable that means LOCALHOST as the discovery range. If it is 1, it takes precedence."""
+"""Older environment variable for the discovery range. If it is 1, the range is LOCALHOST, whatever
+:data:`RANGE_VARIABLE` holds."""
 WHEEL_MIDDLEWARE = "rmw_fastrtps_cpp"
-"""The only middleware among the wheels."""
+"""Name of the only ROS middleware that the wheels contain."""
 
 
 class RosUnavailableError(RuntimeError):
-    """ROS 2 cannot be used in this process; the text says why and what to do."""
+    """ROS 2 cannot be used in this process. The message gives the reason and the remedy."""
 
 
 def unavailable_reason() -> str | None:
@@ -35,14 +38,14 @@ def unavailable_reason() -> str | None:
     sourced = os.environ.get("AMENT_PREFIX_PATH", "")
     if wheels and sourced:
         return (
-            f"ROS 2 is installed here as wheels and sourced from {sourced.split(os.pathsep)[0]} as well, and which "
-            "libraries would be loaded is chance; start from a shell where nothing is sourced, or use an environment "
+            f"ROS 2 is installed here as wheels and sourced from {sourced.split(os.pathsep)[0]} as well, so it is "
+            "undefined which libraries are loaded; start from a shell where nothing is sourced, or use an environment "
             "without the extra vinesim[ros]"
         )
     if wheels and str(pathlib.Path(sys.prefix) / "lib") not in os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep):
         return (
-            "the ROS 2 wheels did not get to set LD_LIBRARY_PATH (Python was started with -S or -I, or by a program of "
-            "another environment); start Python plainly, or unset _ROS_WHEELS_BOOTSTRAP_COMPLETE"
+            "the ROS 2 wheels could not set LD_LIBRARY_PATH (Python was started with -S or -I, or by a program of "
+            "another environment); start Python without these options, or unset _ROS_WHEELS_BOOTSTRAP_COMPLETE"
         )
     chosen = os.environ.get("RMW_IMPLEMENTATION", WHEEL_MIDDLEWARE)
     if wheels and chosen != WHEEL_MIDDLEWARE:
@@ -57,8 +60,9 @@ def unavailable_reason() -> str | None:
 
 
 def profile_file(*, large_messages: bool, local: bool) -> pathlib.Path:
-    """Fast DDS profile of a process: with a shared-memory segment that large messages fit into, or with UDP alone, as
-    that does not wait for subscribers that are stopped. ``local``: peers are on this machine only."""
+    """Returns the Fast DDS profile for a process. ``large_messages``: whether the profile has a shared-memory
+    segment into which large messages fit; otherwise it uses UDP only, which never waits for stopped subscribers.
+    ``local``: whether all peers are on this machine."""
     return FOLDER / f"{'shared_memory' if large_messages else 'udp'}{'_loopback' if local else ''}.xml"
 
 
@@ -71,11 +75,11 @@ OWN_PROFILES = {
 
 
 def configure(*, large_messages: bool | None = None) -> None:
-    """Set the environment for the first ROS context. Raises :class:`RosUnavailableError` if ROS cannot be used.
+    """Set the environment variables of the middleware, before the first ROS context is created. Raises
+    :class:`RosUnavailableError` if ROS cannot be used.
 
-    Shared memory that killed processes left is removed.
-    ``large_messages``: whether the process sends pictures or clouds. None: as in the call before, at first True.
-    A profile that the user has chosen stays.
+    Also removes shared memory that killed processes left. ``large_messages``: whether the process publishes pictures or
+    clouds. None: as in the previous call, True in the first one. A profile that the user has chosen is kept.
     """
     reason = unavailable_reason()
     if reason is not None:
@@ -88,8 +92,8 @@ def configure(*, large_messages: bool | None = None) -> None:
     if large_messages is not None:
         large = large_messages
     if discovers_this_machine_only() and not os.environ.get("ROS_STATIC_PEERS"):
-        # With LOCALHOST, rmw_fastrtps adds transports of its own to the profile's, shared memory among them. The
-        # profile limits discovery to this machine instead.
+        # With LOCALHOST, rmw_fastrtps would add its own transports to those of the profile, shared memory among them.
+        # So the profile limits discovery to this machine instead.
         os.environ[RANGE_VARIABLE] = "SYSTEM_DEFAULT"
         os.environ.pop(LOCALHOST_VARIABLE, None)
         local = True
@@ -97,26 +101,27 @@ def configure(*, large_messages: bool | None = None) -> None:
 
 
 def asks_for_acknowledgements() -> bool:
-    """Whether publishers request acknowledgements from their subscribers many times a second, which vinesim's profile
-    without large messages sets. Otherwise Fast DDS requests them every three seconds."""
+    """Returns whether publishers request acknowledgements from their subscribers many times a second, as set by
+    vinesim's profile without large messages. Otherwise Fast DDS requests them every three seconds."""
     large, _ = OWN_PROFILES.get(os.environ.get(PROFILE_VARIABLE, ""), (True, False))
     return uses_fast_dds() and not large
 
 
 def uses_fast_dds() -> bool:
-    """Whether this process uses Fast DDS as its middleware."""
+    """Returns whether this process uses Fast DDS as its middleware."""
     from rclpy.utilities import get_rmw_implementation_identifier
 
     return get_rmw_implementation_identifier().startswith("rmw_fastrtps")
 
 
 def discovers_this_machine_only() -> bool:
-    """Whether the environment asks for peers on this machine only."""
+    """Returns whether the environment variables limit discovery to peers on this machine."""
     return os.environ.get(LOCALHOST_VARIABLE) == "1" or os.environ.get(RANGE_VARIABLE, "").upper() == "LOCALHOST"
 
 
 def clear_profile() -> None:
-    """Remove vinesim's own profile again, to run as a program that knows nothing of vinesim."""
+    """Remove vinesim's own Fast DDS profile from the environment, so that this process runs like any other ROS
+    program."""
     profile = os.environ.get(PROFILE_VARIABLE, "")
     if profile in OWN_PROFILES:
         del os.environ[PROFILE_VARIABLE]

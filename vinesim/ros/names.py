@@ -1,4 +1,4 @@
-"""Names that ROS allows."""
+"""Conversion of names of actors to names that ROS allows."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import re
 
 
 def ros_name(actor: str) -> str:
-    """An actor's name as part of a topic or as the name of a node. All characters but ASCII letters, digits and
-    underscores are replaced by underscores. A digit at the start gets an underscore before it."""
+    """Convert an actor's name to a name that ROS allows in topics and for nodes. All characters but ASCII letters,
+    digits and underscores become underscores. A name that is empty or starts with a digit gets an underscore in
+    front."""
     return re.sub(r"^(?=\d|$)", "_", re.sub(r"\W", "_", actor, flags=re.ASCII))

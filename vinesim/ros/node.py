@@ -1,7 +1,7 @@
-"""Base class of all ROS 2 nodes of vinesim: topics with counts, a thread that receives, and an orderly end.
+"""Base class of all ROS 2 nodes of vinesim: topics with message counts, a receiving thread, and an orderly shutdown.
 
-Messages without subscribers are not built. With :meth:`Node.has_subscribers` the simulation can also skip the
-computation of their content.
+A message is built only if its topic has subscribers. With :meth:`Node.has_subscribers` the simulation can also skip the
+computation of its content.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ SUBSCRIPTION_COUNT_PERIOD = 0.1
 
 
 class Node:
-    """A node under ``namespace``; several may live in one process, each with its own ROS context.
+    """A ROS 2 node under ``namespace``. Several nodes may exist in one process, each with its own ROS context unless it
+    shares that of another node (``beside``). A node is a context manager, which calls :meth:`close` at its end.
 
     Raises :class:`middleware.RosUnavailableError`, :class:`message_packages.InterfacesError`, or :class:`ValueError`
-    for a name that ROS does not allow; each with one line of text. A context: :meth:`close` at its end.
+    for a name that ROS does not allow. Their messages have one line.
     """
 
     def __init__(
@@ -51,17 +52,17 @@ class Node:
         *,
         beside: Node | None = None,
     ) -> None:
-        """``topics``: names given by the user, checked before anything starts. ``params_file``: values of parameters
-        (YAML, as ``--params-file`` of ROS 2 takes it); ``parameters``: those that were set in an earlier run.
-        ``beside``: a node that is open longer, whose ROS context this one shares; a context of its own takes 8 MB and
-        seven threads."""
+        """``topics``: topic names given by the user, which are checked before anything starts. ``params_file``: YAML
+        file with values of parameters, as for ``--params-file`` of ROS 2. ``parameters``: values that were set in an
+        earlier run of the node, by name of the parameter. ``beside``: a node whose ROS context this one shares and
+        that is closed later than this one; a context of its own takes 8 MB and seven threads."""
         try:
             validate_node_name(name)
             validate_namespace(f"/{namespace}" if namespace else "/")
             for topic in topics:
                 validate_topic_name(topic)
         except NameValidationException as error:
-            # rclpy points at the wrong letter in a second line.
+            # The second line of rclpy's message marks a wrong letter.
             raise ValueError(" ".join(str(error).replace("^", "").split())) from error
         middleware.configure()
         self._topics: dict[str, Topic] = {}
@@ -78,7 +79,7 @@ class Node:
                 self._open()
                 self._parameters.apply()
             except BaseException:
-                # An end of the context alone leaves its publishers in the graph, for as long as the error is kept.
+                # Without this, the publishers would stay in the ROS graph for as long as the error is referenced.
                 self._node.destroy_node()
                 raise
         except BaseException:
@@ -101,20 +102,22 @@ class Node:
             raise ValueError(f"{params_file} is no ROS 2 parameter file: {' '.join(str(error).split())}") from error
 
     def _open(self) -> None:
-        """Create publishers and subscriptions."""
+        """Create the publishers and subscriptions of a subclass."""
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
-        """Threads in addition to the receiving one. They end after ``_closing`` is set and :meth:`_wake` was called."""
+        """Returns the threads that a subclass needs besides the receiving one. They must end once ``_closing`` is
+        set and :meth:`_wake` was called."""
         return []
 
     def _wake(self) -> None:
-        """Wake the node's own threads."""
+        """Wake the threads of :meth:`_own_threads`, so that they notice that the node closes."""
 
     def _look_around(self) -> None:
-        """Called by the receiving thread every :data:`SUBSCRIPTION_COUNT_PERIOD`."""
+        """Hook for subclasses, called by the receiving thread every :data:`SUBSCRIPTION_COUNT_PERIOD`."""
 
     def has_subscribers(self, family: str) -> bool:
-        """Whether a topic, or one below it, has subscribers: ``"head_front_camera/depth"``, ``"lidar"``, ``"tf"``.
+        """Returns whether a topic, or any topic below it, has subscribers. ``family`` is a topic or the first part of
+        one, such as ``"head_front_camera/depth"``, ``"lidar"`` or ``"tf"``.
 
         The count is at most :data:`SUBSCRIPTION_COUNT_PERIOD` old. Raises :class:`ValueError` for an unknown topic.
         """
@@ -126,21 +129,22 @@ class Node:
 
     @property
     def set_parameters(self) -> dict[str, Any]:
-        """Values of the parameters that were ever set, by name. It is a new object after each change."""
+        """Values of the parameters that were ever set, by name. Each change creates a new dictionary."""
         return self._parameters.set_by_user
 
     @property
     def sent(self) -> dict[str, int]:
-        """Messages sent so far, by topic."""
+        """Number of messages sent so far, by topic."""
         return {name: topic.sent for name, topic in self._topics.items()}
 
     @property
     def dropped(self) -> dict[str, int]:
-        """Number of messages with subscribers that were replaced by newer ones or could not be built, by topic."""
+        """Number of messages that were replaced by newer ones before they were sent, or that could not be built or
+        sent, by topic."""
         return {name: topic.dropped for name, topic in self._topics.items()}
 
     def close(self) -> None:
-        """Leave the ROS graph, and wait until the threads have ended. A second call does nothing."""
+        """Leave the ROS graph and wait until the node's threads have ended. A second call does nothing."""
         if self._closing.is_set():
             return
         self._closing.set()
@@ -171,18 +175,18 @@ class Node:
         return topic
 
     def _withdraw(self, topic: Topic) -> None:
-        """Remove a topic's publisher from the ROS graph. Its counts stay."""
+        """Remove a topic's publisher from the ROS graph. The topic's message counts are kept."""
         topic.close()
         self._node.destroy_publisher(topic.publisher)
 
     def _receive(self) -> None:
-        """The receiving thread: commands, the services that every node has, and counts of subscribers."""
+        """Body of the receiving thread: handle commands and the services that every node has, and count subscribers."""
         next_count = 0.0
         while not self._closing.is_set() and self._context.ok():
             try:
                 self._executor.spin_once(timeout_sec=SUBSCRIPTION_COUNT_PERIOD)
             except Exception:
-                log.exception("a ROS callback failed; the node goes on")
+                log.exception("a ROS callback failed; the node continues")
             if wall.monotonic() >= next_count:
                 self._look_around()
                 for topic in list(self._topics.values()):

@@ -13,11 +13,11 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.parameter import Parameter
 
 _FRAME = re.compile(r"[^/\s]\S*")
-"""Pattern of valid names of frames."""
+"""Pattern of valid frame ids."""
 
 
 class Parameters:
-    """The parameters of one node. The receiving thread changes them; every thread may read them."""
+    """The parameters of one node. Only the node's receiving thread changes them; every thread may read them."""
 
     def __init__(self, node: rclpy.node.Node, values: Mapping[str, Any] | None = None) -> None:
         """``values``: values of the parameters that were set in an earlier run of the node, by name."""
@@ -38,12 +38,12 @@ class Parameters:
         between: tuple[float, float] | None = None,
         changed: Callable[[], None] | None = None,
     ) -> None:
-        """Declare a parameter of the type of its ``default``: bool, int, float, or str for the name of a frame.
+        """Declare a parameter with the type of its ``default``: bool, int, float, or str for a frame id.
 
-        Its value is the one that was set before, else the one of the node's parameter file, else the default. Raises
-        :class:`ValueError` if the value of the file is invalid.
+        Its value is the one that was set in an earlier run, else the one in the node's parameter file, else the
+        default. Raises :class:`ValueError` if the value in the file is invalid.
 
-        ``between``: the least and the greatest value of a number. ``changed`` is called after it was set.
+        ``between``: smallest and largest value of a number. ``changed``: function to call after the parameter was set.
         """
         descriptor = ParameterDescriptor(description=description)
         if between is not None and isinstance(default, int):
@@ -60,7 +60,7 @@ class Parameters:
         except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise ValueError(" ".join(str(error).split())) from error
         self._values[name] = declared.value
-        self.set_by_user = before  # rclpy calls a declaration a setting, too
+        self.set_by_user = before  # rclpy also calls _take for a declaration
         if changed is not None:
             self._changed[name] = changed
 
@@ -74,7 +74,8 @@ class Parameters:
         return self._values[name]
 
     def _check(self, parameters: list[Parameter]) -> SetParametersResult:
-        """Refuse invalid values that rclpy accepts. It compares with ranges, and NaN is neither below nor above one."""
+        """Refuse values that rclpy accepts but that are invalid: numbers that are not finite (NaN passes rclpy's
+        range check) and text that is no frame id."""
         for one in parameters:
             if isinstance(one.value, float) and not math.isfinite(one.value):
                 reason = f"parameter {one.name} is {one.value}; give a finite number"
@@ -87,6 +88,7 @@ class Parameters:
         return SetParametersResult(successful=True)
 
     def _take(self, parameters: list[Parameter]) -> None:
+        """Store parameters that were set, then call their change handlers."""
         for one in parameters:
             if one.name in self._values:
                 self._values[one.name] = one.value

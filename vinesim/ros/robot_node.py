@@ -1,6 +1,7 @@
-"""The ROS 2 node of a robot: state, transforms, ground truth, diagnostics, commands; not its cameras and lidars.
+"""The ROS 2 node of a robot: state, transforms, ground truth, diagnostics, commands. Its cameras and lidars have
+another node.
 
-Every message is built and sent by the thread that passes its values, in order.
+The thread that calls a ``publish_`` method builds and sends its messages, in order.
 """
 
 from __future__ import annotations
@@ -43,28 +44,35 @@ log = logging.getLogger(__name__)
 FEEDBACK_PERIOD = 5
 """Number of steps between two feedback messages of an action: 20 Hz, as in joint_trajectory_controller."""
 MAP_TO_ODOM = "publish_map_to_odom"
+"""Name of the parameter that switches the transform from map to odom on ``tf`` on and off."""
 TRUTH = "publish_truth"
+"""Name of the parameter that switches the topics with ground truth on and off."""
 ENVIRONMENT_RATE = "environment_rate"
+"""Name of the parameter with the rate of ``tf_environment`` [Hz]."""
 EXACT_ODOMETRY = "exact_odometry"
+"""Name of the parameter that makes odometry exact."""
 ODOM_FRAME_ID = "odom_frame_id"
-"""Names of parameters."""
+"""Name of the parameter with the frame id of odometry."""
 LOOK_PERIOD = 1.0
 """Wall time between two checks for another robot under the same names, and for commands of another type [s]."""
 STAMPED_REMEDY = " (teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)"
+"""Hint that is added to the warning about a base command of the wrong message type."""
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
-"""Name that rmw reports for a node that has not introduced itself yet."""
+"""Name that rmw reports for a node that it has not discovered completely yet."""
 OWN_MESSAGES = ("tf2_msgs", "control_msgs", "audio_common_msgs")
-"""Message packages that no wheel has."""
+"""Message packages that a robot's node needs and that no wheel contains."""
 
 
 class RobotNode(Node):
-    """The topics of one robot, except those of its cameras and lidars (:mod:`vinesim.ros.sensor_node`).
+    """The node of one robot, with all its topics except those of its cameras and lidars
+    (:mod:`vinesim.ros.sensor_node`). All topics but /clock and /diagnostics are in the namespace, tf too (as in Nav2
+    with several robots).
 
-    ``static_transforms`` are (parent, child, pose [7]) of every fixed joint, ``imus`` and ``wrenches`` the names of
-    sensors, ``bunch_of_body`` [body] the bunch that a body of plants belongs to, -1 for none, ``interest_radius`` [m]
-    that of the area of interest around the robot, None without a server. All topics but /clock and /diagnostics stand
-    under the namespace, tf too (as Nav2 does with several robots). ``clock``: whether this node may publish it, which
-    one node of a ROS domain does. ``params_file``, ``parameters``: see :class:`Node`.
+    ``static_transforms``: (parent, child, pose [7]) of every fixed joint. ``imus``, ``wrenches``: names of the IMUs and
+    of the force-torque sensors. ``bunch_of_body`` [body]: index of the bunch that each plant body belongs to, -1 for
+    none. ``interest_radius`` [m]: radius of the area of interest around the robot; None without a server. ``base``:
+    root link. ``clock``: whether this node may publish /clock; of all nodes in a ROS domain, one does. ``params_file``,
+    ``parameters``: see :class:`Node`.
     """
 
     def __init__(
@@ -130,35 +138,36 @@ class RobotNode(Node):
         self._declare_parameters()
 
     def _declare_parameters(self) -> None:
-        """Parameters that can be set while the node runs."""
+        """Declare the parameters that can be set while the node runs."""
         declare = self._parameters.declare
         declare(
             MAP_TO_ODOM,
             True,
-            "Publish the true pose of odom in the map on /tf; off for a localisation of your own.",
+            "Publish the true pose of odom in the map on /tf; false if your own localisation publishes it.",
             changed=self._apply_parameters,
         )
         declare(
             TRUTH,
             True,
-            "Publish what no robot could measure: tf_environment, vine/contacts, vine/markers.",
+            "Publish ground truth: tf_environment, vine/contacts, vine/markers.",
             changed=self._apply_parameters,
         )
         declare(
             EXACT_ODOMETRY,
             False,
-            "Odometry of the motion of the base from now on, without the slip of its tracks.",
+            "From now on, odometry measures the true motion of the base, without the slip of its tracks.",
             changed=self._apply_parameters,
         )
         declare(
             ODOM_FRAME_ID,
             ODOM_FRAME,
-            "Frame in which odometry measures, on /tf too.",
+            "Frame id of odometry, also on /tf.",
             changed=self._apply_parameters,
         )
         declare(ENVIRONMENT_RATE, 10.0, "Messages a second of tf_environment [Hz].", (0.1, 50.0))
 
     def _apply_parameters(self) -> None:
+        """Pass the values of the parameters to the publishers."""
         self._robot.publishes_map_to_odom = self._parameters[MAP_TO_ODOM]
         self._robot.has_exact_odometry = self._parameters[EXACT_ODOMETRY]
         self._robot.odom_frame = self._parameters[ODOM_FRAME_ID]
@@ -167,7 +176,7 @@ class RobotNode(Node):
 
     @property
     def environment_rate(self) -> float:
-        """Rate at which messages with true poses are to be published [Hz]."""
+        """Rate at which :meth:`publish_environment` is to be called [Hz]."""
         return self._parameters[ENVIRONMENT_RATE]
 
     def has_subscribers(self, family: str) -> bool:
@@ -175,7 +184,7 @@ class RobotNode(Node):
 
     @property
     def has_clock_subscribers(self) -> bool:
-        """Whether this node publishes /clock, and has subscribers to it."""
+        """Whether this node publishes /clock, and the topic has subscribers."""
         return self._clock is not None and self._clock.has_subscribers
 
     def _look_around(self) -> None:
@@ -189,9 +198,9 @@ class RobotNode(Node):
             self._warn_of_types()
 
     def _locate_subscribers(self) -> None:
-        """Note whether all subscribers of the topics that every step publishes are on this machine.
+        """Update for each topic that is published in every step whether all its subscribers are on this machine.
 
-        Identifiers of Fast DDS begin with the maker and the machine, two bytes each.
+        The first four bytes of a Fast DDS identifier are the vendor and the machine, two bytes each.
         """
         for topic in self._topics_of_every_step():
             name = self._node.resolve_topic_name(topic.name)
@@ -208,7 +217,7 @@ class RobotNode(Node):
         return [topic for topic in list(self._topics.values()) if topic.is_of_every_step]
 
     def _warn_if_shared(self) -> None:
-        """Say once that another robot has this one's names."""
+        """Warn once if another node publishes the same odometry topic, so that two robots share their names."""
         own = self._node.get_fully_qualified_name()
         topic = self._node.resolve_topic_name(ODOMETRY)
         publishers = self._node.get_publishers_info_by_topic(topic)
@@ -216,22 +225,23 @@ class RobotNode(Node):
         if others := nodes - {own}:
             self._shares_topics = True
             log.warning(
-                "%s and %s publish %s: frames, joints and commands of two robots mix; give each client a --namespace "
-                "of its own",
+                "%s and %s publish %s: frames, joints and commands of two robots mix; give each client its own "
+                "--namespace",
                 own,
                 ", ".join(sorted(others)),
                 topic,
             )
 
     def _warn_of_types(self) -> None:
-        """Say once of each topic of commands that it is published as a type that this robot does not take."""
+        """Warn once for each command topic that another node publishes with a message type that this robot does not
+        receive."""
         self._foreign_types = self._subscriptions.foreign_types()
         for topic, types in self._foreign_types.items():
             if topic not in self._warned_topics:
                 self._warned_topics.add(topic)
                 is_base = topic.endswith(BASE_COMMAND)
                 log.warning(
-                    "%s is published as %s, of which nothing arrives; publish %s%s",
+                    "%s is published as %s, which this robot cannot receive; publish %s%s",
                     topic,
                     ", ".join(types),
                     self._subscriptions.types[topic],
@@ -239,17 +249,18 @@ class RobotNode(Node):
                 )
 
     def must_wait(self, now: float) -> bool:
-        """Whether no step shall be published at ``now`` [s], because subscribers do not keep up; see
-        :class:`FlowControl`. False if nothing is known about the subscribers."""
+        """Returns whether publishing must wait at ``now`` [s] because subscribers have not caught up; see
+        :class:`FlowControl`. Returns False if the middleware does not report acknowledgements often enough."""
         return self._flow_control is not None and self._flow_control.must_wait(self._topics_of_every_step(), now)
 
     def publish_clock(self, time: float) -> None:
-        """Publish /clock at ``time`` [s], if this node is the one that does; for every step."""
+        """Publish /clock at ``time`` [s], if this node is the one that publishes it. Call this in every step."""
         if self._clock is not None:
             self._send(self._clock.pending(time))
 
     def publish_robot_state(self, sample: RobotSample) -> None:
-        """Publish joint states, transforms, odometry, sensors of the body, controllers and contacts; for every step."""
+        """Publish joint states, transforms, odometry, IMUs, wrenches, controller states and contacts. Call this in
+        every step."""
         self._send(self._robot.pending(sample))
         self._send(self._proprioception.pending(sample))
         self._send(self._control.pending(sample))
@@ -259,35 +270,39 @@ class RobotNode(Node):
             self._actions.publish_feedback(sample)
 
     def publish_environment(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish the true poses [name, 7] m, 1 of moving objects in the map, at :attr:`environment_rate`.
+        """Publish the true poses [name, 7] m, 1 of moving objects in the map. Call this at :attr:`environment_rate`.
 
-        Pass the same tuple object as long as the names stay: the serialised message is then patched, not built.
+        Pass the same tuple object as long as the names stay the same: then only the numbers in the serialised message
+        are replaced.
         """
         self._send(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish the true poses [name, 7] m, 1 of poles in the map, once. Late subscribers receive them, too."""
+        """Publish the true poses [name, 7] m, 1 of poles in the map, once. Subscribers that join late receive them,
+        too."""
         self._send(self._ground_truth.pending_static(names, poses), always=True)
 
     def publish_intentions(self, intentions: Sequence[Intention]) -> None:
-        """Publish the intentions of people when they change. Late subscribers receive the last message, too."""
+        """Publish the intentions of people; call this when they change. Subscribers that join late receive the last
+        message."""
         self._send([(self._intentions, lambda: convert.intentions(intentions))], always=True)
 
     def publish_gestures(self, time: float, gestures: Sequence[HandGestures]) -> None:
-        """Publish the gestures that the hands of people show since ``time`` of the world [s]. Late subscribers receive
-        the last message, too."""
+        """Publish the gestures that the hands of people show since ``time`` of the world [s]. Subscribers that join
+        late receive the last message."""
         self._send([(self._gestures, lambda: convert.gestures(time, gestures))], always=True)
 
     def publish_lights(self, color: Color | None) -> None:
-        """Publish the colour of the indicator lights when it changes: UNLIT between flashes, None when they are off."""
+        """Publish the colour of the indicator lights; call this when it changes. ``color`` is UNLIT between flashes,
+        and None when the lights are off."""
         self._send(self._lights.pending(color), always=True)
 
     def publish_sound(self, time: float, pcm: bytes) -> None:
-        """Publish the sound that the microphone recorded from ``time`` [s] of the world on: PCM16 of 16 kHz, mono."""
+        """Publish sound of the microphone that begins at ``time`` of the world [s]. ``pcm``: PCM16 of 16 kHz, mono."""
         self._send(self._sound.pending(time, pcm))
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
-        """Publish the states of parts of the client. The node adds its own state. A rate of 1 Hz is enough."""
+        """Publish the states of the client's ``components`` and that of this node. Call this about once a second."""
         own = {"refused_commands": self.refused_commands}
         prefix = self._node.get_fully_qualified_name()
         trouble = [f"{topic} is published as {', '.join(types)}" for topic, types in self._foreign_types.items()]
@@ -296,21 +311,21 @@ class RobotNode(Node):
         self._send([(self._diagnostics, lambda: convert.diagnostics(time, prefix, statuses))])
 
     def commands(self) -> list[Command]:
-        """Commands that arrived since the last call, in order."""
+        """Returns the commands that arrived since the last call, in order of arrival."""
         return self._commands.drain()
 
     @property
     def refused_commands(self) -> int:
-        """Number of messages and goals that contradicted themselves, or were dropped from a full queue unread."""
+        """Number of messages and goals that were invalid, or that were dropped unread because the queue was full."""
         return self._commands.rejected
 
     @property
     def has_goals(self) -> bool:
-        """Whether goals of actions are being executed, whose clients want feedback."""
+        """Whether goals of actions are being executed. Their clients expect feedback."""
         return bool(self._actions.goals)
 
     def finish_goal(self, result: GoalResult) -> None:
-        """Tell the client of an action how its goal ended."""
+        """Send the result of a goal to its action client."""
         self._actions.finish(result)
 
     def _send(self, messages: Iterable[PendingMessage], *, always: bool = False) -> None:

@@ -1,7 +1,7 @@
-"""The ROS 2 node of a robot's sensors, which replaces their drivers on a real robot.
+"""The ROS 2 node of a robot's sensors. It publishes what the drivers of the sensors publish on a real robot.
 
-The thread that renders frames passes them to the node. A thread of the node builds and sends the messages. Only the
-newest frame of each topic waits: it replaces an older one that was not sent, which is counted as dropped.
+The rendering thread passes frames to the node. The node's sending thread builds and sends the messages. Each topic has
+at most one waiting message: a newer message replaces it, which is counted as dropped.
 """
 
 from __future__ import annotations
@@ -19,42 +19,45 @@ from vinesim.ros.topic import Advertise, Build, PendingMessage, Topic
 from vinesim.scene.values import SENSOR_KINDS, CameraOutput, SensorFrame
 
 TRUTH = "publish_truth"
-"""Name of a parameter."""
+"""Name of the parameter that switches the topics with ground truth on and off."""
 
 
 class SensorPublisher(Protocol):
-    """The topics of one sensor: ``PUBLISHER`` of the module that :class:`~vinesim.scene.values.SensorKind` names."""
+    """Interface of a class that publishes the topics of one sensor. :class:`~vinesim.scene.values.SensorKind` names
+    the module whose ``PUBLISHER`` is the class for a kind of sensor."""
 
     packages: ClassVar[tuple[str, ...]]
-    """Message packages that must be importable and may not come with ROS."""
+    """Message packages that the publisher needs and that ROS may lack."""
 
     def __init__(
         self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
     ) -> None:
-        """``number`` counts the sensors of its kind from 0; ``channels`` are its images, if its data file decides."""
+        """``number``: index of the sensor among those of its kind, from 0. ``channels``: names of its images, if its
+        data file defines them."""
         ...
 
     @property
     def truth(self) -> Sequence[Topic]:
-        """Topics that no real sensor has."""
+        """Topics with ground truth, which no real sensor has."""
         ...
 
     def wanted(self) -> CameraOutput:
-        """The outputs that the present subscribers need."""
+        """Returns the sensor outputs that the present subscribers need."""
         ...
 
     def pending(self, frame: Any) -> Iterator[PendingMessage]:
-        """The messages of one frame, the cheap ones first."""
+        """Returns the messages of one frame, cheap ones first."""
         ...
 
 
 def publisher(kind: str) -> type[SensorPublisher]:
-    """Class that publishes the sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    """Returns the class that publishes sensors of ``kind``, one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     return importlib.import_module(SENSOR_KINDS[kind].publisher).PUBLISHER
 
 
 class SensorNode(Node):
-    """The topics of ``sensors``: the kind of each by the name under which it publishes."""
+    """A node that publishes ``sensors``: a dictionary from the name of each sensor, which its topics begin with, to
+    its kind."""
 
     def __init__(
         self,
@@ -67,9 +70,9 @@ class SensorNode(Node):
         params_file: pathlib.Path | None = None,
         parameters: Mapping[str, Any] | None = None,
     ) -> None:
-        """``channels``: images of a sensor, where its data file decides which there are. ``rates``: those of sensors
-        [Hz], with which their parameters start; others have none. ``params_file``, ``parameters``: see :class:`Node`.
-        """
+        """``channels``: names of a sensor's images, by sensor, if its data file defines them. ``rates``: initial
+        values of the ``rate`` parameters [Hz], by sensor; sensors that are not listed have no such parameter.
+        ``params_file``, ``parameters``: see :class:`Node`."""
         self._kinds = sensors
         self._channels = channels or {}
         needed = {package: None for kind in sensors.values() for package in publisher(kind).packages}
@@ -77,7 +80,8 @@ class SensorNode(Node):
             message_packages.ensure_importable(needed)
         self._rates = rates or {}
         self._pending: dict[Topic, Build] = {}
-        """The function that builds the newest message of each topic. The topic that waits longest is the first."""
+        """Function that builds the newest message of each topic, by topic. The topic that has waited longest is
+        first."""
         self._changed = threading.Condition()
         self._sending = False
         super().__init__(name, namespace, tuple(sensors), params_file, parameters)
@@ -103,7 +107,7 @@ class SensorNode(Node):
                 topic.mute(not self._parameters[TRUTH])
 
     def rate(self, sensor: str) -> float:
-        """Requested rate of a sensor of ``rates`` [Hz]."""
+        """Returns the requested rate [Hz] of a sensor, which must be listed in ``rates``."""
         return self._parameters[f"{sensor}.rate"]
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
@@ -114,11 +118,11 @@ class SensorNode(Node):
             self._changed.notify_all()
 
     def publish(self, frame: SensorFrame) -> None:
-        """Publish one frame of one of ``sensors``; :class:`ValueError` if there is no such sensor."""
+        """Publish one frame of a sensor. Raises :class:`ValueError` if the node does not have this sensor."""
         self._enqueue(self._publisher(frame.name).pending(frame))
 
     def outputs_wanted(self, sensor: str) -> CameraOutput:
-        """Outputs of one of ``sensors`` that subscribers need. Raises :class:`ValueError` for an unknown sensor."""
+        """Returns the outputs of a sensor that subscribers need. Raises :class:`ValueError` for an unknown sensor."""
         return self._publisher(sensor).wanted()
 
     @property
@@ -130,7 +134,7 @@ class SensorNode(Node):
     def _publisher(self, name: str) -> SensorPublisher:
         if name not in self._publishers:
             known = ", ".join(self._publishers) or "none"
-            raise ValueError(f"no sensor {name!r} in this node; it was made with: {known}")
+            raise ValueError(f"no sensor {name!r} in this node; it has: {known}")
         return self._publishers[name]
 
     def _enqueue(self, messages: Iterable[PendingMessage], *, always: bool = False) -> None:
@@ -142,7 +146,8 @@ class SensorNode(Node):
             self._changed.notify()
 
     def _send(self) -> None:
-        """The sending thread. Among the topics with a message, the one that waits longest comes first."""
+        """Body of the sending thread: build and send the waiting messages, first that of the topic that has waited
+        longest."""
         while True:
             with self._changed:
                 self._sending = False

@@ -1,7 +1,7 @@
-"""simulation_interfaces: how test programs pause, step and reset a simulation, and change what is in it.
+"""The ROS 2 node of simulation_interfaces: test programs pause, step and reset a simulation, and change its entities.
 
-Services wait for an answer of the simulation, which comes between two steps, so this node has a thread of its own.
-Services that are not supported answer with result 0 and a text.
+A service waits for the answer of the simulation, which comes between two steps; so the node has its own receiving
+thread. Services that are not supported answer RESULT_FEATURE_UNSUPPORTED (0) with a text.
 """
 
 from __future__ import annotations
@@ -32,11 +32,11 @@ from vinesim.ros.node import Node
 from vinesim.ros.publishers.robot import MAP_FRAME
 
 REPLY_TIMEOUT = 10.0
-"""[s] A simulation that has not answered a request within this time is taken to be stopped."""
+"""[s] Time within which the simulation must answer a request; after it, the simulation counts as stopped."""
 RESET_TIMEOUT = 120.0
-"""[s] Longest time for the answer to a reset, which takes as long as a start of the physics."""
+"""[s] Time within which the simulation must answer a reset, which takes as long as a start of the physics."""
 STEP_TIMEOUT = 1.0
-"""[s] Additional time for the answer for each requested step. A slower simulation is taken to be stopped."""
+"""[s] Time that is added to :data:`REPLY_TIMEOUT` for each requested step."""
 UNSUPPORTED = (
     "SpawnEntities",
     "SetEntityInfo",
@@ -45,7 +45,7 @@ UNSUPPORTED = (
     "GetNamedPoses",
     "GetEntityBounds",
 )
-"""Services that answer that they are not supported."""
+"""Services that always answer RESULT_FEATURE_UNSUPPORTED."""
 _REMEDY = "not supported by vinesim; scene, robots and people are options of vinesim client and server"
 
 
@@ -61,15 +61,17 @@ _CODES = {
     Refusal.RESOURCE_PARSE_ERROR: 106,
     Refusal.MISSING_ASSETS: 107,
 }
+"""Result codes of simulation_interfaces by reason of refusal, except for invalid poses."""
 INVALID_SPAWN_POSE = 109
+"""Result code of spawn_entity for an invalid pose."""
 INVALID_POSE = 101
-"""Results of simulation_interfaces; an invalid pose has one for each service."""
+"""Result code of set_entity_state for an invalid pose."""
 
 
 class SimulationNode(Node):
-    """The services and the action, in addition to a robot's node.
+    """A node with the services and the action of simulation_interfaces, besides a robot's own node.
 
-    ``ask`` sends a request to the simulation; :meth:`answer` takes replies.
+    ``ask`` sends a request to the simulation; the simulation's replies are passed to :meth:`answer`.
     """
 
     def __init__(
@@ -77,14 +79,15 @@ class SimulationNode(Node):
     ) -> None:
         message_packages.ensure_importable(["simulation_interfaces"])
         self._ask = ask
-        # another run of the process may get late answers to requests of this one
+        # starts at the clock, so that a late answer to a request of an earlier run matches no number of this one
         self._numbers = itertools.count(wall.monotonic_ns())
         self._waiting: dict[int, threading.Event] = {}
         self._replies: dict[int, SimulationReply] = {}
         super().__init__(name, namespace, (), beside=beside)
 
     def answer(self, reply: SimulationReply | StepProgress) -> None:
-        """Pass on the simulation's answer, or how far it is; called by any thread."""
+        """Pass a reply of the simulation, or the progress of its steps, to the service or action that waits for it.
+        Any thread may call this."""
         waiting = self._waiting.get(reply.number)
         if waiting is not None and isinstance(reply, SimulationReply):
             self._replies[reply.number] = reply
@@ -170,7 +173,7 @@ class SimulationNode(Node):
         if request.state.state in actions:
             self._request(actions[request.state.state], response.result)
         else:
-            self._fail(response.result, self._result.RESULT_FEATURE_UNSUPPORTED, "vinesim plays and pauses, no more")
+            self._fail(response.result, self._result.RESULT_FEATURE_UNSUPPORTED, "vinesim can only play and pause")
         return response
 
     def _step(self, request: Any, response: Any) -> Any:
@@ -255,9 +258,10 @@ class SimulationNode(Node):
     def _request(
         self, action: SimulationAction, result: Any, *, steps: int = 0, timeout: float = REPLY_TIMEOUT, **values: Any
     ) -> SimulationReply | None:
-        """Ask the simulation and wait up to ``timeout`` [s]; fills ``result``. None if it refused or did not answer.
+        """Send a request to the simulation and wait for the reply, up to ``timeout`` [s] and :data:`STEP_TIMEOUT` for
+        each of the ``steps``. Fills ``result``. Returns None if the simulation refused or did not answer.
 
-        ``values``: fields of the request.
+        ``values``: further fields of the request.
         """
         number = next(self._numbers)
         done = threading.Event()
@@ -280,17 +284,19 @@ class SimulationNode(Node):
         return reply
 
     def _result_of(self, reply: SimulationReply) -> Any:
-        """The answer to a request of steps as a Result."""
+        """Convert the reply to a step request to a Result message."""
         if reply.refusal:
             return self._result(result=_CODES[reply.kind], error_message=reply.refusal)
         return self._result(result=self._result.RESULT_OK)
 
     def _fail(self, result: Any, code: int, text: str) -> None:
+        """Fill ``result`` with an error code and its text."""
         result.result = code
         result.error_message = text
 
     def _filtered(self, filters: Any, result: Any) -> list[Entity]:
-        """The entities that a filter leaves, none if it asks for what is not supported."""
+        """Returns the entities that pass ``filters``. Returns none, and fills ``result`` with an error, if a filter
+        is not supported or invalid."""
         if filters.tags.tags or filters.bounds.points:
             self._fail(result, self._result.RESULT_FEATURE_UNSUPPORTED, "no filter by tags or bounds; name a category")
             return []
@@ -310,6 +316,7 @@ class SimulationNode(Node):
         ]
 
     def _named(self, name: str, result: Any) -> Entity | None:
+        """Returns the entity called ``name``. If there is none, fills ``result`` with an error and returns None."""
         reply = self._request(SimulationAction.GET_ENTITIES, result)
         found = next((entity for entity in (() if reply is None else reply.entities) if entity.name == name), None)
         if reply is not None and found is None:
@@ -328,12 +335,12 @@ class SimulationNode(Node):
 
 
 def _read_pose(header: Any, message: Pose) -> np.ndarray | None:
-    """A pose [7]; None if it is in another frame than the map."""
+    """Returns a pose [7] m, 1; None if its frame id is neither empty nor the map."""
     x = message.position
     q = message.orientation
     return np.array([x.x, x.y, x.z, q.x, q.y, q.z, q.w]) if header.frame_id in ("", MAP_FRAME) else None
 
 
 def _read_twist(message: Twist) -> np.ndarray:
-    """A velocity [6]."""
+    """Returns a twist as [6] m/s, rad/s: linear, then angular velocity."""
     return np.array([getattr(part, axis) for part in (message.linear, message.angular) for axis in "xyz"])

@@ -1,4 +1,5 @@
-"""The ROS 2 node that shows a whole world and takes no commands: clock, robots, true poses of all other objects."""
+"""The ROS 2 node of a whole world: publishes clock, robots and true poses of all other objects, and takes no
+commands."""
 
 from __future__ import annotations
 
@@ -20,8 +21,8 @@ from vinesim.scene.values import RobotSample
 
 
 class WorldNode(Node):
-    """Publishes ``/clock``, ``/tf_environment``, and of every robot joint states, frames and description under its
-    name. Every message is built and sent by the thread that passes its values."""
+    """Publishes ``/clock``, ``/tf_environment``, and joint states, frames and description of every robot under the
+    robot's name. The thread that calls a ``publish_`` method builds and sends its messages."""
 
     def __init__(self, name: str) -> None:
         message_packages.ensure_importable(["tf2_msgs"])
@@ -39,15 +40,15 @@ class WorldNode(Node):
         self._clock.update()
 
     def publish_clock(self, time: float) -> None:
-        """Publish /clock at ``time`` [s], unless another node does."""
+        """Publish /clock at ``time`` [s], unless another node publishes this topic."""
         self._send(self._clock.pending(time))
 
     def publish_robot(
         self, name: str, urdf: str, base: str, static: Sequence[tuple[str, str, np.ndarray]], sample: RobotSample
     ) -> None:
-        """Publish a robot's joints and frames. Data that never change are published at its first sample.
+        """Publish a robot's joint states and frames. The first call also publishes the data that never change.
 
-        ``static``: (parent, child, pose [7]) of every fixed joint; ``base``: the root link, whose parent is the map.
+        ``base``: root link, whose parent frame is the map. ``static``: (parent, child, pose [7]) of every fixed joint.
         """
         if name not in self._robots:
             self._robots[name] = _ShownRobot(self._advertise, self._tf_message, ros_name(name), urdf, base, static)
@@ -58,7 +59,8 @@ class WorldNode(Node):
         self._send(self._ground_truth.pending(time, names, poses))
 
     def publish_environment_static(self, names: tuple[str, ...], poses: np.ndarray) -> None:
-        """Publish the true poses [name, 7] m, 1 of static objects in the map, once. Late subscribers get them, too."""
+        """Publish the true poses [name, 7] m, 1 of static objects in the map, once. Subscribers that join late
+        receive them, too."""
         for topic, build in self._ground_truth.pending_static(names, poses):
             topic.build_and_send(build)
 
@@ -69,7 +71,7 @@ class WorldNode(Node):
 
 
 class _ShownRobot:
-    """The topics of one robot."""
+    """The published topics of one robot, all under its namespace."""
 
     def __init__(
         self,

@@ -1,8 +1,8 @@
-"""Berries of a bunch, derived from (count, seed), for sensors and ground truth; the physics has no berries.
+"""Berries of a bunch, computed from (count, seed), for sensors and ground truth. The physics has no berries.
 
-A small library of prototypes is packed once by position-based relaxation, with berries of unit radius: each berry is
-pulled by its pedicel to its foot on the rachis and pushed out of its neighbours. A bunch scales the prototype that its
-seed selects, so ten thousand bunches need only eighteen relaxations.
+Eighteen prototypes with berries of unit radius are packed once by position-based relaxation: a berry's pedicel pulls
+the berry to its foot on the rachis, and neighbouring berries push it out of overlaps. A bunch is a scaled copy of the
+prototype that its seed selects, so ten thousand bunches need only eighteen relaxations.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from vinesim.scene import plant_parameters
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Variety:
-    """Looks and size of the berries of one variety (sources in ``data/plants/varieties.toml``)."""
+    """Colours and size of the berries of one variety (sources in ``data/plants/varieties.toml``)."""
 
     name: str
     colour: tuple[float, float, float]
@@ -50,7 +50,7 @@ VARIETIES = tuple(
 """Varieties, indexed by ``Model.bunch_variety``."""
 
 PROTOTYPE_BERRIES = (50, 64, 80, 97, 116, 140)
-"""Numbers of berries of the prototypes. A bunch takes the next larger prototype and leaves berries off at its tip."""
+"""Numbers of berries of the prototypes. A bunch uses the next larger prototype without the last berries at its tip."""
 MIN_BERRIES = 40
 MAX_BERRIES = PROTOTYPE_BERRIES[-1]
 _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
@@ -65,13 +65,13 @@ class BerryLayout:
     """Berries in the bunch's body frame: origin at the end of the peduncle, +x down the rachis."""
 
     position: np.ndarray
-    """[n, 3] m"""
+    """[n, 3] m, centre of each berry."""
     radius: np.ndarray
     """[n] m, half of the thickness across the axis; half of the length is ``radius * elongation``."""
     axis: np.ndarray
-    """[n, 3] unit, from pedicel to stylar scar."""
+    """[n, 3] unit vector from the pedicel to the stylar scar (the far end of the berry)."""
     foot: np.ndarray
-    """[n, 3] m, where the pedicel leaves the rachis."""
+    """[n, 3] m, point of the rachis at which the pedicel begins."""
     rachis: np.ndarray
     """[line, point, 3] m, main axis and wings."""
     neighbours: np.ndarray
@@ -79,30 +79,32 @@ class BerryLayout:
 
 
 def lay_out_berries(length: float, radius: float, count: int, variety: int, seed: int) -> BerryLayout:
-    """The berries of one bunch of ``Model``, scaled to a hull of ``length`` and ``radius`` [m]."""
+    """Returns the berries of one bunch of ``Model``, scaled to a hull of ``length`` [m] and ``radius`` [m]."""
     return _scaled(int(_prototype(count, seed)), int(count), float(length), float(radius), int(variety))
 
 
 def hull_size(count: np.ndarray, seed: np.ndarray) -> np.ndarray:
-    """Length and radius of the hulls of bunches [..., 2] in units of the berry's volume radius."""
+    """Returns length and radius of the hulls of bunches [..., 2], in units of the berry's volume radius."""
     which = _prototype(count, seed)
     count = np.asarray(count)
     return np.stack([_tables()[0][which, count], _tables()[1][which]], -1)
 
 
 def segment_of(position: np.ndarray, length: float | np.ndarray, pieces: int | np.ndarray) -> np.ndarray:
-    """Index of the piece to which points [..., 3] belong if a rachis is cut into equal pieces; 0 is at the peduncle."""
+    """Returns the index of the piece to which each point [..., 3] belongs if a rachis of ``length`` is cut into equal
+    pieces. Piece 0 is at the peduncle."""
     return np.clip((position[..., 0] * (pieces / length)).astype(int), 0, pieces - 1)
 
 
 def mass_by_segment(
     count: np.ndarray, seed: np.ndarray, pieces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mass of the berries on ``pieces`` [n] equal pieces of the rachis, for bunches [n] of unit mass and length.
+    """Returns the mass of the berries on ``pieces`` [n] equal pieces of the rachis, for bunches [n] of unit mass and
+    length.
 
     Returns:
         Share of the mass [n, most], centre of mass [n, most, 3] and moments of inertia about it [n, most, 3] in the
-        axes of the bunch's body; zero behind the last piece. ``most`` is the largest of ``pieces``.
+        axes of the bunch's body; zero after a bunch's last piece. ``most`` is the largest of ``pieces``.
     """
     which = _prototype(count, seed)
     position, radius = _packed()
@@ -132,7 +134,8 @@ def mass_by_segment(
 
 @functools.cache
 def _packed() -> tuple[np.ndarray, np.ndarray]:
-    """Positions [prototype, MAX_BERRIES, 3] and radii [prototype, MAX_BERRIES], rounded as in :func:`_tables`."""
+    """Returns the positions [prototype, MAX_BERRIES, 3] and radii [prototype, MAX_BERRIES], rounded as in
+    :func:`_tables`."""
     position = np.zeros((len(prototypes()), MAX_BERRIES, 3))
     radius = np.zeros((len(prototypes()), MAX_BERRIES))
     for i, bunch in enumerate(prototypes()):
@@ -142,7 +145,8 @@ def _packed() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
-    """Index of a bunch's prototype: the next larger count, in the shape that the seed selects."""
+    """Returns the index of a bunch's prototype: the one with the next larger count, in the shape that the seed
+    selects."""
     if np.min(count) < 1 or np.max(count) > MAX_BERRIES:
         raise ValueError(f"a bunch has 1 to {MAX_BERRIES} berries, not {np.min(count)} to {np.max(count)}")
     return np.searchsorted(PROTOTYPE_BERRIES, count) * len(_SHAPES) + np.asarray(seed, np.int64) % len(_SHAPES)
@@ -150,7 +154,8 @@ def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
 
 @functools.cache
 def _tables() -> tuple[np.ndarray, np.ndarray]:
-    """Length by prototype and count, radius by prototype; rounded so that all machines have the same bits."""
+    """Returns hull lengths by prototype and count, and hull radii by prototype, rounded so that all machines have the
+    same bits."""
     lengths = np.zeros((len(prototypes()), MAX_BERRIES + 1))
     for i, bunch in enumerate(prototypes()):
         reach = np.maximum.accumulate(bunch.position[:, 0] + bunch.radius)
@@ -179,7 +184,7 @@ def _scaled(which: int, count: int, length: float, radius: float, variety: int) 
 
 @functools.cache
 def prototypes() -> tuple[BerryLayout, ...]:
-    """The packed prototypes: berries of unit volume radius, sorted from the top of the bunch to its tip."""
+    """Returns the packed prototypes: berries of unit volume radius, sorted from the top of the bunch to its tip."""
     digest = disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(frames.__file__))
     names = [field.name for field in dataclasses.fields(BerryLayout)]
 
@@ -221,7 +226,8 @@ def _pack() -> list[BerryLayout]:
 
 
 def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray, ...]:
-    """Position, foot and radius of loose berries, and their rachis, in units of the mean berry radius."""
+    """Returns position, foot and radius of the berries before packing, and the rachis, in units of the mean berry
+    radius."""
     g = np.random.default_rng([seed, count])
     radius = np.clip(g.normal(1.0, _SPREAD, count), 0.8, 1.15)
     length = g.uniform(11.5, 13.5) * (count / 90.0) ** (1.0 / 3.0)
@@ -246,7 +252,8 @@ def _draft(count: int, taper: float, wings: int, seed: int) -> tuple[np.ndarray,
 
 
 def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: list[int]) -> np.ndarray:
-    """Pack several bunches at once: pedicels pull in the first 3/4 of the iterations, neighbours push in all."""
+    """Pack several bunches at once. Pedicels pull in the first 3/4 of the iterations, neighbours push in all
+    iterations. ``sizes``: number of berries of each bunch. Returns the positions."""
     p = position.copy()
     total = len(position)
     first = np.zeros(0, np.int64)
@@ -270,7 +277,7 @@ def _relax(position: np.ndarray, foot: np.ndarray, radius: np.ndarray, sizes: li
 
 
 def _near(p: np.ndarray, sizes: list[int], reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pairs of berries of the same bunch that are closer than ``reach``."""
+    """Returns the pairs of berries of the same bunch that are closer than ``reach``."""
     firsts = []
     seconds = []
     start = 0

@@ -1,8 +1,9 @@
-"""Builds bodies from rods: mass, inertia and joint springs of segments; and assembles trees to a :class:`Model`.
+"""Builds bodies from rods (mass, inertia and joint springs of segments), and assembles trees into a :class:`Model`.
 
-The bending of a segment of length h is split into two halves, each a spring of 2EI/h. A joint puts the two halves that
-meet there in series. This gives EI/h within a rod, and 2EI/h at a clamp, where there is only one half (with EI/h the
-deflection of the tip would be 12.8 % off). Unlike segments have unlike halves.
+The bending of a segment of length h is split into two halves, each a spring of 2EI/h. The spring of a joint is the
+series connection of the two halves that meet there. So its stiffness is EI/h within a rod, and 2EI/h at a clamp, where
+there is only one half (with EI/h the deflection of the tip would be wrong by 12.8 %). Segments that differ have halves
+that differ.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
-"""[m/s^2], world axes."""
+"""[m/s^2] Gravitational acceleration, world axes."""
 
 
 MAX_CLUSTERS = 8
@@ -34,7 +35,7 @@ class RodMaterial:
     modulus: float
     """Young's modulus E of bending [Pa]."""
     density: float
-    """[kg/m^3]"""
+    """[kg/m^3] Density of the material."""
     damping: float = 0.0
     """Stiffness-proportional damping beta [s]: joint damping = beta * joint stiffness."""
     shear_modulus: float | None = None
@@ -46,7 +47,7 @@ class BunchSegments:
     """Bunches [n] cut across the rachis into a chain of segments of equal length: first the head, then the clusters.
 
     The frame of a segment has its origin on the rachis at the beginning of the segment, and the axes of the bunch.
-    ``max`` is the largest count of all bunches; rows of a bunch beyond its own count are zero.
+    ``max`` is the largest number of segments of a bunch. Rows of a bunch beyond its own number are zero.
     """
 
     count: np.ndarray
@@ -54,7 +55,7 @@ class BunchSegments:
     length: np.ndarray
     """[n] m, length of one segment."""
     mass: np.ndarray
-    """[n, max] kg"""
+    """[n, max] kg, mass of each segment."""
     com: np.ndarray
     """[n, max, 3] m, centre of mass in the segment's frame."""
     inertia: np.ndarray
@@ -62,10 +63,12 @@ class BunchSegments:
     radius: np.ndarray
     """[n, max, 2] m, radius of the bunch's hull at both ends of a segment."""
     stiffness: np.ndarray
-    """[n, max, 3] N m/rad, stiffness of the joint at the beginning of a segment; for the head, of the peduncle."""
+    """[n, max, 3] N m/rad, stiffness of the joint at the beginning of a segment. For the head this is the joint to the
+    peduncle."""
 
     def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, head's frame."""
+        """Returns mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, in the
+        head's frame."""
         along = self.length[:, None] * np.arange(self.mass.shape[1])
         centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
         mass = self.mass.sum(1)
@@ -137,7 +140,7 @@ class TreeBuilder:
     """
 
     def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
-        """``pose`` [7]: the root's joint frame in the world; ``vine``: number of the vine, -1 for none.
+        """``pose`` [7]: world pose of the root's joint frame. ``vine``: number of the vine, -1 for none.
 
         :class:`ValueError` if ``pose`` is not a pose.
         """
@@ -145,14 +148,15 @@ class TreeBuilder:
         self.vine = vine
         self.bodies: list[dict[str, Any]] = []
         self.clusters: list[dict[str, Any]] = []
-        """Berry clusters, bunch by bunch; ``parent`` None means the cluster before."""
+        """Berry clusters, bunch by bunch. ``parent`` None stands for the previous cluster in the list."""
         self.bunches: list[dict[str, Any]] = []
         self.leaves: list[dict[str, Any]] = []
 
     def add_body(
         self, parent: int, *, offset: Any = (0.0, 0.0, 0.0), rest: Any = frames.IDENTITY, **fields: Any
     ) -> int:
-        """Append one body with explicit :class:`Model` fields (names without prefix) and return its number.
+        """Append one body and return its number. ``fields``: its fields of :class:`Model`, named without the prefix
+        ``body_`` or ``joint_``.
 
         ``offset`` [3] m and ``rest`` [4] place its joint in the frame of ``parent`` (-1: the tree's root frame).
         :class:`ValueError` if the parent is not in the list, for an unknown field, or for a number out of range.
@@ -353,7 +357,8 @@ class TreeBuilder:
         return body
 
     def solve_rest_pose(self) -> None:
-        """Choose rest rotations so that the shape drawn so far is in equilibrium: see :func:`solve_rest_pose`."""
+        """Choose rest rotations so that the present shape of the tree is in equilibrium; see
+        :func:`solve_rest_pose`."""
         model = solve_rest_pose(assemble([self]))
         for body, rest, settled in zip(
             [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
@@ -367,7 +372,7 @@ _FIELDS = {"offset", "rest", "organ", "com", "settled", *_POSITIVE, *_NOT_NEGATI
 
 
 def _check_fields(body: int, fields: dict[str, Any]) -> None:
-    """Raise :class:`ValueError` naming the first field that is unknown or has an invalid value."""
+    """Raise :class:`ValueError` for the first field that is unknown or has an invalid value."""
     for name, given in fields.items():
         if name not in _FIELDS:
             raise ValueError(f"body {body} has no field {name!r}; it has: {', '.join(sorted(_FIELDS))}")
@@ -381,7 +386,7 @@ def _check_fields(body: int, fields: dict[str, Any]) -> None:
 
 
 def shear_modulus(modulus: Any) -> Any:
-    """Shear modulus [...] Pa of wood with Young's modulus [...] Pa, for Poisson's ratio 0.3."""
+    """Returns the shear modulus [...] Pa of wood with Young's modulus [...] Pa, for Poisson's ratio 0.3."""
     return modulus / 2.6
 
 
@@ -393,7 +398,8 @@ def segment_properties(
     density: float,
     shear: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Mass [...] kg, moments of inertia [..., 3] kg m^2 and half springs of tapered round segments of a rod.
+    """Returns mass [...] kg, moments of inertia [..., 3] kg m^2 and the two half springs of tapered round segments of a
+    rod.
 
     The two half springs, near the start and near the end, are [..., 3] N m/rad each: torsion, and bending about two
     axes. Each half has the cross-section at its end of the segment, where the joint is.
@@ -421,12 +427,13 @@ def segment_properties(
 
 
 def solve_rest_pose(model: Model) -> Model:
-    """Convert rest rotations that describe the *drawn* shape so that the drawn shape is in equilibrium under gravity.
+    """Convert the rest rotations of a model, which describe its *drawn* shape, so that the drawn shape is in
+    equilibrium under gravity.
 
-    Each spring must carry the weight that hangs on its joint. So its slack axes are rotated by the theta at which the
-    gradient of theta^T K theta / 2 equals the torque, and ``joint_settled`` rotates them back: drawn = rest * settled.
-    Writes both fields of the model and returns it. The weight of a bunch with clusters is the weight of its head and
-    its clusters. :class:`ValueError` if a joint has no stiffness.
+    Each spring must carry the weight of the bodies beyond its joint. So the rest rotation is changed by the rotation
+    vector theta at which the gradient of theta^T K theta / 2 equals the torque of this weight, and ``joint_settled`` is
+    the opposite rotation: drawn = rest * settled. Writes both fields into ``model`` and returns it. The weight of a
+    bunch with clusters is the weight of its head and its clusters. :class:`ValueError` if a joint has no stiffness.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
@@ -459,7 +466,7 @@ def solve_rest_pose(model: Model) -> Model:
         change = np.abs(after - before).max(1, initial=0.0)
         if change.max(initial=0.0) < 1e-12:
             break
-        open_joints = open_joints[change > 0.0]  # the others have reached a fixed point, to the last bit
+        open_joints = open_joints[change > 0.0]  # the other joints have reached a fixed point, to the last bit
     settled = frames.exp(theta)
     model.body_rest[:] = frames.multiply(drawn, frames.conjugate(settled))
     model.joint_settled[:] = settled
@@ -467,9 +474,11 @@ def solve_rest_pose(model: Model) -> Model:
 
 
 def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
-    """K theta [n, 3] of springs at rotation vectors theta [n, 3] rad whose torque in middle axes is ``torque`` [n, 3].
+    """Returns K theta [n, 3] N m of springs with rotation vectors theta [n, 3] rad that have the torque ``torque`` [n,
+    3] N m in middle axes.
 
-    It solves torque = s K theta + (1 - s) n n^T K theta, see ``spring_torque`` in :mod:`vinesim.kernels.plants.forces`.
+    This solves torque = s K theta + (1 - s) n n^T K theta for K theta; see ``spring_torque`` in
+    :mod:`vinesim.kernels.plants.forces`.
     """
     half = 0.5 * np.linalg.norm(theta, axis=1, keepdims=True)
     along = theta / np.maximum(2.0 * half, 1e-12)
@@ -478,7 +487,8 @@ def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
-    """One :class:`Model` of all trees in the given order; ``others`` are its other arrays (``fixed_start=...``)."""
+    """Returns one :class:`Model` of all trees, in the given order. ``others``: other arrays of the model, for example
+    ``fixed_start``."""
     counts = {
         "tree": len(trees),
         "body": sum(len(t.bodies) + len(t.clusters) for t in trees),

@@ -9,25 +9,25 @@ import numpy as np
 from vinesim.scene.values import CameraFrame, CameraInfo
 
 MAX_MILLIMETRES = 65535.5
-"""Depths from this value on [mm] overflow 16 bits."""
+"""Smallest depth [mm] that does not fit into 16 bits."""
 POINT_DTYPE = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 """One point of a cloud: metres in the optical frame, colour packed as 0x00RRGGBB (as in the PCL)."""
 
 
 def intrinsic_matrix(info: CameraInfo) -> list[float]:
-    """The matrix K of sensor_msgs/CameraInfo, row by row [9] px."""
+    """Returns the matrix K of sensor_msgs/CameraInfo, row by row [9] px."""
     return [info.fx, 0.0, info.cx, 0.0, info.fy, info.cy, 0.0, 0.0, 1.0]
 
 
 def distortion_model(info: CameraInfo) -> tuple[str, tuple[float, ...]]:
-    """Name of the distortion model and its coefficients D, as in sensor_msgs/CameraInfo."""
+    """Returns the name of the distortion model and its coefficients D, as in sensor_msgs/CameraInfo."""
     coefficients = info.distortion or NONE
     return MODELS[len(coefficients)], coefficients
 
 
 @functools.lru_cache(maxsize=16)
 def pixel_rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
-    """Ratios x / z and y / z of the ray through each pixel, float32. Pixel centres are whole numbers.
+    """Returns the ratios x / z and y / z of the ray through each pixel, float32. Pixel centres are whole numbers.
 
     The shapes are [1, width] and [height, 1] for a pinhole, to be broadcast, and [height, width] for a distorting lens.
     """
@@ -40,7 +40,7 @@ def pixel_rays(info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
 
 
 def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
-    """Pixels [..., 2] (column, row) of points [..., 3] m in the optical frame; NaN behind the camera."""
+    """Returns the pixels [..., 2] (column, row) of points [..., 3] m in the optical frame; NaN behind the camera."""
     points = np.asarray(points, float)
     z = np.where(points[..., 2] > 0.0, points[..., 2], np.nan)
     across = points[..., 0] / z
@@ -53,7 +53,7 @@ def project_points(points: np.ndarray, info: CameraInfo) -> np.ndarray:
 
 
 def back_project(pixels: np.ndarray, depth: np.ndarray, info: CameraInfo) -> np.ndarray:
-    """Points [..., 3] m in the optical frame that appear at pixels [..., 2] (column, row) at depths [...] m.
+    """Returns the points [..., 3] m in the optical frame seen at pixels [..., 2] (column, row) at depths [...] m.
 
     The inverse of :func:`project_points`; pixels need not be whole. NaN at pixels that no ray reaches.
     """
@@ -65,7 +65,8 @@ def back_project(pixels: np.ndarray, depth: np.ndarray, info: CameraInfo) -> np.
 
 
 def depth_millimetres(depth: np.ndarray) -> np.ndarray:
-    """Depth [height, width] m as 16UC1 of REP-118: millimetres, 0 where nothing was measured or 16 bits overflow."""
+    """Returns a depth picture [height, width] m in the encoding 16UC1 of REP-118: millimetres, 0 for pixels without a
+    measurement or beyond 16 bits."""
     millimetres = np.where(np.isfinite(depth), depth * 1000.0, 0.0)
     return np.where(millimetres < MAX_MILLIMETRES, np.round(millimetres), 0.0).astype(np.uint16)
 
@@ -82,7 +83,8 @@ def write_points(frame: CameraFrame, points_out: np.ndarray) -> None:
 
 
 def measured_points(frame: CameraFrame, step: int = 1) -> np.ndarray:
-    """Measured pixels of every ``step``-th row and column as :data:`POINT_DTYPE` [point], in the optical frame."""
+    """Returns the measured pixels of every ``step``-th row and column as :data:`POINT_DTYPE` [point], in the optical
+    frame."""
     cloud = np.empty(frame.depth.shape, POINT_DTYPE)
     write_points(frame, cloud)
     cloud = cloud[::step, ::step]
@@ -101,14 +103,14 @@ def measured_points(frame: CameraFrame, step: int = 1) -> np.ndarray:
 MODELS = {5: "plumb_bob", 8: "rational_polynomial"}
 """Names of the models by their number of coefficients."""
 NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
-"""No distortion."""
+"""Coefficients of a lens without distortion."""
 _STEPS = 20
 _TOLERANCE = 1e-9
-"""Tolerance of Newton's method for points of the plane at depth 1, where a pixel is about 1e-3 wide."""
+"""Tolerance of Newton's method for points in the plane at depth 1, in which a pixel is about 1e-3 wide."""
 
 
 def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """The radial factor of the distortion and its derivative with respect to r2."""
+    """Returns the radial factor of the distortion and its derivative with respect to r2."""
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
     above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
@@ -118,7 +120,7 @@ def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.nd
 
 
 def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Distorted positions [..., 2] of points [..., 2] in the plane at depth 1."""
+    """Returns the distorted positions [..., 2] of points [..., 2] in the plane at depth 1."""
     x = points[..., 0]
     y = points[..., 1]
     r2 = x * x + y * y
@@ -134,7 +136,7 @@ def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
 
 
 def _jacobian(points: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Derivatives of :func:`distort`: dx/dx, dx/dy (which equals dy/dx) and dy/dy."""
+    """Returns the derivatives of :func:`distort`: dx/dx, dx/dy (which equals dy/dx) and dy/dy."""
     x = points[..., 0]
     y = points[..., 1]
     p1, p2 = coefficients[2:4]
@@ -147,10 +149,10 @@ def _jacobian(points: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.n
 
 
 def undistort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Inverse of :func:`distort` by Newton's method; NaN for ``points`` [..., 2] without an inverse.
+    """Returns the inverse of :func:`distort` at ``points`` [..., 2], by Newton's method; NaN where there is no inverse.
 
-    A solution counts only if the map is one-to-one from the axis up to it. Further out, a lens with these coefficients
-    would show two directions at one point.
+    A solution is accepted only if the map is one-to-one from the optical axis to the solution. Further out, a lens with
+    these coefficients would show two directions at one point.
     """
     points = np.asarray(points, float)
     found = points.copy()

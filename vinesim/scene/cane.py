@@ -28,17 +28,17 @@ _HORIZONTAL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 class CaneBuilder:
     """A cane: a tapered round rod of equal segments, joined by elastic ball joints.
 
-    Raises :class:`ValueError` with the field, its value and the remedy if a number is out of range.
+    Raises :class:`ValueError` if a number is out of range; the message names the field, its value and the valid range.
     """
 
     length: float = 1.0
-    """[m]"""
+    """[m] Length of the cane."""
     radius: float | tuple[float, float] = 0.004
     """[m] Radius of the rod, or its radii at the base and at the tip."""
     youngs_modulus: float = 5e9
     """[Pa] Young's modulus E of bending; the shear modulus is E / 2.6 (Poisson's ratio 0.3)."""
     density: float = 800.0
-    """[kg/m^3]"""
+    """[kg/m^3] Density of the wood."""
     segments: int = 16
     """Number of rigid bodies of the cane."""
     tip_mass: float = 0.0
@@ -47,8 +47,8 @@ class CaneBuilder:
     """[1] Damping ratio of the first bending mode (see :meth:`first_mode`); it sets ``beta`` = 2 ratio / angular
     frequency."""
     beta: float | None = None
-    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. 0 unless this or ``damping_ratio`` is
-    given."""
+    """[s] Stiffness-proportional damping: joint damping = beta * joint stiffness. If neither ``beta`` nor
+    ``damping_ratio`` is given, beta is 0."""
     pose: np.ndarray | tuple[float, ...] = _HORIZONTAL
     """[7] m, 1, pose of the base in the world (position, quaternion xyzw); the cane grows along its x axis."""
     base: Literal["clamped", "pinned"] = "clamped"
@@ -57,8 +57,8 @@ class CaneBuilder:
     """[segments, 3] rad, rotation vector of each segment relative to the segment before it, in the drawn shape. By
     default the cane is straight."""
     shape: Literal["slack", "equilibrium"] = "slack"
-    """State of the drawn shape. In ``slack`` all springs are slack, and a released cane sags under its weight. In
-    ``equilibrium`` the springs balance gravity, and a released cane stays."""
+    """State of the drawn shape. ``slack``: all springs are slack in it, and a released cane sags under its weight.
+    ``equilibrium``: the springs balance gravity, and a released cane keeps the drawn shape."""
 
     @property
     def angular_stiffness(self) -> np.ndarray:
@@ -83,9 +83,10 @@ class CaneBuilder:
         return base, tip
 
     def first_mode(self) -> float:
-        """Angular frequency [rad/s] of the first bending mode of the straight cane, clamped, without gravity.
+        """Returns the angular frequency [rad/s] of the first bending mode of the straight, clamped cane without
+        gravity.
 
-        It is the mode of the chain of segments. With many segments it converges to the mode of the Euler-Bernoulli
+        This is the mode of the chain of segments. With many segments it converges to the mode of the Euler-Bernoulli
         beam, 1.8751^2 sqrt(E I / (rho A L^4)) for a cane without taper and tip mass.
         """
         self._check()
@@ -104,7 +105,8 @@ class CaneBuilder:
         return float(1.0 / np.sqrt(np.linalg.eigvalsh(root[:, None] * matrix * root)[-1]))
 
     def tree(self) -> TreeBuilder:
-        """The cane as a :class:`~vinesim.scene.builder.TreeBuilder`, to which branches and bunches can be added."""
+        """Returns the cane as a :class:`~vinesim.scene.builder.TreeBuilder`, to which branches and bunches can be
+        added."""
         self._check()
         beta = self.beta or 0.0
         if self.damping_ratio is not None:
@@ -119,11 +121,11 @@ class CaneBuilder:
         return tree
 
     def build(self) -> Model:
-        """A model of this cane alone."""
+        """Returns a model of this cane alone."""
         return builder.assemble([self.tree()])
 
     def _check(self) -> None:
-        """:class:`ValueError` naming the first field that is out of range."""
+        """Raise :class:`ValueError` for the first field that is out of range."""
         vars(self).pop("_undamped", None)
         if np.shape(self.radius) not in ((), (2,)):
             raise ValueError(f"cane: radius is {self.radius}; give one number, or two for base and tip")
@@ -169,10 +171,10 @@ def _add_point_mass(body: dict, mass: float) -> None:
 
 
 def cane(**fields: object) -> Model:
-    """A model of one cane; the arguments are the fields of :class:`CaneBuilder`."""
+    """Returns a model of one cane. ``fields``: fields of :class:`CaneBuilder`."""
     return CaneBuilder(**fields).build()  # pyright: ignore[reportArgumentType] # checked by the builder
 
 
 def assemble(canes: Iterable[CaneBuilder | TreeBuilder]) -> Model:
-    """One model of several canes. Each cane is a tree; trees are numbered in the given order."""
+    """Returns one model of several canes. Each cane is a tree; trees are numbered in the given order."""
     return builder.assemble([one.tree() if isinstance(one, CaneBuilder) else one for one in canes])

@@ -10,7 +10,7 @@ import enum
 
 
 class Organ(enum.IntEnum):
-    """What an object is: the class in label images, in COCO categories and in the material table."""
+    """Class of an object: its class in label images, its COCO category and its row in the table of materials."""
 
     NOTHING = 0
     GROUND = 1
@@ -37,46 +37,46 @@ class ObjectKind(enum.IntEnum):
 
 
 OBJECT_STRIDE = 1 << 24
-"""An object id is ``kind * OBJECT_STRIDE + index``, so that ids of trees equal their indices."""
+"""Factor of the kind in an object id, which is ``kind * OBJECT_STRIDE + index``. Ids of trees equal their indices."""
 
 
 def object_id(kind: ObjectKind, index: int) -> int:
-    """The id of a tree, a free bunch or a box. ``index`` counts the objects of each kind from 0."""
+    """Returns the id of a tree, a free bunch or a box. ``index`` counts the objects of each kind from 0."""
     return int(kind) * OBJECT_STRIDE + index
 
 
 def split_object_id(value: int) -> tuple[ObjectKind, int]:
-    """Kind and index of an object id; :class:`ValueError` for a number that is not an object id."""
+    """Returns kind and index of an object id. Raises :class:`ValueError` for a number that is not an object id."""
     return ObjectKind(value // OBJECT_STRIDE), value % OBJECT_STRIDE
 
 
 def is_tree(value: int) -> bool:
-    """Whether an object id belongs to a tree; all other objects are rigid."""
+    """Returns whether an object id belongs to a tree; all other objects are rigid."""
     return value < OBJECT_STRIDE
 
 
 def object_name(value: int) -> str:
-    """Link name of a box or a free bunch, such as ``box/3``."""
+    """Returns the link name of a box or a free bunch, such as ``box/3``."""
     kind, index = split_object_id(value)
     return f"{kind.name.lower()}/{index}"
 
 
 def parse_object_name(name: str) -> int | None:
-    """Object id of the box or free bunch with a name such as ``box/3``; None for other names."""
+    """Returns the object id of the box or free bunch with a name such as ``box/3``; None for other names."""
     kind, _, index = name.partition("/")
     rigid = {"bunch": ObjectKind.BUNCH, "box": ObjectKind.BOX}
     return object_id(rigid[kind], int(index)) if kind in rigid and index.isdecimal() else None
 
 
 LABEL_STRIDE = 1 << 20
-"""A label in label images is ``organ * LABEL_STRIDE + index``, one int32 for organ and instance."""
+"""Factor of the organ in a label of label images, which is ``organ * LABEL_STRIDE + index``, one int32."""
 
 
 def label(organ: Organ, index: int) -> int:
-    """The label of one object in a label image. ``index`` counts bunches, boxes, trees or actors from 0."""
+    """Returns the label of one object in a label image. ``index`` counts bunches, boxes, trees or actors from 0."""
     return int(organ) * LABEL_STRIDE + index
 
 
 def unlabel(value: int) -> tuple[Organ, int]:
-    """Organ and index of a label."""
+    """Returns the organ and index of a label."""
     return Organ(value // LABEL_STRIDE), value % LABEL_STRIDE

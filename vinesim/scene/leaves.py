@@ -28,7 +28,7 @@ _TEETH_PER_LOBE = 11.0
 
 
 def _blade(theta: np.ndarray, shape: int) -> np.ndarray:
-    """Radius of the outline in units of the length of the middle lobe."""
+    """Returns the radius of the outline in units of the length of the middle lobe."""
     radius = np.full_like(theta, 0.05)
     for (angle, length), kappa in zip(_LOBES, _KAPPA[shape], strict=True):
         for side in (1.0, -1.0) if angle else (1.0,):
@@ -43,7 +43,7 @@ def _blade(theta: np.ndarray, shape: int) -> np.ndarray:
 
 @functools.cache
 def _circle(shape: int) -> tuple[float, float]:
-    """Half width and area of the unscaled blade."""
+    """Returns the half width and area of the unscaled blade."""
     theta = np.linspace(-np.pi, np.pi, 4001)
     radius = _blade(theta, shape)
     width = float(np.abs(radius * np.sin(theta)).max())
@@ -51,18 +51,20 @@ def _circle(shape: int) -> tuple[float, float]:
 
 
 def blade_outline(theta: np.ndarray, shape: int = 0) -> np.ndarray:
-    """Distance from the petiole's junction to the edge at ``theta`` [rad, -pi..pi], in units of ``leaf_size``."""
+    """Returns the distance from the petiole's junction to the blade's edge at the angle ``theta`` [rad], -pi to pi, in
+    units of ``leaf_size``."""
     return _blade(np.asarray(theta, float), shape) / _circle(shape)[0]
 
 
 def blade_area(shape: int = 0) -> float:
-    """Area of the flat blade [leaf_size^2]."""
+    """Returns the area of the flat blade [leaf_size^2]."""
     width, blade = _circle(shape)
     return blade / width**2
 
 
 def blade_shape(leaf: np.ndarray) -> np.ndarray:
-    """Index of the outline [leaf] of leaves with these numbers; equal on all clients."""
+    """Returns the index of the outline [leaf] of each leaf, computed from the leaf's number, so that it is equal on all
+    clients."""
     scrambled = np.asarray(leaf, np.uint32) * np.uint32(2654435761)
     return (scrambled >> np.uint32(16)).astype(np.int32) % SHAPE_COUNT
 
@@ -97,10 +99,10 @@ class LeafNodes:
 def grow_leaves(
     scene: Scene, leaf: Leaf, nodes: LeafNodes, normal: np.ndarray, uniform: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """Leaves of a scene's season at ``nodes``.
+    """Grow leaves at ``nodes`` according to the scene's season.
 
     Args:
-        scene: gives season and training.
+        scene: its season and training are used.
         leaf: sizes and weights of leaves.
         nodes: positions of the leaves.
         normal: [8, ...] standard normal random numbers.
@@ -131,7 +133,7 @@ def grow_leaves(
     base = np.stack([along, 0.0 * along, 0.0 * along], -1) + nodes.thick[..., None] * local
     blade = base + petiole[..., None] * local
 
-    # blades face the light: flat over the net in a tendone, hanging and facing outwards in a hedge
+    # blades face the light: flat above the net in a tendone, hanging and facing outwards in a hedge
     flat = frames.normalize(out * [1.0, 1.0, 0.0])
     midrib = frames.normalize(flat + 0.3 * swing * axis + ((-0.45 if tendone else -1.0) + 0.3 * droop) * up)
     upper = up + (0.0 if tendone else 0.9) * flat + 0.3 * np.concatenate(lean, -1)
@@ -181,6 +183,6 @@ def add_point_masses(
 
 
 def _squared_distances(p: np.ndarray) -> np.ndarray:
-    """Squared distances [..., 3] of points [..., 3] from the three axes."""
+    """Returns the squared distances [..., 3] of points [..., 3] from the three axes."""
     square = p * p
     return square.sum(-1, keepdims=True) - square

@@ -1,4 +1,4 @@
-"""Materials of surfaces that touch: friction and contact stiffness by pair, read from ``data/materials``."""
+"""Materials of surfaces: friction and contact stiffness of each pair of materials, read from ``data/materials``."""
 
 from __future__ import annotations
 
@@ -51,28 +51,30 @@ OF_ORGAN = {
 
 
 class Quantity(NamedTuple):
-    """A number of each pair of materials."""
+    """A contact property that has a value for each pair of materials."""
 
     unit: str
-    """In which the file gives it."""
+    """Unit of the value in the file."""
     default: Callable[[PhysicsParameters], float]
-    """Of pairs that the file does not list."""
+    """Function that returns the value of pairs that the file does not list."""
 
 
 QUANTITIES = {
     "friction": Quantity("1", lambda p: p.friction),
     "stiffness": Quantity("N/m", lambda p: p.contact_stiffness),
 }
-"""Tables of the file; :class:`vinesim.kernels.contact.friction_law.Surface` says which of them contacts have."""
+"""Contact properties, by the name of their table in the file. Contacts use those that are fields of
+:class:`vinesim.kernels.contact.friction_law.Surface`."""
 
 _ContactFile = msgspec.defstruct(
     "_ContactFile", [(name, dict[str, Number], {}) for name in QUANTITIES], frozen=True, forbid_unknown_fields=True
 )
-"""Numbers by pair, written ``bark-steel``, in either order."""
+"""Structure of the file: one table for each quantity, with numbers by pair, such as ``bark-steel``, in either order."""
 
 
 def materials_of_organs(organs: np.ndarray) -> np.ndarray:
-    """:class:`Material` of pieces of plants and trellis from their ``organs`` [k] (:class:`Organ`), int32."""
+    """Returns the :class:`Material` [k], int32, of pieces of plants and trellis with the given ``organs`` [k]
+    (:class:`Organ`)."""
     table = np.zeros(max(Organ) + 1, np.int32)
     for organ, material in OF_ORGAN.items():
         table[organ] = material
@@ -80,7 +82,7 @@ def materials_of_organs(organs: np.ndarray) -> np.ndarray:
 
 
 def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarray:
-    """One of :data:`QUANTITIES` of each two materials, symmetric [material, material].
+    """Returns the values of one of :data:`QUANTITIES` for all pairs of materials, symmetric [material, material].
 
     ``default`` is used for pairs that the file does not list. ``name`` is the name of a file in ``data/materials``, or
     a path. Raises :class:`DataError` for an unknown pair or a wrong unit.
@@ -92,12 +94,12 @@ def pair_table(quantity: str, default: float, name: str = "contact") -> np.ndarr
 
 
 def pair_tables(parameters: PhysicsParameters) -> dict[str, np.ndarray]:
-    """All :data:`QUANTITIES` of each two materials."""
+    """Returns the values of all :data:`QUANTITIES` for all pairs of materials, each [material, material]."""
     return {name: pair_table(name, quantity.default(parameters)) for name, quantity in QUANTITIES.items()}
 
 
 def pair_numbers(name: str = "contact") -> dict[str, dict[str, Number]]:
-    """All numbers of the file with their sources, by quantity and pair as written."""
+    """Returns all numbers of the file with their sources, by quantity and by pair as written in the file."""
     return msgspec.structs.asdict(load_toml(find_data_file("materials", name, ".toml"), _ContactFile))
 
 

@@ -7,7 +7,7 @@ Every organ grows along its body's +x axis, from the joint at the body's origin.
 A ball joint connects body ``b`` to its parent. The joint frame is fixed in the parent, with origin ``body_offset`` and
 axes ``body_rest``. ``State.joint_q`` is the rotation of the body relative to the joint frame; the spring is slack at
 ``joint_q`` = identity. So ``world pose of b = pose of parent * (body_offset, body_rest) * (0, joint_q)``. For a root,
-``tree_pose`` takes the place of the parent's pose.
+``tree_pose`` is used instead of the parent's pose.
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ _UNIT_QUAT = (0.0, 0.0, 0.0, 1.0)
 
 @dataclasses.dataclass
 class Model(StructOfArrays):
-    """Constants of a vineyard. The declarations give the units, the module docstring explains the frames."""
+    """Constants of a vineyard. The field declarations contain units and shapes; the module docstring explains the
+    frames."""
 
     # a tree is the smallest unit that wakes, sleeps, is owned and is transmitted
     tree_first: np.ndarray = array("tree", unit="1", dtype=np.int32)
@@ -96,7 +97,7 @@ class Model(StructOfArrays):
 
     # ties bind canes to wires: springs between a point of a body and a point of a wire or the world, slack as drawn
     tie_body: np.ndarray = array("tie", unit="1", dtype=np.int32)
-    """Body that is tied; ties are sorted by it."""
+    """Body that is tied. Ties are sorted by this index."""
     tie_point: np.ndarray = array("tie", 3, unit="m")
     """Tied point in the body's frame."""
     tie_anchor: np.ndarray = array("tie", 3, unit="m")
@@ -128,30 +129,31 @@ class Model(StructOfArrays):
     """Tension of a piece of wire between its ends; 0: it does not deflect."""
 
     fixed_shear_modulus: np.ndarray = array("fixed", unit="Pa")
-    """Shear modulus of the wood of an arm, which its shoots twist; 0: it does not twist. An arm is the sequence of
-    pieces of organ ARM with one ``fixed_index``; its start is clamped, its end free."""
+    """Shear modulus of the wood of an arm that its shoots can twist; 0: the piece does not twist. An arm is the
+    sequence of pieces of organ ARM with the same ``fixed_index``. Its start is clamped, its end is free."""
 
     # picking boxes: open crates, dynamic
     box_pose: np.ndarray = array("box", 7, unit="m, 1", fill=_UNIT_POSE)
     """Start pose of the centre of the crate's bottom (x along the length)."""
     box_size: np.ndarray = array("box", 3, unit="m")
-    """Outer length, width, height."""
+    """Outer length, width and height of the box."""
     box_mass: np.ndarray = array("box", unit="kg")
 
     def digest(self) -> str:
-        """Hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
+        """Returns a hash of all arrays (16 hex digits): two clients with equal digests hold the same vineyard."""
         h = hashlib.blake2b(digest_size=8)
         for name in self.array_fields():
             h.update(np.ascontiguousarray(getattr(self, name)).tobytes())
         return h.hexdigest()
 
     def bodies_of(self, tree: int) -> slice:
-        """The bodies of one tree."""
+        """Returns the bodies of one tree."""
         first = int(self.tree_first[tree])
         return slice(first, first + int(self.tree_size[tree]))
 
     def forward_kinematics(self, joint_q: np.ndarray) -> np.ndarray:
-        """World poses [body, 7] for joint rotations [body, 4]. It loops over depth, too slow for every step."""
+        """Returns the world poses [body, 7] for joint rotations [body, 4]. The function loops in Python over the depth
+        of the trees, so it is too slow for every step."""
         body_q = np.zeros((len(self.body_mass), 7))
         joint = np.concatenate([self.body_offset, frames.multiply(self.body_rest, joint_q)], -1).astype(float)
         depth = self.depth()
@@ -163,7 +165,8 @@ class Model(StructOfArrays):
         return body_q
 
     def bunch_of_body(self) -> np.ndarray:
-        """Index of the bunch of each body [body]: of bunches, their clusters and their peduncles; -1 for all others."""
+        """[body] Index of the bunch to which the body belongs as bunch, cluster or peduncle; -1 for all other
+        bodies."""
         owner = np.full(len(self.body_mass), -1, np.int32)
         owner[self.bunch_body] = bunch = np.arange(len(self.bunch_body), dtype=np.int32)
         for k in range(int(self.bunch_clusters.max(initial=0))):
@@ -187,9 +190,9 @@ class Model(StructOfArrays):
         return (self.fixed_organ == int(Organ.ARM)) & (self.fixed_shear_modulus > 0.0)
 
     def depth(self) -> np.ndarray:
-        """Number of bodies between each body and its root [body].
+        """[body] Number of joints between each body and its root.
 
-        :class:`ValueError` if a parent does not come before its child, as in a cycle.
+        Raises :class:`ValueError` if a parent does not come before its child, as in a cycle.
         """
         depth = np.zeros(len(self.body_mass), np.int32)
         if (late := self.body_parent >= np.arange(len(depth))).any():

@@ -1,8 +1,8 @@
 """Parameters of the physics: one frozen struct with the unit and the source of each number.
 
-It is in this package because a scene may override it in a table ``[physics]``. Times are in seconds and distances in
-metres, so their meaning does not change with ``dt``. READ: from the source named; DERIVED: computed from other numbers;
-TUNED: chosen by experiment with this solver; GUESSED: nothing better is known.
+The struct is in this package because a scene may override it in a table ``[physics]``. Times are in seconds and
+distances in metres, so their meaning does not change with ``dt``. READ: from the source named; DERIVED: computed from
+other numbers; TUNED: chosen by experiment with this solver; GUESSED: nothing better is known.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Capacity = Annotated[int, msgspec.Meta(ge=1, le=1024)]
 
 
 class ParameterError(ValueError):
-    """A physics parameter out of its range; one line with name, value and remedy."""
+    """Raised for a physics parameter out of its range. The message is one line with name, value and valid range."""
 
 
 class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -39,13 +39,14 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[1] Coulomb coefficient of every contact whose pair of materials ``data/materials`` does not list. GUESSED for
     rubber pads, plastic crates and berries alike."""
     sleep: bool = True
-    """Whether plants that are at rest are put to sleep. Off: every plant that was woken stays awake."""
+    """Whether plants that are at rest are put to sleep. If not, every plant that was woken stays awake."""
 
     # ------------------------------------------------------------------ articulation solver (plants)
     phi: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.55
     """[1] Implicitness of the integration: 1/2 trapezoidal, 1 backward Euler. TUNED."""
     fast_joint_rate: Positive = 5.0
-    """[rad/s] A tree with a faster joint is integrated with phi = 1, and a body that turns faster feels drag. TUNED."""
+    """[rad/s] A tree with a faster joint is integrated with phi = 1, and a drag slows a body that turns faster.
+    TUNED."""
     max_joint_rate: Positive = 50.0
     """[rad/s] Joint rates are limited to this value. DERIVED: half a radian in a step of 10 ms."""
     fault_joint_rate: Positive = 5000.0
@@ -87,7 +88,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     detail_rate: Positive = 0.05
     """[rad/s] The clusters of a tree count as at rest while all turn slower than this against their parents. TUNED."""
     detail_rest_duration: Positive = 0.25
-    """[s] Clusters are fused again after this time at rest. DERIVED: longer than they are slow at a turning point."""
+    """[s] Time at rest after which clusters are locked again. DERIVED: longer than a swing is slow at its turning
+    point."""
 
     # ------------------------------------------------------------------ detachment
     detachment_duration: Positive = 0.03
@@ -102,7 +104,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     contact_damping_time: NotNegative = 0.02
     """[s] Damping of a contact divided by its stiffness. TUNED: two steps of 10 ms."""
     contact_margin: Positive = 0.002
-    """[m] A contact exists if the gap is smaller than this, or than what can close in one step. TUNED."""
+    """[m] A contact exists if the gap is smaller than this, or smaller than the distance by which it can close in one
+    step. TUNED."""
     static_contact_margin: Positive = 0.0002
     """[m] A contact with a static geom or another branch exists if a step brings the gap below this. TUNED."""
     impact_speed: Positive = 0.3
@@ -118,7 +121,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     solver_sweeps: Count = 100
     """Largest number of Gauss-Seidel sweeps; with warm start and Newton steps, two to five are usual. TUNED."""
     solver_newton_steps: Annotated[int, msgspec.Meta(ge=0)] = 6
-    """Number of first sweeps of an island that are each followed by a Newton step; after them one sweep in ten is.
+    """Number of first sweeps of an island that are each followed by a Newton step. Of the later sweeps one in ten is.
     TUNED."""
     solver_newton_contacts: Annotated[int, msgspec.Meta(ge=0)] = 16
     """Islands in which plants couple more contacts than this take no Newton step, whose cost grows with the cube of the
@@ -177,20 +180,20 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     hand_return_speed: Positive = 1.5
     """[m/s] Largest speed of a free hand that returns to its controller. TUNED."""
     max_body_speed: Positive = 5.0
-    """[m/s] Largest speed at which parts of a person push, whatever the trackers report. GUESSED."""
+    """[m/s] Upper limit of the speed of a person's parts in contacts, for higher speeds in tracking data. GUESSED."""
     teleport_distance: Positive = 0.5
     """[m] A head that moves further than this in a step was teleported: the person's velocity is then set to zero.
     GUESSED."""
     grasp_distance: Positive = 0.03
     """[m] A closing hand grasps objects closer than this to its palm or fingers. GUESSED."""
     grasp_duration: Positive = 0.2
-    """[s] For this time a hand that closed on nothing still grasps what comes into it; then it is a fist. GUESSED."""
+    """[s] Time for which a hand that closed without grasping anything still grasps a body that touches it. GUESSED."""
     haptic_period: Positive = 0.05
     """[s] Period at which a lasting contact is reported to the controller. GUESSED."""
     haptic_onset_amplitude: Fraction = 0.2
     """[1] Smallest amplitude at the onset of a contact, strong enough to be felt. GUESSED."""
     haptic_min_amplitude: Fraction = 0.01
-    """[1] Smaller amplitudes are not reported. GUESSED."""
+    """[1] Amplitude below which a contact is not reported. GUESSED."""
 
     # ------------------------------------------------------------------ support of boxes and free bunches
     support_rest_duration: Positive = 0.5
@@ -198,7 +201,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     support_move_speed: Positive = 0.01
     """[m/s] A box faster than this counts as moving even if it stays near its anchor pose. TUNED."""
     support_snap_distance: Positive = 0.5
-    """[m] A copy further than this from its received pose is moved there at once. GUESSED."""
+    """[m] Distance between a copy of an object and its received pose above which the copy is moved there at once.
+    GUESSED."""
 
     def __post_init__(self) -> None:
         """Check every number, because msgspec checks only values that were read from a file."""
@@ -213,12 +217,12 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
             )
 
     def steps(self, duration: float) -> int:
-        """Number of steps in a ``duration`` [s], rounded, at least 1."""
+        """Returns the number of steps in a ``duration`` [s], rounded, at least 1."""
         return max(1, round(duration / self.dt))
 
 
 def _trouble(annotation: Any, value: Any) -> str:
-    """Text that says which values are valid; empty if ``value`` is one of them."""
+    """Returns a text that describes the valid values of a parameter; empty if ``value`` is valid."""
     kind = msgspec.inspect.type_info(annotation)
     if isinstance(kind, msgspec.inspect.BoolType):
         return "" if isinstance(value, bool) else "True or False"

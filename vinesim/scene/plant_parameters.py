@@ -39,7 +39,7 @@ class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     source: str
 
     def at(self, share: typing.Any) -> typing.Any:
-        """The value at ``share`` of the range: 0 gives its lower end, 1 its upper end."""
+        """Returns the value at the fraction ``share`` of the range: its lower end for 0, its upper end for 1."""
         return self.value[0] + (self.value[1] - self.value[0]) * share
 
 
@@ -57,7 +57,7 @@ class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Cane(_Part, frozen=True, kw_only=True):
-    """A shoot of this year, woody at its base and green at its tip, and the side shoot that may fork from it."""
+    """Parameters of shoots of this year, which are woody at the base and green at the tip, and of their side shoots."""
 
     length: Annotated[Range, "m"]
     nodes: Annotated[Range, "1"]
@@ -76,7 +76,7 @@ class Cane(_Part, frozen=True, kw_only=True):
 
 
 class Peduncle(_Part, frozen=True, kw_only=True):
-    """The stalk on which a bunch hangs."""
+    """Parameters of peduncles: the stalks on which bunches hang."""
 
     length: Annotated[Range, "m"]
     diameter: Annotated[Range, "m"]
@@ -88,7 +88,7 @@ class Peduncle(_Part, frozen=True, kw_only=True):
 
 
 class Bunch(_Part, frozen=True, kw_only=True):
-    """The fruit."""
+    """Parameters of the bunches of berries."""
 
     mass: Annotated[Number, "kg"]
     mass_variation: Annotated[Number, "1"]
@@ -99,7 +99,8 @@ class Bunch(_Part, frozen=True, kw_only=True):
 
 
 class Rachis(_Part, frozen=True, kw_only=True):
-    """The stem inside a bunch, which continues the peduncle, and the berries around it, which support each other."""
+    """Parameters of the rachis, the stem inside a bunch that continues the peduncle, and of the mutual support of the
+    berries around it."""
 
     piece: Annotated[Number, "m"]
     diameter: Annotated[Range, "m"]
@@ -108,7 +109,7 @@ class Rachis(_Part, frozen=True, kw_only=True):
 
 
 class Leaf(_Part, frozen=True, kw_only=True):
-    """Blade and petiole."""
+    """Parameters of leaves: blade and petiole."""
 
     area: Annotated[Range, "m^2"]
     young_area: Annotated[Number, "1"]
@@ -119,7 +120,7 @@ class Leaf(_Part, frozen=True, kw_only=True):
 
 
 class Arm(_Part, frozen=True, kw_only=True):
-    """Permanent wood along the wires, on which shoots grow."""
+    """Parameters of arms: permanent wood along the wires, on which shoots grow."""
 
     diameter: Annotated[Range, "m"]
     share: Annotated[Number, "1"]
@@ -130,14 +131,14 @@ class Arm(_Part, frozen=True, kw_only=True):
 
 
 class Trunk(_Part, frozen=True, kw_only=True):
-    """The trunk from the ground to the head."""
+    """Parameters of the trunk, from the ground to the head."""
 
     diameter: Annotated[Range, "m"]
     beside_pole: Annotated[Number, "m"]
 
 
 class Trellis(_Part, frozen=True, kw_only=True):
-    """Poles and wires."""
+    """Parameters of poles, wires and ties."""
 
     pole_diameter: Annotated[Number, "m"]
     wire_diameter: Annotated[Number, "m"]
@@ -197,7 +198,7 @@ class VineParameters(_Part, frozen=True, kw_only=True):
 
 
 class Berry(_Part, frozen=True, kw_only=True):
-    """Berries of one variety."""
+    """Parameters of the berries of one variety."""
 
     name: str
     colour: Annotated[Colour, "1"]
@@ -206,14 +207,15 @@ class Berry(_Part, frozen=True, kw_only=True):
 
 
 class Varieties(_Part, frozen=True, kw_only=True):
-    """The file of varieties."""
+    """Content of the file of varieties."""
 
     varieties: tuple[Berry, ...]
 
 
 @functools.cache
 def load_plant(name: str) -> VineParameters:
-    """Parameters from the file ``name``, or else from ``data/plants``; :class:`DataError` if a unit is wrong."""
+    """Returns the parameters in the file ``name``, or else in the file of that name in ``data/plants``. Raises
+    :class:`DataError` if the file cannot be used, for example because a unit is wrong."""
     path = find_data_file("plants", name, ".toml")
     vine = load_toml(path, VineParameters)
     _check_units(vine, str(path))
@@ -221,7 +223,7 @@ def load_plant(name: str) -> VineParameters:
 
 
 def load_varieties() -> tuple[Berry, ...]:
-    """The varieties that ship with vinesim, in the order of ``Model.bunch_variety``."""
+    """Returns the varieties that ship with vinesim, in the order of ``Model.bunch_variety``."""
     path = find_data_file("plants", "varieties", ".toml")
     varieties = load_toml(path, Varieties).varieties
     for i, berry in enumerate(varieties):
@@ -234,9 +236,9 @@ class _SpecimenFile(_Part, frozen=True):
 
 
 def load_specimen(path: str | pathlib.Path) -> Specimen:
-    """The table ``[specimen]`` of a file, which may also contain plant parameters.
+    """Returns the table ``[specimen]`` of a file, which may also contain plant parameters.
 
-    :class:`DataError` with file, place, value and remedy if it cannot be used.
+    Raises :class:`DataError` if the table cannot be used.
     """
     path = pathlib.Path(path)
     if not path.is_file():
@@ -262,7 +264,7 @@ def _check_specimen(specimen: Specimen, path: str) -> None:
     if specimen.axis:
         _check_axis(specimen, path)
     for name, place in specimen.markers.items():
-        if name.lower() == "base":  # in a track, columns of this name hold the motion of the base
+        if name.lower() == "base":  # a track uses this name for the columns with the motion of the base
             raise DataError(f"{path}: specimen.markers.{name} is no name for a marker; give it another one")
         if not 0.0 < place <= specimen.length.value:
             raise DataError(

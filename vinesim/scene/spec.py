@@ -1,7 +1,8 @@
 """The content of a scene file: a vineyard's layout, season, fruit, boxes, sun, wind, and start positions of robots.
 
-Lengths are in metres, angles in radians, axes as in :mod:`vinesim.core.frames`. The first vine of the first row stands
-at the origin, vines follow along +x, rows along +y. So a longer row or an additional row moves no other vine.
+Lengths are in metres, angles in radians, axes as in :mod:`vinesim.core.frames`. The first vine of the first row is at
+the origin; vines follow along +x, rows along +y. So a longer row or an additional row changes the position of no other
+vine.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Count = Annotated[int, msgspec.Meta(ge=1)]
 
 
 class SceneError(DataError):
-    """A scene that cannot be used; one line with file, place, finding and remedy."""
+    """Raised for a scene that cannot be used. The message is one line with file, field, error and correction."""
 
 
 class _Part(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -67,7 +68,7 @@ class Fruit(_Part, frozen=True, kw_only=True):
     bunches: tuple[int, int]
     """Smallest and largest number of bunches on a vine."""
     varieties: Annotated[tuple[str, ...], msgspec.Meta(min_length=1)]
-    """Names from :data:`vinesim.scene.berries.VARIETIES`; the rows take them in turn."""
+    """Names from :data:`vinesim.scene.berries.VARIETIES`. Row i has variety i modulo their number."""
 
 
 class Box(_Part, frozen=True, kw_only=True):
@@ -90,15 +91,15 @@ class Sun(_Part, frozen=True, kw_only=True):
     elevation: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.9
     """[rad] Elevation above the horizon."""
     hour: Annotated[float, msgspec.Meta(ge=0.0, le=24.0)] | None = None
-    """Solar time at the start [h]. If given, the sun moves from there, with x to the east and y to the north, and
-    azimuth and elevation are ignored."""
+    """Solar time at the start [h]. If given, the sun moves with simulated time, with x to the east and y to the north,
+    and ``azimuth`` and ``elevation`` are ignored."""
     day: Annotated[int, msgspec.Meta(ge=1, le=366)] = 258
     """Day of the year; 258 is the middle of September, the season of table grapes."""
     latitude: Annotated[float, msgspec.Meta(ge=-math.pi / 2, le=math.pi / 2)] = 0.726
     """[rad] Latitude, positive to the north; 41.6 degrees is Aprilia, Italy, where CANOPIES picks."""
 
     def direction(self, time: float = 0.0) -> tuple[float, float, float]:
-        """Unit vector from the ground to the sun, world axes, at simulated ``time`` [s]."""
+        """Returns the unit vector from the ground to the sun, world axes, at simulated ``time`` [s]."""
         if self.hour is not None:
             # Cooper (1969), accurate to 0.4 degrees
             declination = math.radians(23.45) * math.sin(2.0 * math.pi * (284 + self.day) / 365.0)
@@ -108,7 +109,8 @@ class Sun(_Part, frozen=True, kw_only=True):
 
 
 def sun_direction(hour: float, declination: float, latitude: float) -> tuple[float, float, float]:
-    """Unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude [rad]."""
+    """Returns the unit vector to the sun (x east, y north, z up) at an hour of solar time [h]; declination and latitude
+    [rad]."""
     turn = math.radians(15.0) * (hour - 12.0)
     east = -math.cos(declination) * math.sin(turn)
     north = math.cos(latitude) * math.sin(declination) - math.sin(latitude) * math.cos(declination) * math.cos(turn)
@@ -147,7 +149,7 @@ class Imported(_Part, frozen=True, kw_only=True):
     """[m] Height of the plant's base above the ground."""
     yaw: float = 0.0
     leaves: bool = True
-    """Whether its shoots carry leaves according to the season."""
+    """Whether the plant's shoots have leaves, according to the season."""
     tie_gap: Annotated[float, msgspec.Meta(ge=0.0)] = 0.02
     """[m] Largest gap at which a shoot is tied to a wire that it passes; 0: no ties."""
 
@@ -170,13 +172,14 @@ class Scene(_Part, frozen=True, kw_only=True):
     wind: Wind = Wind()
     spawns: tuple[Spawn, ...] = ()
     physics: PhysicsParameters = PhysicsParameters()
-    """Physics parameters, by default the usual ones; they are not part of the vineyard's digest."""
+    """Physics parameters. They are not part of the vineyard's digest."""
 
 
 def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Scene:
-    """The scene in a file, or the scene of that name in ``data/scenes``; :class:`SceneError` if it cannot be used.
+    """Returns the scene in a file, or the scene of that name in ``data/scenes``. Raises :class:`SceneError` if the
+    scene cannot be used.
 
-    ``seed`` replaces the seed of the file, which gives the same layout with different vines.
+    ``seed`` replaces the seed of the file: the layout stays the same, but the vines differ.
     """
     try:
         path = find_data_file("scenes", str(path_or_name), ".toml")
@@ -192,12 +195,14 @@ def load_scene(path_or_name: str | pathlib.Path, seed: int | None = None) -> Sce
 
 
 def _beside(scene: pathlib.Path, file: str) -> pathlib.Path:
-    """Path of a file that a scene names: in the scene's folder if it exists there, else as given."""
+    """Returns the path of a file that a scene names: in the scene's folder if the file exists there, else ``file``
+    unchanged."""
     return near if (near := scene.parent / file).is_file() else pathlib.Path(file)
 
 
 def _find_error(scene: Scene) -> str:
-    """Check rules that the types cannot express. Returns place, finding and remedy; empty if the scene is valid."""
+    """Check rules that the types cannot express. Returns a message with field, error and correction; empty if the scene
+    is valid."""
     low, high = scene.fruit.bunches
     if not 0 <= low <= high:
         return f"fruit.bunches is [{low}, {high}]; give [fewest, most] with 0 <= fewest <= most"
@@ -231,7 +236,7 @@ def _find_error(scene: Scene) -> str:
 
 
 def with_seed(scene: Scene, seed: int | None) -> Scene:
-    """A copy of the scene with another seed; None keeps the scene's own seed."""
+    """Returns a copy of the scene with the given seed; None keeps the scene's own seed."""
     if seed is None:
         return scene
     if seed < 0:

@@ -23,8 +23,8 @@ class State(StructOfArrays):
     body_qd: np.ndarray = array("body", 6, unit="m/s, rad/s")
     """World velocity of the body's origin, then angular velocity, derived from ``joint_qd``."""
     body_cut: np.ndarray = array("body", unit="1", dtype=np.bool_)
-    """Whether the body has been cut off its parent. A cut body is the floating root of everything that grows on it:
-    ``joint_q`` is its rotation in the world and ``joint_qd`` its angular velocity in world axes."""
+    """Whether the body has been cut off its parent. A cut body is the floating root of its descendants: ``joint_q`` is
+    its rotation in the world and ``joint_qd`` its angular velocity in world axes."""
     joint_x: np.ndarray = array("body", 3, unit="m")
     """World position of the origin of a cut body; unused for other bodies."""
     joint_xd: np.ndarray = array("body", 3, unit="m/s")
@@ -36,7 +36,7 @@ class State(StructOfArrays):
 
     @classmethod
     def at_rest(cls, model: Model) -> State:
-        """State with all trees asleep in the drawn shape (``Model.joint_settled``) and zero rates."""
+        """Returns the state with all trees asleep in the drawn shape (``Model.joint_settled``), with zero rates."""
         counts = model.counts()
         state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
         state.joint_q[:] = model.joint_settled

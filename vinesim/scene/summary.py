@@ -11,7 +11,7 @@ from vinesim.scene.spec import Scene
 
 
 def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
-    """Rows of (quantity, value, unit)."""
+    """Returns the rows of the summary table: (quantity, value, unit)."""
     counts = model.counts()
     layout = scene.layout
     places = layout.rows * layout.vines
@@ -42,6 +42,6 @@ def summary_rows(scene: Scene, model: Model) -> list[tuple[str, str, str]]:
 
 
 def total_leaf_area(model: Model) -> float:
-    """Area of one side of all flat blades [m^2]."""
+    """Returns the area of one side of all flat blades [m^2]."""
     unit = np.array([leaves.blade_area(shape) for shape in range(leaves.SHAPE_COUNT)])
     return float((unit[leaves.blade_shape(np.arange(len(model.leaf_size)))] * model.leaf_size.astype(float) ** 2).sum())

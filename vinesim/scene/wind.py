@@ -1,4 +1,4 @@
-"""Wind: a steady mean and gusts that travel with it. Plants feel it as drag on leaves and wood.
+"""Wind: a steady mean and gusts that travel with it. It acts on plants as drag on leaves and wood.
 
 Turbulence is *frozen* (Taylor, Proc. R. Soc. A 164, 1938): the mean carries a fixed pattern along, so a gust that is
 here now is downwind later, and trees in a row bend one after the other. The pattern is a sum of divergence-free plane
@@ -53,7 +53,7 @@ class Wind:
         and ``wave_phase`` [wave] rad their phases."""
 
     def velocity_at(self, points: np.ndarray, time: float) -> np.ndarray:
-        """Velocity of the undisturbed air [..., 3] m/s at world ``points`` [..., 3] m and ``time`` [s]."""
+        """Returns the velocity of the undisturbed air [..., 3] m/s at world ``points`` [..., 3] m and ``time`` [s]."""
         points = np.asarray(points, float)
         if self.gusts == 0.0:
             return np.broadcast_to(self.mean, points.shape)
@@ -62,7 +62,7 @@ class Wind:
 
 
 def wind_of(scene: Scene) -> Wind | None:
-    """The wind that a scene file describes; None for calm air."""
+    """Returns the wind that a scene file describes; None for calm air."""
     wind = scene.wind
     if not any(wind.mean) and wind.gusts == 0.0:
         return None

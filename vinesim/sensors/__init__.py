@@ -1,1 +1,1 @@
-"""Cameras, lidars and exact ground truth."""
+"""Simulated cameras and lidars, their schedule, exact ground truth, and data sets."""

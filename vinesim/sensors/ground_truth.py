@@ -1,7 +1,7 @@
-"""Ground truth of pictures: which bunches are seen, how much of each, where, and how every pixel moves.
+"""Ground truth of pictures: visible bunches, their occlusion, boxes and cut points, and optical flow.
 
-All of it follows from the primitives, not from the picture: noise and range limits of a camera change nothing here.
-All ids are the same on every client: bunch numbers are those of the model, and berry numbers those of
+The ground truth is computed from the primitives, not from the picture, so noise and range limits of a camera do not
+affect it. Ids are equal on all clients: bunch indices are those of the model, berry indices those of
 :func:`vinesim.scene.berries.lay_out_berries`.
 """
 
@@ -28,20 +28,20 @@ from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Detection:
-    """One bunch as seen in one picture."""
+    """One visible bunch in one picture."""
 
     bunch: int
     """Index of the bunch in the model."""
     pixels: int
     """Number of pixels that show the bunch."""
     box: Box
-    """Bounding box of these pixels."""
+    """Bounding box of the pixels that show the bunch."""
     distance: float
-    """Median depth [m] of the pixels that measured; NaN if none did."""
+    """Median measured depth [m] of these pixels; NaN if none of them has a measurement."""
 
 
 def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
-    """A detection for every bunch that at least one pixel shows, by index."""
+    """Returns a detection for every bunch that is visible in at least one pixel, sorted by index."""
     rows, columns = np.nonzero(frame.labels // LABEL_STRIDE == int(Organ.BUNCH))
     index = frame.labels[rows, columns] % LABEL_STRIDE
     order = np.argsort(index, kind="stable")
@@ -68,7 +68,7 @@ def detect_bunches(frame: CameraFrame) -> tuple[Detection, ...]:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class PixelBuffers:
-    """The surfaces that every pixel of an ideal camera sees at one instant."""
+    """Exact buffers of an ideal camera at one instant: primitive, depth, label and berry in each pixel."""
 
     info: CameraInfo
     pose: np.ndarray
@@ -78,18 +78,19 @@ class PixelBuffers:
     depth: np.ndarray
     """[height, width] float32 m, depth along the optical axis, exact to 2 um; +Inf for the sky."""
     labels: np.ndarray
-    """[height, width] int32, labels as of :func:`vinesim.scene.ids.label`."""
+    """[height, width] int32, labels as defined by :func:`vinesim.scene.ids.label`."""
     berries: np.ndarray
-    """[height, width] int32, number of the berry in its bunch; -1 where no berry is seen."""
+    """[height, width] int32, index of the berry in its bunch; -1 where no berry is visible."""
     carrier_poses: np.ndarray
     """[primitive, 7] Pose of the body that carries each primitive, for :func:`optical_flow`."""
     layout_version: int
-    """:attr:`Primitives.layout_version`. Indices of primitives are comparable only between buffers of the same
-    version."""
+    """Value of :attr:`Primitives.layout_version`; indices of primitives are comparable only between buffers with equal
+    values."""
 
 
 def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -> PixelBuffers:
-    """Look from ``pose`` [7] (optical frame) through the lens, without noise."""
+    """Render exact buffers, without noise, of a camera with intrinsics ``info`` (and lens distortion) at ``pose`` [7],
+    the pose of its optical frame."""
     view = lens_map(info)
     shape = view.pinhole.height, view.pinhole.width
     seen = CameraRasterizer(shape[1], shape[0], primitives.device)
@@ -98,7 +99,7 @@ def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -
         view.nearest(a.numpy().reshape(shape).copy()) for a in (seen.primitive, seen.depth, seen.labels)
     )
     depth[primitive == -1] = np.inf
-    numbers = np.append(_berry_numbers(primitives), [-1, -1])  # so that -1 and -2 find no berry
+    numbers = np.append(_berry_numbers(primitives), [-1, -1])  # the last two entries are for sky (-1) and ground (-2)
     everything = primitives.carrier_poses(np.arange(primitives.count))
     return PixelBuffers(
         info, np.array(pose, float), primitive, depth, labels, numbers[primitive], everything, primitives.layout_version
@@ -106,12 +107,12 @@ def render_buffers(primitives: Primitives, info: CameraInfo, pose: np.ndarray) -
 
 
 def _primitives_shown(primitives: Primitives) -> np.ndarray:
-    """[primitive] Whether each primitive is drawn."""
+    """Returns [primitive] whether each primitive is drawn."""
     return np.repeat(primitives.clusters_shown(), primitives.cluster_size)
 
 
 def _berry_numbers(primitives: Primitives) -> np.ndarray:
-    """[primitive] Number of the berry in its bunch, -1 for primitives that are not berries."""
+    """Returns [primitive] the index of each berry in its bunch, -1 for primitives that are not berries."""
     kind = np.repeat(primitives.cluster_kind, primitives.cluster_size)
     fruit = np.flatnonzero((kind == SPHEROID) & (primitives.organ == int(Organ.BUNCH)) & _primitives_shown(primitives))
     bunch = primitives.label[fruit]
@@ -124,10 +125,10 @@ def _berry_numbers(primitives: Primitives) -> np.ndarray:
 def bunch_truths(
     primitives: Primitives, snapshot: Snapshot, seen: PixelBuffers, caster: RayCaster | None = None
 ) -> tuple[BunchTruth, ...]:
-    """Every bunch that would cover a pixel if it were the only object in the scene, by index.
+    """Returns the ground truth of every bunch that is in the view, even if fully occluded, sorted by index.
 
-    ``primitives`` must be posed to the ``snapshot`` at which ``seen`` was rendered. A given ``caster`` for them saves
-    the time to build one.
+    ``seen``: buffers of the view; ``primitives`` must be posed to the ``snapshot`` at which ``seen`` was rendered;
+    ``caster``: ray caster of ``primitives``, which is built if not given.
     """
     info = seen.info
     drawn = lens_map(seen.info).pinhole
@@ -144,10 +145,11 @@ def bunch_truths(
 def visible_bunches(
     primitives: Primitives, snapshot: Snapshot, info: CameraInfo, pose: np.ndarray, drawn: CameraRasterizer
 ) -> tuple[BunchTruth, ...]:
-    """Every bunch that at least one pixel shows, by index, computed fast enough for live pictures.
+    """Returns the ground truth of every bunch that is visible in at least one pixel, sorted by index, fast enough for
+    live pictures.
 
-    ``drawn`` holds the view from ``pose`` [7] of ``primitives``, posed to ``snapshot``; its keys are overwritten. A cut
-    point counts as seen if the pixel in which it lies shows its own peduncle; this test needs no rays.
+    ``drawn``: rasteriser with the view from ``pose`` [7] of ``primitives``, posed to ``snapshot``; its keys are
+    overwritten. A cut point counts as visible if its pixel shows the bunch's own peduncle; this test needs no rays.
     """
     view = lens_map(info)
     shape = view.pinhole.height, view.pinhole.width
@@ -162,7 +164,8 @@ def visible_bunches(
 
 @dataclasses.dataclass(frozen=True)
 class _Look:
-    """The view of one camera from its present pose; ``rasterizer`` draws single bunches."""
+    """One view, for the computation of its ground truth; ``rasterizer`` draws single bunches without their
+    surroundings."""
 
     primitives: Primitives
     snapshot: Snapshot
@@ -173,12 +176,13 @@ class _Look:
     labels: np.ndarray
 
     def pixel(self, point: np.ndarray) -> np.ndarray | None:
-        """Pixel column and row [2] of a point [3] m in the world; None for a point behind the camera."""
+        """Returns column and row [2] px of the image of ``point`` [3] m in the world; None for a point behind the
+        camera."""
         local = frames.rotate(frames.conjugate(self.pose[3:]), point - self.pose[:3])
         return project_points(local, self.info) if local[2] > 0.0 else None
 
     def shows_peduncle(self, bunch: int, point: np.ndarray) -> bool:
-        """Whether the pixel in which ``point`` [3] m lies shows the peduncle of a bunch."""
+        """Returns whether the pixel onto which ``point`` [3] m projects shows the peduncle of ``bunch``."""
         pixel = self.pixel(point)
         if pixel is None or not _inside(pixel, self.info):
             return False
@@ -186,9 +190,9 @@ class _Look:
         return bool(self.labels[row, column] == label(Organ.PEDUNCLE, bunch))
 
     def bunches(self, bunches: np.ndarray, cuts: dict[int, np.ndarray], clear: set[int]) -> Iterator[BunchTruth]:
-        """The truth of those bunches among some bunches [k] that would cover a pixel if they were alone in the scene.
+        """Yield the ground truth of those ``bunches`` [k] that are in the view, even if fully occluded.
 
-        ``cuts``: cut points [3] m by bunch. ``clear``: bunches whose cut point nothing hides.
+        ``cuts``: cut points [3] m by bunch; ``clear``: bunches with a visible cut point.
         """
         p = self.primitives
         snapshot = self.snapshot
@@ -237,13 +241,13 @@ class _Look:
 
 
 def _cut_points(model: Model, snapshot: Snapshot, bunches: np.ndarray) -> dict[int, np.ndarray]:
-    """Cut points [3] m of those bunches among some bunches [k] that still hang."""
+    """Returns the cut points [3] m, by bunch, of those ``bunches`` [k] that still hang on their vines."""
     hanging = bunches[snapshot.bunch_attached[bunches]].tolist()
     return {bunch: cut_point(model, snapshot.body_q, bunch) for bunch in hanging}
 
 
 def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
-    """Cut point [3] m of a hanging bunch: the middle of its peduncle along the axis. ``body_q`` [body, 7]: world
+    """Returns the cut point [3] m of a hanging bunch, the middle of its peduncle's axis; ``body_q``: [body, 7] world
     poses."""
     stalk = []
     body = int(model.body_parent[model.bunch_body[bunch]])
@@ -261,15 +265,17 @@ def cut_point(model: Model, body_q: np.ndarray, bunch: int) -> np.ndarray:
 
 
 def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray, np.ndarray]:
-    """Optical flow from one picture to another, by motion of the camera, of the plants, or of both.
+    """Returns the optical flow from the first to the second picture, by motion of camera and objects, and visibility.
 
-    Returns the displacement [height, width, 2] of each pixel's surface point, columns and rows [px]. It is exact for
-    the point that the pixel's ray meets, which moves with the body that carries it. It is NaN for the sky, and for
-    points that are behind the camera in the second picture. Also returns whether the second picture shows the same
-    primitive at the new place [height, width].
+    The flow [height, width, 2] is the displacement [px] of each pixel's surface point, in columns and rows. It is exact
+    for the point that the pixel's ray hits, which moves with its body, and NaN for the sky and for points that are
+    behind the camera in the second picture. The visibility [height, width] tells whether the second picture shows the
+    same primitive at the displaced position.
     """
     if first.layout_version != second.layout_version:
-        raise ValueError("things came or went between the two looks; flow needs the same ones in both")
+        raise ValueError(
+            "bodies were added or removed between the two pictures; optical flow needs equal bodies in both"
+        )
     info = first.info
     other = second.info
     v, u = np.nonzero(np.isfinite(first.depth))
@@ -286,7 +292,7 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
     before, after = (one.carrier_poses[primitive[solid]] for one in (first, second))
     attached = frames.rotate(frames.conjugate(before[:, 3:]), point[solid] - before[:, :3])
     moved = point.copy()
-    # as a difference, so that rounding does not displace points that did not move
+    # computed as a difference, so that rounding does not displace points that did not move
     still = frames.rotate(before[:, 3:], attached) + before[:, :3]
     moved[solid] += frames.rotate(after[:, 3:], attached) + after[:, :3] - still
     there = project_points(frames.rotate(frames.conjugate(second.pose[3:]), moved - second.pose[:3]), other)
@@ -301,7 +307,10 @@ def optical_flow(first: PixelBuffers, second: PixelBuffers) -> tuple[np.ndarray,
 
 
 def _visible_cut_points(caster: RayCaster, eye: np.ndarray, points: dict[int, np.ndarray]) -> set[int]:
-    """Bunches whose cut point is visible from the eye: nothing but the bunch's own peduncle lies between."""
+    """Returns the bunches whose cut point is visible from ``eye`` [3] m, or hidden only by the bunch's own peduncle.
+
+    ``points``: cut points [3] m by bunch.
+    """
     if not points:
         return set()
     bunch = np.array(list(points))
@@ -312,8 +321,11 @@ def _visible_cut_points(caster: RayCaster, eye: np.ndarray, points: dict[int, np
 
 
 def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose [7] and edge lengths [3] m of the tightest box around spheroids and cones [k] with the orientation
-    ``turn``."""
+    """Returns the pose [7] and edge lengths [3] m of the smallest box with orientation ``turn`` (quaternion) that
+    contains spheroids and cones [k].
+
+    ``a``, ``b``: vectors of the primitives [k, 4]; ``kind``: [k].
+    """
     back = frames.conjugate(np.asarray(turn, float))
     start, end = (frames.rotate(back, v[:, :3].astype(float)) for v in (a, b))  # for a spheroid, end is its axis
     radius = a[:, 3:].astype(float)
@@ -327,8 +339,8 @@ def _box_around(a: np.ndarray, b: np.ndarray, kind: np.ndarray, turn: np.ndarray
 
 
 def _box_of(mask: np.ndarray, window: Box) -> Box | None:
-    """Bounding box, in the picture, of a mask [rows, columns] of a ``window`` of the picture; None for an empty
-    mask."""
+    """Returns the bounding box, in pixels of the picture, of a ``mask`` [rows, columns] of the picture's rectangle
+    ``window``; None for an empty mask."""
     rows = np.flatnonzero(mask.any(1))
     columns = np.flatnonzero(mask.any(0))
     if not len(rows):

@@ -1,6 +1,6 @@
-"""RGB-D pictures that were recorded: from rosbag2's MCAP files, without ROS, or a folder as ``vinesim dataset`` writes.
+"""Reader of recorded RGB-D pictures: MCAP files of rosbag2, without ROS, or folders written by ``vinesim dataset``.
 
-The only ROS messages read (CDR, XCDR1) are sensor_msgs/Image and CameraInfo, by their definitions.
+Of ROS messages (CDR, XCDR1), only sensor_msgs/Image and sensor_msgs/CameraInfo are decoded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from vinesim.scene.values import CameraFrame, CameraInfo
 LEVEL_POSE = np.array([0.0, 0.0, 0.0, -np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """[7] Pose of the optical frame of a level camera that looks along the world's y axis: x to the right, z up."""
 PAIR_TIME = 0.01
-"""[s] Longest time between the stamps of a colour picture and of its depth picture."""
+"""Largest time [s] between the stamps of a colour picture and of its depth picture."""
 IMAGE = "sensor_msgs/msg/Image"
 INFO = "sensor_msgs/msg/CameraInfo"
 _COLOURS = {"rgb8": (3, [0, 1, 2]), "bgr8": (3, [2, 1, 0]), "rgba8": (4, [0, 1, 2]), "bgra8": (4, [2, 1, 0])}
@@ -33,7 +33,7 @@ _LENSES = ("plumb_bob", "rational_polynomial", "")
 
 
 class RecordedPicturesError(ValueError):
-    """Recorded pictures cannot be used; the text is one line with file, topic and remedy."""
+    """Error: recorded pictures cannot be used. The message is one line with file, topic and remedy."""
 
 
 def read_pictures(
@@ -44,19 +44,20 @@ def read_pictures(
     pose: np.ndarray | None = None,
     rate: float | None = None,
 ) -> Iterator[CameraFrame]:
-    """Yield the pictures of an MCAP file, of a rosbag2 folder with such files, or of a data set, in the order of time.
+    """Yield the pictures of an MCAP file, of a rosbag2 folder with such files, or of a data set, sorted by time.
 
-    A colour picture for which there is no depth has depth NaN.
+    A colour picture without a depth picture has depth NaN.
 
     Args:
         path: file or folder.
-        image: topic of the colours; unless given, the only one with rgb or color in its name. ``camera_info`` is read
+        image: topic of the colours; by default the only topic with rgb or color in its name. ``camera_info`` is read
             from the same namespace.
-        depth: topic of the depth, aligned with the colours; found in the same way unless given.
-        pose: [7] pose of the optical frame in the world; unless given, that of the data set, or :data:`LEVEL_POSE`.
+        depth: topic of the depth, aligned with the colours; by default the only topic with depth in its name.
+        pose: [7] pose of the optical frame in the world; by default that of the data set, or :data:`LEVEL_POSE`.
         rate: pictures a second [Hz] of a data set whose records have no ``time``.
 
-    :class:`RecordedPicturesError` before the first picture if there is none, or for one that cannot be read.
+    Raises :class:`RecordedPicturesError` before the first picture if there are no pictures, or at a picture that cannot
+    be read.
     """
     if not path.exists():
         raise RecordedPicturesError(f"{path}: is not there; give an MCAP file, a rosbag2 folder or a data set")
@@ -110,7 +111,7 @@ def _png(file: pathlib.Path, flags: int) -> np.ndarray:
 
 
 def _metres(depth: np.ndarray) -> np.ndarray:
-    """Depth in metres, NaN where there is none, from an array in metres or 16-bit millimetres."""
+    """Returns depth [m], NaN where it is missing, from an array in metres or in 16-bit millimetres (0: missing)."""
     if depth.dtype.kind == "u":
         return np.where(depth > 0, 1e-3 * depth, np.nan).astype(np.float32)
     return np.where(depth > 0.0, depth, np.nan).astype(np.float32)
@@ -148,7 +149,7 @@ def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: 
 
 
 def _topics(files: list[pathlib.Path]) -> dict[str, str]:
-    """Message type of each topic, by topic."""
+    """Returns the message type of each topic in MCAP files, by topic."""
     types: dict[str, str] = {}
     for file in files:
         try:
@@ -163,7 +164,10 @@ def _topics(files: list[pathlib.Path]) -> dict[str, str]:
 
 
 def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[str, ...], option: str) -> str:
-    """Choose a topic of images: the given one, or else the only one whose name contains one of these words."""
+    """Returns a topic of images: ``given`` if not None, else the only topic whose name contains one of ``words``.
+
+    ``name``: file, and ``option``: command line option, for error messages; ``types``: message type by topic.
+    """
     images = sorted(topic for topic, kind in types.items() if kind == IMAGE)
     if given is not None:
         if given not in images:
@@ -202,7 +206,10 @@ def _pair(
     pose: np.ndarray,
     last: bool,
 ) -> Iterator[CameraFrame]:
-    """Colour pictures whose depth picture has been found, or can no longer come."""
+    """Yield the frames of those waiting colour pictures whose depth picture has been read, or can no longer follow.
+
+    ``waiting``, ``depths``: colour and depth pictures that were read but not used yet; ``last``: no more will be read.
+    """
     while waiting:
         time, rgb = waiting[0]
         while depths and depths[0][0] < time - PAIR_TIME:
@@ -223,11 +230,11 @@ def _pair(
 
 @dataclasses.dataclass(slots=True)
 class _Cdr:
-    """Reads the members of a serialised CDR message, one after the other."""
+    """Reader of a serialised CDR message, member by member."""
 
     data: bytes
     at: int = 4
-    """Position in the message, after the encapsulation header; alignment counts from there."""
+    """Index of the next byte to read; reading starts after the encapsulation header, from which alignment counts."""
 
     def number(self, code: str) -> Any:
         size = struct.calcsize(code)
@@ -247,14 +254,15 @@ class _Cdr:
         return self.block().rstrip(b"\0").decode()
 
     def stamp(self) -> float:
-        """Read a header: its stamp [s]. The frame is skipped."""
+        """Read a std_msgs/Header and return its stamp [s]; the frame id is skipped."""
         time = self.number("i") + 1e-9 * self.number("I")
         self.text()
         return time
 
 
 def _read_image(data: bytes) -> tuple[float, np.ndarray]:
-    """Stamp [s] of an image message, and its colours uint8 or its depth [m]."""
+    """Returns the stamp [s] of a serialised image message, and its colours [height, width, 3] uint8 or its depth
+    [height, width] m."""
     cdr = _Cdr(data)
     time = cdr.stamp()
     height = cdr.number("I")

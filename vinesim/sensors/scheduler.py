@@ -1,8 +1,8 @@
-"""The schedule of a robot's sensors: it renders those that are due and wanted, and counts the frames that are late.
+"""The scheduler of a robot's sensors, which renders sensors that are due and wanted, and counts late frames.
 
 Most sensors, such as cameras, render a whole frame at once, from the newest snapshot. A swept sensor, such as a lidar,
-takes at every snapshot the parts of a frame that are due, each from the pose at its own time, and delivers the frame
-after the last part.
+renders at every snapshot the parts of a frame that are due, each from the sensor's pose at the time of the part, and
+delivers the frame after the last part.
 """
 
 from __future__ import annotations
@@ -21,38 +21,39 @@ from vinesim.sensors.sensor import Sensor, SweptSensor
 from vinesim.wind.sway import Sway
 
 LEAST_RATE_MARGIN = 0.9
-"""Margin on the least rate of live sensors: snapshots come at whole steps, so sensors are taken more often than the
-least rate requires, by the inverse of this factor."""
+"""Factor on the longest time between frames of live sensors. It is below 1, because snapshots exist only at whole
+steps, so that sensors would otherwise fall below the least rate."""
 COST_GAIN = 0.3
-"""Weight of the newest frame in the smoothed time that frames take."""
+"""Weight of the newest frame in the smoothed real time that a sensor's frames take."""
 
 DemandQuery = Callable[[], CameraOutput]
-"""Gives the outputs of a sensor that are wanted now. The sensor renders if there is any."""
+"""Function that returns the outputs of a sensor that are wanted now; the sensor renders only if any is wanted."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ScheduledSensor:
-    """One sensor, the callback for its frames, and the outputs that are wanted of it."""
+    """A sensor in the schedule, with the callback for its frames and the function that returns its wanted outputs."""
 
     sensor: Sensor
     deliver: Callable[[Any], None]
-    """Called with every frame."""
+    """Function that is called with every rendered frame of the sensor."""
     wanted: DemandQuery = lambda: CameraOutput.ALL
     rate: float | None = None
-    """Frames a second of simulation time [Hz]; the sensor's own rate unless given."""
+    """Frames a second of simulated time [Hz]; None: the sensor's own rate."""
     present_rate: Callable[[], float] | None = None
-    """Frames a second of simulation time [Hz] where that may change: a function that is called before every frame."""
+    """Function that is called before every frame and returns the rate [Hz] in simulated time, for a rate that changes.
+    """
 
     @property
     def period(self) -> float:
-        """Time between two frames [s]."""
+        """Simulated time between two frames [s]."""
         if self.present_rate is not None:
             return 1.0 / self.present_rate()
         return 1.0 / (self.rate or self.sensor.rate)
 
     @property
     def name(self) -> str:
-        """The sensor's name; its pose has the same name."""
+        """The sensor's name, which is also the key of its pose in :data:`SensorPoses`."""
         return self.sensor.name
 
 
@@ -61,7 +62,7 @@ SensorPoses = Mapping[str, np.ndarray]
 
 
 class SensorScheduler:
-    """Renders the sensors of one robot, in the caller's thread."""
+    """Renders the sensors of one robot when they are due and wanted, in the caller's thread."""
 
     def __init__(
         self,
@@ -72,7 +73,8 @@ class SensorScheduler:
         pacing: SensorPacing = SensorPacing(),
         on_taken: Callable[[], None] = lambda: None,
     ) -> None:
-        """``on_taken`` is called when it is known what a snapshot is needed for, before that is rendered."""
+        """``on_taken``: called for each snapshot when the sensors to render from it are known, before they are
+        rendered."""
         names = [m.name for m in sensors]
         if len(set(names)) != len(names):
             twice = next(n for n in names if names.count(n) > 1)
@@ -82,27 +84,28 @@ class SensorScheduler:
         self.frames = dict.fromkeys(names, 0)
         """Number of frames that each sensor has delivered, by name."""
         self.dropped = dict.fromkeys(names, 0)
-        """Number of frames of each sensor that were due and were not rendered in time, by name."""
+        """Number of frames of each sensor that were due but were not rendered in time, by name."""
         self._next_time = dict.fromkeys(names, -np.inf)
         self._is_first = dict.fromkeys(names, True)
-        """Whether a sensor has delivered at most one frame since it became wanted; the first may take longer."""
+        """Whether a sensor has rendered at most one frame since it became wanted. The first frame may take longer, so
+        frames that are missed meanwhile are not counted."""
         self._sweeps = {m.name: m.sensor.sweep(m.rate) for m in sensors if isinstance(m.sensor, SweptSensor)}
         self._pacing = pacing
         self._on_taken = on_taken
         self._taken: dict[str, float] = {}
         """Simulated time of the newest snapshot that each wanted sensor has taken [s]."""
         self._costs: dict[str, float] = {}
-        """Real time that a frame of each sensor takes, smoothed [s]."""
+        """Smoothed real time that a frame of each sensor takes [s]."""
         self._unfinished = dict.fromkeys(names, 0.0)
-        """Real time that the present frame of each swept sensor has taken so far [s]."""
+        """Real time that the unfinished frame of each swept sensor has taken so far [s]."""
         self._sway = Sway(model)
         self._moved = np.zeros(len(model.tree_first), bool)
         """[tree] Whether each tree has moved since the primitives were last posed."""
 
     def warm_up(self, snapshot: Snapshot, poses: SensorPoses) -> Iterator[str]:
-        """Render one frame of every sensor and discard it; yields the name of each sensor before its frame.
+        """Render one frame of every sensor and discard it; yield the name of each sensor before its frame.
 
-        The first frame of a sensor takes many times as long as later ones: it makes buffers, tables and the last
+        The first frame of a sensor takes many times as long as later frames, because it allocates buffers and compiles
         kernels.
         """
         outputs = CameraOutput.RGB | CameraOutput.DEPTH | CameraOutput.LABELS
@@ -114,10 +117,10 @@ class SensorScheduler:
     def advance(
         self, snapshot: Snapshot, poses: SensorPoses, earlier: Sequence[tuple[float, SensorPoses]] = ()
     ) -> None:
-        """Render and deliver the frames that are due, from the newest snapshot.
+        """Render and deliver the frames that are due, from the newest ``snapshot``.
 
-        Its ``moved_trees`` must be those that moved since the last call. ``earlier``: poses of the sensors between the
-        last call and this one, with their times [s].
+        ``snapshot.moved_trees`` must contain all trees that moved since the last call. ``poses``: poses of the sensors
+        at the snapshot; ``earlier``: times [s] and poses of the sensors between the last call and this one.
         """
         self._moved[snapshot.moved_trees] = True
         for name, sweep in self._sweeps.items():
@@ -144,7 +147,7 @@ class SensorScheduler:
             begun = now
 
     def _note_cost(self, name: str, seconds: float, count: int) -> None:
-        """Note the real time that a sensor took in one call, in which ``count`` frames were completed."""
+        """Record the real time ``seconds`` that sensor ``name`` took in one call, which completed ``count`` frames."""
         self._unfinished[name] += seconds
         if count:
             cost = self._unfinished[name] / count
@@ -153,11 +156,11 @@ class SensorScheduler:
             self._unfinished[name] = 0.0
 
     def horizon(self) -> float:
-        """Simulated time [s] that the world must not pass before a newer snapshot is taken. Beyond it a wanted sensor
-        would fall below the rate that its mode promises. Infinite if no sensor is wanted.
+        """Returns the simulated time [s] up to which the world may advance before the sensors take a newer snapshot.
 
-        Call it regularly, also while no snapshots come. The promise to a sensor that is not wanted ends here, and
-        begins again with the first snapshot that the sensor takes.
+        Beyond that time a wanted sensor would fall below the rate that its mode guarantees. Infinite if no sensor is
+        wanted. Call this regularly, also while no snapshots come: the guarantee for a sensor that is no longer wanted
+        ends in this call, and begins again with the first snapshot that the sensor takes.
         """
         for one in self.sensors:
             if not one.wanted():
@@ -167,8 +170,10 @@ class SensorScheduler:
         )
 
     def sustainable_factor(self) -> float:
-        """The largest real-time factor at which the wanted sensors keep the rate that their mode promises, from the
-        time that their last frames took. Infinite if no sensor is wanted."""
+        """Returns the largest real-time factor at which all wanted sensors reach the rate that their mode guarantees.
+
+        It is estimated from the real time of recent frames, and infinite if no sensor is wanted.
+        """
         load = sum(self._costs.get(one.name, 0.0) / self._gap(one) for one in self._wanted())
         return 1.0 / load if load > 0.0 else np.inf
 
@@ -176,18 +181,19 @@ class SensorScheduler:
         return [one for one in self.sensors if one.name in self._taken and one.wanted()]
 
     def _gap(self, scheduled: ScheduledSensor) -> float:
-        """Longest simulated time between two snapshots that the mode allows a sensor to take [s]."""
+        """Returns the longest simulated time [s] that the mode allows between two snapshots that a sensor takes."""
         is_live = self._pacing.mode is SensorMode.LIVE
         if scheduled.name in self._sweeps and not is_live:
-            return 1.0 / scheduled.sensor.rate  # a frame that is taken later than this is left out
+            return 1.0 / scheduled.sensor.rate  # a swept sensor leaves a frame out if it begins later
         return max(scheduled.period, LEAST_RATE_MARGIN / self._pacing.least_rate) if is_live else scheduled.period
 
     def _due_time(self, scheduled: ScheduledSensor) -> float:
-        """Simulated time [s] at which the next frame is due, of a sensor that renders whole frames."""
+        """Returns the simulated time [s] at which the next frame of a sensor that renders whole frames is due."""
         return -np.inf if scheduled.name in self._sweeps else self._next_time[scheduled.name]
 
     def _update_primitives(self, snapshot: Snapshot, poses: SensorPoses) -> Snapshot:
-        """Pose the primitives. Returns the snapshot as it is drawn, valid until the next call."""
+        """Move the primitives to the poses of ``snapshot``. Returns the snapshot to render, valid until the next
+        call."""
         eye = next((pose[:3] for pose in poses.values()), None)
         seen = self._sway.apply(snapshot, np.flatnonzero(self._moved), eye)
         self.primitives.update(seen, seen.moved_trees)
@@ -195,7 +201,7 @@ class SensorScheduler:
         return seen
 
     def _results(self, scheduled: ScheduledSensor, snapshot: Snapshot, pose: np.ndarray) -> Iterator[SensorFrame]:
-        """Render the frames that a sensor has to deliver from a snapshot, to which the primitives are posed."""
+        """Render and yield the frames that a sensor delivers from ``snapshot``, to which the primitives are posed."""
         sweep = self._sweeps.get(scheduled.name)
         if sweep is None:
             yield scheduled.sensor.frame(self.primitives, snapshot, pose, scheduled.wanted())
@@ -206,10 +212,14 @@ class SensorScheduler:
         self.dropped[scheduled.name] += sweep.dropped - missed
 
     def _is_due(self, scheduled: ScheduledSensor, now: float, poses: SensorPoses) -> bool:
-        """Whether a sensor has something to render at simulation time ``now`` [s]; counts the frames it has missed."""
+        """Returns whether a sensor has a frame, or a part of one, to render at simulated time ``now`` [s].
+
+        Also counts the frames that the sensor has missed.
+        """
         name = scheduled.name
         if name not in poses or not scheduled.wanted():
-            self._next_time[name] = -np.inf  # a subscriber that returns gets a frame at once, and missed none
+            # a later subscriber gets a frame at once; frames without a subscriber do not count as missed
+            self._next_time[name] = -np.inf
             self._is_first[name] = True
             self._taken.pop(name, None)
             if name in self._sweeps:

@@ -1,4 +1,4 @@
-"""Interfaces through which the scheduler, the sensor process and the command line use any rendered sensor."""
+"""Interfaces of rendered sensors of all kinds, for the scheduler, the sensor process and the command line."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 class Sensor(Protocol):
-    """One sensor. It renders the present state of the :class:`Primitives`, from a pose in the world."""
+    """Interface of one rendered sensor, which renders the present state of the :class:`Primitives` from a given
+    pose."""
 
     name: str
 
@@ -27,101 +28,109 @@ class Sensor(Protocol):
         ...
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> SensorFrame:
-        """One frame from ``pose`` [7] at the time of ``snapshot``, to which the primitives are posed. Only ``outputs``
-        of the frame are needed."""
+        """Render one frame from ``pose`` [7] at the time of ``snapshot``, to which the primitives are already posed.
+
+        Only ``outputs`` are needed; other arrays of the frame may be empty.
+        """
         ...
 
 
 class Sweep(Protocol):
-    """Frames that a sensor takes little by little, each part at its own time and from where the sensor was then."""
+    """Interface of a sequence of frames that are rendered in parts, each part for its own time and pose of the
+    sensor."""
 
     dropped: int
-    """Number of frames that could not be begun in time."""
+    """Number of frames that were left out, because they could not begin in time."""
 
     def add_pose(self, time: float, pose: np.ndarray) -> None:
-        """Record that the sensor was at ``pose`` [7] at ``time`` [s]."""
+        """Record that the sensor was at ``pose`` [7] at simulated ``time`` [s]."""
         ...
 
     def set_demand(self, period: float, outputs: CameraOutput) -> None:
-        """Set the time between two frames [s] and the outputs that are needed, from the next frame on."""
+        """Set the time between two frames, ``period`` [s], and the needed ``outputs``, from the next frame on."""
         ...
 
     def is_due(self, now: float) -> bool:
-        """Whether a part of a frame is due at ``now`` [s]."""
+        """Returns whether a part of a frame is due at simulated time ``now`` [s]."""
         ...
 
     def advance(self, primitives: Primitives, now: float) -> Iterator[SensorFrame]:
-        """Take the parts that are due at ``now`` [s]; yields the frames that this completes."""
+        """Render the parts that are due at simulated time ``now`` [s], and yield the frames that become complete."""
         ...
 
     def cancel(self, now: float) -> None:
-        """Abandon the present frame at ``now`` [s]."""
+        """Abandon the unfinished frame at simulated time ``now`` [s]."""
         ...
 
 
 @runtime_checkable
 class SweptSensor(Protocol):
-    """A :class:`Sensor` that takes the parts of a frame at different times."""
+    """Interface of a :class:`Sensor` that measures the parts of a frame at different times, such as a spinning
+    lidar."""
 
     def sweep(self, rate: float | None) -> Sweep:
-        """The sweep of this sensor, with ``rate`` frames a second [Hz]: at most the sensor's own rate, and that rate
-        unless given."""
+        """Returns a new sweep of this sensor with ``rate`` frames a second [Hz], at most the sensor's own rate, which
+        is the default."""
         ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SensorSetting:
-    """Settings with which a sensor is made, in addition to its mount."""
+    """Settings with which a sensor is made, in addition to its mount: sun, noise and device."""
 
     sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
-    """Unit vector towards the sun, or a function that gives it for a time."""
+    """Unit vector towards the sun, or a function from simulated time [s] to that vector."""
     seed: int = 0
-    """Seed of the noise. The noise follows from the seed, the sensor's name and the number of the frame."""
+    """Seed of the noise, which the seed, the sensor's name and the index of the frame determine."""
     number: int = 0
-    """Number of the sensor's first frame."""
+    """Index of the sensor's first frame."""
     device: str = "cpu"
     threads: int | None = None
-    """Number of CPU threads that draw; the number of cores, up to four, unless given."""
+    """Number of CPU threads that render; None: the number of cores, at most four."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Export:
-    """The part of a frame that a data set stores."""
+    """The parts of a sensor's frame that a data set stores."""
 
     images: dict[str, np.ndarray]
     """Images by name: RGB uint8 or grey uint16 [height, width]."""
     record: dict[str, Any]
-    """Meaning of the numbers in the images, as JSON."""
+    """Description of the images (meaning and scale of their numbers), for JSON."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SensorMaker:
-    """Makes the sensors of one kind. It is ``MAKER`` of the module that the kind's
-    :class:`~vinesim.scene.values.SensorKind` names."""
+    """Functions that make and export the sensors of one kind.
+
+    Each kind's module, which :class:`~vinesim.scene.values.SensorKind` names, has one as ``MAKER``.
+    """
 
     rate: Callable[[str], float]
-    """Frame rate [Hz] of a sensor, by the name of its data file; :class:`~vinesim.sensors.spec_file.SensorError` if the
-    file cannot be used."""
+    """Function from the name of a sensor's data file to its frame rate [Hz]; raises
+    :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used."""
     make: Callable[[Any, SensorSetting], Sensor]
-    """Makes the sensor of a mount of this kind."""
+    """Function that makes the sensor of a mount of this kind."""
     load_kernels: Callable[[], None]
-    """Compiles the CPU kernels of this kind, or reads them from the cache, before the first frame is due."""
+    """Function that compiles the CPU kernels of this kind, or loads them from the cache, before the first frame."""
     channels: Callable[[str], tuple[str, ...]] = lambda _: ()
-    """Names of the images of a sensor, by the name of its data file, where the file decides which images there are."""
+    """Function from the name of a sensor's data file to the names of its images, for kinds whose file defines these."""
     export: Callable[[Any], Export] | None = None
-    """Converts a frame to what a data set stores; None: a data set stores nothing of this kind."""
+    """Function that converts a frame for a data set; None: data sets store nothing of this kind."""
 
 
 def maker(kind: str) -> SensorMaker:
-    """The maker of one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    """Returns the maker of sensors of a ``kind``, one of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     return importlib.import_module(SENSOR_KINDS[kind].maker).MAKER
 
 
 def export_frame(
     mount: RenderedMount, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, setting: SensorSetting
 ) -> Export:
-    """Make a sensor, take one frame from ``pose`` [7], and return what a data set stores of it; its kind must have an
-    export."""
+    """Make a sensor, render one frame from ``pose`` [7], and return the parts of it that a data set stores.
+
+    The maker of the sensor's kind must have an ``export``.
+    """
     kind = maker(mount.kind)
     assert kind.export is not None
     whole = SENSOR_KINDS[mount.kind].whole
@@ -129,7 +138,8 @@ def export_frame(
 
 
 def load_kernels(*kinds: str) -> None:
-    """Load the CPU kernels of some kinds of sensors: threads must not do so at the same time."""
+    """Compile the CPU kernels of some kinds of sensors, or load them from the cache. Only one thread may do so at a
+    time."""
     wp.load_module(transform_primitives, device="cpu")
     for kind in kinds:
         maker(kind).load_kernels()

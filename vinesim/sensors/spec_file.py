@@ -1,5 +1,4 @@
-"""Sensor data files. Every number has unit, grade and source; a wrong unit or an absurd value is refused in one
-line."""
+"""Data files of sensors. Every number has unit, grade and source; a wrong unit or a value out of range is an error."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A list of numbers with unit, grade and source."""
+    """A list of numbers in a data file, with unit, grade and source."""
 
     value: tuple[float, ...]
     unit: str
@@ -27,13 +26,14 @@ class Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SensorError(DataError):
-    """A sensor's data file cannot be used. The text is one line."""
+    """Error: a sensor's data file cannot be used. The message is one line."""
 
 
 def load(folder: str, name: str, kind: type[T]) -> T:
-    """Read the file ``name``, or the one of that name in ``data/<folder>``, as a struct of type ``kind``.
+    """Read a data file as a struct of type ``kind`` and check all units and ranges.
 
-    The fields of ``kind`` declare unit and range: ``Annotated[Number, unit, (lowest, highest)]``.
+    ``name``: path of the file, or name of a file in ``data/<folder>``. The fields of ``kind`` declare unit and range as
+    ``Annotated[Number, unit, (lowest, highest)]``.
     """
     path = find_data_file(folder, name, ".toml")
     spec = load_toml(path, kind, SensorError)
@@ -62,6 +62,8 @@ def _check(path: pathlib.Path, spec: msgspec.Struct, place: str = "") -> None:
 
 
 def noise_rng(seed: int, name: str, number: int) -> np.random.Generator:
-    """Random generator for one image or revolution. It gives the same numbers for the same (seed, sensor, number), on
-    every machine."""
+    """Returns the random generator for one image or revolution of a sensor.
+
+    Equal ``seed``, ``name`` of the sensor and ``number`` of the image yield equal random numbers on every machine.
+    """
     return np.random.default_rng([seed & 0xFFFFFFFF, zlib.crc32(name.encode()), number & 0xFFFFFFFF])

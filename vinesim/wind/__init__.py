@@ -1,3 +1,3 @@
-"""Wind on plants: ``plant_wind`` applies wind to simulated trees, ``sway`` computes the motion of the other trees,
-``shelter`` how much of the wind reaches each tree.
+"""Wind on plants: ``plant_wind`` applies wind to simulated trees, ``sway`` computes the motion of all other trees,
+``shelter`` computes the share of the wind that reaches each tree.
 """

@@ -1,12 +1,13 @@
-"""Wind on the plants: simulates it on trees near observers, and leaves the motion of other trees to sensors.
+"""Wind on the plants: it is simulated on trees near robots and people. Sensors compute the motion of all other trees.
 
 Trees in gusts never sleep, and a step has no time for ten thousand awake trees. So wind is simulated only on trees near
-a robot or a person. All other trees sleep where they last rested. Their motion in the wind is a function of position
-and time, which sensors compute for the trees that they see (:mod:`vinesim.wind.sway`).
+a robot or a person. All other trees sleep in their last rest pose. Their motion in the wind is a function of position
+and time, which sensors compute for visible trees (:mod:`vinesim.wind.sway`).
 
 Each tree has a phase from 0 (its motion is drawn) to 1 (its motion is simulated). The phase rises while the tree is
-awake and near: in its first half the air velocity at the simulated tree grows to the wind's, in its second half the
-drawn motion fades out. Otherwise the phase falls, and the tree keeps its last air velocity. So no visible motion jumps.
+awake and near an observer. From 0 to 0.5 the air velocity at the simulated tree grows to the wind's; from 0.5 to 1 the
+drawn motion fades out. Otherwise the phase falls, and the tree keeps its last air velocity. So visible motion is
+continuous.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class WindOnPlants:
         model = plants.model
         first = plants.model.tree_first
         number = np.arange(len(model.body_mass)) - first[model.body_tree]
-        core = number < model.tree_core[model.body_tree]  # the mass of a bunch includes its clusters
+        core = number < model.tree_core[model.body_tree]  # a bunch's mass includes its clusters
         self._foot = model.tree_pose[:, :3].astype(float)
         self._weight = np.add.reduceat(model.body_mass * core, first) * -GRAVITY[2] if len(first) else np.zeros(0)
         self.phase = np.zeros(len(first), np.float32)
@@ -52,10 +53,10 @@ class WindOnPlants:
         self._steps = 0
 
     def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
-        """Before a step: apply ``wind`` (None: calm air) at world ``time`` [s].
+        """Apply ``wind`` (None: calm air) at world ``time`` [s] before a step.
 
         Without ``observers`` wind is simulated on all awake trees. A wind given in the first step has full strength at
-        once; a later one grows, and one that ends fades out.
+        once. A wind that begins or ends later fades in or out.
         """
         self._follow(wind)
         self._time = time
@@ -90,7 +91,8 @@ class WindOnPlants:
         return WindState(self._wind, self._time, self._strength, self.plants.tree_air.copy(), drawn)
 
     def _follow(self, wind: Wind | None) -> None:
-        """Change the strength of the present wind; it ends before another wind begins."""
+        """Change the strength of the present wind by one step towards ``wind``. The present wind ends before another
+        wind begins."""
         step = self.parameters.dt / FADE_DURATION
         if wind is self._wind:
             self._strength = min(self._strength + step, 1.0)
@@ -106,13 +108,13 @@ class WindOnPlants:
                 self._strength = 1.0 if self._steps == 0 else step
 
     def _air(self, trees: np.ndarray) -> np.ndarray:
-        """Velocity [k, 3] m/s of the wind at ``trees`` [k]."""
+        """Returns the velocity [k, 3] m/s of the wind at ``trees`` [k]."""
         assert self._wind is not None
         velocity = self._wind.velocity_at(self._foot[trees], self._time)
         return self._strength * self._share[trees, None] * velocity
 
     def _calm(self, trees: np.ndarray) -> None:
-        """While a wind fades out, wake trees [tree] bool that keep an air velocity, and reduce it."""
+        """While a wind fades out, reduce the air velocity of ``trees`` [tree] bool, and wake these trees."""
         felt = np.flatnonzero(trees & (self.plants.tree_air != 0.0).any(1))
         if len(felt):
             self.plants.wake(felt)
@@ -120,7 +122,7 @@ class WindOnPlants:
             self.plants.tree_air[felt] *= self._strength / ago
 
     def _wake_stirred(self, observers: Observers | None) -> None:
-        """Wake sleeping trees on which the drag has changed; each step checks an equal number of them."""
+        """Wake sleeping trees whose drag has changed. Each step checks a fixed share of the sleeping trees."""
         plants = self.plants
         parameters = self.parameters
         rounds = parameters.steps(parameters.wind_check_period)
@@ -136,12 +138,12 @@ class WindOnPlants:
         plants.wake(some[force > parameters.wind_wake_load * self._weight[some]])
 
     def _near(self, trees: np.ndarray, observers: Observers | None) -> np.ndarray:
-        """The subset of ``trees`` whose foot is near an observer."""
+        """Returns the subset of ``trees`` whose foot is near an observer."""
         if observers is None:
             return trees
         points = np.atleast_2d(np.asarray(observers[0], float))
         distance = observers[1]
         near = np.zeros(len(trees), bool)
-        for point in points:  # a handful of robots and people
+        for point in points:  # there are few robots and people
             near |= ((self._foot[trees] - point) ** 2).sum(-1) < distance * distance
         return trees[near]

@@ -6,7 +6,7 @@ of the squared speed to its value upwind of the first row, and a the drag area p
 
     dq/dx = -a q + (1 - q) / L
 
-along the wind. It is solved cell by cell on a grid aligned with the wind, once for each model and wind.
+along the wind. This equation is solved cell by cell on a grid aligned with the wind, once for each model and wind.
 """
 
 from __future__ import annotations
@@ -30,11 +30,12 @@ are 10 to 20 heights long."""
 CELL = 0.5
 """[m] Edge of the cells of the grid."""
 MIN_DEPTH = 0.3
-"""[m] Smallest depth of a canopy that is assumed."""
+"""[m] Lower bound of the depth of a canopy; thinner canopies are treated as this deep."""
 
 
 def height_profile(height: np.ndarray, top: float) -> np.ndarray:
-    """Ratio [...] of the mean wind at ``height`` [...] m above ground to the wind at the ``top`` [m] of the canopy."""
+    """Returns the ratio [...] of the mean wind at ``height`` [...] m above ground to the wind at the ``top`` [m] of the
+    canopy."""
     z = np.maximum(np.asarray(height, float) / top, 0.0)
     above = np.log((np.maximum(z, 1.0) - DISPLACEMENT) / ROUGHNESS) / np.log((1.0 - DISPLACEMENT) / ROUGHNESS)
     return np.where(z < 1.0, np.exp(-ATTENUATION * (1.0 - z)), above)
@@ -49,13 +50,14 @@ class TreeDrag:
     centre: np.ndarray
     """[tree, 3] m, centre of the drag area; for a tree without drag, its foot."""
     profile: np.ndarray
-    """[tree] Ratio of the uniform wind with the drag of the height profile to the wind at the top of the canopy."""
+    """[tree] Wind speed that would cause the same drag if it were uniform over the tree's height, as a share of the
+    wind speed at the top of the canopy."""
     depth: float
     """Depth of the canopy [m]: between the 5 % and 95 % quantiles of the drag area over height."""
 
     @classmethod
     def of(cls, model: Model, body_q: np.ndarray) -> TreeDrag:
-        """The drag areas of ``model`` with its bodies at the rest poses ``body_q`` [body, 7]."""
+        """Returns the drag areas of ``model`` with its bodies at the rest poses ``body_q`` [body, 7]."""
         first = model.tree_first
         area = model.body_drag.astype(float)
         point = body_q[:, :3] + frames.rotate(body_q[:, 3:].astype(float), model.body_com.astype(float))
@@ -73,14 +75,15 @@ class TreeDrag:
         return cls(total, centre, profile, max(top - low, MIN_DEPTH))
 
     def air_share(self, mean: np.ndarray) -> np.ndarray:
-        """Ratio [tree] of the air speed at each tree to the undisturbed speed at the top of the canopy.
+        """Returns the ratio [tree] of the air speed at each tree to the undisturbed speed at the top of the canopy.
 
         ``mean`` [3] m/s is the mean wind.
         """
         return self.profile * np.sqrt(self._sheltered_pressure(np.asarray(mean, float)[:2]))
 
     def _sheltered_pressure(self, wind: np.ndarray) -> np.ndarray:
-        """Ratio q [tree] of the squared wind speed behind the leaves upwind to the undisturbed squared speed."""
+        """Returns the ratio q [tree] of the squared wind speed at each tree, behind the leaves upwind, to the
+        undisturbed squared speed."""
         speed = float(np.hypot(*wind))
         if speed == 0.0 or not len(self.area):
             return np.ones(len(self.area))

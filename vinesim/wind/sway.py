@@ -29,13 +29,14 @@ from vinesim.wind.shelter import TreeDrag
 from vinesim.wires.elastic_supports import ElasticSupports
 
 MAX_TREES = 120
-"""Largest number of trees posed for one frame if there is no time for all. TUNED: it takes up to 0.5 ms."""
+"""Largest number of trees that get a new pose for one frame if an ``eye`` is given. TUNED: these take up to 0.5 ms."""
 _LOAD_STEPS = 4
 _NEWTON_STEPS = 80
 _CONVERGED = 1e-4
 """[m] Distance from equilibrium below which a tree has converged; trees that do not converge do not sway."""
 _ENOUGH = 0.99
-"""[1] Share of the trees that must be well converged; rounding errors delay a few trees far from the origin."""
+"""[1] Share of the trees that must have converged before the iteration ends. Rounding errors delay a few trees far from
+the origin."""
 _MIN_DISTANCE = 1.0
 """[m] Trees nearer than this are treated as if they were at this distance."""
 
@@ -43,7 +44,7 @@ _MIN_DISTANCE = 1.0
 class Sway:
     """Moves the trees in snapshots according to the wind.
 
-    It keeps the poses that it computed last, so the snapshots of a world must come in order of time.
+    A ``Sway`` stores the poses that it computed last, so the snapshots must be passed in order of time.
     """
 
     def __init__(self, model: Model) -> None:
@@ -58,11 +59,11 @@ class Sway:
         self._body_q = np.zeros((0, 7), np.float32)
 
     def apply(self, snapshot: Snapshot, moved: np.ndarray | None = None, eye: np.ndarray | None = None) -> Snapshot:
-        """The snapshot with all trees where they are to be drawn; ``snapshot`` itself if the air is calm.
+        """Returns the snapshot with the poses in which trees are drawn; ``snapshot`` itself if the air is calm.
 
-        ``moved`` lists the trees whose simulated pose may have changed since the last call; by default those of the
-        snapshot. With an ``eye`` [3] m at most :data:`MAX_TREES` trees get new poses, first the trees whose picture
-        from the eye is most out of date. The poses are valid until the next call.
+        ``moved``: trees [k] whose simulated pose may have changed since the last call; default
+        ``snapshot.moved_trees``. With a viewpoint ``eye`` [3] m at most :data:`MAX_TREES` trees get new poses, first
+        the trees whose picture from the eye is most out of date. The next call overwrites the poses.
         """
         state = snapshot.wind
         if state is None and self._wind is None:
@@ -80,7 +81,7 @@ class Sway:
         if not self._is_drawn.any() or self._body_q.shape != snapshot.body_q.shape:
             self._body_q = np.array(snapshot.body_q, np.float32)
         drawn = (state.tree_drawn > 0.0) & self._table.sways
-        changed |= self._is_drawn & ~drawn  # these return to their simulated poses
+        changed |= self._is_drawn & ~drawn  # trees that return to their simulated poses
         is_limited = eye is not None and len(drawn) > MAX_TREES
         changed[self._most_urgent(drawn, state.time, np.asarray(eye, np.float32)) if is_limited else drawn] = True
         trees = np.flatnonzero(changed)
@@ -90,7 +91,8 @@ class Sway:
         return dataclasses.replace(snapshot, body_q=self._body_q, moved_trees=trees)
 
     def _most_urgent(self, drawn: np.ndarray, time: float, eye: np.ndarray) -> np.ndarray:
-        """The :data:`MAX_TREES` trees among ``drawn`` [tree] bool whose picture from ``eye`` is most out of date.
+        """Returns the :data:`MAX_TREES` trees among ``drawn`` [tree] bool whose picture from ``eye`` is most out of
+        date.
 
         The measure is an angle: reach of the tree times age of its pose, divided by distance.
         """
@@ -106,7 +108,8 @@ class Sway:
 
 
 def windblown(model: Model, snapshot: Snapshot, wind: Wind | None, time: float) -> Snapshot:
-    """A snapshot of plants at rest, moved by the wind as at ``time`` [s]; for pictures without physics."""
+    """Returns a snapshot of plants at rest with the poses that the wind causes at ``time`` [s]. For pictures without
+    physics."""
     if wind is None:
         return snapshot
     trees = len(model.tree_first)
@@ -116,7 +119,7 @@ def windblown(model: Model, snapshot: Snapshot, wind: Wind | None, time: float) 
 
 @dataclasses.dataclass(slots=True)
 class _Table:
-    """Response of a model's trees to a wind; see the kernel for the arrays."""
+    """Response of a model's trees to a wind. :mod:`vinesim.kernels.plants.sway` describes the arrays."""
 
     wind: Wind
     tree_reach: np.ndarray
@@ -224,7 +227,7 @@ class _Response:
         """[body, 4] orientation of each joint's axes in the world at rest."""
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """The arrays of the table, see the kernel."""
+        """Returns the arrays of the table, by name; :mod:`vinesim.kernels.plants.sway` describes them."""
         model = self.model
         trees = np.arange(len(self.model.tree_first), dtype=np.int32)
         at_rest = self.state.body_q.copy()
@@ -269,9 +272,9 @@ class _Response:
     def _move_to_equilibrium(self, trees: np.ndarray) -> np.ndarray:
         """Move trees to their equilibrium in the steady wind. Returns whether each tree has converged [tree] bool.
 
-        The iteration alternates Newton's method for trees on fixed supports with moving the supports to where the trees
-        hold them. It approaches equilibrium from one side. With the softer springs of moving supports, Newton's method
-        would overshoot.
+        The iteration alternates two steps: Newton's method for the trees with fixed supports, and moving the supports
+        into equilibrium with the forces of the trees. It approaches equilibrium from one side. Newton's method with the
+        softer springs of moving supports would overshoot.
         """
         good = np.ones(len(trees), bool)
         for step in range(_LOAD_STEPS + _NEWTON_STEPS):
@@ -288,7 +291,8 @@ class _Response:
         return good & (distance < _CONVERGED)
 
     def _residual_turn(self, trees: np.ndarray, velocity: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-        """Remaining rotation [body, 3] rad of each joint, in its own axes, under the drag of a wind ``velocity``."""
+        """Returns the remaining rotation [body, 3] rad of each joint, in its own axes, under the drag of a wind
+        ``velocity``."""
         pressure = self._pressure(velocity)
         self._load(pressure if extra is None else pressure + extra)
         self._finder.residual_motion(trees)
@@ -297,9 +301,10 @@ class _Response:
         return 0.25 * REST_STEP * np.where(self._core[:, None], self.plants.joint_qd_free, 0.0).astype(float)
 
     def _oscillator(self, axis: int, turn: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angular frequency [tree] rad/s and damping ratio [tree] of the oscillator for wind along a world ``axis``.
+        """Returns the angular frequency [tree] rad/s and damping ratio [tree] of the oscillator for wind along a world
+        ``axis``.
 
-        ``turn`` [body, 3] rad are the rotations of the joints by that wind, which give the shape.
+        ``turn`` [body, 3] rad: rotations of the joints by that wind, which define the oscillator's shape.
         """
         model = self.model
         first = self.model.tree_first
@@ -330,7 +335,7 @@ class _Response:
         return rate, np.where(ok, damping / (2.0 * rate * np.where(ok, modal_mass, 1.0)), 1.0)
 
     def _filtered_gusts(self, rate: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-        """Responses to the gusts: factors [tree, 2 waves, 3] m/s of the cosines and sines of the waves.
+        """Returns the responses to the gusts: factors [tree, 2 waves, 3] m/s of the cosines and sines of the waves.
 
         The oscillators have angular frequencies ``rate`` [tree, 3] rad/s and damping ratios ``ratio`` [tree, 3].
         """

@@ -1,6 +1,5 @@
-"""Trellis wires and the arms of cordons: they give under their shoots and under what presses on them.
+"""Elastic supports: trellis wires and the arms of cordons, which deflect under the forces of shoots and of contacts.
 
-``elastic_supports`` couples the shoots that hang on one wire or stand on one arm; ``deflected_wires`` holds the springs
-at which contacts with wires end; ``wire_segments`` cuts wires into segments and says where these are in pictures and
-scans.
+``elastic_supports`` couples the shoots that hang on one wire or stand on one arm; ``deflected_wires`` represents wires
+in contacts as springs; ``wire_segments`` cuts wires into segments and computes their poses for pictures and scans.
 """

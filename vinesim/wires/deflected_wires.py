@@ -1,15 +1,17 @@
-"""Wires that give under contacts: the springs behind the contacts, and the positions of the wires' geoms.
+"""Wires that deflect under contacts: the spring behind each contact, and the positions of the wires' geoms.
 
-A wire has no mass here (see :mod:`vinesim.wires.elastic_supports`). So a contact with a wire is a contact with a spring
-that has the wire's stiffness across the wire. Both solvers treat this spring implicitly, as they do any contact. The
-wire's geom follows the contacts, so that normals and closest points are those of the deflected wire. The deflection of
-the spring is measured from where the wire would be without that contact's force.
+A wire is modelled without mass (see :mod:`vinesim.wires.elastic_supports`). So a contact with a wire is a contact with
+a spring that has the wire's stiffness across the wire. The contact solver and MuJoCo both treat this spring implicitly,
+as they do any contact. The wire's geom follows the deflection, so that normals and closest points belong to the
+deflected wire. The deflection of a contact's spring is measured from the position that the wire would have without that
+contact's force.
 
-Several contacts share a wire. The spring of each is softer than the wire alone by a factor: the sum of the deflections
-there by all contacts, over the deflection by the contact itself (as of a string without ties). The actual effect of the
-other contacts follows from the forces of the last step. With springs as soft as that, these forces converge: the row
-sums of a matrix of compliances, weighted by any positive numbers, bound its eigenvalues. The weights are means of
-forces over some time, since weights that follow the forces themselves would feed oscillations.
+Several contacts share a wire. The spring of each contact is softer than the wire alone by a factor: the deflection at
+the contact by all contacts, divided by the deflection by this contact alone, both computed for a string without ties.
+The actual deflection by the other contacts is computed from the forces of the last step. With springs that are this
+much softer, the forces converge over the steps, because the weighted row sums of a compliance matrix, for any positive
+weights, bound its eigenvalues. The weights are mean forces over the time :data:`MEMORY`; present forces as weights
+would excite oscillations.
 """
 
 from __future__ import annotations
@@ -27,46 +29,49 @@ from vinesim.scene.model import Model
 from vinesim.wires.elastic_supports import LEAST_SHARE, WIRE_DAMPING_TIME, ElasticSupports
 
 MAX_DEFLECTION = 0.25
-"""[m] The geom of a wire follows no further than this; a contact still feels the wire's spring. TUNED: far beyond the
+"""[m] Largest displacement of a wire's geom. Beyond it the wire's spring still acts on a contact. TUNED: far beyond the
 range in which the law of a taut string holds."""
 LEAST_DEFLECTION = 1e-6
-"""[m] A wire that is nearer than this to its drawn position is put there."""
+"""[m] Deflection below which a wire is set to its undeflected position."""
 LEAST_SPREAD = 0.1
-"""[1] Share of a wire's length. Contacts that are further apart than this tilt the wire; others move it as a whole.
-TUNED."""
+"""[1] Distance between contacts, as a share of the wire's length, above which their deflections also tilt the wire's
+geom. Below it they only translate the geom. TUNED."""
 FOLLOWED = 0.7
-"""[1] Share of the deflection by other contacts' forces that a contact with the same wire takes over within a step. For
-the rest it takes the mean deflection over :data:`MEMORY`. DERIVED: the largest share for which a mass on two such
-springs is stable, whatever its mass, with a wire's damping."""
+"""[1] Weight of the present deflection by the forces of other contacts on the same wire. The mean of this deflection
+over :data:`MEMORY` has the remaining weight. DERIVED: the largest share for which a mass on two such springs is stable,
+whatever its mass, with a wire's damping."""
 EXTRAPOLATED = 0.5
-"""[steps] Time by which the deflection that :data:`FOLLOWED` refers to is extrapolated. DERIVED with it."""
+"""[steps] Time by which the present deflection in :data:`FOLLOWED` is extrapolated. DERIVED together with
+:data:`FOLLOWED`."""
 MEMORY = 0.5
 """[s] Time constant of the mean forces by which several contacts share a wire. TUNED."""
 LEAST_WEIGHT = 0.05
-"""[1] Smallest force that a contact counts with in this sharing, as a share of the largest force. TUNED."""
+"""[1] Smallest weight of a contact when several contacts share a wire, relative to the largest weight. TUNED."""
 TOUCHING = 1e-3
-"""[m] A contact with a larger gap to the geom of a wire does not touch it, however far others deflect it. TUNED."""
+"""[m] Gap to the geom of a wire above which a contact does not touch the wire, whatever deflection other contacts
+cause. TUNED."""
 MAX_NORMAL_ALONG_WIRE = 0.5
-"""[1] Largest cosine between the normal of a contact and the wire. A contact with a larger one is not on the wire's
-side, and is ignored."""
+"""[1] Largest cosine between the normal of a contact and the wire. A contact with a larger cosine, as when the wire's
+axis is inside the other shape, is ignored."""
 OUT_OF_REACH = 1e3
-"""[m] Shift of the wire that is assumed for an ignored contact, so that it pushes nothing."""
+"""[m] Shift of the wire that is assumed for an ignored contact, so that the contact exerts no force."""
 SAME_PLACE = 0.05
-"""[m] Contacts of the same pair of shapes that are further apart in two steps are different ones. TUNED: less than any
-box is long, more than anything slides in a step."""
+"""[m] Distance up to which contacts of the same pair of shapes in two successive steps are the same contact. TUNED:
+shorter than any box, longer than any sliding distance in a step."""
 ROOM = 32
 MOST_PRESSES = 512
-"""Most pressing contacts of both solvers that count. ``ROOM``: number of contacts with wires in one solve for which
-there is room at first."""
+"""Largest number of pressing contacts that are stored for wires, of plants and rigid bodies together. ``ROOM``: initial
+capacity for contacts with wires in one solve."""
 NO_TREE = int(np.iinfo(np.int32).min)
-"""Tree number of presses that do not outlive a step: their shape is gone, or was put somewhere else."""
+"""Tree number of presses that end with the step, because their shape was removed or moved elsewhere."""
 
 
 class DeflectedWires:
     """The wires of one model, and the contacts that press on them."""
 
     def __init__(self, model: Model, supports: ElasticSupports, tree_awake: np.ndarray, dt: float) -> None:
-        """``tree_awake``: [tree] a tree that sleeps goes on pressing as it did."""
+        """``tree_awake``: [tree] whether each tree is awake. A sleeping tree keeps pressing on wires with its last
+        force."""
         self._supports = supports
         self.is_compliant = model.fixed_tension > 0.0
         """[piece] Whether the piece is a wire under tension."""
@@ -75,7 +80,8 @@ class DeflectedWires:
         way = self.end - self.start
         count = len(self.start)
         self.offset = np.zeros((count, 2, 3))
-        """[piece, 2, 3] m Displacement of the start and the end of the piece's geom from where they were drawn."""
+        """[piece, 2, 3] m Displacement of the start and the end of each piece's geom from their undeflected
+        positions."""
         axis = way / np.maximum(np.linalg.norm(way, axis=1), 1e-9)[:, None]
         self._geoms = SharedArrays.zeros(
             kernels.WireGeoms, count, start=self.start, axis=axis, offset=self.offset, count=np.zeros(2, np.int32)
@@ -100,7 +106,8 @@ class DeflectedWires:
         return self._geoms.deflected[: self._geoms.count[0]]
 
     def bind(self, contacts: SharedArrays) -> tuple[KernelGraph, KernelGraph]:
-        """Two kernel graphs: the first finds the springs of ``contacts``, the second adds the contacts that press."""
+        """Returns two kernel graphs: the first finds the springs of ``contacts``, the second stores the contacts that
+        press on a wire."""
         wires, nodes, bodies, springs = self._supports.wire_structs
         find = KernelLaunch(
             kernels.find_wire_springs,
@@ -112,9 +119,11 @@ class DeflectedWires:
         return KernelGraph(find), KernelGraph(add)
 
     def end_step(self, rigid_asleep: np.ndarray) -> None:
-        """Move the geoms of wires with the contacts, release wires that nothing presses on, and load the supports.
+        """Move the geoms of wires with the contacts, return wires without contacts to their undeflected positions, and
+        set the contact forces on the elastic supports.
 
-        ``rigid_asleep``: [kinematic tree] not negative while the kinematic tree sleeps.
+        ``rigid_asleep``: [kinematic tree] MuJoCo's ``tree_asleep``, which is negative while the kinematic tree is
+        awake.
         """
         if not (self._found.count[0] or self.presses.count[0] or self._geoms.count[0]):
             return
@@ -123,13 +132,14 @@ class DeflectedWires:
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
     def let_go(self, trees: np.ndarray) -> None:
-        """Remove the presses of sleeping trees [k] that were put somewhere else: they press on nothing until they
-        wake."""
+        """Remove the presses of sleeping trees [k] that were moved to another pose. These trees press on no wire until
+        they wake."""
         self.presses.tree[np.isin(self.presses.tree, trees)] = NO_TREE
 
     def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
-        """Take over a rigid world that was compiled again, with ``trees`` kinematic trees. ``numbers`` maps the old key
-        of a pair of shapes to the new key and the new tree, which is :data:`NO_TREE` if the shape is gone."""
+        """Update the keys and trees of presses after the rigid world was recompiled. ``numbers`` maps the old key of a
+        pair of shapes to the new key and the new tree, which is :data:`NO_TREE` if the shape was removed. ``trees``:
+        new number of kinematic trees."""
         presses = self.presses
         for k in np.flatnonzero(presses.tree[: presses.count[0]] < 0).tolist():
             presses.key[k], presses.tree[k] = numbers(int(presses.key[k]))
@@ -144,7 +154,7 @@ class DeflectedWires:
 
 
 class WireContacts:
-    """The contacts of one solver with wires, in its last solve."""
+    """The contacts with wires in the last solve of one solver (plants or rigid bodies)."""
 
     def __init__(self, wires: DeflectedWires) -> None:
         self._wires = wires
@@ -159,13 +169,14 @@ class WireContacts:
 
     @property
     def stiffness(self) -> np.ndarray:
-        """[contact] N/m Stiffness of each contact's spring; if several contacts press on one wire, the share of
-        each."""
+        """[contact] N/m Stiffness of each contact's spring. If several contacts press on one wire, each has a share of
+        the wire's stiffness."""
         return self._arrays.stiffness[: len(self)]
 
     @property
     def shift(self) -> np.ndarray:
-        """[contact] m Gap to where the wire would be without the contact's force, less the gap to the wire's geom."""
+        """[contact] m Gap between the other shape and the position of the wire without this contact's force, minus the
+        gap to the wire's geom."""
         return self._arrays.shift[: len(self)]
 
     @property
@@ -183,7 +194,7 @@ class WireContacts:
         key: np.ndarray,
         tree: np.ndarray,
     ) -> None:
-        """Find the springs of contacts with wires; poses of awake trees must be up to date.
+        """Find the springs of contacts with wires. Poses of awake trees must be up to date.
 
         Args:
             piece: [k] index of the fixed piece; all must be wires under tension.
@@ -213,7 +224,7 @@ class WireContacts:
 
         Args:
             force: [contact] N, normal force; 0 for contacts that are near but do not press.
-            velocity: [contact] m/s along the normal, of the shape that presses, at the end of the step.
+            velocity: [contact] m/s, velocity of the pressing shape along the normal at the end of the step.
         """
         self._arrays.force[: len(self)], self._arrays.velocity[: len(self)] = force, velocity
         self._add()

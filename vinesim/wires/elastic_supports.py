@@ -1,5 +1,5 @@
-"""Elastic supports: the wires that shoots are tied to, and the arms that shoots stand on, give. So shoots move each
-other.
+"""Elastic supports: wires that shoots are tied to, and arms that shoots stand on. They deform, so shoots on one support
+move each other.
 
 See :mod:`vinesim.kernels.wires.elastic_supports`. Only supports of trees that are awake are computed. The
 anchors in the tie table follow the wires, and the rest poses of root springs turn with the arms. So the code of trees,
@@ -20,16 +20,16 @@ from vinesim.plants.equilibrium import EquilibriumFinder
 from vinesim.scene.physics_parameters import PhysicsParameters
 
 WAKE_SHARE = 0.25
-"""[1] A sleeping tree wakes when a wire has moved one of its ties by this share of ``sleep_distance``, or its arm
-would move a point of it by as much. TUNED: twenty shoots that sleep on a wire hold it with 2 N until then."""
+"""[1] Displacement by a wire or arm at which a sleeping tree wakes, as a share of ``sleep_distance``. For a wire it is
+the displacement of a tie, for an arm the displacement of the point of the tree that moves most. TUNED: twenty shoots
+that sleep on a wire hold it with 2 N until then."""
 
 LEAST_SHARE = 5e-4
-"""[1] Share of a support's compliance. Nodes are assumed to be at least this far from each other and from the support's
-ends."""
+"""[1] Smallest compliance between adjacent nodes, and between a node and an end of its support, as a share of the
+support's compliance. Smaller values are replaced by this one."""
 
 WIRE_DAMPING_TIME = 0.01
-"""[s] Damping of a wire over its stiffness, where something presses on it. GUESSED: as ``tie_damping`` of the
-plants."""
+"""[s] Ratio of damping to stiffness of a wire at a contact. GUESSED: as ``tie_damping`` of the plants."""
 
 _NO_TREES = _NO_SUPPORTS = np.zeros(0, np.int32)
 
@@ -54,27 +54,27 @@ class ElasticSupports:
         trees = len(model.tree_first)
         self._tree_start = np.searchsorted(self._tree[by_tree], np.arange(trees + 1)).astype(np.int32)
         self.deflection = np.zeros((len(self._tree), 3))
-        """[node, 3] Displacement of nodes of wires [m] from where they are when nothing has moved; twist of nodes of
-        arms, [rad, 0, 0]. Wires come first; the nodes of each support go from its start to its end."""
+        """[node, 3] For nodes of wires the displacement [m] from their rest position; for nodes of arms the twist,
+        [rad, 0, 0]. Wires come first. The nodes of each support are in order from its start to its end."""
         self.count = len(first)
         """Number of supports."""
         piece = nodes["support"][first]
         self._piece = np.where(piece < len(model.fixed_start), piece, -1)
-        """[support] Index of the piece of wire that the support is; -1 for an arm."""
+        """[support] Index of the piece of wire; -1 for an arm."""
         self._was_active = np.zeros(len(first), np.bool_)
         self._active = np.zeros(len(first), np.int32)
         self._is_moved = np.zeros(trees, np.bool_)
         self._active_count = np.zeros(1, np.int32)
         self._moved_count = np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)
-        """[tree] Whether another tree that is awake is on one of its supports."""
+        """[tree] Whether the tree shares a support with another awake tree."""
         self._is_placed = np.zeros(trees, np.bool_)
         self._awake = _NO_TREES
         self._placed = _NO_TREES
         self._is_listed = False
         self._loaded = self._unloaded = _NO_SUPPORTS
         self.load = np.zeros((len(self._tree), 3))
-        """[node, 3] N Forces on nodes of wires, without those of ties."""
+        """[node, 3] N Forces on nodes of wires, without the forces of ties."""
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
         self._bind(
@@ -92,7 +92,7 @@ class ElasticSupports:
         )
 
     def _wires(self, nodes: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """Arrays of the pieces of wire for :func:`kernels.wire_spring`; ``nodes`` are the nodes of wires."""
+        """Returns the arrays of the pieces of wire for :func:`kernels.wire_spring`. ``nodes``: nodes of the wires."""
         model = self._plants.model
         tension = model.fixed_tension.astype(float)
         way = (model.fixed_end - model.fixed_start).astype(float)
@@ -163,7 +163,7 @@ class ElasticSupports:
         """Arguments of :func:`kernels.wire_spring`, except the loads."""
 
     def set_loaded(self, supports: np.ndarray) -> None:
-        """Set the supports [k] that :attr:`load` acts on from now on."""
+        """Set the supports [k] on which :attr:`load` acts until the next call."""
         if not np.array_equal(supports, self._loaded):
             self._unloaded = self._loaded
             self._loaded = supports.copy()
@@ -175,20 +175,20 @@ class ElasticSupports:
         return self._active[: self._active_count[0]]
 
     def moved_pieces(self) -> np.ndarray:
-        """Pieces of wire [k] that may have moved: those computed since the last call, and those that will be computed
-        next."""
+        """Returns the pieces of wire [k] that may have moved: those computed since the last call, and those that the
+        next :meth:`update` computes."""
         pieces = self._piece[self._was_active]
         self._was_active[:] = False
         self._was_active[self.active] = True
         return pieces[pieces >= 0]
 
     def place(self, trees: np.ndarray) -> None:
-        """Tell the next :meth:`update` that sleeping trees [k] were put somewhere else."""
+        """Mark sleeping trees [k] as moved to another pose, so that the next :meth:`update` computes their supports."""
         self._placed = np.union1d(self._placed, trees).astype(np.int32)
 
     def update(self) -> None:
-        """Move the supports to where the trees hold them, and wake the trees that are moved by it. Poses and velocities
-        of awake trees must be up to date."""
+        """Move the supports into equilibrium with the forces of their trees, and wake the trees that this moves. Poses
+        and velocities of awake trees must be up to date."""
         plants = self._plants
         awake = self._plants.awake
         if awake is not self._awake:
@@ -213,8 +213,8 @@ class ElasticSupports:
             plants.wake(moved)
 
     def _list_supports(self) -> None:
-        """List the supports of the trees that are awake or were put somewhere else; find the awake trees that share a
-        support."""
+        """List the supports of the trees that are awake or marked by :meth:`place`, and find the awake trees that share
+        a support."""
         trees = np.concatenate([self._awake, self._placed])
         count = self._tree_start[trees + 1] - self._tree_start[trees]
         support = self._tree_supports[spans(self._tree_start[trees], count)]
@@ -230,7 +230,8 @@ class ElasticSupports:
 
 
 def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Nodes of wires: the ties that are bound to wires under tension, wire by wire, and along each wire."""
+    """Returns the nodes of wires: the ties that are bound to wires under tension, sorted by wire and along each
+    wire."""
     model = plants.model
     tied = plants.ties.on_wire
     piece = model.tie_wire[tied]
@@ -257,7 +258,7 @@ def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
 
 
 def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Nodes of arms: the roots of trees that stand on elastic arms, arm by arm, and along each arm."""
+    """Returns the nodes of arms: the roots of trees that stand on elastic arms, sorted by arm and along each arm."""
     model = plants.model
     pieces = np.flatnonzero(model.arm_gives())
     tree = np.flatnonzero(model.is_on_arm())
@@ -273,7 +274,7 @@ def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     arm = model.fixed_index[pieces]
     _, first, number = np.unique(arm, return_index=True, return_inverse=True)
     before = np.cumsum(twist) - twist
-    before -= before[first][number]  # the pieces of an arm are neighbours
+    before -= before[first][number]  # the pieces of an arm are adjacent
     along = np.clip(((model.tree_pose[tree, :3] - start[here]) * axis).sum(1), 0.0, length[here])
     wide = thick[here] + (thin - thick)[here] * along / length[here]
     compliance = before[here] + _twist(along, thick[here], wide, modulus[here])
@@ -298,14 +299,15 @@ def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
 
 
 def _twist(length: np.ndarray, thick: np.ndarray, thin: np.ndarray, shear_modulus: np.ndarray) -> np.ndarray:
-    """Twist [...] rad/(N m) of round cones: the integral of 2 / (pi G r^4) along them."""
+    """Returns the torsional compliance [...] rad/(N m) of round cones: the integral of 2 / (pi G r^4) along their
+    axes."""
     squares = thick * thick + thick * thin + thin * thin
     return 2.0 * length * squares / (3.0 * np.pi * shear_modulus * (thick * thin) ** 3)
 
 
 def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """[k] m/rad Displacement of the point of each tree that moves most, per rotation of its rest pose by an arm about
-    the axis [k, 3]. Wires are held fixed."""
+    """Returns for each tree the displacement [k] m/rad of the point that moves most, per rotation of the tree's rest
+    pose by an arm about ``axis`` [k, 3]. Wires are held fixed."""
     if len(tree) == 0:
         return np.zeros(0)
     plants.root_rests.turn[tree] = axis
@@ -317,9 +319,10 @@ def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray
 def _springs_in_series(
     compliance: np.ndarray, whole: np.ndarray, is_free: np.ndarray, first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Stiffness [node] of the part before each node of a support, and [support] of the part behind its last node, which
-    is 0 where the end ``is_free`` [node]. ``compliance`` [node]: from the start to the node; ``whole`` [node]: of the
-    node's whole support; ``first`` [support]: first node of each support."""
+    """Returns the stiffness [node] of the part of a support before each node, and the stiffness [support] of the part
+    after its last node, which is 0 for a free end. ``compliance`` [node]: compliance from the support's start to the
+    node. ``whole`` [node]: compliance of the node's whole support. ``is_free`` [node]: whether the end of the node's
+    support is free. ``first`` [support]: first node of each support."""
     before = np.append(0.0, compliance[:-1])[: len(compliance)]
     before[first] = 0.0
     last = np.append(first[1:], len(compliance))[: len(first)] - 1

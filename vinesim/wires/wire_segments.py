@@ -1,4 +1,5 @@
-"""Wires under tension, cut into short straight segments: the parts of wires that move in pictures, scans and pages."""
+"""Wires under tension, cut into short straight segments: the moving parts of wires in pictures, scans and the web
+page."""
 
 from __future__ import annotations
 
@@ -18,8 +19,8 @@ from vinesim.wires.deflected_wires import DeflectedWires
 from vinesim.wires.elastic_supports import ElasticSupports
 
 MAX_LENGTH = 0.25
-"""Longest segment [m]: a force F on a wire of tension T is drawn with an error of F / T times a quarter of it at most,
-1.4 mm for 20 N."""
+"""Largest length of a segment [m]. With a force F on a wire of tension T the drawn position errs by at most F / T times
+a quarter of this length: 1.4 mm for 20 N."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,20 +28,20 @@ class WireSegments:
     """Segments of the wires of a model, along each wire from its start to its end."""
 
     piece: np.ndarray
-    """[segment] int32, the piece of the segment: an index of ``Model.fixed_start``."""
+    """[segment] int32, fixed piece that the segment is a part of: an index of ``Model.fixed_start``."""
     start: np.ndarray
-    """[segment] 1, place on the piece where the segment begins, from 0 to 1."""
+    """[segment] Start of the segment as a share of the piece's length, from 0 to 1."""
     end: np.ndarray
-    """[segment] 1, place on the piece where the segment ends."""
+    """[segment] End of the segment as a share of the piece's length, from 0 to 1."""
     rest_q: np.ndarray
-    """[segment, 7] m, 1: pose of the segment's middle as drawn, axes of the world."""
+    """[segment, 7] m, xyzw: world pose of the segment's middle on the undeflected wire."""
 
     def __len__(self) -> int:
         return len(self.piece)
 
     def poses(self, which: np.ndarray, away: SegmentPoses) -> np.ndarray:
-        """Poses [k, 7] float32 m, 1 of some segments [k], in ascending order. All are as drawn, except those in
-        ``away``."""
+        """Returns the world poses [k, 7] float32 of the segments ``which`` [k], in ascending order. Segments that are
+        not in ``away`` have their rest pose."""
         q = self.rest_q[which].astype(np.float32)
         _, here, there = np.intersect1d(which, away.segment, assume_unique=True, return_indices=True)
         q[here] = away.q[there]
@@ -48,7 +49,7 @@ class WireSegments:
 
 
 def wire_segments(model: Model) -> WireSegments:
-    """The segments of all pieces of wire under tension; the others never move."""
+    """Returns the segments of all pieces of wire under tension. Other pieces never move."""
     gives = np.flatnonzero(model.fixed_tension > 0.0)
     way = (model.fixed_end - model.fixed_start)[gives].astype(float)
     whole, start, end = cut(np.linalg.norm(way, axis=1), MAX_LENGTH)
@@ -59,8 +60,8 @@ def wire_segments(model: Model) -> WireSegments:
 
 
 def cut(length: np.ndarray, longest: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Cut lines of ``length`` [k] m into equal parts of at most ``longest`` [m]. Returns the line of each part [part],
-    and where on the line the part begins and ends [part], from 0 to 1."""
+    """Cut lines of ``length`` [k] m into equal parts of at most ``longest`` [m]. Returns three arrays [part]: index of
+    the line, and start and end of the part as shares of the line's length."""
     parts = np.maximum(np.ceil(length / longest), 1.0).astype(int)
     whole = np.repeat(np.arange(len(parts)), parts)
     number = np.arange(len(whole)) - np.repeat(np.cumsum(parts) - parts, parts)
@@ -112,7 +113,7 @@ class WireShapes:
         self._pose = KernelGraph(pose)
 
     def poses(self) -> SegmentPoses:
-        """The segments that are away from where they were drawn, with their poses."""
+        """Returns the segments of deflected wires, with their poses."""
         marked = self._may_have_moved
         presses = self._wires.presses
         marked[self._supports.moved_pieces()] = True

@@ -57,7 +57,7 @@ def run_push(
     out: pathlib.Path,
 ) -> int:
     """Run the demo for ``seconds`` of simulated time after all is ready, and write ``out``. Returns the exit code."""
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False)
     begin = time.time()
     check_device(device)
     plan = with_seed(load_scene(scene), seed)

@@ -45,7 +45,7 @@ def run_job(
     """Let one robot do a task, and write the results into ``out``. Returns 0 if the task was done, 5 otherwise."""
     if job not in JOBS:
         raise UnknownTask(f"no job {job!r}; give push, {', '.join(list(JOBS)[:-1])} or {list(JOBS)[-1]}")
-    console = Console(stderr=True)
+    console = Console(stderr=True, markup=False)
     check_device(device)
     default_robot, done_key = JOBS[job]
     robot = robot or default_robot

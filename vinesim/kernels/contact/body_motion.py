@@ -7,19 +7,20 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def to_double(v: wp.vec3):
-    """A vector of single precision in double precision."""
+    """Converts a vector from single to double precision."""
     return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
 
 @wp.func
 def to_single(v: wp.vec3d):
-    """A vector of double precision in single precision."""
+    """Converts a vector from double to single precision."""
     return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 
 @wp.func
 def velocity_at(pose: wp.transform, velocity: wp.spatial_vector, point: wp.vec3d):
-    """World velocity [m/s] of a body's material at a point; ``velocity`` (linear, angular) is that of its origin."""
+    """Returns the world velocity [m/s] of a body's material at ``point`` [m]. ``velocity`` (linear, angular): velocity
+    of the body's origin."""
     lever = point - to_double(wp.transform_get_translation(pose))
     return to_double(wp.spatial_top(velocity)) + wp.cross(to_double(wp.spatial_bottom(velocity)), lever)
 
@@ -59,8 +60,9 @@ def velocity_product_acceleration(
 ):
     """Returns a body's acceleration (linear, angular) while all joints between it and its root turn at constant rates.
 
-    ``known``: a body whose acceleration is known, -1 for none. If it carries this body, only the joints between the two
-    are visited. Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product accelerations.
+    ``known``: a body with a known acceleration, -1 for none. If it is an ancestor of ``body``, only the joints between
+    the two bodies are visited. Featherstone, Rigid Body Dynamics Algorithms (2008), section 5.3: the velocity-product
+    accelerations.
     """
     origin = wp.transform_get_translation(body_q[body])
     linear = wp.vec3()

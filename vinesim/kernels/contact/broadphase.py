@@ -1,7 +1,8 @@
-"""Broadphase: boxes around geoms, actors, capsules and trees, swept over the step, and the trees near actors.
+"""Broadphase: bounding boxes of geoms, actors, capsules and trees, swept over the step, and the search for trees near
+actors.
 
-All boxes are axis-aligned. They are grown by the distance that their content can move in the step, so that a sleeping
-tree wakes before anything reaches it.
+All boxes are axis-aligned. They are enlarged by the distance that their contents can move in the step, so that a
+sleeping tree wakes before a body reaches it.
 """
 
 import warp as wp
@@ -42,7 +43,7 @@ DISJOINT = """
     };
 """
 """Native code that tests whether two boxes are disjoint. It has no branches: with a branch for each axis, a CPU would
-spend most of the time on wrong predictions."""
+spend most of the time on mispredicted branches."""
 
 
 @wp.func_native(DISJOINT + "return disjoint(a_low, a_high, b_low, b_high);")
@@ -61,13 +62,15 @@ def aabbs_disjoint(a_low: wp.vec3, a_high: wp.vec3, b_low: wp.vec3, b_high: wp.v
 def next_overlap(
     first: int, end: int, low: wp.vec3, high: wp.vec3, lows: wp.array(dtype=wp.vec3), highs: wp.array(dtype=wp.vec3)
 ) -> int:
-    """Returns the first box, from ``first`` on, that overlaps a given box; ``end`` if none does."""
+    """Returns the index of the first box, from ``first`` to before ``end``, that overlaps the box ``low``, ``high``;
+    ``end`` if no box does."""
     ...
 
 
 @wp.func
 def exists_at_level(level: int, is_fine: bool):
-    """Whether a capsule exists at its tree's level of detail: always (0), while coarse (1), while fine (2)."""
+    """Returns whether a capsule exists at its tree's level of detail. ``level``: 0 always, 1 while the tree is coarse,
+    2 while the tree is fine."""
     return level == 0 or (level == 2) == is_fine
 
 
@@ -93,7 +96,8 @@ def geom_aabbs(
     # out
     states_out: GeomStates,
 ):
-    """One thread per geom. Compute the motion of its centre, and its box, grown by its possible motion in the step.
+    """One thread per geom. Compute the motion of its centre, and its bounding box, enlarged by its possible motion in
+    the step.
 
     count: [1] number of geoms.
     """
@@ -110,8 +114,8 @@ def geom_aabbs(
     half = geoms.half[g]
     extent = wp.length(half)
     speed = wp.length(velocity) + wp.length(spin) * extent
-    # A drive may start within the step. Its likely speed: the free one with the smaller correction of the last two
-    # steps, if they agree in sign. Its largest speed: the free one.
+    # A drive may start within the step. Its likely speed is the free speed plus the smaller correction of the last two
+    # steps, if these agree in sign. Its largest speed is the free speed.
     linear_likely = wp.vec3d()
     spin_likely = wp.vec3d()
     linear_free = wp.vec3d()
@@ -177,7 +181,8 @@ def tree_aabbs(
     wood_boxes_out: Aabbs,
     tree_boxes_out: Aabbs,
 ):
-    """One thread per tree. Compute its capsules in the world, their boxes, and the boxes of the tree and of its wood.
+    """One thread per tree. Compute the world positions of its capsules, their boxes, and the boxes of the tree and of
+    its wood.
 
     Thread i takes the tree ``trees.awake[i]``.
     """
@@ -220,7 +225,8 @@ def take_free_velocities(
     # out
     rigid_out: RigidBodies,
 ):
-    """One thread per degree of freedom. Copy its free velocity of the coming step, and compute the last correction.
+    """One thread per degree of freedom. Copy its free velocity in this step, and compute the correction of the last
+    step.
 
     The correction is the amount by which plants changed the velocity in the last step. qvel, qacc: [dof] MuJoCo's
     arrays. A sleeping body has an outdated acceleration, and no velocity.
@@ -245,10 +251,10 @@ def actor_aabbs(
     # out
     actor_boxes_out: Aabbs,
 ):
-    """One thread per actor. Compute the box around it. It is empty for boxes and free bunches that MuJoCo has put to
+    """One thread per actor. Compute its bounding box, which is empty for boxes and free bunches that MuJoCo has put to
     sleep.
 
-    MuJoCo puts no body to sleep that plants press on.
+    A body that plants press on does not fall asleep in MuJoCo.
     """
     actor = wp.tid()
     if actor >= actors.count[0]:
@@ -273,7 +279,7 @@ def block_aabbs(
     # out
     block_boxes_out: Aabbs,
 ):
-    """One thread per block of 32 boxes. Compute the box around them. Thread i takes the block ``blocks[i]``."""
+    """One thread per block of 32 boxes. Compute their common bounding box. Thread i takes the block ``blocks[i]``."""
     place = wp.tid()
     if place >= counters[CHANGED_BLOCKS]:
         return
@@ -320,8 +326,9 @@ def mark_near_trees(
     """One thread per block. Mark the trees of the block whose box a geom of an actor overlaps, and unmark its other
     trees.
 
-    Boxes and free bunches must overlap the box of a capsule: a box that lies on a canopy for hours keeps few trees
-    awake. A remote actor counts at remote trees only. capsule_states: from the last step of each tree.
+    For a box or free bunch the box of one of the tree's capsules must also overlap, so that a box that lies on a canopy
+    for hours keeps few trees awake. A remote actor marks remote trees only. capsule_states: from the last step of each
+    tree.
     """
     block = wp.tid()
     for tree in range(block * AABB_BLOCK, wp.min((block + 1) * AABB_BLOCK, tree_boxes.low.shape[0])):
@@ -357,7 +364,7 @@ def list_near_geoms(
     static_blocks: Aabbs,
     near_geoms_out: wp.array2d(dtype=wp.int32),
 ):
-    """List the geoms whose boxes overlap a tree's box, at most ``most`` static geoms of them.
+    """List the geoms whose boxes overlap a tree's box, among them at most ``most`` static geoms.
 
     Returns the number of overlapping geoms, including those that were not listed.
     """

@@ -1,4 +1,4 @@
-"""One contact as the narrowphase finds it, and the functions that both narrowphases use for it."""
+"""The result of the narrowphase for one contact, and functions that both narrowphases use."""
 
 import warp as wp
 
@@ -12,10 +12,10 @@ MIN_NORMAL_COSINE = wp.constant(wp.float64(0.5))
 
 @wp.struct
 class Candidate:
-    """A pair of a capsule and another shape."""
+    """A contact between a capsule and another shape that may touch in the step."""
 
     exists: wp.bool
-    """Whether the two may touch before the step ends."""
+    """Whether capsule and shape may touch before the step ends."""
     is_impact: wp.bool
     gap: wp.float64
     end_gap: wp.float64
@@ -31,17 +31,17 @@ def is_smooth(normal: wp.vec3d, end_normal: wp.vec3d):
 
 @wp.func
 def curvature_gap(distance: wp.float64, end_distance: wp.float64, approach: wp.float64, motion: wp.float64):
-    """Returns the change of distance [m] in a step that constant velocity does not explain.
+    """Returns the change of distance [m] in a step minus the change at constant velocity.
 
-    It is at most the relative ``motion`` [m]. ``approach`` [m]: change of distance at constant velocity; negative if
-    the two come together.
+    The result is limited to the relative ``motion`` [m] of the two sides. ``approach`` [m]: change of distance at
+    constant velocity; negative if the sides approach each other.
     """
     return wp.clamp(end_distance - distance - approach, -motion, motion)
 
 
 @wp.func
 def store_candidate(row: int, slot: int, feature: int, other: int, candidate: Candidate, candidates_out: Candidates):
-    """Write a candidate to its slot of its tree, if there is one left."""
+    """Write a candidate to the slot ``slot`` of the row ``row``, unless the row has no such slot."""
     if slot < candidates_out.feature.shape[1]:
         candidates_out.feature[row, slot] = feature
         candidates_out.other[row, slot] = other

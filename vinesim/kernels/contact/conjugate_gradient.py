@@ -1,4 +1,5 @@
-"""Nonlinear conjugate gradients over sweeps: for islands whose Newton steps would cost too much or do not settle.
+"""Nonlinear conjugate gradients over Gauss-Seidel sweeps, for islands whose Newton steps are too slow or do not
+converge.
 
 Sweeps alone converge slowly where many contacts share a body. The change that a sweep makes serves as the gradient:
 Silcowitz-Hansen, Niebe, Erleben, A nonsmooth nonlinear conjugate gradient method for interactive contact force problems,

@@ -1,11 +1,11 @@
 """The Delassus matrix A = J M^-1 J^T: how impulses of contacts change the velocities along their rows.
 
 For plants M^-1 J^T comes from ``row_response``; for rigid bodies from MuJoCo's sparse factor L^T D L of M^ (mass with
-implicit servos). Where active constraints bind a rigid body, the caller fills in its response.
+implicit servos). For rigid bodies with active constraints the caller fills in the response.
 
-Only the plants' part is assembled, a matrix for each block of contacts that plants couple. Rigid bodies couple blocks; what
-they add, J_r H^-1 J_r^T, has the rank of their degrees of freedom and stays in its factors: ``rigid_jacobian`` and
-``rigid_response``.
+Only the plants' part is assembled, a matrix for each block of contacts that plants couple. Rigid bodies couple blocks.
+Their contribution J_r H^-1 J_r^T has the rank of their degrees of freedom and is stored as two factors:
+``rigid_jacobian`` and ``rigid_response``.
 """
 
 import warp as wp
@@ -55,7 +55,7 @@ def solve_rigid_rows(
     response: wp.array2d(dtype=wp.vec3d),
 ):
     """Solve L^T D L x = j for the three rows j of a contact, within the degrees of freedom from ``first`` to ``end`` of
-    one kinematic tree; ``entry`` of L, ``inverse`` of D."""
+    one kinematic tree. ``entry``: entries of L. ``inverse``: inverse of D."""
     ...
 
 
@@ -71,7 +71,7 @@ def respond_rigidly(
     # out
     rows_out: Rows,
 ):
-    """One thread per contact: M^-1 j of its three rows j, of one kinematic tree of MuJoCo."""
+    """One thread per contact. Compute M^-1 j for its three rows j, for one kinematic tree of MuJoCo."""
     c = wp.tid()
     if c >= counters[CONTACTS]:
         return
@@ -145,9 +145,9 @@ def add_entries(
     at: int,
     pitch: int,
 ):
-    """Add the velocities along the rows of a side by unit impulses along those of a group of ``count`` sides, listed from
-    ``start`` on. ``number``: first one of the response of the side's body to them, in rows of ``width``; ``at``: entry of
-    the first row."""
+    """Add to the Delassus matrix the velocities along the rows of a side by unit impulses along the rows of a group of
+    ``count`` sides, listed from ``start`` on. ``number``: index of the first value in the response of the side's body
+    to these impulses, which has rows of ``width``. ``at``: index of the matrix entry of the side's first row."""
     ...
 
 
@@ -155,7 +155,7 @@ def add_entries(
     for (int i = 0; i < count; ++i) values.data[at + i] = 0.0;
 """)
 def clear_entries(values: wp.array(dtype=wp.float64), at: int, count: int):
-    """Clear ``count`` entries from ``at`` on."""
+    """Set ``count`` entries to zero, from ``at`` on."""
     ...
 
 
@@ -171,7 +171,7 @@ def assemble_delassus(
     # out
     rows_out: Rows,
 ):
-    """One thread per contact: the plants' entries of J M^-1 J^T of its three rows with all rows of its block."""
+    """One thread per contact. Compute the plants' part of J M^-1 J^T for its three rows and all rows of its block."""
     c = wp.tid()
     if c >= counters[CONTACTS]:
         return

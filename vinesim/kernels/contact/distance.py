@@ -1,9 +1,9 @@
 """Distances: from points and segments to MuJoCo's primitives, and between two segments.
 
 A plant's capsule is a segment with a radius (a sphere when both ends agree). A rigid geom is one of MuJoCo's
-primitives. :func:`primitive_distance` gives distance and direction from a point to a primitive. For planes, spheres and
-capsules, a formula gives the closest point of a segment. For other primitives a bisection of the slope of the distance
-finds it, since the distance from any of them is convex along a segment.
+primitives. :func:`primitive_distance` returns distance and direction from a point to a primitive. For planes, spheres
+and capsules, the closest point of a segment is computed by a formula. For other primitives a bisection of the slope of
+the distance finds it, since the distance from any of them is convex along a segment.
 """
 
 import warp as wp
@@ -20,15 +20,18 @@ BOX = wp.constant(6)
 MESH = wp.constant(7)
 
 MIN_COPLANAR_COSINE = wp.constant(wp.float64(0.999))
-"""[1] Least cosine between the normals at both ends of the part of a segment that lies along one face. TUNED."""
+"""[1] Least cosine between the normals at two points of a segment for which both points lie along the same face.
+TUNED."""
 MIN_SLANT = wp.constant(wp.float64(1.0e-6))
-"""[1] A segment runs along a cylinder's side if the squared sine of its angle to the axis is smaller than this."""
+"""[1] Squared sine of the angle between a segment and a cylinder's axis below which the segment is treated as parallel
+to the axis."""
 SLOPE_BISECTIONS = wp.constant(30)
-"""Halvings of the segment in the search for its closest point: to 1e-9 of its length."""
+"""Number of bisections in the search for a segment's closest point: precise to 1e-9 of its length."""
 ELLIPSOID_NEWTON_STEPS = wp.constant(12)
-"""Newton steps to the closest point of an ellipsoid: to 1e-9 m wherever the point is."""
+"""Number of Newton steps to the closest point of an ellipsoid: precise to 1e-9 m for any point."""
 FACE_BISECTIONS = wp.constant(12)
-"""Halvings in the search for the ends of the part along a face: to 1/4096 of the segment's length."""
+"""Number of bisections in the search for the ends of the part of a segment along a face: precise to 1/4096 of the
+segment's length."""
 
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
@@ -36,7 +39,8 @@ vec6d = wp.types.vector(length=6, dtype=wp.float64)
 
 @wp.func
 def cylinder_distance(size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a cylinder along z, in its frame."""
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from a cylinder along z, in the
+    cylinder's frame."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     rho = wp.sqrt(p[0] * p[0] + p[1] * p[1])
@@ -57,7 +61,7 @@ def cylinder_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def box_distance(size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a box, in its frame."""
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from a box, in the box's frame."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     q = wp.vec3d(
@@ -78,11 +82,12 @@ def box_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from an ellipsoid, in its frame.
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from an ellipsoid, in the
+    ellipsoid's frame.
 
     Outside, the closest point is q_i = a_i^2 p_i / (a_i^2 + m), where m solves sum (q_i / a_i)^2 = 1 (Eberly,
-    Distance from a Point to an Ellipsoid, 2013). The sum falls with m and is
-    convex, so Newton's method rises to its root from below. Inside, the distance is of first order about the surface.
+    Distance from a Point to an Ellipsoid, 2013). The sum falls with m and is convex, so Newton's method approaches the
+    root from below. Inside the ellipsoid the distance is a first-order approximation about the surface.
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -115,7 +120,7 @@ def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def round_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
-    """:func:`primitive_distance` of planes, spheres and capsules."""
+    """Returns :func:`primitive_distance` for a plane, sphere or capsule."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
@@ -132,9 +137,11 @@ def round_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
-    """Outward normal (0 to 2) and signed distance (3) [m] of a point from a primitive, in the primitive's frame.
+    """Returns outward normal (entries 0 to 2) and signed distance (3) [m] of a point from a primitive, in the
+    primitive's frame.
 
-    ``size`` is MuJoCo's ``geom_size``. Inside of an ellipsoid the distance is of first order, all else is exact.
+    ``size`` is MuJoCo's ``geom_size``. Inside an ellipsoid the distance is a first-order approximation; all other
+    results are exact.
     """
     if kind == PLANE or kind == SPHERE or kind == CAPSULE:
         return round_distance(kind, size, p)
@@ -147,7 +154,8 @@ def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def distance_of(is_round: bool, kind: int, size: wp.vec3d, p: wp.vec3d):
-    """:func:`primitive_distance`; ``is_round``: the kind is known to be one of :func:`round_distance`."""
+    """Returns :func:`primitive_distance`. ``is_round``: ``kind`` is known to be a plane, sphere or capsule, so that
+    less code is compiled."""
     found = wp.vec4d()
     if is_round:
         found = round_distance(kind, size, p)
@@ -158,14 +166,15 @@ def distance_of(is_round: bool, kind: int, size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def distance_slope(kind: int, size: wp.vec3d, p: wp.vec3d, direction: wp.vec3d):
-    """Derivative of the distance from a primitive as the point moves along ``direction`` [m]."""
+    """Returns the directional derivative of the distance from a primitive at point ``p`` along ``direction``."""
     n = primitive_distance(kind, size, p)
     return n[0] * direction[0] + n[1] * direction[1] + n[2] * direction[2]
 
 
 @wp.func
 def closest_to_plane(a: wp.vec3d, b: wp.vec3d):
-    """Where (0 to 1) on the segment from a to b the plane z = 0 is closest; the middle if it is level."""
+    """Returns the parameter (0 to 1) of the point of the segment a b that is closest to the plane z = 0; 0.5 if the
+    segment is level."""
     rise = b[2] - a[2]
     flat = wp.float64(1.0e-9) * wp.length(b - a)
     t = wp.float64(0.5)
@@ -178,7 +187,8 @@ def closest_to_plane(a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def closest_to_axis(a: wp.vec3d, along: wp.vec3d):
-    """Where (0 to 1) on the segment from a along a vector the z axis is closest; its start if they are parallel."""
+    """Returns the parameter (0 to 1) of the point of the segment from ``a`` to ``a + along`` that is closest to the z
+    axis; 0 if both are parallel."""
     zero = wp.float64(0.0)
     t = wp.float64(0.0)
     across = along[0] * along[0] + along[1] * along[1]
@@ -189,7 +199,8 @@ def closest_to_axis(a: wp.vec3d, along: wp.vec3d):
 
 @wp.func
 def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Returns :func:`closest_on_segment` for any kind of primitive. A formula serves for the side of a cylinder."""
+    """Returns :func:`closest_on_segment` for any kind of primitive, by bisection; for the side of a cylinder by a
+    formula."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     half = wp.float64(0.5)
@@ -199,7 +210,7 @@ def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
         return zero
     if (
         kind == CYLINDER
-    ):  # where its axis is closest, if the side is closest there: no other point is nearer to the side
+    ):  # the point closest to the axis, if the side is the closest part there: no point is nearer to the side
         t = closest_to_axis(a, along)
         p = a + t * along
         across = along[0] * along[0] + along[1] * along[1]
@@ -239,7 +250,7 @@ def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def closest_to_round(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """:func:`closest_on_segment` of planes, spheres and capsules."""
+    """Returns :func:`closest_on_segment` for a plane, sphere or capsule."""
     t = wp.float64(0.0)
     if kind == PLANE:
         t = closest_to_plane(a, b)
@@ -252,7 +263,8 @@ def closest_to_round(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Where (0 to 1) on the segment from a to b the primitive is closest; the middle of all such places if many."""
+    """Returns the parameter (0 to 1) of the point of the segment a b that is closest to the primitive; the middle if
+    several points are equally close."""
     t = wp.float64(0.0)
     if kind == PLANE or kind == SPHERE or kind == CAPSULE:
         t = closest_to_round(kind, size, a, b)
@@ -265,7 +277,8 @@ def closest_on_segment(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 def segment_primitive_distance(
     is_round: bool, kind: int, size: wp.vec3d, rotation: wp.mat33d, center: wp.vec3d, a: wp.vec3d, b: wp.vec3d
 ):
-    """World normal (0 to 2) and distance (3) [m] from a primitive to the segment a b, and where on it (4, 0 to 1).
+    """Returns world normal (entries 0 to 2) and distance (3) [m] from a primitive to the segment a b, and the parameter
+    (4) of its closest point, 0 to 1.
 
     ``is_round``: see :func:`distance_of`.
     """
@@ -284,9 +297,9 @@ def segment_primitive_distance(
 
 @wp.func
 def is_outside_box(half: wp.vec3d, a: wp.vec3d, b: wp.vec3d, reach: wp.float64):
-    """Whether the segment a b is farther than ``reach`` [m] beyond one side of a box, in the box's frame.
+    """Returns whether the segment a b is farther than ``reach`` [m] beyond one side of a box, in the box's frame.
 
-    ``half`` [m]: half edges. Everything that the box contains is at least as far away.
+    ``half`` [m]: half edges. If so, a shape inside the box is also farther away than ``reach``.
     """
     outside = bool(False)
     for i in range(3):
@@ -296,13 +309,14 @@ def is_outside_box(half: wp.vec3d, a: wp.vec3d, b: wp.vec3d, reach: wp.float64):
 
 @wp.func
 def has_flat_or_straight_side(kind: int):
-    """Whether a segment can lie along this kind of primitive."""
+    """Returns whether this kind of primitive has a flat or straight side, along which a segment can lie."""
     return kind == BOX or kind == CAPSULE or kind == CYLINDER
 
 
 @wp.func
 def on_same_face(closest: wp.vec4d, other: wp.vec4d, tolerance: wp.float64):
-    """Whether a point lies along the same face as the closest one, to within ``tolerance`` [m]."""
+    """Returns whether a point lies along the same face as the closest point, to within ``tolerance`` [m]. Both
+    arguments: normal (entries 0 to 2) and distance (3)."""
     cosine = closest[0] * other[0] + closest[1] * other[1] + closest[2] * other[2]
     return cosine > MIN_COPLANAR_COSINE and other[3] < closest[3] + tolerance
 
@@ -311,16 +325,18 @@ def on_same_face(closest: wp.vec4d, other: wp.vec4d, tolerance: wp.float64):
 def interval_along_face(
     is_round: bool, kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d, t: wp.float64, tolerance: wp.float64
 ):
-    """Both ends (0 to 1) of the part of a segment along a primitive's face about its closest point ``t``.
+    """Returns the parameters (0 to 1) of both ends of the part of the segment a b that lies along a primitive's face,
+    around the closest point ``t``.
 
-    They are the same if it crosses the face. What lies along a face needs two contacts: with one, it rocks about it from
-    step to step. All in the primitive's frame; ``is_round``: see :func:`distance_of`.
+    The two are equal if the segment crosses the face. A capsule that lies along a face needs two contacts; with one
+    contact it would rock from step to step. All arguments are in the primitive's frame. ``is_round``: see
+    :func:`distance_of`.
     """
     half = wp.float64(0.5)
     along = b - a
     closest = distance_of(is_round, kind, size, a + t * along)
     near = tolerance / wp.length(along)
-    leaves = bool(True)  # the face or the segment so soon on both sides that what lies along it is too short
+    leaves = bool(True)  # whether the part along the face is too short on both sides
     for side in range(2):
         u = t + wp.where(side == 0, -near, near)
         if u >= wp.float64(0.0) and u <= wp.float64(1.0):
@@ -346,7 +362,8 @@ def interval_along_face(
 
 @wp.func
 def segment_segment_distance(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, d: wp.vec3d):
-    """World normal (0 to 2) and distance (3) [m] from segment c d to a b, where on a b (4) and on c d (5), 0 to 1.
+    """Returns world normal (entries 0 to 2) and distance (3) [m] from segment c d to segment a b, and the parameters of
+    the closest points on a b (4) and on c d (5), 0 to 1.
 
     Ericson, Real-Time Collision Detection (2005), section 5.1.9; parallel segments meet in the middle of their overlap.
     """

@@ -1,4 +1,4 @@
-"""From impulses to forces: contact forces, wrenches on plant bodies, and the warm start of the next step."""
+"""Results of the contact solve: contact forces, wrenches on plant bodies, and the warm start of the next step."""
 
 import warp as wp
 
@@ -38,14 +38,14 @@ def store_contact(
     t2 = wp.vec3d(axes[2, 0], axes[2, 1], axes[2, 2])
     impulse = wp.vec3d(impulses[n], impulses[n + 1], impulses[n + 2])
     contacts_out.force[c] = wp.transpose(axes) * impulse / parameters.dt
-    # the stretch at which spring and damper give exactly this friction: a sliding contact drags its anchor along
+    # the stretch at which spring and damper exert exactly this friction: a sliding contact drags its anchor along
     surface = contacts_out.surface[c]
     force_u = impulse[1] / parameters.dt + surface.damping * slip_u
     force_v = impulse[2] / parameters.dt + surface.damping * slip_v
     anchor = -force_u / surface.stiffness * t1
     anchor = anchor - force_v / surface.stiffness * t2
     friction = impulse[1] * t1 + impulse[2] * t2
-    if impulse[0] <= wp.float64(0.0):  # an open one starts from nothing, but is listed: it is looked for, too
+    if impulse[0] <= wp.float64(0.0):  # an open contact starts from zero, but the next step looks for it
         anchor = wp.vec3d()
         friction = wp.vec3d()
     warm_start_out.feature[c] = contacts_out.feature[c]
@@ -89,7 +89,7 @@ def count_unfinished(
 ):
     """One thread in all.
 
-    Count the islands whose solve took ``most_sweeps``, so that it may be outside its tolerance.
+    Count the islands whose solve took ``most_sweeps`` sweeps. Their impulses may be outside the tolerance.
     """
     unfinished = int(0)
     for island in range(counters_out[ISLANDS]):

@@ -1,12 +1,13 @@
 """The contact law, and the functions that solvers need for it: compressive normal impulse, Coulomb friction cone.
 
-All solvers of contacts with plants call these functions, on a CPU and on a GPU: islands (``projected_gauss_seidel``,
-``newton``), trees of batches (``tree_solver``), and the same with rows in the registers of a GPU (``row_solver``).
+All solvers of contacts with plants call these functions, on a CPU and on a GPU: for islands
+(``projected_gauss_seidel``, ``newton``), for the trees of batches (``tree_solver``), and for the trees of batches with
+rows in the registers of a GPU (``row_solver``).
 
 A contact has an impulse x = (x_n, x_u, x_v) [N s] along its normal and its tangents, and a residual velocity
 r = A x + v_free + bias + compliance x [m/s] along them. The conditions: x_n >= 0, r_n >= 0 and x_n r_n = 0; friction
-|x_t| <= mu x_n, where r_t = 0 inside of the cone, and r_t against x_t on it. They hold where :func:`relaxed` leaves x as
-it is. In double precision.
+|x_t| <= mu x_n, with r_t = 0 inside the cone, and r_t opposite to x_t on the cone's surface. They hold if
+:func:`relaxed` does not change x. All computations are in double precision.
 """
 
 import warp as wp
@@ -17,14 +18,15 @@ SLIDING_SHARE = wp.constant(wp.float64(0.999999))
 """[1] A contact slides if its friction is at least this share of the largest possible friction."""
 
 MIN_IMPULSE_SCALE = wp.constant(wp.float64(1.0e-5))
-"""[N s] Lower bound of the impulse to which changes are compared when convergence is judged. TUNED: 1 mN over 10 ms."""
+"""[N s] Lower bound of the impulse to which changes are compared in the test of convergence. TUNED: 1 mN over 10 ms."""
 
 
 @wp.struct
 class Surface:
     """Contact properties of a pair of materials.
 
-    A new property needs a field here, and no other change between :mod:`vinesim.scene.materials` and this law.
+    To add a property, add a field here; no other code between :mod:`vinesim.scene.materials` and this law needs a
+    change.
     """
 
     friction: wp.float64
@@ -32,14 +34,14 @@ class Surface:
     stiffness: wp.float64
     """[N/m] Normal stiffness; also the tangential stiffness of the friction anchor."""
     damping: wp.float64
-    """[N s/m]"""
+    """[N s/m] Damping in the normal direction, and of the friction anchor."""
     compliance: wp.float64
     """[m/(N s^2)] 1 / (dt (stiffness dt + damping)), added to the diagonal of the Delassus matrix."""
 
 
 @wp.struct
 class Steps:
-    """Step sizes of a contact's Gauss-Seidel step."""
+    """Factors of a contact's Gauss-Seidel step from residual velocities to changes of impulses."""
 
     normal: wp.float64
     """[kg] Factor from a residual velocity along the normal to a change of impulse."""
@@ -112,7 +114,8 @@ def size_of_change(change: wp.vec3d):
 
 @wp.func
 def linearise_sliding(x: wp.vec3d, residual: wp.vec3d, steps: Steps, surface: Surface):
-    """Friction of a sliding contact about the present state: x_t = K (x_t - step r_t) + g x_n. Returns K and g.
+    """Returns K and g of the linearised friction of a sliding contact about its present state: x_t = K (x_t - step r_t)
+    + g x_n.
 
     Friction is the projection of f = x_t - step r_t on the disk of radius mu x_n, where step is ``steps.tangential``. With
     d = f / |f| its derivatives are K = s (1 - d d^T), s = mu x_n / |f|, and g = mu d (Alart and Curnier, A mixed

@@ -1,8 +1,8 @@
 """Distance from a segment to a convex hull, exact to rounding, by the hull's planes and edges.
 
-Where the segment enters the hull, the distance is that to the nearest plane, as for MuJoCo's primitives. Outside, the
-segment is closest to the hull at one of its ends, above the inside of a face, or at one of the hull's edges; only edges
-of faces that an end of the segment sees can be closest.
+If the segment enters the hull, the distance is the distance to the nearest plane, as for MuJoCo's primitives.
+Otherwise, the closest points are at an end of the segment above the inside of a face, or on one of the hull's edges.
+Edges are tested only if an end of the segment is in front of one of their two faces.
 """
 
 import warp as wp
@@ -13,14 +13,16 @@ from vinesim.kernels.contact.structs import Hulls
 wp.set_module_options({"enable_backward": False})
 
 PLANE_STEPS = wp.constant(64)
-"""Largest number of steps to the deepest place of a segment. Each step takes another plane, so about five suffice."""
+"""Largest number of steps in the search for the deepest point of a segment. Each step takes another plane, so about
+five are enough."""
 HULL_TOLERANCE = wp.constant(wp.float64(1.0e-7))
-"""[m] A point this far beyond a face's border still counts as above the face, as vertices of a mesh are rounded."""
+"""[m] Distance beyond a face's border up to which a point counts as above the face, because vertices of a mesh are
+rounded."""
 
 
 @wp.func
 def plane_gap(plane: wp.vec4d, p: wp.vec3d):
-    """Signed distance [m] of a point from a plane (outward normal, offset)."""
+    """Returns the signed distance [m] of a point from a plane (outward normal, offset)."""
     return plane[0] * p[0] + plane[1] * p[1] + plane[2] * p[2] - plane[3]
 
 
@@ -39,7 +41,7 @@ def outermost_plane(hulls: Hulls, hull: int, p: wp.vec3d):
 
 @wp.func
 def is_above_face(hulls: Hulls, hull: int, face: int, p: wp.vec3d):
-    """Returns whether the foot of a point on the plane of a face lies on the hull."""
+    """Returns whether the projection of point ``p`` onto the plane of a face is on that face."""
     plane = hulls.plane[face]
     foot = p - plane_gap(plane, p) * wp.vec3d(plane[0], plane[1], plane[2])
     inside = bool(True)
@@ -51,10 +53,11 @@ def is_above_face(hulls: Hulls, hull: int, face: int, p: wp.vec3d):
 
 @wp.func
 def deepest_place(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d):
-    """Where (0 to 1) on the segment a b the largest signed distance from the planes is smallest.
+    """Returns the parameter (0 to 1) of the point of the segment a b that is deepest in the hull: its largest signed
+    distance from the planes is smallest.
 
-    That distance is the largest of linear functions: where the steepest one that falls and the one that rises meet, a
-    third one may be larger and takes the place of one of both.
+    The largest signed distance is the maximum of linear functions of the parameter. The search intersects a falling and
+    a rising function. If a third function is larger at the intersection, it replaces one of the two.
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -88,7 +91,8 @@ def deepest_place(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def segment_hull_distance(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, reach: wp.float64):
-    """Normal (0 to 2) and distance (3) [m] from a hull to the segment a b, and where on it (4, 0 to 1).
+    """Returns normal (entries 0 to 2) and distance (3) [m] from a hull to the segment a b, and the parameter (4) of its
+    closest point, 0 to 1.
 
     All in the hull's frame. Beyond ``reach`` [m] the distance is a lower bound.
     """
@@ -128,7 +132,8 @@ def segment_hull_distance(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, rea
 
 @wp.func
 def clip(ends: wp.vec2d, gap_a: wp.float64, gap_b: wp.float64):
-    """Returns the part (0 to 1) of an interval where a linear function with these values at 0 and 1 is not above 0."""
+    """Returns the part (0 to 1) of the interval ``ends`` in which a linear function, with the values ``gap_a`` at 0 and
+    ``gap_b`` at 1, is not above 0."""
     change = gap_b - gap_a
     low = ends[0]
     high = ends[1]
@@ -143,10 +148,11 @@ def clip(ends: wp.vec2d, gap_a: wp.float64, gap_b: wp.float64):
 
 @wp.func
 def interval_along_hull(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, closest: vec5d, tolerance: wp.float64):
-    """Returns both ends (0 to 1) of the part of a segment along a face or an edge of a hull; equal if it crosses that.
+    """Returns the parameters (0 to 1) of both ends of the part of a segment along a face or an edge of a hull. The two
+    are equal if the segment crosses the face or edge.
 
-    ``closest``: result of :func:`segment_hull_distance`. ``tolerance`` [m]: how much farther from the hull than the
-    closest point the ends may be.
+    ``closest``: result of :func:`segment_hull_distance`. ``tolerance`` [m]: largest distance of the ends from the hull,
+    minus that of the closest point.
     """
     t = closest[4]
     along = b - a

@@ -1,13 +1,13 @@
-"""The contacts of an island as a dense system, which is gathered once for each solve.
+"""The contacts of an island as a dense system, whose values are gathered once for each solve.
 
-v = free + B x + J_r w. B x is the change of the plants' velocities by the impulses; B has a matrix for each block of
-contacts that plants couple. w = G x, with G = H^-1 J_r^T, are the changes of the velocities of rigid bodies, which
-couple the blocks. J_r and G have columns for the degrees of freedom of this island only, and values that do not change
-from sweep to sweep are computed once.
+The velocities along the rows are v = free + B x + J_r w, with the impulses x. B x is the velocity change of plants; B
+has a matrix for each block of contacts that plants couple. w = G x, with G = H^-1 J_r^T, are the changes of the
+velocities of rigid bodies, which couple the blocks. J_r and G have columns for the degrees of freedom of this island
+only, and values that do not change from sweep to sweep are computed once.
 
 Contacts are in the order of the list of islands, so that a block is contiguous in memory. Its rows are padded with
-zeros to a multiple of eight, so that native loops take eight at a time without a remainder. No multiply-add is fused:
-the results do not depend on the vector width of a CPU.
+zeros to a multiple of eight, so that native loops process eight rows at a time without a remainder. No multiply-add is
+fused, so the results do not depend on the vector width of a CPU.
 """
 
 import warp as wp
@@ -18,7 +18,7 @@ from vinesim.kernels.contact.structs import Contacts, Geoms, Islands, Rows
 wp.set_module_options({"enable_backward": False})
 
 EIGHT = "typedef double Eight __attribute__((vector_size(64), aligned(8)));"
-"""Native code: a vector of eight numbers. CPUs with narrower vectors compute it in two or four parts."""
+"""Native code: a vector type of eight numbers. CPUs with narrower vectors process it in two or four parts."""
 
 
 @wp.struct
@@ -32,7 +32,7 @@ class IslandSystem:
     free: wp.array(dtype=wp.float64)
     """[row] Velocity without impulses, bias included, m/s."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] Impulse, N s."""
+    """[row] Present impulse along the row, N s."""
     impulse_first: wp.array(dtype=wp.float64)
     """[row] Impulse before the first Newton step, N s."""
     impulse_before: wp.array(dtype=wp.float64)
@@ -100,7 +100,8 @@ def add_rigid_velocity(
     first: int,
     count: int,
 ) -> wp.vec3d:
-    """Returns ``value`` plus the velocities [m/s] along three rows by those of ``count`` degrees of freedom."""
+    """Returns ``value`` [m/s] plus the velocities along three rows due to the velocities of ``count`` degrees of
+    freedom."""
     ...
 
 
@@ -115,7 +116,7 @@ def push_rigid_bodies(
     first: int,
     count: int,
 ):
-    """Change the velocities of ``count`` degrees of freedom by impulses [N s] along three rows."""
+    """Add to the velocities of ``count`` degrees of freedom the changes by impulses [N s] along three rows."""
     ...
 
 
@@ -159,7 +160,8 @@ def rigid_entry(place: int, island: int, islands: Islands):
 
 @wp.func
 def solution_entry(place: int, island: int, islands: Islands):
-    """Returns the first entry of a contact's solution, which is a column longer than its rigid Jacobian."""
+    """Returns the index of the first entry of a contact's solution, which has one column more than its rigid
+    Jacobian."""
     return rigid_entry(place, island, islands) + place
 
 
@@ -186,7 +188,8 @@ def contact_velocity(
 def contact_residual(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system: IslandSystem
 ):
-    """Returns the residual velocities [m/s] along the rows of a contact. They are 0 along rows that press or stick.
+    """Returns the residual velocities [m/s] along the rows of a contact. In a solution they are 0 along rows that press
+    or stick.
 
     The residual is the velocity by all impulses plus the velocity without impulses, the bias and the compliance term.
     """
@@ -206,7 +209,8 @@ def gather_rigid_rows(
     rows: Rows,
     system_out: IslandSystem,
 ):
-    """Gather J_r and G^T of a contact. They are zero unless its other side is a rigid body that moves."""
+    """Gather the rigid Jacobian J_r and the response G^T of a contact. Both are zero unless its other side is a rigid
+    body that can move."""
     moves = bool(False)
     if contacts.other[c] >= 0:
         moves = geoms.dof[contacts.other[c]] >= 0
@@ -235,7 +239,7 @@ def gather_contact(
 ):
     """Gather the values of a contact and compute its response to its own impulses.
 
-    Its rigid rows must be gathered before.
+    Call :func:`gather_rigid_rows` for the contact before.
     """
     k = 3 * (place - islands.block_start[block])
     row = islands.row_start[block] + k
@@ -258,7 +262,7 @@ def gather_contact(
 
 @wp.func
 def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSystem):
-    """Compute the velocities of the rigid bodies of an island again, from all its impulses."""
+    """Recompute the velocity changes of an island's rigid bodies from all its impulses."""
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)
     for k in range(dofs):

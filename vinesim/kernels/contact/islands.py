@@ -1,7 +1,7 @@
 """Islands: the candidates of all trees in one list, the plant bodies in contact, and the sets of contacts that interact.
 
-Contacts interact if they share a tree of plants, or rigid bodies that move each other. Each kernel here is run by one
-thread: there are few contacts, and the order of the result must not depend on the number of threads.
+Contacts interact if they share a tree of plants, or rigid bodies that move each other. One thread runs each of these
+kernels, because there are few contacts and their order must not depend on the number of threads.
 """
 
 import warp as wp
@@ -33,7 +33,7 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 MOST_SIDES = wp.constant(10)
-"""Number of contact sides in a group: their thirty rows fill thirty-two columns."""
+"""Largest number of contact sides in a group: their thirty rows fit into thirty-two columns."""
 
 
 @wp.kernel
@@ -74,7 +74,7 @@ def compact_candidates(
 
 @wp.func
 def island_root(label: wp.array(dtype=wp.int32), contact: int):
-    """Returns the first contact of the island to which a contact belongs so far."""
+    """Returns the root of a contact in the union-find structure ``label``: the first contact of its island."""
     root = int(contact)
     while label[root] != root:
         root = label[root]
@@ -83,7 +83,8 @@ def island_root(label: wp.array(dtype=wp.int32), contact: int):
 
 @wp.func
 def rigid_island(other: int, geoms: Geoms, rigid: RigidBodies):
-    """Returns the label of the rigid bodies that a force on ``other`` moves; -1 for another plant or a static geom."""
+    """Returns the label of the rigid bodies that a force on a contact's other side moves; -1 for another plant or a
+    static geom."""
     label = int(-1)
     if other >= 0 and geoms.dof[wp.max(other, 0)] >= 0:
         label = rigid.tree_island[rigid.dof_tree[geoms.dof[other]]]
@@ -126,7 +127,7 @@ def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
 
 @wp.func
 def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
-    """Find where the touched bodies of each tree begin and end."""
+    """Find the first slot, and the slot after the last, of the touched bodies of each tree."""
     for slot in range(count):
         touched_out.last_contact[slot] = -1
         touched_out.tree_start[slot] = slot
@@ -167,7 +168,8 @@ def is_listed_before(a: int, b: int, islands: Islands):
 
 @wp.func
 def list_contacts(contact_count: int, islands_out: Islands):
-    """List all contacts by island and block. Contacts arrive sorted by tree, so few move far."""
+    """List all contacts by island and block, by insertion sort. Contacts are already sorted by tree, so few of them
+    move far."""
     for c in range(contact_count):
         at = int(c)
         while at > 0 and is_listed_before(c, islands_out.contact[wp.max(at - 1, 0)], islands_out):
@@ -180,7 +182,7 @@ def list_contacts(contact_count: int, islands_out: Islands):
 def number_sets(
     contact_count: int, counters_out: wp.array(dtype=wp.int32), contacts_out: Contacts, islands_out: Islands
 ):
-    """Number the islands and blocks in the order of the list."""
+    """Number the islands and blocks in the order in which contacts are listed."""
     islands = int(-1)
     blocks = int(-1)
     for place in range(contact_count):

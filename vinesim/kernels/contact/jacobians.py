@@ -1,8 +1,8 @@
 """Contact Jacobians, velocities along the rows without contacts, bias velocities, and initial guesses of the impulses.
 
-A contact has three rows: normal n (from the other side to the plant) and two tangents. In each direction there is an
-implicit spring and damper. Along the tangents the spring's stretch is the *anchor*: it remembers where a sticking contact
-began.
+A contact has three rows: normal n (from the other side to the plant) and two tangents. In each direction an implicit
+spring and damper act. The stretch of the tangential spring is called *anchor*; it is the displacement since the contact
+began to stick.
 """
 
 import warp as wp
@@ -52,9 +52,11 @@ def write_plant_row(
 def write_rigid_rows(
     c: int, last_dof: int, axes: wp.mat33d, arm: wp.vec3d, rigid: RigidBodies, jacobian_out: wp.array2d(dtype=wp.vec3d)
 ):
-    """Write the rigid Jacobian of a contact: velocities along its axes of a point of the body that ``last_dof`` moves.
+    """Write the rigid Jacobian of a contact: velocities along the contact's axes of a point of the rigid body whose
+    last degree of freedom is ``last_dof``.
 
-    arm: [m] from the centre of mass of its kinematic tree to that point. Returns its free velocities along the axes.
+    arm: [m] vector from the centre of mass of the body's kinematic tree to the point. Returns the point's free
+    velocities along the axes.
     """
     velocity = wp.vec3d()
     dof = int(last_dof)
@@ -70,7 +72,7 @@ def write_rigid_rows(
 
 @wp.func
 def with_wire(surface: Surface, wire_stiffness: wp.float64, parameters: Parameters):
-    """Returns the surface of a contact, with the spring of a wire [N/m] in series with its own."""
+    """Returns the surface of a contact, with a wire's spring [N/m] in series with the contact's spring."""
     one = wp.float64(1.0)
     surface.stiffness = one / (one / surface.stiffness + one / wire_stiffness)
     surface.damping = parameters.wire_damping_time * surface.stiffness
@@ -84,8 +86,8 @@ def write_bias(
 ):
     """Write the bias velocities and the initial guess of the impulses of one contact.
 
-    The spring of an open gap does not push yet: it only keeps the gap from closing further within the step. A wire's
-    spring may push a body back at any speed.
+    The spring of an open contact exerts no force before the gap is closed within the step. The limit on the speed of
+    separation does not apply to a wire's spring.
     """
     feature = contacts.feature[c]
     other = contacts.other[c]
@@ -103,7 +105,7 @@ def write_bias(
     count = warm_start.count[0]
     middle = wp.min(c, count - 1)
     looked = int(0)
-    while looked < 2 * count:  # a lasting contact is near the same place in the list, before or after it
+    while looked < 2 * count:  # a contact of the last step has a similar place in the list
         step = (looked + 1) // 2
         k = middle + wp.where(looked % 2 == 1, step, -step)
         looked = looked + 1
@@ -132,7 +134,7 @@ def write_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """Write the three rows of contact ``c``, whose candidate is in a slot of a row of trees."""
+    """Write the three rows of contact ``c``. Its candidate is in the slot ``slot`` of the row ``tree_row``."""
     g = contacts_out.other[c]
     n = candidates.normal[tree_row, slot]
     x = candidates.point[tree_row, slot]
@@ -197,7 +199,7 @@ def write_rows_of_contact(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """Write the three rows of contact ``c``, and clear the entries of its rigid rows that the last step wrote."""
+    """Write the three rows of contact ``c``, and set to zero the entries of its rigid rows that the last step wrote."""
     slots = candidates.feature.shape[1]
     span = spans_out[c]
     for dof in range(span[0], span[1]):
@@ -280,7 +282,8 @@ def row_vector(row: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
 
 @wp.func
 def row_columns(c: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
-    """Returns three entries, from ``column`` on, of each of the three rows of a contact, one row a column."""
+    """Returns a matrix with three entries, from ``column`` on, of each of the three rows of a contact. Each row becomes
+    a column of the matrix."""
     return wp.matrix_from_cols(
         row_vector(3 * c, column, jacobian),
         row_vector(3 * c + 1, column, jacobian),

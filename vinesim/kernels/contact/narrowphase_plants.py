@@ -1,7 +1,7 @@
 """Narrowphase of plants among themselves: bunches against wood and other bunches of their tree, and tree against tree.
 
-Two capsules that overlap while all plants rest as generated, or that are nearly in contact then, are in contact only
-where they come closer than that.
+Two capsules that overlap, or almost touch, in the generated rest pose of all plants are in contact only if they come
+closer than in that pose.
 """
 
 import warp as wp
@@ -51,8 +51,8 @@ def distance_after_step(
     bodies: PlantBodies,
     capsule_states: CapsuleStates,
 ):
-    """Returns :func:`segment_segment_distance` of two capsules' axes at the end of the step, at their present
-    velocities.
+    """Returns :func:`segment_segment_distance` of two capsules' axes at the end of the step, if their velocities stay
+    constant.
     """
     none = wp.spatial_vector()
     acceleration = velocity_product_acceleration(body, -1, none, bodies.parent, bodies.is_cut, bodies.q, bodies.qd)
@@ -128,8 +128,8 @@ def plant_candidate(
 
 @wp.func
 def may_touch_own_tree(s: int, tree: int, low: wp.vec3, high: wp.vec3, capsules: Capsules, wood_boxes: Aabbs):
-    """Returns whether a capsule with this box may touch another of its tree: bunches touch wood, and bunches listed
-    later.
+    """Returns whether a capsule with this box may touch another capsule of its tree. Bunches can touch wood, and
+    bunches with a higher index.
     """
     clear = aabbs_disjoint(low, high, wood_boxes.low[tree], wood_boxes.high[tree])
     return capsules.bunch[s] >= 0 and (not clear or capsules.bunch[s] < capsules.tree_last_bunch[tree])

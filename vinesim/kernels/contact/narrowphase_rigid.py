@@ -1,10 +1,11 @@
-"""Narrowphase of plants and rigid geoms: where a tree's capsules touch geoms, or may touch them before the step ends.
+"""Narrowphase of plants and rigid geoms: finds contacts of a tree's capsules with geoms that exist now or may begin
+before the step ends.
 
-Two shapes that overlap while all plants rest as generated, or that are nearly in contact then, are in contact only
-where they come closer than that. For a piece that was cut off, this allowed overlap shrinks by the distance that the
-piece has moved since: a shoot that grew around a wire does not fall through it. A deflected wire is in contact with
-what it would press on in its undeflected position. A bunch that overlaps a tree when it is picked passes through that
-tree until it is clear of it.
+Two shapes that overlap, or almost touch, in the generated rest pose of all plants are in contact only if they come
+closer than in that pose. For a piece that was cut off, this allowed overlap shrinks by the distance that the piece has
+moved since, so that a shoot that grew around a wire does not fall through the wire. A deflected wire is in contact with
+shapes that it would overlap in its undeflected position. A bunch that overlaps a tree when it is picked passes through
+that tree until the two no longer overlap.
 """
 
 import warp as wp
@@ -48,7 +49,7 @@ from vinesim.kernels.contact.structs import (
 wp.set_module_options({"enable_backward": False})
 
 FAR = wp.constant(wp.float64(1.0e30))
-"""[m] Reach of an unlimited search."""
+"""[m] Value of ``reach`` for an unlimited search."""
 
 
 @wp.struct
@@ -60,8 +61,8 @@ class Pair:
     """Plant body of the capsule."""
     geom: int
     ends: int
-    """Number of contacts of the pair: 2, one at each end, if a part of the capsule lies along a face of the geom; else
-    1.
+    """Number of contacts of the pair: 2 if a part of the capsule lies along a face of the geom (one contact at each end
+    of this part), else 1.
     """
     rotation: wp.mat33d
     """Rotation of the geom."""
@@ -79,11 +80,11 @@ def segment_geom_distance(
     b: wp.vec3d,
     reach: wp.float64,
 ):
-    """Returns the world normal (0 to 2) and distance (3) [m] from a geom to the segment a b, and where on it (4, 0 to
-    1).
+    """Returns the world normal (entries 0 to 2) and distance (3) [m] from a geom to the segment a b, and the parameter
+    (4) of its closest point, 0 to 1.
 
-    Beyond ``reach`` [m] the distance from a hull is a lower bound. ``is_round``, here and below: all geoms are known to
-    be planes, spheres and capsules, so that far less code is compiled.
+    Beyond ``reach`` [m] the distance from a hull is a lower bound. ``is_round``: all geoms are known to be planes,
+    spheres and capsules, so that much less code is compiled.
     """
     found = vec5d()
     if not is_round and geoms.kind[g] == MESH:
@@ -116,7 +117,8 @@ def follow_contact(
     hulls: Hulls,
     geom_states: GeomStates,
 ):
-    """Returns the candidate with normal, point and gap of the whole step if both sides keep their present velocities.
+    """Returns the candidate with normal, point and gap that take into account the motion of both sides over the step at
+    their present velocities.
 
     The two ends of a part along a face are followed separately. For a single contact, the closest points are found
     again at the end of the step. ``approach`` [m]: change of distance at constant velocity. ``relative`` [m/s]:
@@ -178,7 +180,7 @@ def rigid_candidate(
     hulls: Hulls,
     geom_states: GeomStates,
 ):
-    """Returns the contact of a pair at ``t`` (0 to 1) on the capsule.
+    """Returns the contact of a pair at the parameter ``t`` (0 to 1) on the capsule's axis.
 
     ``nearest``: see :func:`segment_primitive_distance`.
     """
@@ -256,8 +258,8 @@ def contact_ends(
     b: wp.vec3d,
     nearest: vec5d,
 ):
-    """Returns the ends (0 to 1) of the part of the segment a b along a face of a geom; twice the same if none lies
-    along it.
+    """Returns the parameters (0 to 1) of both ends of the part of the segment a b along a face of a geom. The two are
+    equal if no part lies along a face.
     """
     ends = wp.vec2d(nearest[4], nearest[4])
     to_local = wp.transpose(rotation)
@@ -278,7 +280,7 @@ def contact_ends(
 def is_tied(capsule: int, geom: int, capsules: Capsules, is_cut: wp.array(dtype=wp.bool)):
     """Returns whether a tie prevents collisions of a capsule with a geom, given by its MuJoCo index.
 
-    The tie holds the capsule's body, or a neighbour from which that body was not cut off.
+    The tie holds the capsule's body, or its parent or child if the joint between them was not cut.
     """
     tied = bool(False)
     for k in range(capsules.tied_geom.shape[1]):
@@ -322,7 +324,7 @@ def add_pairs(
     contacts.
 
     The pairs are listed ``pitch`` apart, from ``first`` on, sorted by capsule. Returns the number of contacts, and
-    whether one of them is an impact. One call handles all pairs of a tree, because every call copies all structs.
+    whether one contact is an impact. One call handles all pairs of a tree, because every call copies all structs.
     """
     is_impact = bool(False)
     total = int(count)
@@ -342,7 +344,7 @@ def add_pairs(
         rotation = rigid.xmat[geoms.id[g]]
         near = wp.dot(between, between) < limit * limit
         if near and not is_round and geoms.kind[g] != PLANE:
-            to_local = wp.transpose(rotation)  # the box test is cheap, and decides half of all pairs
+            to_local = wp.transpose(rotation)  # the box test is fast, and excludes half of all pairs
             near = not is_outside_box(geoms.half[g], to_local * (a - center), to_local * (b - center), radius + margin)
         if near:
             nearest = segment_geom_distance(is_round, geoms, hulls, g, rotation, center, a, b, radius + margin)
@@ -456,7 +458,7 @@ def find_contacts_of_tree(
     candidates_out: Candidates,
 ):
     """Find the contacts of the tree ``trees.awake[row]`` with rigid geoms, and write them to row ``row`` of the
-    candidates. Bunches that passed through the tree and are now clear of it no longer pass through it.
+    candidates. End the passing of bunches through the tree that no longer overlap it.
     """
     tree = trees.awake[row]
     near_count = list_near_geoms(

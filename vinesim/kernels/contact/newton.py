@@ -2,8 +2,8 @@
 
 The step assumes that open, sticking and sliding contacts keep their state, and linearises the direction of sliding. The
 conditions are then a linear system, B x + J_r w = r with one matrix B for each block, and w = H^-1 J_r^T x of the rigid
-bodies. Each block is eliminated by itself. The system that remains is as large as the number of degrees of freedom of
-the rigid bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
+bodies. Each block is eliminated separately. The size of the remaining system is the number of degrees of freedom of the
+rigid bodies (Woodbury). See ``docs/decisions/contact-solver.md``.
 """
 
 import warp as wp
@@ -68,7 +68,7 @@ def gather_row(
 """
 )
 def combine_rows(system: wp.array(dtype=wp.float64), at: int, pitch: int, factor: wp.mat22d):
-    """Replace two rows, the first of which begins at ``at``, by ``factor`` times them."""
+    """Multiply two consecutive rows by the 2 x 2 matrix ``factor``. The first row begins at ``at``."""
     ...
 
 
@@ -85,7 +85,7 @@ def linearise_friction(
     matrix: wp.array(dtype=wp.float64),
     system_out: IslandSystem,
 ):
-    """Turn the friction rows at ``at``, written for a sticking contact, into those of a sliding contact.
+    """Convert the two friction rows at ``at`` from those of a sticking contact to those of a sliding contact.
 
     x_t - K (x_t - step r_t) - g x_n = 0, see :func:`vinesim.kernels.contact.friction_law.linearise_sliding`.
     ``number``: index of the contact among the closed contacts. ``right``: number of entries of right-hand sides.
@@ -258,7 +258,7 @@ def subtract_products(
 def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
     """Solve (1 - G X) w = G y for the rigid velocities, where x = y + X w and G = H^-1 J_r^T; w replaces column 0.
 
-    With partial pivoting, because velocities and angular velocities are mixed.
+    The elimination uses partial pivoting, because linear and angular velocities have different scales.
     """
     zero = wp.float64(0.0)
     first = islands.first_dof[island]
@@ -307,8 +307,8 @@ def solve_rigid(island: int, islands: Islands, system_out: IslandSystem):
 
 @wp.func
 def newton_step(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
-    """Compute the impulses that fit the present states of all contacts of an island, projected into their friction
-    cones.
+    """Solve for the impulses of an island with each contact in its present state (open, sticking or sliding), and
+    project them into their friction cones.
     """
     first = islands.first_dof[island]
     dofs = island_dofs(island, islands)

@@ -27,14 +27,15 @@ from vinesim.kernels.contact.structs import ISLANDS, Contacts, Geoms, Islands, P
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 NEWTON_PERIOD = wp.constant(10)
-"""Number of sweeps between further Newton steps of an island that did not converge with the first ones. TUNED"""
+"""Number of sweeps between further Newton steps of an island that did not converge with the first Newton steps.
+TUNED"""
 
 
 @wp.func
 def relax_contact(
     place: int, block: int, island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem
 ):
-    """One Gauss-Seidel step of a contact. Returns the size of the change of its impulse [N s]."""
+    """Take one Gauss-Seidel step of a contact. Returns the size of the change of its impulse [N s]."""
     zero = wp.float64(0.0)
     row = contact_row(place, block, islands)
     before = three(row, system_out.impulse)
@@ -56,8 +57,8 @@ def relax_contact(
 
 @wp.func
 def sweep(island: int, islands: Islands, matrix: wp.array(dtype=wp.float64), system_out: IslandSystem):
-    """One Gauss-Seidel step of each contact in turn. Returns the largest change of an impulse and the largest normal
-    impulse.
+    """Take one Gauss-Seidel step of each contact in turn. Returns the largest change of an impulse and the largest
+    normal impulse.
 
     Both are in N s.
     """
@@ -101,11 +102,11 @@ def solve_island(
 ):
     """Solve an island, starting from the initial guess in ``impulse``.
 
-    Contacts that depend on each other (two fingers around a bunch) slow Gauss-Seidel down: within a few sweeps it finds
-    which contacts stick, slide or open, but it takes a hundred for the rest. So islands of small blocks at first take a
-    Newton step after every sweep. If these steps do not converge, sweeps continue from the impulses before the first
-    Newton step, with conjugate gradients. In islands with a large block, conjugate gradients are used from the first
-    sweep on.
+    Gauss-Seidel converges slowly if contacts depend strongly on each other, such as two fingers around a bunch. It
+    finds the states of contacts (sticking, sliding, open) within a few sweeps, but takes a hundred sweeps for the
+    impulses. So islands of small blocks at first take a Newton step after every sweep. If these steps do not converge,
+    sweeps continue from the impulses before the first Newton step, with conjugate gradients. In islands with a large
+    block, conjugate gradients are used from the first sweep on.
     """
     first = islands_out.row_start[islands_out.first_block[island]]
     last = islands_out.row_start[islands_out.first_block[island + 1]]

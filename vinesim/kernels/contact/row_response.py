@@ -1,9 +1,11 @@
-"""Response of plants to the rows of contacts: velocities of the bodies in contact by unit impulses along them.
+"""Response of plants to contact impulses: velocities of the plant bodies in contact by unit impulses along the rows of
+contacts.
 
 The articulated-body algorithm with impulses only (Featherstone 2008, section 7.3): impulses travel inward along the
 paths to the root, and the velocities that they cause travel outward. A contact of two plant bodies has two *sides*,
-numbered 2 * contact and 2 * contact + 1; for a contact with a rigid geom the second side is empty. The sides on one
-tree travel together, in groups of ten: three rows of each are thirty columns, and eight columns are computed at once.
+numbered 2 * contact and 2 * contact + 1; for a contact with a rigid geom the second side is empty. The impulses of
+sides on one tree are propagated together, in groups of ten sides. Three rows for each side are thirty columns, and
+eight columns are computed at once.
 """
 
 import warp as wp
@@ -15,7 +17,7 @@ from vinesim.kernels.plants.structs import ArticulationModel, Factors
 wp.set_module_options({"enable_backward": False})
 
 COLUMNS = wp.constant(32)
-"""Number of columns for which a body's working memory has room."""
+"""Number of columns in a body's working memory."""
 BODY_NUMBERS = wp.constant(192)
 """Number of values in a body's working memory: force and moment, then linear and angular velocity, of all columns."""
 
@@ -35,7 +37,7 @@ class ResponseScratch:
     """Working memory for the groups that are computed at the same time [row of scratch, body of the tree]."""
 
     is_on_path: wp.array(dtype=wp.bool)
-    """Whether the body is in contact or carries a body that is."""
+    """Whether the body or one of its descendants is in contact."""
     values: wp.array(dtype=float)
     """[body, component, column] Impulses, later velocities."""
 
@@ -100,7 +102,8 @@ def carry_inward(
     lever: wp.vec3,
     root: wp.mat33,
 ):
-    """Carry the impulses at a body to its parent, whose memory begins at ``to``. The joint's share of them stays.
+    """Propagate the impulses at a body to its parent, whose memory begins at ``to``. The part that turns the joint
+    stays in the body's memory.
 
     Without a parent (``to`` < 0) the impulses move the body; ``root`` is its inverse mass.
     """
@@ -135,7 +138,7 @@ def carry_inward(
 def carry_outward(
     values: wp.array(dtype=float), at: int, from_parent: int, width: int, DJ: wp.mat33, DH: wp.mat33, lever: wp.vec3
 ):
-    """Compute the velocities of a body from its joint's share of the impulses and the velocities of its parent."""
+    """Compute the velocities of a body from the impulses that turn its joint and from the velocities of its parent."""
     ...
 
 
@@ -160,8 +163,8 @@ def mark_paths(
     model: ArticulationModel,
     scratch_out: ResponseScratch,
 ):
-    """Mark the touched bodies of a tree, in slots ``start`` to ``end``, and all bodies that carry them; clear their
-    memory.
+    """Mark the touched bodies of a tree, in slots ``start`` to ``end``, and all their ancestors. Set their working
+    memory to zero.
     """
     for k in range(bodies):
         scratch_out.is_on_path[row + k] = False
@@ -178,7 +181,7 @@ def mark_paths(
 
 @wp.func
 def memory_of(body: int, first: int, row: int, pitch: int):
-    """Returns where the working memory of a body begins; negative for no body."""
+    """Returns the index at which the working memory of a body begins; negative if ``body`` is negative."""
     at = int(-1)
     if body >= 0:
         at = (row + (body - first) / pitch) * BODY_NUMBERS

@@ -1,12 +1,18 @@
 """The solver of :mod:`vinesim.kernels.contact.tree_solver` on a GPU, with one thread for each row.
 
 The matrices of trees are small, and their solve is a chain of dependent steps. Each step takes many times longer
-through memory, even shared memory, than through registers and shuffles. The steps, their order and their conditions are
-those of ``tree_solver``. A Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
+through memory, even shared memory, than through registers and shuffles. The algorithm is that of ``tree_solver``. A
+Newton step replaces the rows of contacts that are not closed by rows of an identity matrix.
 
-The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It knows nothing
-of contacts. All threads of a warp must call every function that contains native code.
+The native code exchanges numbers between the threads of a warp and solves linear systems in registers. It does not
+depend on contacts. All threads of a warp must call every function that contains native code.
+
+The matrix column of a thread stays in registers as well, which needs loops of constant length. :func:`row_solver`
+therefore makes the functions for a number of rows and of threads.
 """
+
+from collections.abc import Callable
+from typing import Any
 
 import warp as wp
 
@@ -24,14 +30,10 @@ from vinesim.kernels.contact.tree_solver import FIRST_SWEEPS, TreeSystem, slidin
 
 wp.set_module_options({"enable_backward": False})
 
-MOST_ROWS = wp.constant(30)
-"""Largest number of rows of a tree that the threads of a warp solve. Fewer threads solve one row each."""
-
 
 def _on_gpu(code: str, elsewhere: str = "0") -> str:
-    """Returns native code for a GPU. A CPU compiles ``elsewhere`` in its place, but never calls it."""
-    about = f"constexpr int ROWS = {int(MOST_ROWS)};\nconstexpr unsigned ALL = 0xffffffffu;"
-    return f"#if defined(__CUDA_ARCH__)\n{about}\n{code}\n#else\nreturn {elsewhere};\n#endif\n"
+    """Returns native code for a GPU. On a CPU ``elsewhere`` is compiled instead, but never called."""
+    return f"#if defined(__CUDA_ARCH__)\nconstexpr unsigned ALL = 0xffffffffu;\n{code}\n#else\nreturn {elsewhere};\n#endif\n"
 
 
 @wp.func_native(_on_gpu("return __shfl_sync(ALL, value, source, lanes);"))
@@ -96,36 +98,38 @@ def component(part: int, of: wp.vec3d):
     return wp.where(part == 0, of[0], wp.where(part == 1, of[1], of[2]))
 
 
-@wp.func
-def coupling(j: int, lane: int, size: int, matrix: wp.array2d(dtype=float)):
-    """Returns entry j [1/kg] of a thread's row of a symmetric matrix of ``size`` rows; 0 outside of the matrix."""
-    if j < size and lane < size:
-        return wp.float64(matrix[j, lane])
-    return wp.float64(0.0)
-
-
-@wp.func
-def row_velocity(
-    x: wp.float64, outside: wp.float64, lane: int, lanes: int, size: int, most: int, matrix: wp.array2d(dtype=float)
+@wp.func(inline=True)
+def follow_direction(
+    follows: bool,
+    x: wp.float64,
+    change: wp.float64,
+    direction: wp.float64,
+    gradient_before: wp.float64,
+    lanes: int,
 ):
-    """Returns ``outside`` [m/s] plus the velocity along a thread's row by the impulses of all rows, at most ``most``
-    rows.
+    """Move a thread's impulse on in the conjugate direction after a sweep that changed it by ``change``, if its tree
+    follows that direction. Returns the impulse, the direction, and the square of the tree's change.
+
+    See :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
     """
-    v = outside
-    for j in range(most):
-        v = v + coupling(j, lane, size, matrix) * from_lane(x, j, lanes)
-    return v
+    if not any_of_warp(follows):
+        return x, direction, gradient_before
+    gradient = sum_of_lanes(change * change, lanes)
+    goes = gradient_before > wp.float64(0.0) and gradient <= gradient_before
+    further = wp.where(goes, gradient / gradient_before * direction, wp.float64(0.0))
+    return (
+        wp.where(follows, x + further, x),
+        wp.where(follows, further + change, direction),
+        wp.where(follows, gradient, gradient_before),
+    )
 
 
-@wp.func_native(
-    _on_gpu("""
+_ELIMINATION = """
 double row[ROWS];
 #pragma unroll
 for (int j = 0; j < ROWS; ++j) {
-    row[j] = 0.0;
-    if (columns >> j & 1) {
-        row[j] = own * wp::load(wp::address(matrix, j, lane)) + others * wp::load(wp::address(matrix, j, partner));
-    }
+    const float theirs = __shfl_sync(ALL, column[j], partner, lanes);
+    row[j] = columns >> j & 1 ? own * column[j] + others * theirs : 0.0;
     if (j / 3 == lane / 3) row[j] += added[j % 3];
 }
 double by_pivot = 0.0;
@@ -143,189 +147,206 @@ for (int k = 0; k < ROWS; ++k) {
     right -= factor * __shfl_sync(ALL, right, k, lanes);
 }
 return right * by_pivot;
-""")
-)
-def solve_combined(
-    matrix: wp.array2d(dtype=float),
-    columns: wp.uint32,
-    partner: int,
-    own: wp.float64,
-    others: wp.float64,
-    added: wp.vec3d,
-    right: wp.float64,
-    lane: int,
-    lanes: int,
-    most: int,
-) -> wp.float64:
-    """Solve a linear system of at most ``most`` rows. Returns the entry of this thread.
-
-    The thread's row of the system is ``own`` times its row of the matrix plus ``others`` times its partner's row, in
-    the given columns, plus ``added`` in the columns of its own contact. ``right`` is its right-hand side. Gauss-Jordan
-    elimination without pivoting: see :func:`vinesim.kernels.contact.tree_solver.solve_newton_system`.
-    """
-    ...
+"""
 
 
-@wp.func
-def newton_impulse(
-    x: wp.float64,
-    v: wp.float64,
-    outside: wp.float64,
-    lane: int,
-    lanes: int,
-    is_row: bool,
-    most: int,
-    steps: Steps,
-    surface: Surface,
-    matrix: wp.array2d(dtype=float),
-):
-    """Returns the impulse along a thread's row that fits the present states of all contacts, projected into its cone."""
-    zero = wp.float64(0.0)
-    one = wp.float64(1.0)
-    c = lane // 3
-    part = lane % 3
-    impulse = of_contact(c, x, lanes)
-    velocity = of_contact(c, v, lanes)
-    partner = 3 * c + wp.where(part == 1, 2, 1)
-    outside_partner = from_lane(outside, partner, lanes)
-    is_pressed = is_row and presses(impulse)
-    pressing = lanes_where(is_pressed, lane, lanes)
-    columns = wp.where(is_pressed, pressing, wp.uint32(0))
-    own = wp.where(is_pressed, one, zero)
-    others = wp.float64(0.0)
-    diagonal = wp.where(is_pressed, surface.compliance, one)
-    added = wp.vec3d(
-        wp.where(part == 0, diagonal, zero),
-        wp.where(part == 1, diagonal, zero),
-        wp.where(part == 2, diagonal, zero),
-    )
-    if is_pressed and part > 0 and slides(impulse, surface):
-        by_tangents, added = sliding_row(part, impulse, velocity, steps, surface)
-        own = wp.where(part == 1, by_tangents[0], by_tangents[1])
-        others = wp.where(part == 1, by_tangents[1], by_tangents[0])
-    right = -(own * outside + others * outside_partner)
-    found = solve_combined(matrix, columns, partner, own, others, added, right, lane, lanes, most)
-    found = wp.where(is_pressed, found, x)
-    return component(part, project_into_cone(of_contact(c, found, lanes), surface))
+def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight functions)
+    """Returns a Warp function that solves a tree of at most ``rows`` rows with ``lanes`` threads of a GPU, 16 or 32."""
+    Column = wp.types.vector(length=rows, dtype=wp.float32)
 
+    def func(function: Callable[..., Any]) -> Any:
+        """Register a Warp function under a name of its own, because another solver has functions of the same names."""
+        return wp.func(function, name=f"{function.__name__}_{rows}", inline=True)
 
-@wp.func
-def sweep_rows(
-    x: wp.float64,
-    v: wp.float64,
-    lane: int,
-    lanes: int,
-    size: int,
-    busy: bool,
-    most: int,
-    steps: Steps,
-    surface: Surface,
-    matrix: wp.array2d(dtype=float),
-):
-    """One sweep over all contacts.
+    @func
+    def column_of(lane: int, size: int, matrix: wp.array2d(dtype=float)):
+        """Returns the column [1/kg] of a thread's row in a symmetric matrix of ``size`` rows, filled up with zeros."""
+        column = Column()
+        for j in range(wp.static(rows)):
+            if j < size and lane < size:
+                column[j] = matrix[j, lane]
+        return column
 
-    Returns the impulse and the velocity along the row of a thread, the size of the change of its contact's impulse, and
-    the normal impulse [N s]. Each thread computes for its own contact, and uses the result at that contact's turn.
-    """
-    c = lane // 3
-    part = lane % 3
-    change = wp.float64(0.0)
-    normal = wp.float64(0.0)
-    for k in range(most // 3):
+    @func
+    def row_velocity(x: wp.float64, outside: wp.float64, column: Column):
+        """Returns ``outside`` [m/s] plus the velocity along a thread's row by the impulses of all rows."""
+        v = outside
+        for j in range(wp.static(rows)):
+            v = v + wp.float64(column[j]) * from_lane(x, j, lanes)
+        return v
+
+    @func
+    def moved_velocity(moves: bool, x: wp.float64, v: wp.float64, outside: wp.float64, column: Column):
+        """Returns the velocity [m/s] along a thread's row: ``v`` if no impulse of its tree has changed."""
+        if not any_of_warp(moves):
+            return v
+        return wp.where(moves, row_velocity(x, outside, column), v)
+
+    @wp.func_native(_on_gpu(_ELIMINATION.replace("ROWS", str(rows))))
+    def solve_combined(
+        column: Column,
+        columns: wp.uint32,
+        partner: int,
+        own: wp.float64,
+        others: wp.float64,
+        added: wp.vec3d,
+        right: wp.float64,
+        lane: int,
+        lanes: int,
+        most: int,
+    ) -> wp.float64:
+        """Solve a linear system of at most ``most`` rows. Returns the entry of this thread.
+
+        The thread's row of the system is ``own`` times its column of the symmetric matrix plus ``others`` times its
+        partner's column, in the given columns, plus ``added`` in the columns of its own contact. ``right`` is its
+        right-hand side. Gauss-Jordan elimination without pivoting: see
+        :func:`vinesim.kernels.contact.tree_solver.solve_newton_system`.
+        """
+        ...
+
+    @func
+    def newton_impulse(
+        takes_step: bool,
+        x: wp.float64,
+        v: wp.float64,
+        outside: wp.float64,
+        lane: int,
+        is_row: bool,
+        most: int,
+        steps: Steps,
+        surface: Surface,
+        column: Column,
+    ):
+        """Returns the impulse along a thread's row. If the thread's tree ``takes_step``, the impulse comes from a Newton
+        step with all contacts in their present states, projected into the contact's friction cone; otherwise it is
+        ``x``.
+        """
+        if not any_of_warp(takes_step):
+            return x
+        zero = wp.float64(0.0)
+        one = wp.float64(1.0)
+        c = lane // 3
+        part = lane % 3
         impulse = of_contact(c, x, lanes)
-        residual = of_contact(c, v, lanes) + surface.compliance * impulse
-        after = relaxed(impulse, residual, steps, surface)
-        is_next = busy and lane < size and c == k
-        mine = wp.where(is_next, after - impulse, wp.vec3d())
-        x = wp.where(is_next, component(part, after), x)
-        change = wp.where(is_next, size_of_change(mine), change)
-        normal = wp.where(is_next, after[0], normal)
-        for axis in range(3):
-            v = v + coupling(3 * k + axis, lane, size, matrix) * from_lane(mine[axis], 3 * k, lanes)
-    return x, v, change, normal
+        velocity = of_contact(c, v, lanes)
+        partner = 3 * c + wp.where(part == 1, 2, 1)
+        outside_partner = from_lane(outside, partner, lanes)
+        is_pressed = is_row and presses(impulse)
+        pressing = lanes_where(is_pressed, lane, lanes)
+        columns = wp.where(is_pressed, pressing, wp.uint32(0))
+        own = wp.where(is_pressed, one, zero)
+        others = wp.float64(0.0)
+        diagonal = wp.where(is_pressed, surface.compliance, one)
+        added = wp.vec3d(
+            wp.where(part == 0, diagonal, zero),
+            wp.where(part == 1, diagonal, zero),
+            wp.where(part == 2, diagonal, zero),
+        )
+        if is_pressed and part > 0 and slides(impulse, surface):
+            by_tangents, added = sliding_row(part, impulse, velocity, steps, surface)
+            own = wp.where(part == 1, by_tangents[0], by_tangents[1])
+            others = wp.where(part == 1, by_tangents[1], by_tangents[0])
+        right = -(own * outside + others * outside_partner)
+        found = solve_combined(column, columns, partner, own, others, added, right, lane, lanes, most)
+        found = wp.where(is_pressed, found, x)
+        projected = component(part, project_into_cone(of_contact(c, found, lanes), surface))
+        return wp.where(takes_step, projected, x)
+
+    @func
+    def sweep_rows(x: wp.float64, v: wp.float64, lane: int, turns: int, steps: Steps, surface: Surface, column: Column):
+        """One sweep over the contacts, which take their turns one after the other. Returns the impulse and the velocity
+        along the row of a thread, the size of the change of its contact's impulse, and the normal impulse [N s].
+
+        Each thread computes for its own contact, and uses the result at that contact's turn. turns: number of contacts
+        of the thread's tree; 0 if its impulses do not change any more.
+        """
+        c = lane // 3
+        part = lane % 3
+        change = wp.float64(0.0)
+        normal = wp.float64(0.0)
+        for k in range(wp.static(rows // 3)):
+            impulse = of_contact(c, x, lanes)
+            residual = of_contact(c, v, lanes) + surface.compliance * impulse
+            after = relaxed(impulse, residual, steps, surface)
+            is_next = c == k and k < turns
+            mine = wp.where(is_next, after - impulse, wp.vec3d())
+            x = wp.where(is_next, component(part, after), x)
+            change = wp.where(is_next, size_of_change(mine), change)
+            normal = wp.where(is_next, after[0], normal)
+            v = v + wp.float64(column[3 * k]) * from_lane(mine[0], 3 * k, lanes)
+            v = v + wp.float64(column[3 * k + 1]) * from_lane(mine[1], 3 * k, lanes)
+            v = v + wp.float64(column[3 * k + 2]) * from_lane(mine[2], 3 * k, lanes)
+        return x, v, change, normal
+
+    @func
+    def solve_rows(
+        lane: int,
+        count: int,
+        max_sweeps: int,
+        newton_end: int,
+        tolerance: wp.float64,
+        system_out: TreeSystem,
+    ):
+        """Solve for the impulses of ``count`` contacts of a tree; this thread has the index ``lane``.
+
+        Returns the number of sweeps, or -1 if there are too many rows; nothing is changed then.
+
+        Variables that the loop assigns under a condition stay in registers from one turn to the next, since generated
+        code declares all variables before the loop. So the loop selects values instead of branching, and computes in
+        functions.
+        """
+        size = wp.where(3 * count <= rows, 3 * count, 0)
+        most = most_of_warp(size)  # all trees of a warp go through the same steps
+        if most == 0:
+            return wp.where(count > 0, -1, 0)
+        is_row = lane < size
+        steps = Steps()
+        surface = Surface()
+        x = wp.float64(0.0)
+        outside = wp.float64(0.0)
+        if is_row:
+            steps = steps_of_contact(lane // 3, system_out)
+            surface = system_out.surface[lane // 3]
+            x = system_out.impulse[lane]
+            outside = system_out.free[lane]
+        column = column_of(lane, size, system_out.matrix)
+        v = row_velocity(x, outside, column)
+        first = wp.float64(0.0)
+        before = wp.float64(0.0)
+        direction = wp.float64(0.0)
+        gradient_before = wp.float64(0.0)
+        busy = bool(size > 0)
+        done = int(0)
+        sweeps = int(0)
+        while sweeps < max_sweeps and any_of_warp(busy):
+            restarts = busy and newton_end > 0 and sweeps == newton_end + 1
+            follows = busy and sweeps > newton_end and not restarts
+            takes_step = busy and sweeps > 0 and sweeps <= newton_end
+            first = wp.where(sweeps == FIRST_SWEEPS, x, first)
+            found = wp.where(restarts, first, x)
+            found, direction, gradient_before = follow_direction(
+                follows, found, x - before, direction, gradient_before, lanes
+            )
+            x = newton_impulse(takes_step, found, v, outside, lane, is_row, most, steps, surface, column)
+            v = moved_velocity(restarts or follows or takes_step, x, v, outside, column)
+            before = x
+            x, v, change, normal = sweep_rows(x, v, lane, wp.where(busy, count, 0), steps, surface, column)
+            largest = largest_of_lanes(wp.max(normal, MIN_IMPULSE_SCALE), lanes)
+            sweeps = sweeps + 1
+            done = wp.where(busy, sweeps, done)
+            changing = lanes_where(
+                change > tolerance * largest, lane, lanes
+            )  # all threads call this, also of finished trees
+            busy = busy and changing != wp.uint32(0)
+        if is_row:
+            system_out.impulse[lane] = x
+            system_out.velocity[lane] = v
+        return wp.where(size > 0 or count == 0, done, -1)
+
+    return solve_rows
 
 
-@wp.func
-def further_along(change: wp.float64, direction: wp.float64, gradient: wp.float64, gradient_before: wp.float64):
-    """Returns how far a thread's impulse moves on in the conjugate direction after a sweep.
-
-    See :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
-    """
-    goes = gradient_before > wp.float64(0.0) and gradient <= gradient_before
-    return wp.where(goes, gradient / gradient_before * direction, wp.float64(0.0))
-
-
-@wp.func
-def solve_rows(
-    lane: int,
-    lanes: int,
-    count: int,
-    max_sweeps: int,
-    newton_end: int,
-    tolerance: wp.float64,
-    system_out: TreeSystem,
-):
-    """Solve for the impulses of ``count`` contacts of a tree with ``lanes`` threads; this thread has the index
-    ``lane``.
-
-    Returns the number of sweeps, or -1 if there are more rows than threads; nothing is changed then.
-
-    Variables that the loop assigns under a condition stay in registers from one turn to the next, since generated code
-    declares all variables before the loop. So the loop selects values instead of branching, and computes in functions.
-    """
-    size = wp.where(3 * count <= wp.min(lanes, MOST_ROWS), 3 * count, 0)
-    most = most_of_warp(size)  # all trees of a warp go through the same steps
-    if most == 0:
-        return wp.where(count > 0, -1, 0)
-    is_row = lane < size
-    steps = Steps()
-    surface = Surface()
-    x = wp.float64(0.0)
-    outside = wp.float64(0.0)
-    if is_row:
-        steps = steps_of_contact(lane // 3, system_out)
-        surface = system_out.surface[lane // 3]
-        x = system_out.impulse[lane]
-        outside = system_out.free[lane]
-    v = row_velocity(x, outside, lane, lanes, size, most, system_out.matrix)
-    first = wp.float64(0.0)
-    before = wp.float64(0.0)
-    direction = wp.float64(0.0)
-    gradient_before = wp.float64(0.0)
-    busy = bool(size > 0)
-    done = int(0)
-    sweeps = int(0)
-    while sweeps < max_sweeps and any_of_warp(busy):
-        restarts = busy and newton_end > 0 and sweeps == newton_end + 1
-        follows = busy and sweeps > newton_end and not restarts
-        takes_step = busy and sweeps > 0 and sweeps <= newton_end
-        first = wp.where(sweeps == FIRST_SWEEPS, x, first)
-        found = wp.where(restarts, first, x)
-        if any_of_warp(follows):
-            change = x - before
-            gradient = sum_of_lanes(change * change, lanes)
-            further = further_along(change, direction, gradient, gradient_before)
-            direction = wp.where(follows, further + change, direction)
-            gradient_before = wp.where(follows, gradient, gradient_before)
-            found = wp.where(follows, x + further, found)
-        if any_of_warp(takes_step):
-            impulse = newton_impulse(x, v, outside, lane, lanes, is_row, most, steps, surface, system_out.matrix)
-            found = wp.where(takes_step, impulse, found)
-        x = found
-        moves = restarts or follows or takes_step
-        if any_of_warp(moves):
-            velocity = row_velocity(x, outside, lane, lanes, size, most, system_out.matrix)
-            v = wp.where(moves, velocity, v)
-        before = x
-        x, v, change, normal = sweep_rows(x, v, lane, lanes, size, busy, most, steps, surface, system_out.matrix)
-        largest = largest_of_lanes(wp.max(normal, MIN_IMPULSE_SCALE), lanes)
-        sweeps = sweeps + 1
-        done = wp.where(busy, sweeps, done)
-        changing = lanes_where(
-            change > tolerance * largest, lane, lanes
-        )  # all threads call this, also of finished trees
-        busy = busy and changing != wp.uint32(0)
-    if is_row:
-        system_out.impulse[lane] = x
-        system_out.velocity[lane] = v
-    return wp.where(size > 0 or count == 0, done, -1)
+solve_few_rows = row_solver(15, 16)
+"""Solves a tree of at most 15 rows with 16 threads."""
+solve_many_rows = row_solver(30, 32)
+"""Solves a tree of at most 30 rows with the 32 threads of a warp."""

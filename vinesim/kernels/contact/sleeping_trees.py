@@ -1,7 +1,8 @@
-"""Sleeping trees that awake trees are about to touch: boxes of blocks, trees and capsules, then the narrowphase.
+"""Search for sleeping trees that awake trees will touch in the step: by boxes of blocks, trees and capsules, then by
+the narrowphase.
 
-A capsule that has been compared with all sleeping trees around it need not be compared again before it has moved as far
-as its clearance. An awake tree that hardly moves therefore costs one comparison for each capsule.
+A capsule that was compared with all sleeping trees around it is compared again only after it has moved as far as its
+clearance at that time. So an awake tree that hardly moves takes one comparison for each capsule.
 """
 
 import warp as wp
@@ -38,9 +39,9 @@ def list_due_capsules(
     capsule_states: CapsuleStates,
     clearances_out: Clearances,
 ):
-    """Find the capsules of a tree that may touch something before the step ends.
+    """Find the *due* capsules of a tree: those that may touch a sleeping tree before the step ends.
 
-    Returns the box around these capsules.
+    Returns the bounding box of these capsules.
     """
     low = wp.vec3(FAR)
     high = wp.vec3(-FAR)
@@ -119,11 +120,11 @@ def find_reached_trees(
     clearances_out: Clearances,
     is_reached_out: wp.array(dtype=wp.bool),
 ):
-    """One thread per awake tree. Mark the sleeping trees with which it will be in contact before the step ends.
+    """One thread per awake tree. Mark the sleeping trees that the tree will touch before the step ends.
 
-    Thread i takes the tree ``trees.awake[i]``. Capsules that overlap as generated, or nearly do, are in contact
-    only where they come closer than that (:func:`plant_candidate`), so that trees that merely stand together do not
-    wake each other.
+    Thread i takes the tree ``trees.awake[i]``. Capsules that overlap, or almost touch, in the generated pose are in
+    contact only if they come closer than in that pose (:func:`plant_candidate`), so that trees that stand close
+    together do not wake each other.
     """
     row = wp.tid()
     if row >= counters[SEARCHING_TREES]:

@@ -11,7 +11,7 @@ from vinesim.kernels.contact.friction_law import Surface
 
 wp.set_module_options({"enable_backward": False})
 
-# indices into ``counters``; each entry is a count unless its docstring says otherwise
+# indices into ``counters``; each entry is a count, except those whose docstring describes another meaning
 AWAKE_TREES = wp.constant(0)
 CONTACTS = wp.constant(1)
 OVERFLOW = wp.constant(2)
@@ -47,7 +47,7 @@ PAIRED_TREES = wp.constant(17)
 COUNTERS = 18
 
 AABB_BLOCK = wp.constant(32)
-"""Number of boxes in a block. They share one box around them, so that one comparison can skip them all."""
+"""Number of boxes in a block. A block has a common bounding box, so that one comparison can skip all its boxes."""
 
 
 @wp.struct
@@ -57,13 +57,13 @@ class Parameters:
     dt: wp.float64
     """[s] Time step."""
     margin: wp.float64
-    """[m] Contacts with movable geoms exist from this gap on."""
+    """[m] Gap below which contacts with movable geoms exist."""
     static_margin: wp.float64
-    """[m] Contacts with static geoms and other plants exist from this gap on."""
+    """[m] Gap below which contacts with static geoms and other plants exist."""
     max_separation_speed: wp.float64
     """[m/s] Largest velocity with which a contact pushes overlapping sides apart."""
     impact_speed: wp.float64
-    """[m/s] A contact that closes faster is an impact."""
+    """[m/s] Closing speed above which a contact is an impact."""
     wire_damping_time: wp.float64
     """[s] Damping of a wire divided by its stiffness."""
 
@@ -81,7 +81,7 @@ class Trees:
     """State of all trees; a tree is one kinematic tree of a plant."""
 
     awake: wp.array(dtype=wp.int32)
-    """[k] Indices of the trees that this step handles. The thread count is their number."""
+    """[k] Indices of the trees that this step handles. Kernels with a thread for each awake tree have k threads."""
     is_awake: wp.array(dtype=wp.bool)
     """[tree] Whether the tree is awake."""
     is_fine: wp.array(dtype=wp.bool)
@@ -122,7 +122,7 @@ class Capsules:
     bunch: wp.array(dtype=wp.int32)
     """[capsule] Index of the bunch that the capsule belongs to; -1 for wood."""
     level: wp.array(dtype=wp.int32)
-    """[capsule] Level of detail of its tree at which the capsule exists: 0 both, 1 coarse, 2 fine."""
+    """[capsule] Level of detail of the tree at which the capsule exists: 0 always, 1 only coarse, 2 only fine."""
     local_start: wp.array(dtype=wp.vec3)
     """[capsule] Start of the axis, m, in the body's frame."""
     local_end: wp.array(dtype=wp.vec3)
@@ -150,7 +150,8 @@ class Capsules:
 
 @wp.struct
 class CapsuleStates:
-    """The capsules [capsule] at the start of the step. For sleeping trees: where they fell asleep."""
+    """Positions and boxes of the capsules [capsule] at the start of the step. For sleeping trees: in the pose in which
+    they fell asleep."""
 
     start: wp.array(dtype=wp.vec3)
     end: wp.array(dtype=wp.vec3)
@@ -166,10 +167,11 @@ class Clearances:
     """Distance of each capsule of an awake tree from contact with sleeping trees at their last comparison [capsule]."""
 
     start: wp.array(dtype=wp.vec3)
-    """[m] Start of the capsule's axis at that comparison."""
+    """[m] Start of the capsule's axis at its last comparison with sleeping trees."""
     end: wp.array(dtype=wp.vec3)
     distance: wp.array(dtype=float)
-    """[m] Distance that the capsule may move from there without a new comparison. Negative: compare in any case."""
+    """[m] Distance that the capsule may move from ``start`` without a new comparison. Negative: compare in every
+    step."""
     reach: wp.array(dtype=float)
     """[m] Distance around the capsule that is searched in this step; 0 for no search."""
 
@@ -208,12 +210,14 @@ class Geoms:
     friction: wp.array(dtype=wp.float64)
     """[1] The geom's own friction coefficient, for all contacts. 0: the coefficient of the two materials applies."""
     is_remote: wp.array(dtype=wp.bool)
-    """[geom] Whether the geom belongs to a copy of another client's robot or person. It touches remote trees only."""
+    """[geom] Whether the geom belongs to a copy of another client's robot or person. Such a geom touches remote trees
+    only."""
 
 
 @wp.struct
 class PassingBunches:
-    """Free bunches that pass through some trees, because they overlapped them when they were picked and still do."""
+    """Free bunches that pass through trees without contact, because they have overlapped these trees since they were
+    picked."""
 
     by_tree: wp.array2d(dtype=wp.int32)
     """[tree, k] Index of a bunch that passes through the tree; -1 for an empty place."""
@@ -223,7 +227,7 @@ class PassingBunches:
 
 @wp.struct
 class Hulls:
-    """Convex hulls of meshes. Each is given in the frame of its geoms, relative to their centre."""
+    """Convex hulls of meshes, in the frame of the geoms with that mesh, relative to the centre of their box."""
 
     first_plane: wp.array(dtype=wp.int32)
     """[hull + 1] Index of the hull's first plane."""
@@ -232,9 +236,9 @@ class Hulls:
     plane: wp.array(dtype=wp.vec4d)
     """[plane] Outward normal, and distance [m] from the centre."""
     edge_start: wp.array(dtype=wp.vec3d)
-    """[edge] Start, m."""
+    """[edge] m, start of the edge."""
     edge_end: wp.array(dtype=wp.vec3d)
-    """[edge] End, m."""
+    """[edge] m, end of the edge."""
     edge_left: wp.array(dtype=wp.int32)
     """[edge] Index of the plane on one side of the edge."""
     edge_right: wp.array(dtype=wp.int32)
@@ -249,11 +253,11 @@ class GeomStates:
     velocity: wp.array(dtype=wp.vec3d)
     """[m/s] Velocity of the centre."""
     angular_velocity: wp.array(dtype=wp.vec3d)
-    """[rad/s]"""
+    """[rad/s] Angular velocity of the geom."""
     speed: wp.array(dtype=wp.float64)
     """[m/s] Likely upper bound of the speed of all points of the geom in the step."""
     offset: wp.array(dtype=wp.vec3d)
-    """[m] Displacement of a deflected wire's centre from the position that the scene gives it."""
+    """[m] Displacement of a deflected wire's centre from its position in the scene."""
     low: wp.array(dtype=wp.vec3)
     """[m] Lower corner of the box around the space that the geom can sweep in the step."""
     high: wp.array(dtype=wp.vec3)
@@ -296,9 +300,9 @@ class RigidBodies:
     velocity_free: wp.array(dtype=wp.float64)
     """[dof] Velocity at the end of the step if there were no plants."""
     correction: wp.array(dtype=wp.float64)
-    """[dof] By how much plants changed that predicted velocity in the last step."""
+    """[dof] Change of the predicted velocity by plants in the last step."""
     correction_before: wp.array(dtype=wp.float64)
-    """[dof] By how much plants changed the predicted velocity in the step before the last."""
+    """[dof] Change of the predicted velocity by plants in the step before the last."""
     tree_island: wp.array(dtype=wp.int32)
     """[MuJoCo tree] Label that all trees coupled by active constraints share."""
 
@@ -308,14 +312,14 @@ class RigidFactors:
     """MuJoCo's sparse factors L^T D L of the mass matrix M, and of M^, which is M with the implicit servos added."""
 
     tree_dof: wp.array(dtype=wp.int32)
-    """MuJoCo's tree_dofadr."""
+    """[MuJoCo tree] First degree of freedom of the tree: MuJoCo's tree_dofadr."""
     tree_dof_count: wp.array(dtype=wp.int32)
     row_start: wp.array(dtype=wp.int32)
-    """MuJoCo's M_rowadr."""
+    """[dof] Index of the first entry of the row in sparse matrices: MuJoCo's M_rowadr."""
     row_count: wp.array(dtype=wp.int32)
-    """MuJoCo's M_rownnz."""
+    """[dof] Number of entries of the row in sparse matrices: MuJoCo's M_rownnz."""
     column: wp.array(dtype=wp.int32)
-    """MuJoCo's M_colind."""
+    """[entry] Column of the entry in sparse matrices: MuJoCo's M_colind."""
     implicit: wp.array(dtype=wp.float64)
     """MuJoCo's qH: factor of M^."""
     implicit_inverse: wp.array(dtype=wp.float64)
@@ -323,7 +327,7 @@ class RigidFactors:
     plain: wp.array(dtype=wp.float64)
     """MuJoCo's qLD: factor of M."""
     plain_inverse: wp.array(dtype=wp.float64)
-    """MuJoCo's qLDiagInv."""
+    """[dof] Inverse diagonal of the factor of M: MuJoCo's qLDiagInv."""
 
 
 @wp.struct
@@ -363,7 +367,7 @@ class Contacts:
     feature: wp.array(dtype=wp.int32)
     other: wp.array(dtype=wp.int32)
     body: wp.array(dtype=wp.int32)
-    """[contact] Plant body."""
+    """[contact] Plant body of the capsule."""
     body_slot: wp.array(dtype=wp.int32)
     """[contact] Index of ``body`` in the list of bodies in contact (:class:`TouchedBodies`)."""
     other_body: wp.array(dtype=wp.int32)
@@ -376,7 +380,7 @@ class Contacts:
     spring.
     """
     wire_stiffness: wp.array(dtype=wp.float64)
-    """[N/m] Stiffness of the wire that is the contact's other side; 0 if it is no wire or a rigid one."""
+    """[N/m] Stiffness of the wire on the contact's other side; 0 for a rigid wire or another shape."""
     wire_shift: wp.array(dtype=wp.float64)
     """[m] Gap to the unloaded wire minus the gap to the wire's geom."""
     point: wp.array(dtype=wp.vec3d)
@@ -392,7 +396,7 @@ class Contacts:
 
 @wp.struct
 class TouchedBodies:
-    """Plant bodies in contact [slot], sorted, each listed once. The bodies of one tree are neighbours in the list."""
+    """Plant bodies in contact [slot], sorted, each listed once. The bodies of one tree are adjacent in the list."""
 
     body: wp.array(dtype=wp.int32)
     tree_start: wp.array(dtype=wp.int32)
@@ -405,7 +409,8 @@ class TouchedBodies:
 
 @wp.struct
 class SideGroups:
-    """Sides of contacts on plants, in groups of at most ten on one tree: see :mod:`vinesim.kernels.contact.row_response`."""
+    """Sides of contacts on plants, in groups of at most ten sides on one tree; see
+    :mod:`vinesim.kernels.contact.row_response`."""
 
     side: wp.array(dtype=wp.int32)
     """[place] 2 * contact, plus 1 for the side of the other plant body.
@@ -429,9 +434,10 @@ class SideGroups:
 
 @wp.struct
 class Islands:
-    """Islands: sets of contacts that do not affect each other within the step. Each consists of blocks.
+    """Islands: sets of contacts. Contacts of different islands do not affect each other within the step. An island
+    consists of blocks.
 
-    A block is a set of contacts that plants couple. The blocks of an island are coupled by rigid bodies only.
+    A block is a set of contacts that a tree or touching trees couple. Only rigid bodies couple the blocks of an island.
     """
 
     start: wp.array(dtype=wp.int32)
@@ -487,7 +493,7 @@ class Rows:
     bias: wp.array(dtype=wp.float64)
     """[row] Velocity that the solver adds to the residual of the row, m/s."""
     impulse: wp.array(dtype=wp.float64)
-    """[row] Impulse, N s."""
+    """[row] Impulse along the row, N s."""
 
 
 @wp.struct
@@ -501,6 +507,6 @@ class WarmStart:
     other: wp.array(dtype=wp.int32)
     normal_impulse: wp.array(dtype=wp.float64)
     friction_impulse: wp.array(dtype=wp.vec3d)
-    """[N s] In world axes."""
+    """[N s] Friction impulse, world axes."""
     anchor: wp.array(dtype=wp.vec3d)
     """[m] Stretch of the tangential spring since the contact began to stick, world axes."""

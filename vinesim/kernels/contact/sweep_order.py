@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def widest_axis(count: int, trees: Trees, boxes: Aabbs):
-    """Axis along which the lower corners of the awake trees' boxes differ most."""
+    """Returns the axis (0, 1, 2) along which the lower corners of the awake trees' boxes differ most."""
     least = wp.vec3(FAR)
     greatest = wp.vec3(-FAR)
     for row in range(count):
@@ -35,7 +35,7 @@ def merge_runs(
     rows: wp.array(dtype=wp.int32),
     rows_out: wp.array(dtype=wp.int32),
 ):
-    """Merge each two neighbouring sorted runs of ``width`` rows into one; of equals the first stays first."""
+    """Merge each two adjacent sorted runs of ``width`` rows into one sorted run (stable)."""
     for start in range(0, count, 2 * width):
         left = int(start)
         middle = wp.min(start + width, count)
@@ -63,9 +63,10 @@ def sort_awake_trees(
     rows_out: wp.array(dtype=wp.int32),
     scratch_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all: the axis (``SORT_AXIS``), and the rows of the awake trees in the order of their boxes along it.
+    """One thread in all. Choose the axis (``SORT_AXIS``), and sort the rows of the awake trees by their boxes along
+    this axis.
 
-    A merge sort; scratch_out: [row].
+    The algorithm is a merge sort. scratch_out: [row].
     """
     count = counters_out[AWAKE_TREES]
     axis = widest_axis(count, trees, boxes)

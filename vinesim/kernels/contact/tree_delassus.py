@@ -1,4 +1,5 @@
-"""The Delassus matrices of trees that touch static geoms: the velocities at a tree's contacts by its contact impulses.
+"""The Delassus matrices of trees that touch static geoms: velocity changes at a tree's contacts by its contact
+impulses.
 
 They are computed from the factored joints, in one pass outward for the tree and one inward for each contact: see
 :func:`respond_at_contacts` and :func:`write_delassus`.
@@ -19,27 +20,28 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class BodyCompliances:
-    """Velocity of a body by an impulse on it, at bodies where a tree branches [body].
+    """Velocity change of a body by an impulse wrench on the same body, for bodies at which a tree branches [body].
 
     (a, alpha) = [[P, Q], [Q^T, R]] (force, moment).
     """
 
     P: wp.array(dtype=wp.mat33)
-    """[1/kg]"""
+    """[1/kg] Linear velocity change per force impulse."""
     Q: wp.array(dtype=wp.mat33)
-    """[1/(kg m)]"""
+    """[1/(kg m)] Linear velocity change per moment impulse."""
     R: wp.array(dtype=wp.mat33)
-    """[1/(kg m^2)]"""
+    """[1/(kg m^2)] Angular velocity change per moment impulse."""
 
 
 @wp.struct
 class ResponseRows:
-    """Velocity of a contact's body by unit impulses along its three rows, one column each [slot * trees + tree]."""
+    """Velocity changes of a contact's body by unit impulses along the contact's three rows, one column for each row
+    [slot * trees + tree]."""
 
     a: wp.array(dtype=wp.mat33)
-    """[1/kg] linear."""
+    """[1/kg] Linear velocity changes."""
     alpha: wp.array(dtype=wp.mat33)
-    """[1/(kg m)] angular."""
+    """[1/(kg m)] Angular velocity changes."""
 
 
 @wp.kernel
@@ -57,13 +59,14 @@ def respond_at_contacts(
     compliances_out: BodyCompliances,
     response_out: ResponseRows,
 ):
-    """One thread per tree. Compute the response of each body to impulses on itself, from the root to the last contact.
+    """One thread per tree. Compute the velocity change of each body by impulses on the same body, from the root to the
+    body of the last contact.
 
-    This is the inverse of the body's articulated inertia, seen from the root, by the operational-space recursion
-    (Featherstone 2008, section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992), for trees that stand. With a = a' - l x
-    alpha' carried from the parent along the lever l, alpha = (1 - DJ) alpha' - DH a + D moment for a moment on the
-    joint itself. Contacts are in the order of their bodies. is_branching: [body] whether a body is the parent of a body
-    other than the next one.
+    This is the body's operational-space inverse inertia, computed by the recursion from the root (Featherstone 2008,
+    section 9.6; Kreutz-Delgado, Jain and Rodriguez 1992), for trees with a fixed root. With the parent's (a', alpha'),
+    the lever l and a = a' - l x alpha', the body has alpha = (1 - DJ) alpha' - DH a + D moment, where moment acts on
+    the body's joint. Contacts are in the order of their bodies. is_branching: [body] whether a body is the parent of a
+    body other than the next one.
     """
     tree = wp.tid()
     count = tree_contacts.count[tree]
@@ -117,7 +120,8 @@ def respond_at_contacts(
 
 @wp.func
 def carry_to_parent(k: int, factors: Factors, force: wp.mat33, moment: wp.mat33):
-    """Returns the impulses that the parent feels by impulses on body k, one column each: the joint takes its share."""
+    """Returns the impulses (force, moment) on the parent due to impulses on body k, minus the parts that turn the
+    joint; one column for each impulse."""
     lever = factors.lever[k]
     DH = factors.DH[k]
     DJ = factors.DJ[k]
@@ -140,10 +144,10 @@ def common_body_response(
     force: wp.mat33,
     moment: wp.mat33,
 ):
-    """Returns the velocities along the rows of contact ``other`` by impulses on body ``at``, on another branch of the
-    tree.
+    """Returns the velocity changes along the rows of contact ``other`` by the impulses ``force``, ``moment`` on body
+    ``at``, which may be on another branch of the tree.
 
-    Contact ``other`` is on ``body``.
+    ``body``: body of contact ``other``.
     """
     force_other = row_columns(other, 0, jacobian)
     moment_other = row_columns(other, 3, jacobian)
@@ -180,10 +184,12 @@ def write_delassus(
     # out
     system_out: TreeSystem,
 ):
-    """One thread per slot of a tree. Write its part of the system, and the velocities that impulses along it cause.
+    """One thread per slot of a tree. Write the slot's contact into the tree's system, and the entries of the Delassus
+    matrix for its impulses.
 
-    These are the velocities along the rows of all contacts up to its own. Its impulses are carried inward. Where they
-    reach a body with another contact, the response of that contact gives their effect, as the matrix is symmetric.
+    The entries are velocity changes along the rows of all contacts up to the slot's own. The slot's impulses are
+    propagated inward. When they reach a body with another contact, the entry follows from the response of that contact,
+    because the matrix is symmetric.
     """
     tree, c = tree_and_entry(wp.tid(), width / 3)
     if tree >= trees or c >= tree_contacts.count[wp.min(tree, trees - 1)]:

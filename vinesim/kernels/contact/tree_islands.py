@@ -2,9 +2,10 @@
 
 A GPU uses one thread for each tree, or one for each contact. The arrays of contacts interleave the trees: entry ``i``
 of a tree is at ``i * trees + tree``, so that threads in step read contiguous memory. A *view* of an array has an offset
-and a pitch that show one tree all of its own entries and nothing else. With views, narrowphase and rows use the same
-functions as a vineyard. The time is spent on reading memory. One kernel finds contacts and one solves them; between
-these, each body's record is read once outward for the tree, and once inward for each contact beyond it.
+and a pitch, such that it contains exactly the entries of one tree. With views, narrowphase and rows use the same
+functions as in a vineyard. Most of the time is spent on reading memory. One kernel finds contacts and one solves them.
+Between these two, each body's record is read once outward for the tree, and once inward for each contact beyond the
+body.
 """
 
 import warp as wp
@@ -13,7 +14,7 @@ from vinesim.kernels.contact.body_motion import to_double, to_single
 from vinesim.kernels.contact.forces import store_contact
 from vinesim.kernels.contact.friction_law import Surface
 from vinesim.kernels.contact.jacobians import write_rows
-from vinesim.kernels.contact.row_solver import solve_rows
+from vinesim.kernels.contact.row_solver import solve_few_rows, solve_many_rows
 from vinesim.kernels.contact.structs import (
     Candidates,
     Capsules,
@@ -83,7 +84,7 @@ def predict_impacted_trees(
 ):
     """One thread per tree.
 
-    Predict it again with phi = 1 if it is about to suffer an impact and was predicted otherwise.
+    Repeat the prediction with phi = 1 if one of the tree's contacts is an impact and phi was smaller.
     """
     tree = wp.tid()
     if is_impact[tree] and tree_phi_out[tree] < 1.0:
@@ -158,10 +159,10 @@ def apply_loaded_wrenches(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Add the effect of wrenches over a step to the prediction of one standing tree.
+    """Add the effect of wrenches over a step to the prediction of one tree with a fixed root.
 
-    The wrenches act on the tree's ``count`` loaded bodies, in order. This is
-    :func:`vinesim.kernels.plants.impulse_response.apply_tree_wrenches` with little memory traffic: sums stay in
+    The wrenches act on the tree's ``count`` loaded bodies, which are in ascending order. The result is that of
+    :func:`vinesim.kernels.plants.impulse_response.apply_tree_wrenches`, with less memory traffic: sums stay in
     registers from one body to the next, and go through records where the tree branches.
     """
     first = model.tree_first[tree]
@@ -240,7 +241,7 @@ def last_newton_sweep(count: int, max_newton_steps: int, max_newton_contacts: in
 
 @wp.func
 def copy_system(lane: int, lanes: int, size: int, source: TreeSystem, target_out: TreeSystem):
-    """Copy the system that the contacts of one tree must fulfil, and their present impulses."""
+    """Copy the contact system of one tree, and its present impulses."""
     for row in range(lane, size, lanes):
         for k in range(size):
             target_out.matrix[k, row] = source.matrix[k, row]
@@ -266,7 +267,8 @@ def begin_trees(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """One thread of a CPU per tree. Take two sweeps for its impulses, and list the tree if it needs more."""
+    """One CPU thread per tree. Take two sweeps for the tree's impulses, and list the tree as busy if it needs more
+    sweeps."""
     tree = wp.tid()
     count = tree_contacts_out.count[tree]
     if count > 0:
@@ -296,9 +298,9 @@ def solve_small_trees(
     tree_contacts_out: TreeContacts,
     system_out: TreeSystem,
 ):
-    """``lanes`` threads of a GPU per tree, in full warps. Solve for the tree's impulses.
+    """``lanes`` GPU threads per tree, in full warps. Solve for the tree's impulses.
 
-    Trees with more rows are skipped; see :func:`vinesim.kernels.contact.row_solver.solve_rows`.
+    Trees with more rows are skipped; see :func:`vinesim.kernels.contact.row_solver.row_solver`.
     """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
@@ -307,7 +309,7 @@ def solve_small_trees(
         count = tree_contacts_out.count[tree]
     system = view_system(system_out, tree, trees, width)
     newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
-    sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
+    sweeps = solve_few_rows(lane, count, max_sweeps, newton_end, tolerance, system)
     if lane == 0 and count > 0 and sweeps >= 0:
         tree_contacts_out.sweeps[tree] = sweeps
 
@@ -330,8 +332,8 @@ def solve_busy_trees(
     dense_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """``lanes`` threads for each tree that needs more sweeps. Each of ``groups`` groups of threads takes tree after
-    tree.
+    """``lanes`` threads per busy tree. Solve for its impulses. Each of ``groups`` groups of threads processes one tree
+    after the other.
 
     dense_out: scratch, the system of each group's tree in contiguous memory.
     """
@@ -346,7 +348,7 @@ def solve_busy_trees(
         newton_end = last_newton_sweep(count, max_newton_steps, max_newton_contacts)
         sweeps = int(-1)
         if lanes > 1:
-            sweeps = solve_rows(lane, lanes, count, max_sweeps, newton_end, tolerance, system)
+            sweeps = solve_many_rows(lane, count, max_sweeps, newton_end, tolerance, system)
         if sweeps < 0:
             sweeps = tree_contacts_out.sweeps[tree]
             copy_system(lane, lanes, 3 * count, system, dense)
@@ -387,10 +389,11 @@ def apply_tree_impulses(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread per tree. Add the effect of its contact impulses to its prediction, and store the next warm start.
+    """One thread per tree. Add the effect of the tree's contact impulses to its prediction, and store the warm start
+    for the next step.
 
     was_in_contact_out: [tree] whether the tree was in contact in the last step; updated here. A tree whose contact
-    begins takes ``onset_steps`` backward Euler steps, this one included.
+    begins takes ``onset_steps`` backward Euler steps, including this step.
     """
     tree = wp.tid()
     loaded = view_int(tree_contacts_out.loaded, tree, trees)

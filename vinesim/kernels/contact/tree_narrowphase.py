@@ -1,8 +1,8 @@
-"""Narrowphase for trees that are worlds of their own, with geoms that do not move: pairs and contacts of each tree.
+"""Narrowphase for batches of independent trees with static geoms: near pairs and contacts of each tree.
 
 Contacts are found by a kernel for geoms of any kind, or by a far shorter kernel for planes, spheres and capsules only.
-A GPU whose threads are at many places of a long kernel mostly waits for instructions. The index of a contact in its
-tree follows from the pairs before its own, so that it is the same in every run.
+If the threads of a GPU execute different parts of a long kernel, the GPU mostly waits for instructions. The index of a
+contact in its tree is computed from the numbers of contacts of earlier pairs, so that it is the same in every run.
 """
 
 import warp as wp
@@ -70,7 +70,7 @@ def list_near_geoms(
     static_blocks: Aabbs,
     tree_contacts_out: TreeContacts,
 ):
-    """List the geoms whose boxes overlap the box of capsule ``s``. Returns the number of pairs that the tree then has.
+    """List the geoms whose boxes overlap the box of capsule ``s``. Returns the new number of near pairs of the tree.
 
     Pairs for which there is no ``room`` are counted but not listed.
     """
@@ -151,7 +151,7 @@ def find_contacts_of_pairs(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """Find the contacts of every n-th near pair.
+    """Find the contacts of the near pairs ``thread``, ``thread + threads``, ``thread + 2 threads`` ...
 
     Contacts of pair i of a tree are the tree's candidates 2 i and 2 i + 1.
     """
@@ -199,7 +199,7 @@ def find_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """``threads`` threads. :func:`find_contacts_of_pairs` for geoms of any kind."""
+    """``threads`` threads. Find contacts by :func:`find_contacts_of_pairs`, for geoms of any kind."""
     find_contacts_of_pairs(
         wp.tid(),
         False,
@@ -236,7 +236,8 @@ def find_round_tree_contacts(
     tree_contacts_out: TreeContacts,
     candidates_out: Candidates,
 ):
-    """``threads`` threads. :func:`find_contacts_of_pairs` if all geoms are planes, spheres or capsules."""
+    """``threads`` threads. Find contacts by :func:`find_contacts_of_pairs`, if all geoms are planes, spheres or
+    capsules."""
     find_contacts_of_pairs(
         wp.tid(),
         True,
@@ -265,8 +266,8 @@ def number_tree_contacts(
     tree_contacts_out: TreeContacts,
     source_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per tree. List its contacts in the order of (capsule, geom, end). Contacts beyond the slots are
-    counted.
+    """One thread per tree. List the tree's contacts in the order of (capsule, geom, end). Contacts beyond the slots are
+    counted as dropped.
 
     few: trees with more contacts than this are listed as busy. source_out: [slot * trees + tree] candidate of each
     contact.

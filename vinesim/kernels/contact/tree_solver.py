@@ -1,12 +1,11 @@
-"""Solves the contacts of one tree with static geoms by the conditions and steps of the island solver, as a dense
-system.
+"""Solves the contacts of one tree with static geoms as a dense system, by the algorithm of the island solver.
 
-:mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, and finds
-its way through lists of them. The contacts of a single tree form one matrix, and nothing else moves, so the velocity
-along a row is one sum. On a GPU, :mod:`vinesim.kernels.contact.row_solver` does the same with one thread for each row.
-This module solves the trees with too many contacts for that, with one warp for each tree. The threads of a warp share
-the rows and take the same decisions from the same numbers. On a CPU one thread has all rows. The matrix is in single
-precision, like the impulse response from which it is computed. All else is in double precision.
+:mod:`vinesim.kernels.contact.projected_gauss_seidel` solves islands of many blocks that rigid bodies couple, with lists
+of blocks. The contacts of a single tree form one matrix and no rigid body moves, so the velocity along a row is one
+sum. On a GPU, :mod:`vinesim.kernels.contact.row_solver` does the same with one thread for each row. This module solves
+trees with too many contacts for ``row_solver``, with one warp for each tree. The threads of a warp share the rows and
+take the same decisions from the same numbers. On a CPU one thread has all rows. The matrix is in single precision, like
+the impulse response from which it is computed. All other numbers are in double precision.
 """
 
 import warp as wp
@@ -29,16 +28,18 @@ wp.set_module_options({"enable_backward": False})
 
 
 LANES_ACROSS = wp.constant(16)
-"""Number of threads that share the columns of a row in the solution of a linear system. A warp takes two rows at once."""
+"""Number of threads that share the columns of a row in the solution of a linear system. A warp processes two rows at
+once."""
 FIRST_SWEEPS = wp.constant(2)
-"""Number of sweeps after which a tree is listed as one that needs more. The search can return to the impulses then."""
+"""Number of sweeps after which a tree that has not converged is listed as busy. The search can return to the impulses
+at this point."""
 MOST_NEWTON_CONTACTS = wp.constant(16)
 """Largest number of contacts whose indices fit into one word. Trees with more contacts take no Newton steps."""
 
 
 @wp.struct
 class TreeSystem:
-    """Contacts of one tree: the system that their impulses must fulfil."""
+    """The linear system and the contact properties that determine the impulses of one tree's contacts."""
 
     matrix: wp.array2d(dtype=float)
     """[row, row] Delassus matrix, 1/kg."""
@@ -75,9 +76,10 @@ if (lanes > 1) {
 #endif
 """)
 def synchronize_lanes(lanes: int):
-    """Wait until all threads that share the tree have come here. Each thread then sees what the others wrote.
+    """Wait until all threads that share the tree have called this function. Writes before the call are then visible to
+    all of them.
 
-    The threads are neighbours in one warp; ``lanes`` divides 32.
+    The threads are adjacent in one warp; ``lanes`` divides 32.
     """
     ...
 
@@ -146,17 +148,19 @@ def list_pressing(count: int, system: TreeSystem):
 
 @wp.func
 def row_of(listed: wp.int64, i: int):
-    """Returns the row of entry ``i`` of the linear system, which contains the rows of listed contacts only."""
+    """Returns the contact row of row ``i`` of the linear system, which contains the rows of listed contacts only."""
     return 3 * int((listed >> wp.int64(4 * (i // 3))) & wp.int64(15)) + i % 3
 
 
 @wp.func
 def sliding_row(part: int, x: wp.vec3d, velocity: wp.vec3d, steps: Steps, surface: Surface):
-    """A row of Newton's system for the friction of a sliding contact along its tangent ``part``, 1 or 2:
-    x_t - K (x_t - step r_t) - g x_n = 0, see :func:`vinesim.kernels.contact.friction_law.linearise_sliding`.
+    """Returns the coefficients of the row of the Newton system for the friction of a sliding contact along its tangent
+    ``part`` (1 or 2): x_t - K (x_t - step r_t) - g x_n = 0, see
+    :func:`vinesim.kernels.contact.friction_law.linearise_sliding`.
 
-    x [N s] impulses and velocity [m/s], compliance left out, of the contact. Returns by how much the matrix rows and the
-    free velocities of the two tangents are multiplied, and what is then added for the impulses of the contact itself.
+    ``x`` [N s]: impulses of the contact. ``velocity`` [m/s]: its velocities without the compliance term. Returns the
+    factors of the matrix rows and free velocities of the two tangents, and the terms that are added for the contact's
+    own impulses.
     """
     K, g = linearise_sliding(x, velocity + surface.compliance * x, steps, surface)
     along_u = wp.where(part == 1, wp.float64(1.0), wp.float64(0.0))
@@ -189,7 +193,8 @@ def write_sliding_row(i: int, listed: wp.int64, size: int, system: TreeSystem, s
 
 @wp.func
 def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, system: TreeSystem, search_out: TreeSearch):
-    """Write the linear system for the present states of the listed contacts. These are closed; others have no impulse.
+    """Write the linear system for the present states of the listed contacts, which are the closed ones. Open contacts
+    have no impulse.
 
     Sticking rows: (A + compliance) x = -velocity. Friction of sliding contacts: see :func:`write_sliding_row`.
     """
@@ -210,7 +215,8 @@ def write_newton_system(listed: wp.int64, lane: int, lanes: int, size: int, syst
 def solve_newton_system(
     listed: wp.int64, lane: int, lanes: int, size: int, system_out: TreeSystem, search_out: TreeSearch
 ):
-    """Gaussian elimination without pivoting: the matrix is positive definite, and sliding rows change it little."""
+    """Solve the linear system by Gaussian elimination without pivoting: the matrix is positive definite, and sliding
+    rows change it little."""
     across = wp.min(lanes, LANES_ACROSS)
     down = wp.max(lanes / LANES_ACROSS, 1)
     for k in range(size):
@@ -233,7 +239,8 @@ def solve_newton_system(
 
 @wp.func
 def take_newton_step(lane: int, lanes: int, count: int, system_out: TreeSystem, search_out: TreeSearch):
-    """Compute the impulses that fit the present states of all contacts, and project them into their friction cones."""
+    """Solve for the impulses with each contact in its present state (open, sticking or sliding), and project them into
+    their friction cones."""
     listed, found = list_pressing(count, system_out)
     synchronize_lanes(lanes)
     write_newton_system(listed, lane, lanes, 3 * found, system_out, search_out)
@@ -302,7 +309,8 @@ def search_on(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """Do the work between two sweeps: a Newton step or a conjugate direction. Returns the square of the gradient."""
+    """Continue the search between two sweeps, by a Newton step or along a conjugate direction. Returns the square of
+    the gradient [N^2 s^2]."""
     size = 3 * count
     if sweeps == newton_end + 1 and newton_end > 0:
         copy_rows(lane, lanes, size, search_out.first, system_out.impulse)
@@ -316,7 +324,7 @@ def search_on(
 
 @wp.func
 def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, system_out: TreeSystem):
-    """One sweep over all contacts of a tree.
+    """Take one Gauss-Seidel step of each contact of a tree.
 
     Returns whether it changed more than ``tolerance`` of the largest impulse.
     """
@@ -341,9 +349,10 @@ def solve_tree(
     system_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """Solve for the impulses of ``count`` contacts of a tree for which ``sweeps`` sweeps have been done.
+    """Solve for the impulses of ``count`` contacts of a tree. ``sweeps``: number of sweeps that were taken before the
+    call.
 
-    Returns the number of sweeps done then, and whether the last sweep changed more than ``tolerance``.
+    Returns the total number of sweeps, and whether the last sweep changed more than ``tolerance``.
 
     The method is that of :func:`vinesim.kernels.contact.projected_gauss_seidel.solve_island`, but with a Newton step
     after every sweep up to ``newton_end``, in which the direction of sliding is linearised. ``lane``: index of this

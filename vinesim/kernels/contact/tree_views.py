@@ -1,4 +1,4 @@
-"""Views of the contact arrays. Their offset and pitch show one tree all of its own entries, and nothing else.
+"""Views of the contact arrays. A view contains exactly the entries of one tree.
 
 Entry ``i`` of a tree is at ``i * trees + tree``; see :mod:`vinesim.kernels.contact.tree_islands`.
 """
@@ -67,12 +67,12 @@ def part_table(a: wp.array2d(dtype=wp.float64), first: int) -> wp.array2d(dtype=
 
 
 GROUP = wp.constant(32)
-"""Number of trees whose entries neighbouring threads take: a warp of a GPU."""
+"""Number of trees whose entries adjacent threads process: a GPU warp."""
 
 
 @wp.func
 def tree_and_entry(thread: int, entries: int):
-    """Returns the tree, and the index among its ``entries``, that a thread takes.
+    """Returns the tree that a thread processes, and the index of the thread's entry among the tree's ``entries``.
 
     All entries of 32 trees come before those of the next 32 trees, so that the threads of a GPU's block read the same
     bodies from a cache. The returned tree may be beyond the last tree.
@@ -133,7 +133,7 @@ def view_warm_start(s: WarmStart, tree: int, trees: int):
 
 @wp.func
 def view_system(s: TreeSystem, tree: int, trees: int, width: int):
-    """Returns views of the system that one tree's contacts must fulfil; its matrix has ``width`` columns."""
+    """Returns views of the contact system of one tree; its matrix has ``width`` columns."""
     return TreeSystem(
         view_matrix(s.matrix, tree, trees, width),
         view_double(s.free, tree, trees),

@@ -1,1 +1,1 @@
-"""Kernels of lidars: which primitive each ray of a spinning head meets, and what comes back of a laser shot."""
+"""Kernels of lidars: the nearest primitive along each ray of a spinning head, and the echoes of a laser shot."""

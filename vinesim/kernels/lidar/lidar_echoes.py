@@ -1,4 +1,4 @@
-"""Echoes of a laser shot, and the returns that a lidar reports for them."""
+"""Echoes of laser shots, each sampled by several rays, and the returns that a lidar reports for these echoes."""
 
 import warp as wp
 
@@ -7,25 +7,25 @@ from vinesim.kernels.raster.primitives import Shapes, normal_at
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 RayValues = wp.types.vector(length=8, dtype=wp.float32)
-"""One number for each ray of a shot; an echo is (signal, range, brightness, index of the ray that contributes most)."""
+"""Vector with one number for each ray of a laser shot, at most eight."""
 
 
 @wp.struct
 class Receiver:
-    """Properties of a lidar's receiver."""
+    """Properties of a lidar's receiver: range, pulse length, detection threshold and noise."""
 
     rays: int
-    """Number of rays in one shot. The first ray is in the middle of the shot."""
+    """Number of rays that sample one laser shot; the first ray is along the middle of the beam."""
     used: int
-    """Number of rays that count, from the first ray on."""
+    """Number of rays of a shot that are evaluated, from the first ray on."""
     reflectance: wp.array(dtype=wp.float32)
-    """[organ] Reflectance."""
+    """[organ] Reflectance at the laser's wavelength, 0 to 1."""
     nearest: float
     farthest: float
     merge: float
     separation: float
     returns: int
-    """Which echoes are reported: 0 the strongest, 1 the last, 2 both."""
+    """Which echoes of a shot are reported: 0 the strongest, 1 the last, 2 both."""
     noise: float
     weak_noise: float
     step: float
@@ -35,7 +35,10 @@ class Receiver:
 
 @wp.func
 def measured_range(r: Receiver, echo: wp.vec4, noise: float) -> float:
-    """Returns the range of an echo [m]. Noise grows as the signal approaches the weakest one that is detected."""
+    """Returns the measured range [m] of an ``echo`` (signal, range [m], brightness, ray), with noise and quantisation.
+
+    ``noise`` is a standard normal number. Its scale grows as the signal approaches the weakest detectable one.
+    """
     sigma = r.noise
     if r.weakest > 0.0:
         sigma = wp.max(sigma, r.weak_noise * wp.sqrt(r.weakest / echo[0]))
@@ -47,7 +50,7 @@ def measured_range(r: Receiver, echo: wp.vec4, noise: float) -> float:
 
 @wp.func
 def label_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int) -> int:
-    """Returns the label of the primitive that a ray has hit."""
+    """Returns the label of ``primitive``, or ``ground_label`` if ``primitive`` is negative; label: [primitive]."""
     if primitive < 0:
         return ground_label
     return label[primitive]
@@ -55,14 +58,14 @@ def label_of(primitive: int, label: wp.array(dtype=wp.int32), ground_label: int)
 
 @wp.struct
 class SortedRays:
-    """The rays of one shot that met something in range, nearest first."""
+    """The rays of one laser shot that hit a surface within the lidar's range, sorted from near to far."""
 
     range: RayValues
-    """[m]"""
+    """Range of each hit [m]."""
     brightness: RayValues
-    """Reflectance times cosine, over the number of rays that count."""
+    """Reflectance times cosine of the angle of incidence, divided by the number of evaluated rays."""
     ray: RayValues
-    """Index of the ray in its shot."""
+    """Index of the ray among all rays of the scan."""
     count: int
 
 
@@ -78,11 +81,15 @@ def sorted_rays(
     primitive: wp.array(dtype=wp.int32),
     ground_organ: int,
 ) -> SortedRays:
-    """What the rays of one shot met, sorted by range (insertion sort)."""
+    """Returns the hits of the rays of laser shot ``shot``, sorted by range (insertion sort).
+
+    organ: [primitive]; pose: of the lidar in the world; direction: [ray] unit vectors in the lidar's frame; distance:
+    [ray] m; primitive: [ray] -1 no hit, -2 the ground.
+    """
     rays = receiver.rays
     t = RayValues()
     bright = RayValues()
-    name = RayValues()  # which ray, sorted with the others
+    name = RayValues()  # index of the ray, sorted with the ranges
     count = wp.int32(0)
     for k in range(receiver.used):
         ray = shot * rays + k
@@ -96,7 +103,7 @@ def sorted_rays(
                 matter = organ[it]
             slant = wp.abs(wp.dot(n, wp.transform_vector(pose, direction[ray])))
             light = receiver.reflectance[matter] * slant / float(receiver.used)
-            # insert by range
+            # insert the hit at its place by range
             j = count
             while j > 0 and t[j - 1] > r:
                 t[j] = t[j - 1]
@@ -117,7 +124,10 @@ def sorted_rays(
 
 @wp.struct
 class Echoes:
-    """Echoes of one shot, each (signal, range [m], brightness, ray that shows most of it); signal 0: none."""
+    """Echoes of one laser shot, each as (signal, range [m], brightness, index of the ray that contributes most).
+
+    An echo with signal 0 does not exist.
+    """
 
     strongest: wp.vec4
     second: wp.vec4
@@ -126,7 +136,10 @@ class Echoes:
 
 @wp.func
 def find_echoes(receiver: Receiver, rays: SortedRays, flicker: float) -> Echoes:
-    """Rays closer together along the beam than the pulse is long come back as one echo, at their mean range."""
+    """Returns the echoes of one laser shot: hits closer together in range than ``receiver.merge`` [m] form one echo.
+
+    The range of an echo is the mean range of its hits. ``flicker``: standard normal number that varies the signal.
+    """
     t = rays.range
     bright = rays.brightness
     name = rays.ray
@@ -187,10 +200,10 @@ def detect_returns(
     intensity_out: wp.array2d(dtype=wp.float32),
     label_out: wp.array2d(dtype=wp.int32),
 ):
-    """One thread makes one or two returns of one shot's rays; label -1 where there is none.
+    """One thread computes the one or two returns of one laser shot; the label is -1 where a return is missing.
 
-    first: number of the first thread's shot; pose: of the lidar in the world; direction: [ray] unit vectors in the
-    lidar's frame; distance: [ray] m; primitive: [ray] -2 the ground, -1 nothing; noise: [shot, 3] standard normal, for
+    first: shot of thread 0; pose: of the lidar in the world; direction: [ray] unit vectors in the lidar's frame;
+    distance: [ray] m; primitive: [ray] -2 the ground, -1 no hit; noise: [shot, 3] standard normal numbers for
     the two ranges and the signal; xyz: [shot, return] m in the lidar's frame; intensity: [shot, return] 0 to 255.
     """
     shot = first + wp.tid()

@@ -1,7 +1,7 @@
-"""Rasteriser of a spinning lidar: which rows and columns a primitive may cover, and the nearest primitive of each ray.
+"""Rasteriser of a spinning lidar: finds the nearest primitive along each ray of the grid of elevations and azimuths.
 
-A primitive is bound by balls, one or several along a cone or cylinder; boxes, cylinders and leaves also by the corners of
-a box.
+Bounds select the rows (elevations) and columns (azimuths) to test. A primitive is bounded by a ball, or by several
+along a cone or cylinder; boxes, cylinders and leaves also by the corners of a box.
 """
 
 import warp as wp
@@ -46,34 +46,34 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 ELEVATION_SLOTS = wp.constant(1024)
-"""Number of slots into which elevations from straight down to straight up are divided, to find rows."""
+"""Number of slots into which elevations from straight down to straight up are divided; a table by slot finds rows."""
 BALL_SPACING = wp.constant(0.02)
-"""[rad] Approximate distance between the balls that bound a slender primitive."""
+"""Approximate angular distance [rad] between neighbouring balls that bound a slender primitive."""
 
 
 @wp.struct
 class LidarHead:
-    """Pose of the lidar's head, its rows in the order of elevation, and the columns that are fired."""
+    """Pose of a lidar's head, its rows sorted by elevation, and the columns (azimuths) to fire."""
 
     eye: wp.vec3
     rotation: wp.mat33
-    """Rows: forward, left, up, in the world."""
+    """Rotation from the world to the head's frame; its rows are forward, left and up in the world."""
     tangent: wp.array(dtype=wp.float32)
     """[row] Tangent of the row's elevation."""
     azimuth: wp.array(dtype=wp.float32)
-    """[row] Azimuth of the row's ray in column 0, rad."""
+    """[row] Azimuth of the row's ray in column 0 [rad]."""
     row_index: wp.array(dtype=wp.int32)
-    """[row] Index of the row within a column."""
+    """[row] Index of the row's ray within a column of the output."""
     row_slots: wp.array(dtype=wp.int32)
-    """[slot] First row in the slot or above it."""
+    """[slot] First row in the elevation slot or above it."""
     direction: wp.array2d(dtype=wp.float32)
-    """Unit vectors in the head's frame [column * row, 3]."""
+    """[column * row, 3] Unit vectors of the rays in the head's frame."""
     step: float
-    """Angle from column to column [rad]."""
+    """Angle between neighbouring columns [rad]."""
     azimuth_middle: wp.vec2
-    """Forward and left component of the middle of the azimuths that are fired."""
+    """Unit vector (forward, left) of the middle of the fired azimuths."""
     azimuth_half_range: wp.vec2
-    """Cosine and sine of half the range of fired azimuths; cosine -1 for a full turn."""
+    """Cosine and sine of half the range of fired azimuths; the cosine is -1 for a full turn."""
     first_column: int
     end_column: int
     max_range: float
@@ -81,13 +81,13 @@ class LidarHead:
 
 @wp.func
 def elevation_slot(tangent: float) -> int:
-    """Slot of an elevation, given by its tangent: 0 straight down, ELEVATION_SLOTS straight up."""
+    """Returns the slot of an elevation, given by its tangent: 0 is straight down, ELEVATION_SLOTS straight up."""
     return int((tangent / (1.0 + wp.abs(tangent)) + 1.0) * (0.5 * float(ELEVATION_SLOTS) - 0.01))
 
 
 @wp.func
 def first_row(head: LidarHead, tangent: float) -> int:
-    """First row that is not below an elevation."""
+    """Returns the first (lowest) row whose elevation is not below the elevation with this ``tangent``."""
     row = head.row_slots[elevation_slot(tangent)]
     while row < head.tangent.shape[0] and head.tangent[row] < tangent:
         row += 1
@@ -96,14 +96,21 @@ def first_row(head: LidarHead, tangent: float) -> int:
 
 @wp.func
 def half_angle(r: float, away: float) -> float:
-    """An upper bound of asin(r / away), pi where the circle goes round the origin."""
+    """Returns an upper bound of asin(r / away) [rad], the half angle that a circle subtends at the origin; pi if the
+    circle contains the origin.
+
+    ``r``: radius [m]; ``away``: distance of the centre [m].
+    """
     s = r / wp.max(away, r)
     return wp.where(s < 0.9999, s + 0.5708 * s * s * s, 3.1416)
 
 
 @wp.func
 def may_intersect(head: LidarHead, p: wp.vec3, r: float) -> int:
-    """1 if a ray that is fired may meet a ball, 0 if surely none does. Without a branch."""
+    """Returns 1 if a fired ray may hit the ball of radius ``r`` [m] around ``p`` [m], in the head's frame; else 0.
+
+    The code has no branch, so that it vectorises.
+    """
     flat2 = p[0] * p[0] + p[1] * p[1]
     flat = wp.sqrt(flat2)
     span = circle_tangents(p[2], flat, r)
@@ -118,7 +125,8 @@ def may_intersect(head: LidarHead, p: wp.vec3, r: float) -> int:
 
 @wp.struct
 class BallChain:
-    """Balls of radius ``r`` [m] that hold a primitive, evenly along the line from a to b, in the head's frame [m]."""
+    """``count`` balls of radius ``r`` [m], evenly along the line from ``a`` to ``b`` [m, head's frame], that together
+    contain a primitive."""
 
     a: wp.vec3
     b: wp.vec3
@@ -128,7 +136,7 @@ class BallChain:
 
 @wp.func
 def bounding_balls(shapes: Shapes, i: int, kind: int, head: LidarHead) -> BallChain:
-    """One ball around primitive ``i``, or several along a cone or cylinder, about BALL_SPACING apart."""
+    """Returns one ball that contains primitive ``i``, or several along a cone or cylinder, about BALL_SPACING apart."""
     a4 = shapes.a[i]
     b4 = shapes.b[i]
     a = head.rotation * (xyz(a4) - head.eye)
@@ -182,17 +190,20 @@ class AngularBound:
     """Ranges of azimuth and elevation, in the head's frame, that contain a primitive."""
 
     azimuth: float
-    """[rad] Middle of the azimuths."""
+    """Middle of the range of azimuths [rad]."""
     half: float
-    """[rad] Half of the range of azimuths; pi for a full turn."""
+    """Half of the range of azimuths [rad]; pi for a full turn."""
     low: float
     high: float
-    """Tangents of the elevations."""
+    """Tangents of the lowest and the highest elevation."""
 
 
 @wp.func
 def holds_eye(box: OrientedBox, kind: int, radius: float) -> bool:
-    """Whether the head is inside of a box or cylinder, given by the box around it: no ray meets it from inside."""
+    """Returns whether the lidar's head is inside a box or cylinder, which its rays then do not hit.
+
+    ``box``: bounding box of the primitive, in the head's frame; ``radius``: of the cylinder [m].
+    """
     c = box.centre
     inside = wp.where(kind == BOX, 1.0, 0.999999)
     u = wp.abs(wp.dot(c, box.x)) < inside * wp.dot(box.x, box.x)
@@ -207,8 +218,10 @@ def holds_eye(box: OrientedBox, kind: int, radius: float) -> bool:
 
 @wp.func
 def angular_bound(box: OrientedBox) -> AngularBound:
-    """Bound of a box by its corners. The ball around a link of the robot next to the head holds the head, and would be
-    tested against every ray; the ball around a leaf that is seen edge-on holds many times the rays that the leaf does.
+    """Returns the ranges of azimuth and elevation of a box in the head's frame, from its corners.
+
+    Balls would be too coarse a bound: the ball around a robot link next to the head contains the head, so that every
+    ray would be tested; the ball around an edge-on leaf contains many times as many rays as the leaf.
     """
     centre = box.centre
     x = box.x
@@ -234,12 +247,12 @@ def angular_bound(box: OrientedBox) -> AngularBound:
         bottom = wp.min(bottom, p[2])
         far = wp.max(far, wp.sqrt(p[0] * p[0] + p[1] * p[1]))
     near = float(0.0)
-    if left - right < 3.1:  # else the head's vertical axis may pass through it
+    if left - right < 3.1:  # else the head's vertical axis may pass through the box
         o.half = 0.5 * (left - right) + 1.0e-4
         o.azimuth += 0.5 * (left + right)
         cosine = wp.cos(o.azimuth)
         sine = wp.sin(o.azimuth)
-        # all of it lies at least as far along the middle azimuth as its nearest corner
+        # along the middle azimuth, every point of the box is at least as far as its nearest corner
         reach = wp.abs(x[0] * cosine + x[1] * sine) + wp.abs(y[0] * cosine + y[1] * sine)
         reach += wp.abs(z[0] * cosine + z[1] * sine)
         near = wp.max(centre[0] * cosine + centre[1] * sine - reach, 0.0)
@@ -254,14 +267,15 @@ def angular_bound(box: OrientedBox) -> AngularBound:
 # The nearest primitive along each ray of a spinning head: primitives rasterised into its grid of azimuths and
 # elevations.
 #
-# Bounds of a primitive (:mod:`vinesim.kernels.lidar.lidar_raster`) reach over a range of elevations, which picks
-# rows, and over a range of azimuths, which picks columns; the rays found are tested eight at a time and kept as a
-# camera's pixels are (:mod:`vinesim.kernels.raster.camera_raster`).
+# The bounds of a primitive cover a range of elevations, which selects rows, and a range of azimuths, which selects
+# columns. The selected rays are tested eight at a time. Hits are stored as keys, like those of a camera's pixels
+# (:mod:`vinesim.kernels.raster.camera_raster`).
 
 
 @wp.func
 def ray_direction(head: LidarHead, at: int) -> wp.vec3:
-    """One ray; read number by number, for LLVM makes nothing of eight vectors."""
+    """Returns the unit vector of ray ``at`` in the head's frame; it is read as three scalars so that LLVM vectorises
+    it."""
     return wp.vec3(head.direction[at, 0], head.direction[at, 1], head.direction[at, 2])
 
 
@@ -273,9 +287,10 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread bounds one cluster: its least distance [m] to the head, or FAR if no ray can meet it.
+    """One thread tests one cluster against the fired rays.
 
-    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] m.
+    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] least distance to the head [m], or
+    FAR if no ray can hit the cluster.
     """
     i = wp.tid()
     r = ball[i][3]
@@ -287,25 +302,29 @@ def cull_clusters(
 
 @wp.func
 def axes_in_box(head: LidarHead, q: wp.quat) -> wp.mat33:
-    """Columns: the head's axes in the frame of a box of attitude ``q``."""
+    """Returns the rotation from the head's frame to the frame of a box with orientation ``q`` in the world."""
     return wp.transpose(wp.quat_to_matrix(q)) * wp.transpose(head.rotation)
 
 
 @wp.struct
 class LeafFrame:
-    """A blade's axes, over its size, in the head's frame, and where the head is in the blade's frame and unit."""
+    """Transform of rays from the head's frame to the frame and unit of a leaf.
+
+    ``side``, ``rib``, ``up``: axes of the leaf in the head's frame, divided by its size [m]; ``eye``: position of the
+    head in the leaf's frame and unit.
+    """
 
     side: wp.vec3
     rib: wp.vec3
     up: wp.vec3
     eye: wp.vec3
     per: float
-    """1 / size [1/m]"""
+    """1 divided by the size of the leaf [1/m]."""
 
 
 @wp.func
 def leaf_frame(shapes: Shapes, i: int, head: LidarHead) -> LeafFrame:
-    """Frame of blade ``i``."""
+    """Returns the transform of rays from the head's frame to the frame and unit of leaf ``i``."""
     a4 = shapes.a[i]
     o = LeafFrame()
     base = head.rotation * (xyz(a4) - head.eye)
@@ -319,15 +338,18 @@ def leaf_frame(shapes: Shapes, i: int, head: LidarHead) -> LeafFrame:
 
 @wp.func
 def leaf_ray(leaf: LeafFrame, direction: wp.vec3) -> wp.vec3:
-    """A ray's direction, given in the head's frame, in the blade's frame and unit."""
+    """Returns a ray's ``direction``, given in the head's frame, in the frame and unit of a leaf."""
     d = direction * leaf.per
     return wp.vec3(wp.dot(d, leaf.side), wp.dot(d, leaf.rib), wp.dot(d, leaf.up))
 
 
 @wp.func
 def leaf_range(shapes: Shapes, i: int, leaf: LeafFrame, ray: wp.vec3, t: float) -> float:
-    """Range [m] of blade ``i`` along a ray that meets its rectangle at ``t``, or in several places if that is negative; FAR
-    where its outline is missed."""
+    """Returns the range [m] at which a ray hits leaf ``i``, or FAR if the ray misses the leaf's outline.
+
+    ``ray``: direction in the leaf's frame and unit; ``t``: hit with the rectangle around the leaf [m], negative if the
+    ray hits the rectangle several times.
+    """
     number = int(shapes.b[i][3])
     if t < 0.0:
         return hit_leaf(shapes.outline, number, shapes.d[i], leaf.eye, ray, 0)
@@ -351,11 +373,11 @@ def raster_clusters(  # noqa: PLR0915 - one loop over all kinds of primitives ke
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """A thread enters every ``lanes``-th primitive of a cluster into every ``slices``-th row of the keys; reason: batches
-    stay in registers.
+    """One thread draws every ``lanes``-th primitive of one cluster into every ``slices``-th row of the lidar's rays.
 
-    lower, upper: [primitive, 3] m; visible: [thread] clusters; keys: [column * row] as in
-    :mod:`vinesim.kernels.raster.pinhole`, range [um] above.
+    lower, upper: [primitive, 3] bounding boxes [m]; visible: clusters in view; keys: [column * row] nearest hit, as in
+    :mod:`vinesim.kernels.raster.pinhole` but with the range [um] in the upper 32 bits. The function is long so that
+    batches of rays stay in registers.
     """
     k, lane, part = wp.tid()
     cluster = visible[k]
@@ -366,7 +388,7 @@ def raster_clusters(  # noqa: PLR0915 - one loop over all kinds of primitives ke
     spots = IntBatch()
     depths = FloatBatch()
     size = clusters.size[cluster]
-    # most primitives of far clusters lie between two rows
+    # most primitives of far clusters are between two rows
     found = IntBatch()
     n = wp.int32(0)
     while n < (size + 7) // 8 * 8:
@@ -425,7 +447,7 @@ def raster_clusters(  # noqa: PLR0915 - one loop over all kinds of primitives ke
                                 n += 1
                             column += 1
                         else:
-                            # the same row one turn further, or the next row
+                            # go on with the same row, one turn further, or with the next row
                             begin += period
                             if begin >= float(head.end_column):
                                 row += slices
@@ -495,7 +517,11 @@ def resolve_keys(
     distance_out: wp.array(dtype=wp.float32),
     primitive_out: wp.array(dtype=wp.int32),
 ):
-    """One thread reads the keys of ``run`` rays into distance [m] and primitive (-1 nothing, -2 the ground)."""
+    """One thread converts the keys of ``run`` rays to distance and primitive.
+
+    keys: [column * row] see :func:`raster_clusters`; distance: [column * row] m; primitive: [column * row] index, -1 no
+    hit, -2 the ground.
+    """
     up = wp.vec3(head.rotation[0, 2], head.rotation[1, 2], head.rotation[2, 2])
     first = head.first_column * head.tangent.shape[0] + wp.tid() * run
     for at in range(first, first + run):

@@ -9,46 +9,51 @@ the *metric* phi dt (phi dt K + D) and stiffness cannot make the step unstable. 
 K and D are diagonal in a joint's *middle axes*, turned from the joint's by half of its rotation, and the torque is the
 gradient of theta^T K theta / 2 (:func:`vinesim.kernels.plants.forces.spring_torque`).
 
-A step slows a mode of rate w by (w dt)^2 / 12. While nothing touches it, a tree whose first mode turns by more than
-0.3 rad in a step takes substeps instead: ``tree_steps`` holds their number, :mod:`vinesim.kernels.plants.first_mode`
-explains why. docs/decisions/integrator.md has the figures.
+A step reduces the frequency w of a mode by the share (w dt)^2 / 12. So a tree without contacts takes substeps if its
+first mode advances by more than 0.3 rad in a step. ``tree_steps`` holds the number of substeps,
+:mod:`vinesim.kernels.plants.first_mode` explains it. docs/decisions/integrator.md has the figures.
 
-Loads lend stiffness, too: a force F drawing out a lever d resists turning with (d.F)(1 - dd^T / d.d). Taken explicitly
-it gives a swing of rate w the damping ratio -(1 - phi) dt w / 2 (-0.018 for a bunch on 15 cm), and where a peduncle is
-softer than what it carries it grows without bound. So it enters the inertia with phi^2 dt^2, and the force's moment is taken where
-the lever will be (1 - phi) dt later: a swing then neither gains nor loses. F is weight, load and the last contacts.
+Loads cause *geometric stiffness*: a force F that pulls along a lever d resists rotation with the stiffness (d.F)(1 -
+dd^T / d.d). An explicit geometric stiffness would give a swing of frequency w the damping ratio -(1 - phi) dt w / 2
+(-0.018 for a bunch on 15 cm). A swing would grow without bound where the peduncle's spring is weaker than this
+stiffness. So the geometric stiffness enters the inertia with the factor phi^2 dt^2, and the force's moment is computed
+with the lever's position (1 - phi) dt later. A swing then neither gains nor loses energy. F is the sum of weight, load
+and the contact forces of the last step.
 
-This is one half of the stiffness that a load lends to a tree. The other half couples bending to twist: a force across a
-lever turns with it, and so does the moment of a spring, with the middle of its joint (by half of what parent and body
-turn). In equilibrium both together are symmetric. At phi 1/2, which must keep energy, they are included completely:
-without them, a level cane loses 2 % of a sideways swing in a minute, and with 100 g on its tip it gains forty times its
-energy in twenty seconds. Above phi 1/2 they are left out: they would cost a quarter of the step, and the scheme's own
-damping outweighs them.
+This is one half of the geometric stiffness. The other half couples bending to twist. It has two terms: a force across a
+lever, whose moment changes when the lever turns, and the moment of a spring, which turns with the middle axes of its
+joint (by half of the rotations of parent and body). In equilibrium the sum of the two terms is symmetric. At phi = 1/2,
+where a step must conserve energy, both are included completely. Without them, a level cane loses 2 % of a sideways
+swing in a minute, and with 100 g on its tip it gains forty times its energy in twenty seconds. Above phi = 1/2 they are
+left out: they would take a quarter of the step's time, and the scheme's own damping is larger than their effect.
 
-A body with parent -1 is a root. It hangs on its tree's pose, or *floats* if it has been cut off (``body_root`` names
-the cut body with which a body moves, -1 for bodies that stand). A floating root has no spring and no lever. The inertia
-that remains after its rotation is eliminated gives its linear acceleration: ``root_inverse_mass`` times the remaining
-force. Where no tie holds it, it *falls* (``body_falls``): weight draws nothing out, and its momentum is corrected after
-the step (``floating_components``). Components that hang from a tie are stepped like trees that stand.
+A body with parent -1 is a root. It is attached to its tree's fixed pose, or *floats* if it has been cut off.
+``body_root`` of a body is the floating root whose component contains the body, or -1. A floating root has no spring and
+no lever. Its linear acceleration is ``root_inverse_mass``, the inverse of the inertia that remains after its rotation
+is eliminated, times the remaining force. A floating component that no tie holds *falls* (``body_falls``): its weight
+causes no geometric stiffness, and its momentum is corrected after the step (``floating_components``). Components that
+hang from a tie are integrated like trees with a fixed root.
 
-Ties and air drag are forces at a point c of a body that grow against its velocity. Taken implicitly they look like a
-mass W at c: W = phi dt (phi dt k + c) for a spring and damper, dt c for drag.
+Ties and air drag are forces at a point of a body that oppose its velocity. Implicitly they act like an added mass W at
+this point: W = phi dt (phi dt k + c) for a spring of stiffness k with a damper c, and W = dt c for drag with the
+coefficient c.
 
-Gyroscopic and centrifugal terms stay explicit and err by about dt w^2 a second. A body turning faster than
-``fast_rate`` is therefore held back by a drag dt (w^2 - fast_rate^2) times its momentum, and a tree with a joint beyond
-``max_rate`` goes on at half of it.
+Gyroscopic and centrifugal terms are explicit; their relative error grows by about dt w^2 per second. So a drag of dt
+(w^2 - fast_rate^2) times its momentum slows a body that turns faster than ``fast_rate``, and the rates of a tree with a
+joint beyond ``max_rate`` are scaled down until its fastest joint has half of ``max_rate``.
 
-Signs and frames: world axes; velocities and accelerations are (linear of the body's origin, angular), wrenches (force
-at the origin, moment about it). The inertia of a body or subtree about the body's origin is held as three blocks,
+Signs and frames: all vectors are in world axes. Velocities and accelerations are (linear of the body's origin,
+angular), wrenches are (force, moment about the body's origin). The inertia of a body or subtree about the body's origin
+is stored as three blocks,
 
     moment = J alpha + H a        force = H^T alpha + M a        with H = m [c]x for one body,
 
 and after elimination of its joint a body keeps only D = (J + metric)^-1, D J and D H.
 
-Bodies are numbered by their place in memory: the bodies of a tree are ``pitch`` apart, from ``tree_first`` on, children
-after parents. Consecutive bodies (pitch 1) suit a CPU. A GPU reads neighbouring trees at once if their bodies are
-neighbours in memory. Sums over children are read and stored, not added in place, which would be an atomic operation in
-a GPU's far cache.
+Bodies are numbered by their place in memory: the bodies of a tree are ``pitch`` places apart, from ``tree_first`` on,
+children after parents. Consecutive bodies (pitch 1) are fast on a CPU. A GPU reads several trees at once if bodies of
+the same index in these trees are adjacent in memory. Sums over children are read, increased and stored, because an
+addition in place would be an atomic operation in a distant cache of the GPU.
 
 Files: ``structs`` (arguments), ``spatial`` (rotations, inertias), ``forces`` (springs, ties, drag), ``kinematics``,
 ``body_dynamics`` (one body and its joint), ``prediction`` (the three passes over one tree), ``eight_trees`` (the same

@@ -2,8 +2,8 @@
 
 They are the steps of the articulated-body algorithm (Featherstone 2008, table 7.1) at each body of a tree:
 :mod:`vinesim.kernels.plants.prediction` calls them tree by tree, :mod:`vinesim.kernels.plants.eight_trees` for eight
-trees at once. Both give the same bits: no function has a branch, and only the upper triangle of symmetric matrices
-counts.
+trees at once. Both yield the same bits, because no function has a branch and only the upper triangle of symmetric
+matrices is used.
 """
 
 import warp as wp
@@ -36,12 +36,13 @@ def own_terms(
     falls: float,
     fall: wp.vec3,
 ):
-    """Implicit inertia J, H, M of one body, its bias and its tension; ties and drag come on top.
+    """Returns the implicit inertia J, H, M of one body, its bias, and its tension: the steady force [N] that pulls on
+    levers. Without ties and drag, which other functions compute.
 
-    com: [m] centre of mass from the origin, world axes. inertia: [kg m^2] about it. load, contact: what is applied
-    from outside, and the force [N] of the last contacts. falls: 1 for a body of a floating component that no tie
-    holds, whose root moves at ``fall`` [m/s], else 0: weight does not draw out what falls, and drag does not hold back its fall. Also
-    returns the steady force [N] that draws out levers.
+    com: [m] centre of mass from the origin, world axes. inertia: [kg m^2] about the centre of mass. load: [N, N m]
+    applied wrench. contact: [N] force of the contacts of the last step. falls: 1 for a body of a floating component
+    that no tie holds, else 0. The weight of such a body causes no tension, and the drag of fast bodies does not slow
+    its fall. fall: [m/s] velocity of that component's root.
     """
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
@@ -68,7 +69,7 @@ def own_terms(
 
 @wp.func
 def drag_terms(p: SolverParameters, phi: float, area: float, air: wp.vec3, motion: wp.spatial_vector, com: wp.vec3):
-    """Returns the J, H, M, bias and tension of air drag on one body: of an added mass at its centre of mass, and its
+    """Returns the J, H, M, bias and tension of air drag on one body: an added mass at the centre of mass, and the drag
     force.
 
     air: [m/s] velocity of the air.
@@ -130,7 +131,7 @@ def joint_terms(
     """Returns a joint's metric [kg m^2], its driving torque without the bias of its subtree [N m], and its spring
     torque [N m].
 
-    turning, omega: [rad/s] of the parent and of the body. All in world axes.
+    turning, omega: [rad/s] angular velocity of the parent and of the body. All in world axes.
     """
     half = half_rotation(q)
     frame = wp.quat_to_matrix(axes * half)
@@ -140,7 +141,7 @@ def joint_terms(
     rate = wp.quat_rotate_inv(half, qd)
     torque = spring_torque(stiffness, q)
     spring = torque + wp.cw_mul(phi * dt * stiffness + residual, rate)
-    # the metric acts on the rate as the joint frame sees it, hence turning x omega = turning x (joint rate)
+    # the metric acts on the rate in the rotating joint frame, hence turning x omega = turning x (joint rate)
     drive = metric * wp.cross(turning, omega) - frame * spring
     return metric, drive, frame * torque
 
@@ -156,10 +157,11 @@ def turned_rest_moment(
     turn: wp.vec3,
     turn_rate: wp.vec3,
 ):
-    """Moment [N m], world axes, on a root because the rest of its spring is turned by ``turn`` [rad] and turns on.
+    """Returns the moment [N m], world axes, on a root because its arm has turned the rest pose of its spring by
+    ``turn`` [rad] and turns it at ``turn_rate`` [rad/s].
 
-    Spring and damper of :func:`joint_terms` end there: of theta - turn instead of theta. axes: [xyzw] of the joint in the
-    world; stiffness, damping, turn, turn_rate: in joint axes.
+    With this moment, spring and damper of :func:`joint_terms` act on theta - turn instead of theta. axes: [xyzw] joint
+    frame in the world; stiffness, damping, turn, turn_rate: in joint axes.
     """
     residual = wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, wp.vec3())
     moment = wp.cw_mul(stiffness, turn) + wp.cw_mul(phi * dt * stiffness + residual, turn_rate)
@@ -183,7 +185,7 @@ def terms_left(
     DH: wp.mat33,
     Du: wp.vec3,
 ):
-    """Returns the J, H, M and bias that a subtree passes to its parent, with its joint eliminated."""
+    """Returns the J, H, M and bias that a subtree passes to its parent after its joint is eliminated."""
     ahead = p.geometric_stiffness * (1.0 - phi) * p.dt
     reach = p.geometric_stiffness * phi * phi * p.dt * p.dt
     J_left = metric * DJ  # = J - J D J without the cancellation; the same for H
@@ -215,9 +217,10 @@ def accelerate_body(
     DH: wp.mat33,
     Du: wp.vec3,
 ):
-    """Acceleration of a body over the step, joint rate [rad/s] and velocity of the body at its end.
+    """Returns the acceleration of a body over the step, and its joint rate [rad/s] and velocity at the end of the step.
 
-    above, motion_above: acceleration and velocity at the end of the parent. turning, omega: [rad/s] of both at the start.
+    above: acceleration of the parent. motion_above: velocity of the parent at the end of the step. turning, omega:
+    [rad/s] angular velocity of the parent and of the body at the start of the step.
     """
     alpha = wp.spatial_bottom(above)
     a = wp.spatial_top(above) + wp.cross(alpha, lever) + wp.cross(turning, wp.cross(turning, lever))

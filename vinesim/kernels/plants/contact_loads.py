@@ -1,4 +1,4 @@
-"""Wrenches of contacts on the bodies of plants, and the trees that they touch."""
+"""Sums of contact wrenches on the bodies of plants, and the list of trees with such wrenches."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ wp.set_module_options({"enable_backward": False})
 LOADED = wp.constant(0)
 """Index in ``numbers``: number of bodies that the last step loaded."""
 GIVEN = wp.constant(1)
-"""Index in ``numbers``: number of bodies that are loaded now."""
+"""Index in ``numbers``: number of bodies that this step loads."""
 TICK = wp.constant(2)
 """Index in ``numbers``: number of this step."""
 ONSET_STEPS = wp.constant(3)
@@ -36,14 +36,16 @@ def load_bodies(
     last_contact_out: wp.array(dtype=wp.int64),
     tree_euler_steps_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all. Replace the wrenches of the last step by those of this one, and list the trees touched.
+    """One thread in all. Replace the wrenches of the last step by the wrenches of this step, and list the trees of the
+    loaded bodies.
 
     Nothing happens if a body cannot be loaded: its tree was not in the last prediction (is_stepped [tree]), or it is
     not among the first tree_moving [tree] bodies of its tree. place_in_tree: [body] index in the tree, from 0 on. body,
-    wrench: [k] a body may be given several times. loaded_out: [k] bodies of the last call, then of this call.
+    wrench: [k] bodies and their wrenches (N, N m); a body may occur several times. loaded_out: [k] loaded bodies; it
+    holds the bodies of the last call and is replaced by those of this call.
     body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once; touched_count_out: [1] number of touched
-    trees. last_contact_out: [tree] step in which it was touched last. tree_euler_steps_out: [tree] raised where contact
-    begins.
+    trees. last_contact_out: [tree] number of the step with the last contact. tree_euler_steps_out: [tree] raised where
+    contact begins.
     """
     given = int(numbers_out[GIVEN])
     numbers_out[REFUSED] = wp.int64(0)

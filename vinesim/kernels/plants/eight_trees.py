@@ -1,12 +1,12 @@
 """Prediction of eight trees of one topology at once: one lane of a SIMD vector is one tree.
 
-The same walk as :mod:`vinesim.kernels.plants.prediction` with the same functions of one body, on a CPU only. Everything
-that a walk needs of eight trees is copied into records; LLVM then makes one vector instruction of eight iterations of
-the loops over ``lane`` (docs/decisions/eight-trees.md says what that requires of them). Lanes are independent, so a tree
-gets the same bits whichever trees share its vector, and the same bits as in a prediction alone.
+The three passes are those of :mod:`vinesim.kernels.plants.prediction`, with the same functions of one body, on a CPU
+only. All inputs of eight trees are copied into records. LLVM then compiles eight iterations of a loop over ``lane``
+into one vector instruction (docs/decisions/eight-trees.md states the conditions). Lanes are independent, so the result
+of a tree has the same bits whichever trees share its vector, and as in a separate prediction.
 
 A record has 8 x :data:`RECORD` numbers for each body, with each number stored side by side for all eight trees. The
-inputs of a tree are copied into its lane before a walk, and its results are copied out afterwards.
+inputs of a tree are copied into its lane before the passes, and its results are copied out afterwards.
 """
 
 import warp as wp
@@ -85,7 +85,7 @@ def vec3_at(a: wp.array(dtype=float), i: int) -> wp.vec3:
 
 @wp.func_native("const float* const p = a.data + i; return wp::quat(p[0], p[8], p[16], p[24]);")
 def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
-    """A rotation of one lane."""
+    """Returns a rotation of one lane."""
     ...
 
 
@@ -93,7 +93,7 @@ def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
     "const float* const p = a.data + i; wp::vec_t<6, float> v; for (int c = 0; c < 6; ++c) v[c] = p[8 * c]; return v;"
 )
 def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
-    """A spatial vector of one lane."""
+    """Returns a spatial vector of one lane."""
     ...
 
 
@@ -101,7 +101,7 @@ def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
     "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[24], p[32], p[40], p[48], p[56], p[64]);"
 )
 def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
-    """A matrix of one lane."""
+    """Returns a matrix of one lane."""
     ...
 
 
@@ -109,13 +109,13 @@ def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
     "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[8], p[24], p[32], p[16], p[32], p[40]);"
 )
 def symmetric_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
-    """A symmetric matrix of one lane, of which the upper triangle is kept."""
+    """Returns a symmetric matrix of one lane, of which the upper triangle is stored."""
     ...
 
 
 @wp.func
 def upper_triangle(m: wp.mat33):
-    """The six numbers of a symmetric matrix that are kept."""
+    """Returns the six numbers of the upper triangle of a symmetric matrix."""
     return wp.spatial_vector(m[0, 0], m[0, 1], m[0, 2], m[1, 1], m[1, 2], m[2, 2])
 
 
@@ -142,7 +142,8 @@ def put_spatial(a_out: Floats, i: int, v: wp.spatial_vector):
 
 @wp.func
 def parent_record(model: ArticulationModel, k: int, first: int, records: Floats):
-    """The record of the parent of body k, or that of what roots stand on."""
+    """Returns the record of the parent of body k; for a root, record 0, which has the motion of the frame that roots
+    are attached to."""
     return record(records, wp.max(model.body_parent[k] - first + 1, 0) * STRIDE)
 
 
@@ -157,7 +158,7 @@ def load_tree(
     forces: AppliedForces,
     records_out: Floats,
 ):
-    """Copy what the walk needs of one tree into its lane; record 0 is what roots stand on."""
+    """Copy all inputs of one tree into its lane. Record 0 is the frame that roots are attached to."""
     pose = model.tree_pose[tree]
     put_vec3(records_out, POSE + lane, wp.transform_get_translation(pose))
     put_quat(records_out, POSE + 24 + lane, wp.transform_get_rotation(pose))
@@ -231,7 +232,8 @@ def store_tree(
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 MIN_LANES = wp.constant(2)
-"""Fewer trees are predicted one by one. MEASURED: two trees take 0.7 to 0.9 of the time together, eight 0.3."""
+"""Least number of trees in a group that are predicted together. MEASURED: two trees together take 0.7 to 0.9 of the
+time of separate predictions, eight take 0.3."""
 
 Lanes = wp.types.vector(length=LANES, dtype=wp.float32)
 LaneIndices = wp.types.vector(length=LANES, dtype=wp.int32)
@@ -244,7 +246,8 @@ EndOut = wp.types.vector(length=LANES * 15, dtype=wp.float32)
 
 @wp.func
 def assemble_eight(p: SolverParameters, phis: Lanes, top: Floats, own_out: Floats):
-    """Poses, velocities, implicit inertia, bias and tension of one body of each tree; ``top`` is its parent's record."""
+    """Compute pose, velocity, implicit inertia, bias and tension of one body of each tree. ``top``: record of the
+    body's parent."""
     kinematics = KinematicsOut()
     terms = TermsOut()
     lane = wp.int32(0)
@@ -305,7 +308,7 @@ def assemble_eight(p: SolverParameters, phis: Lanes, top: Floats, own_out: Float
 
 @wp.func
 def add_drag_eight(p: SolverParameters, phis: Lanes, air: Floats, own_out: Floats):
-    """Add the drag of the air, of velocity ``air`` [8 x 3], to one body of each tree."""
+    """Add air drag to one body of each tree. ``air``: [8 x 3] m/s, velocity of the air at each tree."""
     terms = TermsOut()
     lane = wp.int32(0)
     while lane < LANES:
@@ -337,7 +340,8 @@ def add_drag_eight(p: SolverParameters, phis: Lanes, air: Floats, own_out: Float
 
 @wp.func
 def add_ties(p: SolverParameters, phi: float, k: int, model: ArticulationModel, forces: AppliedForces, own_out: Floats):
-    """Add the ties of body k of one tree to its record, seen from its lane."""
+    """Add the ties of body k of one tree to the body's record. ``own_out``: view of the record that begins at the
+    tree's lane."""
     ties = model.tie_span[k]
     for t in range(ties[0], ties[1]):
         J, H, M, bias, tension = tie_terms(
@@ -362,7 +366,7 @@ def add_ties(p: SolverParameters, phi: float, k: int, model: ArticulationModel, 
 
 @wp.func
 def eliminate_eight(p: SolverParameters, phis: Lanes, top_out: Floats, own_out: Floats):
-    """Factor the joint above one body of each tree and hand the rest to its parent."""
+    """Factor the joint of one body of each tree, and add the remaining inertia and bias to the parent's record."""
     factors = FactorsOut()
     terms = TermsOut()
     lane = wp.int32(0)
@@ -423,7 +427,8 @@ def eliminate_eight(p: SolverParameters, phis: Lanes, top_out: Floats, own_out: 
 
 @wp.func
 def accelerate_eight(dt: float, top: Floats, own_out: Floats):
-    """Acceleration, joint rate and velocity of one body of each tree at the end of the step."""
+    """Compute the acceleration of one body of each tree over the step, and its joint rate and velocity at the end of
+    the step."""
     end = EndOut()
     lane = wp.int32(0)
     while lane < LANES:
@@ -466,7 +471,7 @@ def walk_eight(
     factors_out: Factors,
     prediction_out: Prediction,
 ):
-    """The three passes over eight trees of one topology, of which the first ``count`` are kept."""
+    """Run the three passes over eight trees of one topology, and store the results of the first ``count``."""
     first = model.tree_first[trees[0]]
     size = model.tree_moving[trees[0]]
     air = record(records_out, (size + 1) * STRIDE)
@@ -527,10 +532,11 @@ def predict_groups(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread solves the motion of up to eight trees of one topology as :func:`predict` does of each.
+    """One thread solves the motion of up to eight trees of one topology, with the same results as :func:`predict`.
 
-    groups: [thread] first place in ``trees``, and how many; in a group of two or more no root floats. records_out:
-    scratch of all threads, which run one after the other; the others are those of :func:`predict`.
+    groups: [thread] first index in ``trees`` and number of trees; a group of two or more has no floating roots.
+    records_out: scratch that all threads share, because they run one after the other. :func:`predict` describes the
+    other arguments.
     """
     if wp.tid() >= count[0]:
         return

@@ -1,22 +1,22 @@
 """Energy budget: a tree does not gain energy while only weight, springs and fixed ties act on it.
 
 The step is linear about its start. In modes that it does not resolve (w dt from 3 to 100: twist, high bending) its
-error feeds energy; docs/decisions/integrator.md has the figures. So the energy of a tree, kinetic and potential, is
-measured at the end of a step, and may not exceed its least past value by more than a band. If it does, the rates are
-filtered at fixed pose,
+error adds energy; docs/decisions/integrator.md has the figures. So the kinetic plus potential energy of a tree is
+measured at the end of a step. It may not exceed its least value since the budget began by more than :data:`BAND`. If it
+does, the rates are filtered at fixed pose,
 
     (M + c K) v' = M v,    c = 0.1 dt^2,
 
 which removes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and nearly all of modes far beyond. The
 filter can only reduce kinetic energy. Any excess that remains is removed from all rates alike, and the next step is
-taken with phi = 1. If the pose alone has too much energy, the step went too far: the tree is moved back towards its
-pose at the start of the step.
+taken with phi = 1. If the potential energy alone is too large, the tree is moved back towards its pose at the start of
+the step.
 
-The budget begins again whenever anything outside does work on the tree: contacts, loads, moving air, ties that are
-moved, and changes of state or model between steps. Trees with a floating root or on wires have no budget, nor does a
-solver without geometric stiffness, which exists to be compared with others.
+The budget begins again whenever an external force does work on the tree: contacts, loads, moving air, moved ties, and
+changes of state or model between steps. Trees with a floating root or on wires have no budget. Without geometric
+stiffness, which is an option for comparisons with other solvers, no tree has a budget.
 
-Trees that can gain much energy within one step are watched closely, others seldom: :func:`choose_budget`.
+Trees that can gain much energy within one step are checked often, other trees seldom; see :func:`choose_budget`.
 """
 
 import warp as wp
@@ -50,9 +50,9 @@ from vinesim.kernels.plants.tree_energy import is_pushed, state_mark, tree_energ
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": INLINE_ALL})
 
 BAND = wp.constant(0.01)
-"""Share of the kinetic energy (its largest value in the last seconds) by which energy may exceed its budget.
+"""Share of the largest kinetic energy in the last seconds by which the energy of a tree may exceed its budget.
 
-The energy of motion that the step resolves varies by less. TUNED
+The energy of modes that the step resolves varies by less. TUNED
 """
 
 FADE = wp.constant(0.998)
@@ -65,7 +65,7 @@ FILTER = wp.constant(0.1)
 """c / dt^2 of the filter. TUNED: 0.03 to 1 serve as well"""
 
 CLOSE_STEPS = wp.constant(32)
-"""Number of steps that are all checked, after the energy was found to rise or, in a tree that is watched closely, after
+"""Number of consecutive steps that are checked after the energy was found to rise or, in a closely watched tree, after
 its budget began.
 
 Otherwise one step in :data:`CHECK_PERIOD` is checked. TUNED
@@ -74,10 +74,10 @@ Otherwise one step in :data:`CHECK_PERIOD` is checked. TUNED
 NO_BUDGET = 0
 CLOSELY = 1
 NOW_AND_THEN = 2
-"""How the energy of a tree is watched.
+"""The ways in which the energy of a tree is watched.
 
-CLOSELY: the budget is kept in every step. NOW_AND_THEN: energy is checked periodically; when it has risen, the tree is
-watched closely until :data:`CLOSE_STEPS` steps have passed without a rise.
+NO_BUDGET: not at all. CLOSELY: the budget is kept in every step. NOW_AND_THEN: energy is checked periodically; when it
+has risen, the tree is watched closely until :data:`CLOSE_STEPS` steps have passed without a rise.
 """
 
 CHECK_PERIOD = wp.constant(8)
@@ -85,21 +85,22 @@ CHECK_PERIOD = wp.constant(8)
 TUNED: a check costs as much as a third of a step"""
 
 CHECK_RATE = wp.constant(2.0)
-"""[rad/s] Every step of a tree with a faster joint is checked, if it is watched closely. TUNED"""
+"""[rad/s] Joint rate above which every step of a closely watched tree is checked. TUNED"""
 
 MIN_DAMPING = wp.constant(0.5)
-"""Least damping of a joint divided by its stiffness, in steps, in trees that are checked seldom. MEASURED, like
+"""Smallest ratio of damping to stiffness [steps] of the joints of a tree that is checked seldom. MEASURED, like
 :data:`MAX_SAG`: docs/decisions/integrator.md"""
 
 MAX_SAG = wp.constant(4.0)
-"""[rad] Largest angle, along a path from root to tip, by which the weight of such a tree would bend its springs if they
-were linear and the tree kept the shape of its relaxed springs, level."""
+"""[rad] Largest sag of a tree that is checked seldom: the sum of joint angles along a path from root to tip, under the
+weight of the tree in its relaxed shape, held level, with linear springs."""
 
 MIN_PHI = wp.constant(0.549)
-"""A tree with a smaller phi is watched closely, because phi does not damp the modes that the step cannot resolve."""
+"""Value of phi below which a tree is watched closely, because the scheme does not damp modes that the step cannot
+resolve."""
 
 BACKTRACKS = wp.constant(8)
-"""Largest number of times that the turn of a step is halved. DERIVED: 0.4 % of it is then left."""
+"""Largest number of times that the joint rotations of a step are halved. DERIVED: 0.4 % of them then remain."""
 
 NO_LIMIT = wp.constant(1.0e30)
 """[J] Limit of a tree whose budget has not begun."""
@@ -117,11 +118,12 @@ def choose_budget(
     scratch_out: Scratch,
     tree_budget_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per tree. Choose how its energy is watched: closely if the tree is limp or hardly damped.
+    """One thread per tree. Choose how the tree's energy is watched: closely if its springs are weak or it is hardly
+    damped.
 
     trees: [thread] index of the tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or
-    :data:`NO_BUDGET` with a floating root or without geometric stiffness. scratch_out holds nothing that is needed
-    later.
+    :data:`NO_BUDGET` with a floating root or without geometric stiffness. scratch_out: scratch; later kernels do not
+    need it.
     """
     if wp.tid() >= count[0]:
         return
@@ -317,7 +319,8 @@ def lead_back(
     joints_out: JointState,
     bodies_out: BodyState,
 ):
-    """Stop a tree and halve the turns of its joints in the step until its energy is at most ``goal``.
+    """Set the rates of a tree to 0, and halve the rotations of its joints in the step until its energy is at most
+    ``goal`` [J].
 
     Returns the energy.
     """
@@ -350,7 +353,7 @@ def take_energy(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Remove a tree's energy above ``goal`` [J], or above ``pose_goal`` if its pose alone has so much.
+    """Remove a tree's energy above ``goal`` [J], or above ``pose_goal`` [J] if its potential energy exceeds that.
 
     Returns its kinetic and potential energy.
     """
@@ -397,10 +400,12 @@ def keep_budget(
 ):
     """One thread per tree, after an integration. Remove the tree's energy in excess of its budget.
 
-    trees: [thread] index of the tree; nothing happens without a limit or with tree_rate [tree] above ``p.fault_rate``.
-    tree_budget: [tree] how its energy is watched. tree_phi: [tree] requested phi. tree_steps: [tree] substeps that the
-    step is divided into; this is one of them. joints_out: joints at the end of the step, slower where energy was
-    removed; tree_euler_steps_out: [tree] then at least 1. All arguments that follow are scratch.
+    trees: [thread] index of the tree. Nothing happens if the tree's budget has no limit or its tree_rate [tree] is
+    above ``p.fault_rate``.
+    tree_budget: [tree] how its energy is watched. tree_phi: [tree] requested phi. tree_steps: [tree] number of substeps
+    of the step; this launch handles one substep. joints_out: joints at the end of the step, slower where energy was
+    removed. tree_euler_steps_out: [tree] raised to at least 1 where energy was removed. All later arguments are
+    scratch.
     """
     if wp.tid() >= count[0]:
         return

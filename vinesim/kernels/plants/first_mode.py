@@ -1,6 +1,6 @@
 """Slowest mode of each tree, and the number of substeps that a step needs to reproduce its frequency.
 
-The trapezoidal rule slows a mode of rate w by (w dt)^2 / 12, with a similar error in its damping.
+The trapezoidal rule reduces the frequency w of a mode by the share (w dt)^2 / 12, with a similar error in its damping.
 """
 
 import math
@@ -13,9 +13,10 @@ from vinesim.kernels.plants.structs import ArticulationModel, Scratch, WrenchScr
 wp.set_module_options({"enable_backward": False})
 
 MAX_ANGLE = 0.3
-"""[rad] Largest angle by which the first mode may turn in a substep.
+"""[rad] Largest phase angle w dt of the first mode in a substep.
 
-DERIVED: the mode is then 0.75 % slow, and 1 % with a damping ratio of 0.12. At 10 ms, modes above 4.8 Hz take substeps.
+DERIVED: the frequency is then 0.75 % too low, and 1 % with a damping ratio of 0.12. At 10 ms, modes above 4.8 Hz take
+substeps.
 """
 
 MAX_SUBSTEPS = 4
@@ -25,7 +26,8 @@ DERIVED: enough for 19 Hz at 10 ms, above the 16 Hz for which the frequency is p
 """
 
 ITERATIONS = wp.constant(4)
-"""Number of inverse iterations. The error falls with (w1 / w2)^4 in each. For a cane (modes 6.3 apart) one would do."""
+"""Number of inverse iterations. Each reduces the error by the factor (w1 / w2)^4. For a cane (w2 / w1 = 6.3) one
+iteration is enough."""
 
 
 def substeps_for(frequency: float, dt: float) -> int:
@@ -35,7 +37,7 @@ def substeps_for(frequency: float, dt: float) -> int:
 
 @wp.func
 def compliance(stiffness: wp.vec3, torque: wp.vec3):
-    """Returns the angle by a torque on a spring; 0 about an axis without stiffness."""
+    """Returns the angle [rad] by which a torque [N m] turns a spring, in each axis; 0 in an axis without stiffness."""
     angle = wp.vec3()
     for i in range(3):
         if stiffness[i] > 0.0:
@@ -81,15 +83,17 @@ def count_substeps(
     work_out: WrenchScratch,
     tree_substeps_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per tree. Find its slowest mode, and the number of substeps for its step.
+    """One thread per tree. Estimate the frequency of the tree's slowest mode, and choose the number of substeps of its
+    steps.
 
     Inverse iteration x -> K^-1 M x in joint coordinates about the relaxed shape, where K is diagonal. The result
     depends on the model and on which bodies have been cut off or refined, but not on the pose. It ignores weight and
     ties, which also stiffen a tree, and the free motion of a floating root. x^T M x / x^T M K^-1 M x bounds w^2 from
     above.
 
-    trees: [thread] index of the tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the mode turns by at
-    most ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last prediction are kept.
+    trees: [thread] index of the tree. tree_substeps_out: [tree] 1 to ``max_substeps``, such that the phase of the mode
+    advances by at most ``max_angle`` [rad] in a substep. All other arrays are scratch; the factors of the last
+    prediction are kept.
     """
     if wp.tid() >= count[0]:
         return
@@ -152,8 +156,8 @@ def begin_substep(
 ):
     """One thread in all. Set the number of trees and of floating roots that take part in the next substep.
 
-    levels: [substep, 2] these numbers. level_out: [1] index of the next substep; 0 again after the last of level_count
-    [1].
+    levels: [substep, 2] numbers of trees and of floating roots. level_count: [1] number of substeps. level_out: [1]
+    index of the next substep, which returns to 0 after the last.
     """
     level = level_out[0]
     tree_count_out[0] = levels[level, 0]

@@ -1,16 +1,16 @@
-"""Floating components: bodies that were cut off and fall keep the momentum and the path that external forces give them.
+"""Floating components: corrects momentum and path of bodies that were cut off and fall, so that both agree exactly with
+the external forces.
 
-The integration of joints errs in the momentum of a free tree by about dt^2. The root's pose and rate are corrected
-after it, so that linear and angular momentum and the centre of mass are exact.
+The integration of joints changes the momentum of a free tree by an error of about dt^2. So the root's pose and rate are
+corrected after the integration, until linear and angular momentum and the centre of mass are exact.
 
 The component's centre of mass moves, and its root turns, at the mean of the rates before and after the step. A
-component that hits something is the exception: the contact solve lets it come as near as its rate after the step
-allows. By the mean of both rates it would move half of its previous motion into what it hits, and through a wire from
-1.5 m/s on.
+component with contacts moves at the rate after the step instead, as the contact solve assumes. With the mean rate it
+would penetrate the other body by half of its previous motion in a step, and pass through a wire from 1.5 m/s on.
 
-Components held by a tie are left out. The force of a stiff tie turns with the bodies that hang from it; the momentum
-balance would take the force at the start of the step. This is Euler's explicit method for a pendulum, which gains (w
-dt)^2 of its kinetic energy in each step.
+Components held by a tie are left out. The force of a stiff tie turns with the bodies that hang from it, but the
+momentum balance would use the force at the start of the step. This would be Euler's explicit method for a pendulum,
+which gains (w dt)^2 of its kinetic energy in each step.
 """
 
 import warp as wp
@@ -32,10 +32,11 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def least_change(inertia: wp.mat33, momentum: wp.vec3, missing: wp.vec3, dt: float):
-    """Returns the x of the least change that adds the ``missing`` angular momentum.
+    """Returns the vector x that defines the smallest change of pose and rate that adds the ``missing`` angular momentum
+    [N m s].
 
     The change of pose is momentum x dt times x, the change of rate inertia / dt times x. A change of rate is measured
-    by the turn that it makes in a step, so a thin rod is turned rather than spun.
+    by the rotation that it causes in a step, so a thin rod gets a rotation rather than a spin.
     """
     stiff = inertia / dt
     A = stiff * stiff + (wp.dot(momentum, momentum) * wp.identity(n=3, dtype=float) - wp.outer(momentum, momentum))
@@ -56,10 +57,11 @@ def component_before(
     phi: float,
     scratch_out: FloatingScratch,
 ):
-    """Returns sums over a component at the start of the step, about its root and relative to the root's motion.
+    """Returns sums over the bodies of a component at the start of the step, about its root and relative to the root's
+    motion.
 
     They are mass [kg], mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, force [N] and
-    moment [N m] of everything but gravity over the step, and whether contacts are part of it.
+    moment [N m] of all external forces except gravity over the step, and whether contacts are among these forces.
     """
     tree = model.body_tree[root]
     mass = float(0.0)
@@ -74,7 +76,7 @@ def component_before(
             is_pressed = is_pressed or wp.length_sq(forces.body_wrench[k]) > 0.0
             arm = wp.vec3()
             velocity = wp.vec3()
-            if k > root:  # not from world positions and velocities, which lose digits to the fall
+            if k > root:  # not from world positions and velocities, which lose digits in a fall
                 above = model.body_parent[k]
                 arm = wp.spatial_top(scratch_out.before[above]) + lever[k]
                 velocity = wp.spatial_bottom(scratch_out.before[above])
@@ -101,8 +103,8 @@ def component_before(
 
 @wp.func
 def component_after(model: ArticulationModel, joints: JointState, root: int, last: int, scratch_out: FloatingScratch):
-    """Returns sums as :func:`component_before` with the joints as they are now, and the moment of inertia with locked
-    joints.
+    """Returns sums over the bodies of a component at the end of the step, like :func:`component_before`, and its moment
+    of inertia with locked joints.
 
     They are mass times centre of mass [kg m], linear [N s] and angular [N m s] momentum, inertia [kg m^2], all about
     the root and relative to its motion.
@@ -143,7 +145,7 @@ def angular_correction(locked: wp.mat33, angular: wp.vec3, goal: wp.vec3, dt: fl
     """Returns the rotation and rate [rad/s] that give a component the ``goal`` angular momentum [N m s] when added to
     it.
 
-    Newton's method, as angular momentum and inertia turn with the component.
+    Newton's method is needed because angular momentum and inertia turn with the component.
     """
     rotation = wp.quat_identity()
     rate = wp.vec3()
@@ -177,11 +179,11 @@ def correct_floating_momentum(
     scratch_out: FloatingScratch,
     joints_out: JointState,
 ):
-    """One thread per floating component. Correct its momentum and the path of its centre of mass for the external
-    forces.
+    """One thread per floating component. Correct its momentum and the path of its centre of mass to agree with the
+    external forces.
 
-    roots: [thread] the cut body of a component that no tie holds; nothing happens in a tree with tree_rate [tree] above
-    ``p.fault_rate``. tree_steps: [tree] substeps that the step is divided into; this corrects one of them. bodies: at
+    roots: [thread] the cut body of a component that no tie holds. Nothing happens in a tree with tree_rate [tree] above
+    ``p.fault_rate``. tree_steps: [tree] number of substeps of the step; this launch corrects one substep. bodies: at
     the start of the step. body_acceleration: [body] m/s^2, rad/s^2 over the step. lever: [body] m. joints_out: joints
     at the end of the step; rotation, rates and position of the root are corrected.
     """

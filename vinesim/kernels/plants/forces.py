@@ -1,4 +1,4 @@
-"""Forces on single bodies: springs, the stiffness that loads lend to levers, ties, and air drag."""
+"""Forces on single bodies: springs, geometric stiffness, ties, and air drag."""
 
 import warp as wp
 
@@ -7,12 +7,13 @@ from vinesim.kernels.plants.structs import AppliedForces, ArticulationModel
 wp.set_module_options({"enable_backward": False})
 
 AIR_DENSITY = wp.constant(1.2)
-"""[kg/m^3] of air at 20 degrees and sea level"""
+"""[kg/m^3] Density of air at 20 degrees Celsius and sea level"""
 
 
 @wp.func
 def tension_stiffness(lever: wp.vec3, force: wp.vec3):
-    """Returns the rotational stiffness [N m/rad] that a steady force lends to a lever it draws out; 0 if it pushes."""
+    """Returns the geometric stiffness [N m/rad] of a lever [m] under a steady force [N] that pulls along it; 0 if the
+    force pushes."""
     along_lever = wp.max(wp.dot(lever, force), 0.0)
     share = along_lever / wp.max(wp.dot(lever, lever), 1.0e-30)
     return along_lever * wp.identity(n=3, dtype=float) - share * wp.outer(lever, lever)
@@ -20,8 +21,8 @@ def tension_stiffness(lever: wp.vec3, force: wp.vec3):
 
 @wp.func
 def shear_stiffness(lever: wp.vec3, force: wp.vec3):
-    """Returns the symmetric part of (d.F) 1 - d F^T without :func:`tension_stiffness`: the parts of pushing and of
-    shear.
+    """Returns the symmetric part of (d.F) 1 - d F^T minus :func:`tension_stiffness`, with d the lever and F the force:
+    the geometric stiffness [N m/rad] due to compression and shear.
     """
     return (
         wp.dot(lever, force) * wp.identity(n=3, dtype=float)
@@ -54,21 +55,22 @@ def middle_axes_scale(q: wp.quat):
 
 @wp.func
 def in_middle_axes(s: float, excess: float, v: wp.vec3, a: wp.vec3):
-    """Returns s a + (1 - s) n n^T a.
+    """Returns s a + (1 - s) n n^T a; see :func:`middle_axes_scale`.
 
-    It turns a rate in the middle axes into the rate of theta, and a gradient by theta into a gradient by a turn.
+    This maps a rate in the middle axes to the rate of theta, and a gradient with respect to theta to one with respect
+    to a rotation.
     """
     return s * a - excess * wp.dot(v, a) * v
 
 
 @wp.func
 def spring_torque(stiffness: wp.vec3, q: wp.quat):
-    """Returns the torque [N m] with which a spring resists a rotation q, in the joint's middle axes.
+    """Returns the torque [N m] of a joint's spring against the rotation q, in the joint's middle axes.
 
-    It is the gradient of theta^T K theta / 2 by a turn of the joint, with theta the rotation vector of q. The middle
-    axes are turned from the joint's axes by half of q. In them the torque is s K theta + (1 - s) n n^T K theta, with n
-    along theta and s the ratio of |theta| / 2 to its sine. K theta itself is no gradient unless K is isotropic: it does
-    work around a cycle of bending and twist.
+    The torque is the gradient of theta^T K theta / 2 with respect to a rotation of the joint, with theta the rotation
+    vector of q. The middle axes are turned from the joint's axes by half of q. In them the torque is s K theta + (1 -
+    s) n n^T K theta, with n along theta and s the ratio of |theta| / 2 to its sine. K theta itself is no gradient
+    unless K is isotropic: it does work around a cycle of bending and twist.
     """
     s, excess, v = middle_axes_scale(q)
     return in_middle_axes(s, excess, v, wp.cw_mul(stiffness, 2.0 * s * v))
@@ -76,7 +78,7 @@ def spring_torque(stiffness: wp.vec3, q: wp.quat):
 
 @wp.func
 def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
-    """Returns the damping [N s/m] that remains to be added.
+    """Returns the damping [N s/m] of a tie minus the damping that the scheme itself adds, at least 0.
 
     The scheme damps a spring as if its damping time (damping / stiffness) were larger by (2 phi - 1) dt.
     """
@@ -94,7 +96,8 @@ def tie_force(stiffness: float, damping: float, stretch: wp.vec3, speed: wp.vec3
 
 @wp.func
 def drag_coefficient(area: float, wind: wp.vec3):
-    """Returns the drag per relative speed [N s/m] for a drag area Cd A [m^2] in a wind [m/s] relative to it."""
+    """Returns drag force divided by relative speed [N s/m] for a drag area Cd A [m^2]. ``wind``: [m/s] velocity of the
+    air relative to the body."""
     return 0.5 * AIR_DENSITY * area * wp.length(wind)
 
 
@@ -112,7 +115,7 @@ def tie_and_drag_wrench(
 ):
     """Returns the force [N] of ties and air on body k in the last step, and its moment about the body's origin [N m].
 
-    These are the forces of the implicit solve, evaluated with the acceleration that it found.
+    These are the forces of the implicit solve, evaluated with the resulting acceleration.
     """
     velocity = wp.spatial_top(motion)
     omega = wp.spatial_bottom(motion)

@@ -1,4 +1,4 @@
-"""Copies of the rows of some trees between two memories that order them differently."""
+"""Copies rows of some trees between host arrays and device arrays, which have different orders of bodies."""
 
 import warp as wp
 
@@ -22,10 +22,12 @@ def copy_rows(
     # out
     addresses_out: wp.array(dtype=wp.uint64),
 ):
-    """One thread copies one word of four bytes: of one listed tree (the first dimension), of one array.
+    """One thread copies one word of four bytes. First dimension of the launch: listed tree; second: word within the
+    rows of that tree.
 
-    starts, widths: [array] first thread of an array within a tree, and words of one row. addresses, addresses_out:
-    [array] pointers of source and target, of rows ``pitch`` and ``pitch_there`` apart.
+    starts, widths: [array] first thread of each array within a tree, and number of words in a row. addresses,
+    addresses_out: [array] pointers to source and target. pitch, pitch_there: distance between rows of consecutive
+    bodies in source and target.
     """
     slot, thread = wp.tid()
     if slot >= count[0]:

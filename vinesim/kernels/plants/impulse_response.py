@@ -1,4 +1,4 @@
-"""Impulse response: velocities of bodies by unit impulses on them, and the effect of given wrenches on a prediction.
+"""Impulse response: velocity changes of bodies by unit impulses, and the effect of given wrenches on a prediction.
 
 Both reuse the factors of :mod:`vinesim.kernels.plants.prediction`: an impulse travels inward along the path to the
 root, the velocities it causes travel outward (Featherstone 2008, section 7.3, with forces only at the touched
@@ -29,7 +29,8 @@ def propagate_impulses_inward(
     factors: Factors,
     columns_out: ResponseColumns,
 ):
-    """Carry three unit forces and three unit moments at a body along its path to the root. They are 0 off the path."""
+    """Propagate three unit forces and three unit moments at a body along the path from the body to the root. Entries of
+    bodies off this path are 0."""
     zero = wp.mat33()
     force_f = wp.identity(n=3, dtype=float)
     force_m = wp.mat33()
@@ -62,7 +63,7 @@ def propagate_impulses_inward(
 def propagate_velocities_outward(
     first: int, last: int, shift: int, model: ArticulationModel, factors: Factors, columns_out: ResponseColumns
 ):
-    """Compute the velocities of all bodies, from the root to the last, from the joints' shares of the impulses."""
+    """Compute the velocities of all bodies, from the root to ``last``, from the impulses that each joint transmits."""
     for k in range(first, last + 1, model.pitch):
         parent = model.body_parent[k]
         a_f = columns_out.a_by_force[shift + k]
@@ -98,11 +99,12 @@ def impulse_response(
     columns_out: ResponseColumns,
     response_out: wp.array4d(dtype=float),
 ):
-    """One thread per body in the list. Apply six unit impulses to it, and write the velocities of all bodies up to it.
+    """One thread per listed body. Apply six unit impulses to the body, and write the velocities of the listed bodies of
+    its tree up to itself.
 
-    bodies: [thread] index of the body; those of one tree are neighbours in the list. response_out: [u, 6, t, 6]
-    velocity of body u of the list by a unit impulse wrench on the t-th listed body of its tree, linear before angular,
-    in 1/kg, 1/(kg m), 1/(kg m^2). Each thread writes its columns and, because the matrix is symmetric, their transpose.
+    bodies: [thread] index of the body; bodies of one tree are adjacent in the list. response_out: [u, 6, t, 6] velocity
+    of body u of the list by a unit impulse wrench on the t-th listed body of its tree, linear before angular, in 1/kg,
+    1/(kg m), 1/(kg m^2). Each thread writes its columns and, because the matrix is symmetric, their transposes.
     columns_out: [thread * stride + body of the tree] scratch; ``stride`` is the extent of the largest tree.
     """
     slot = wp.tid()
@@ -126,7 +128,7 @@ def impulse_response(
         a_m = columns_out.a_by_moment[place]
         alpha_f = columns_out.alpha_by_force[place]
         alpha_m = columns_out.alpha_by_moment[place]
-        if other == slot:  # symmetric but for rounding
+        if other == slot:  # symmetric except for rounding errors
             a_f = 0.5 * (a_f + wp.transpose(a_f))
             alpha_m = 0.5 * (alpha_m + wp.transpose(alpha_m))
             a_m = 0.5 * (a_m + wp.transpose(alpha_f))

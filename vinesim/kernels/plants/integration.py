@@ -9,17 +9,18 @@ from vinesim.kernels.plants.structs import ArticulationModel, JointState, Predic
 wp.set_module_options({"enable_backward": False})
 
 EULER_ON = wp.constant(0.1)
-"""Share of ``max_rate``. A tree with phi = 1 keeps it if one of its joints turns faster than this, until all are slower
-than ``EULER_OFF``.
+"""Share of ``max_rate``. A tree with a joint faster than this share keeps phi = 1 until all its joints are slower than
+``EULER_OFF``.
 
-With any other phi, a limp thread under a heavy load that was thrown gains energy and would thrash for ever. TUNED
+With a smaller phi, a chain of weak springs that swings a heavy load would gain energy and never come to rest. TUNED
 """
 
 EULER_OFF = wp.constant(0.06)
-"""Share of ``max_rate`` below which all joints of such a tree must turn for ``EULER_DURATION``. TUNED"""
+"""Share of ``max_rate`` below which all joints of a tree must stay for ``EULER_DURATION`` before its phi may fall below
+1 again. TUNED"""
 
 EULER_DURATION = wp.constant(1.0)
-"""[s] How long all joints must turn slower than ``EULER_OFF``. TUNED"""
+"""[s] Time for which all joints must be slower than ``EULER_OFF``. TUNED"""
 
 
 @wp.kernel
@@ -43,12 +44,12 @@ def integrate(
     """One thread per tree. Move its joints to the end of the step. A faulty tree keeps its state from the start of the
     step.
 
-    trees: [thread] index of the tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] as :func:`predict`
-    used it. tree_steps: [tree] substeps that the step is divided into; a tree that is stopped in one of them takes no
-    other. tree_rate_out: [tree] rad/s of the fastest joint and m/s of the fastest floating root, combined as a length;
-    NaN or above ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] steps and substeps still to be
-    taken with phi = 1, counted down here. joints_out: [body] rotations by the exponential map of the mean rate; may be
-    ``joints``.
+    trees: [thread] index of the tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] phi that
+    :func:`predict` used. tree_steps: [tree] number of substeps of the step; a tree that is stopped in one substep takes
+    no further substeps. tree_rate_out: [tree] sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed
+    b [m/s] of a floating root; NaN or above ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree]
+    number of steps and substeps still to be taken with phi = 1; this kernel counts it down. joints_out: [body]
+    rotations by the exponential map of the mean rate; may be ``joints``.
     """
     if wp.tid() >= count[0]:
         return
@@ -80,8 +81,8 @@ def integrate(
         steps = wp.max(steps, int(EULER_DURATION / dt))
     tree_euler_steps_out[tree] = steps
     sound = most <= p.fault_rate
-    # a tree beyond max_rate is slowed as a whole and well below it: holding back single joints would feed energy into
-    # the others, and a loaded cane would thrash at the limit for ever
+    # all joints of a tree beyond max_rate are slowed together, to well below max_rate: slowing single joints would add
+    # energy to other joints, and a loaded cane would swing at the limit for ever
     slower = float(1.0)
     if turning > p.max_rate:
         slower = 0.5 * p.max_rate / turning
@@ -97,7 +98,7 @@ def integrate(
             rate = slower * free
             share = phi
             if floats:
-                if model.body_falls[k]:  # no spring turns it: phi beyond 1/2 would only add error
+                if model.body_falls[k]:  # no spring turns the root: phi above 1/2 would only add error
                     share = 0.5
                 joints_out.joint_x[k] = joints.joint_x[k] + dt * (
                     (1.0 - share) * joints.joint_xd[k] + share * prediction.joint_xd_free[k]

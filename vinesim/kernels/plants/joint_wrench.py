@@ -1,4 +1,4 @@
-"""Wrench that a joint carries, from the motion of all that hangs on it."""
+"""Wrench that a joint carries, computed from the motion of the subtree beyond the joint."""
 
 import warp as wp
 
@@ -25,12 +25,13 @@ def joint_wrench(
     # out
     wrench_out: wp.array(dtype=wp.spatial_vector),
 ):
-    """One thread adds up what one joint must carry so that everything beyond it moves as it did in the last step.
+    """One thread per joint. Sum the wrench that the joint must carry so that the subtree beyond it moves as it did in
+    the last step.
 
     Newton-Euler of the subtree (Featherstone 2008, section 5.3). joint_bodies: [thread] body beyond the joint.
-    bodies: at the start of the step; body_acceleration: [body] m/s^2, rad/s^2 over it; of the last substep if the step was
-    divided into tree_steps [tree]. wrench_out: [thread] N, and N m
-    about the body's origin, world axes; zero for what has been cut off.
+    bodies: motion at the start of the step. body_acceleration: [body] m/s^2, rad/s^2 over the step. If the step was
+    divided into tree_steps [tree] substeps, both belong to the last substep. wrench_out: [thread] N, and N m about the
+    body's origin, world axes; zero for bodies that have been cut off.
     """
     slot = wp.tid()
     if slot >= count[0]:
@@ -42,7 +43,7 @@ def joint_wrench(
     moment = wp.vec3()
     last = model.tree_first[tree] + model.tree_moving[tree] * model.pitch
     if model.body_parent[body] < 0 and model.body_root[body] >= 0:
-        last = body  # nothing holds what has been cut off
+        last = body  # no joint holds a cut-off body
     for k in range(body, last, model.pitch):
         up = int(k)
         while up > body:

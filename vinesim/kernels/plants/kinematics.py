@@ -9,10 +9,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def max_joint_rate(rates: wp.array(dtype=wp.vec3), first: int, size: int, pitch: int):
-    """Returns the largest of some joint rates [rad/s]. NaN is passed on.
+    """Returns the largest joint rate [rad/s] of ``size`` bodies; NaN if one rate is NaN.
 
-    This is a function because Warp's adjoint does not repeat the loops of a kernel before it goes back, but does call
-    functions.
+    This is a separate function because Warp's adjoint of a kernel does not run the kernel's loops again before the
+    backward pass, but does call functions again.
     """
     most = float(0.0)
     for k in range(first, first + size * pitch, pitch):
@@ -35,7 +35,7 @@ def max_rate_and_speed(
 ):
     """Returns the largest joint rate [rad/s] and the largest speed of floating roots [m/s].
 
-    NaN, also in a position, is kept.
+    Both are NaN if a rate, speed or position is NaN.
     """
     turning = float(0.0)
     falling = float(0.0)
@@ -61,7 +61,8 @@ def body_kinematics(
     joint_q: wp.quat,
     joint_qd: wp.vec3,
 ):
-    """Joint axes and lever [m] in the world, pose and velocity of a body whose parent is posed and moves like that."""
+    """Returns a body's joint axes and lever [m] in the world, pose and velocity, from pose and velocity of its
+    parent."""
     turning = wp.spatial_bottom(parent_velocity)
     axes = wp.transform_get_rotation(parent_pose) * rest
     lever = wp.quat_rotate(wp.transform_get_rotation(parent_pose), offset)
@@ -74,8 +75,8 @@ def body_kinematics(
 
 @wp.func
 def parent_kinematics(k: int, tree: int, model: ArticulationModel, joints: JointState, bodies: BodyState):
-    """Returns pose and velocity of the frame on which body k hangs: its parent's, the tree's, or none for a floating
-    root.
+    """Returns pose and velocity of the frame to which the joint of body k is attached: its parent, the tree's fixed
+    pose, or the world's origin for a floating root.
     """
     parent = model.body_parent[k]
     pose = model.tree_pose[tree]
@@ -100,7 +101,8 @@ def forward_kinematics(
     # out
     bodies_out: BodyState,
 ):
-    """One thread per tree. Compute the poses of its bodies from the joints, clusters of a coarse tree included.
+    """One thread per tree. Compute poses and velocities of its bodies from the joints, including the clusters of a
+    coarse tree.
 
     The outward pass of the recursive Newton-Euler algorithm (Featherstone 2008, section 5.3), velocities only.
 

@@ -2,11 +2,12 @@
 
 In that module, the remaining inertia of a subtree is added to its parent's record and read again. On a GPU, where every
 tree is a thread and no record stays in a cache, this takes most of the time. In this module, a body's own inertia is
-computed when its joint is eliminated, and the rest goes on in registers to the parent, which mostly is the previous
-body. Records are used at branches only. The functions of one body and the order of sums are the same, except where two
-branches or more leave one body.
+computed when its joint is eliminated, and the remaining inertia is passed in registers to the parent, which in most
+cases is the previous body. Records are used at branches only. The functions of one body and the order of sums are the
+same, except where two branches or more leave one body.
 
-Warp's adjoint does not restore values that a loop carries in registers: gradients use the passes of the other module.
+Warp's adjoint does not restore values that a loop carries in registers. So gradients use
+:mod:`vinesim.kernels.plants.prediction`.
 """
 
 import warp as wp
@@ -48,7 +49,8 @@ def place_bodies(
     factors_out: Factors,
     scratch_out: Scratch,
 ):
-    """From the root to the tips of one tree: pose and velocity of each body; empty records for what branches leave."""
+    """From the root to the tips of one tree: compute pose and velocity of each body, and set to zero the records in
+    which branches are summed."""
     first = model.tree_first[tree]
     pose = wp.transform()
     motion = wp.spatial_vector()
@@ -93,7 +95,8 @@ def applied_terms(
     stiffness: wp.vec3,
     damping: wp.vec3,
 ):
-    """Implicit inertia J, H, M of body k, its bias and its tension: its own, of drag and of its ties."""
+    """Returns the implicit inertia J, H, M of body k, its bias and its tension: the sums of its own terms, those of
+    drag, and those of its ties."""
     mass = model.body_mass[k]
     local_com = model.body_com[k]
     local_inertia = model.body_inertia[k]
@@ -159,7 +162,8 @@ def eliminate_bodies(
     factors_out: Factors,
     scratch_out: Scratch,
 ):
-    """From the tips to the root of one tree: each body's implicit inertia and bias, its joint's factors, and what is left."""
+    """From the tips to the root of one tree: compute each body's implicit inertia and bias, factor its joint, and pass
+    the remaining inertia and bias to its parent."""
     first = model.tree_first[tree]
     size = model.tree_moving[tree]
     last = first + (size - 1) * model.pitch
@@ -249,7 +253,7 @@ def accelerate_tree(
     tree: int,
     prediction_out: Prediction,
 ):
-    """From the root to the tips of one tree: accelerations, and the rates and velocities they lead to."""
+    """From the root to the tips of one tree: compute accelerations, and the resulting rates and velocities."""
     first = model.tree_first[tree]
     acceleration = wp.spatial_vector()
     velocity = wp.spatial_vector()
@@ -308,10 +312,11 @@ def predict_lean(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread per tree. Solve its motion; see :func:`vinesim.kernels.plants.prediction.predict`.
+    """One thread per tree. Solve the tree's motion, with the arguments and results of
+    :func:`vinesim.kernels.plants.prediction.predict`.
 
-    is_branching: [body] whether a body is the parent of a body other than the next one. Conservative trees take the
-    passes of that kernel.
+    is_branching: [body] whether a body is the parent of a body other than the next one. Trees with phi = 1/2, which
+    must conserve energy, use the passes of :func:`predict`.
     """
     if wp.tid() >= count[0]:
         return

@@ -1,8 +1,8 @@
-"""Prediction: the motion of each tree over a step without new contacts, by the articulated-body algorithm.
+"""Prediction: the motion of each tree over a step without the contacts of this step, by the articulated-body algorithm.
 
 Featherstone, Rigid Body Dynamics Algorithms, 2008, section 7.3: one pass outward for kinematics, inertia and bias of
-each body, one inward that eliminates the joints, one outward for accelerations. Springs, ties, drag and the stiffness
-that loads lend to levers are implicit; :mod:`vinesim.kernels.plants` states the scheme.
+each body, one inward that eliminates the joints, one outward for accelerations. Springs, ties, drag and geometric
+stiffness are implicit; :mod:`vinesim.kernels.plants` describes the scheme.
 """
 
 import warp as wp
@@ -36,7 +36,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def is_conservative(p: SolverParameters, phi: float):
-    """Returns whether a step must keep energy, so that bending and twist are coupled."""
+    """Returns whether a step with this phi must conserve energy (phi = 1/2). Such steps include the coupling of bending
+    and twist."""
     return p.geometric_stiffness > 0.0 and phi == 0.5
 
 
@@ -44,7 +45,7 @@ def is_conservative(p: SolverParameters, phi: float):
 def add_terms(
     k: int, J: wp.mat33, H: wp.mat33, M: wp.mat33, bias: wp.spatial_vector, tension: wp.vec3, scratch_out: Scratch
 ):
-    """Add terms to the inertia, bias and tension of body k: of its children, ties, drag, load and contacts."""
+    """Add terms (of a child, a tie, drag) to the implicit inertia J, H, M, the bias and the tension of body k."""
     scratch_out.J[k] = scratch_out.J[k] + J
     scratch_out.H[k] = scratch_out.H[k] + H
     scratch_out.M[k] = scratch_out.M[k] + M
@@ -143,10 +144,11 @@ def couple_bending_and_twist(
     DH: wp.mat33,
     scratch_out: Scratch,
 ):
-    """Add to the parent the coupling by a force across a lever and by a moment that a joint bears.
+    """Add to the parent's record the coupling of bending and twist, due to a force across a lever and to the moment in
+    a joint.
 
-    In addition to its spring's torque, the joint takes alpha x moment for an acceleration alpha of the parent, and the
-    joint's own acceleration acts on the parent with the same coupling (DJ contains the first part).
+    An angular acceleration alpha of the parent adds the torque alpha x moment to the spring's torque on the joint, and
+    the joint's own acceleration acts on the parent with the same coupling (DJ contains the first part).
     """
     H_more = wp.skew(-moment) * DH
     H_arm = cross_rows(H_more, lever)
@@ -284,7 +286,8 @@ def accelerate_bodies(
 def chosen_phi(
     p: SolverParameters, model: ArticulationModel, joints: JointState, tree: int, asked: float, euler_steps: int
 ):
-    """Returns phi of this step of a tree: ``asked``, but 1 while a joint is fast or ``euler_steps`` are left."""
+    """Returns phi of this step of a tree: 1 if a joint is faster than ``p.fast_rate`` or ``euler_steps`` is above 0,
+    otherwise ``asked``."""
     fastest = max_joint_rate(joints.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch)
     phi = asked
     if fastest > p.fast_rate or euler_steps > 0:
@@ -331,15 +334,16 @@ def predict(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """One thread per tree. Solve its motion over a step without new contacts, and keep the factors for later use.
+    """One thread per tree. Solve its motion over a step without the contacts of this step, and store the factors for
+    impulse responses.
 
     The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
 
     trees: [thread] index of the tree. tree_phi: [tree] requested phi, 1/2 to 1. tree_phi_out: [tree] phi used, 1 for a
-    tree with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] substeps
-    that the step is divided into; this is one of them. bodies_out: poses and velocities at the start of the step.
-    prediction_out: accelerations over the step and velocities at its end. scratch_out holds nothing that is needed
-    later.
+    tree with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] number of
+    substeps of the step; this launch computes one substep. bodies_out: poses and velocities at the start of the step.
+    prediction_out: accelerations over the step and velocities at its end. scratch_out: scratch; later kernels do not
+    need it.
     """
     if wp.tid() >= count[0]:
         return

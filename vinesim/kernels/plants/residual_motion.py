@@ -1,11 +1,12 @@
-"""Residual motion: how fast a tree still moves, and how far it still is from the pose in which it will rest.
+"""Residual motion: the speed of a tree that is coming to rest, and its distance from its rest pose.
 
-The displacement to that pose follows from one step of the articulated-body algorithm that starts at zero velocity, has
-no damping, and is so long that springs outweigh inertia. The step solves (M + (T/2)^2 K) a = u for the unbalanced
-generalised force u, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the tangent stiffness at the present
-pose, including loads and ties. A tie to a wire, and a root's spring on an arm, is taken as soft as it is when all awake
-trees of the wire or arm move as one; none of them is then further from rest than it would be alone. Where K is not
-positive definite, the pose is no stable equilibrium, and the tree counts as far from rest.
+The displacement to the rest pose is computed by one step of the articulated-body algorithm that starts at zero
+velocity, has no damping, and is so long that inertia is negligible compared with springs. The step solves (M + (T/2)^2
+K) a = u for the unbalanced generalised force u, and (T/2)^2 a is K^-1 u, the quasi-static displacement. K is the
+tangent stiffness at the present pose, including loads and ties. For a tie to a wire, and a root's spring on an arm, K
+contains the reduced stiffness that applies when all awake trees on the wire or arm move together. So the computed
+distance from rest is not smaller than the actual distance. Where K is not positive definite, the pose is not a stable
+equilibrium, and the distance is :data:`FAR`.
 """
 
 import warp as wp
@@ -28,8 +29,8 @@ from vinesim.kernels.plants.structs import (
 wp.set_module_options({"enable_backward": False})
 
 REST_STEP = 10.0
-"""[s] Duration T of that step. Of a mode of frequency f it finds all but 1 / (1 + (pi f T)^2): 0.4 % less at half a
-hertz. TUNED"""
+"""[s] Duration T of the long step that finds the rest pose. For a mode of frequency f the displacement is too small by
+the share 1 / (1 + (pi f T)^2): 0.4 % at half a hertz. TUNED"""
 
 
 FAR = wp.constant(1.0e30)
@@ -49,7 +50,7 @@ def is_positive_definite(a: wp.mat33):
 
 @wp.func
 def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far: float):
-    """Returns the largest of ``so_far`` and the displacements of both ends of a body. NaN is passed on."""
+    """Returns the largest of ``so_far`` [m] and the displacements [m] of both ends of a body; NaN if one is NaN."""
     most = wp.max(wp.length(linear), wp.length(linear + wp.cross(angular, arm)))
     if most <= so_far or so_far != so_far:
         most = so_far
@@ -58,8 +59,8 @@ def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far
 
 @wp.func
 def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: Scratch):
-    """Subtract ``mass`` at ``point`` of body k, across ``axis``: the tie is softer by this much because its wire
-    deflects.
+    """Subtract a point mass ``mass`` at ``point`` of body k, across ``axis``, from the implicit inertia. In this form
+    the tie's stiffness is reduced because its wire deflects.
     """
     across = mass * (wp.identity(n=3, dtype=float) - wp.outer(axis, axis))
     arm = wp.skew(point)
@@ -70,10 +71,11 @@ def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: 
 
 @wp.func
 def soften_root(k: int, axes: wp.quat, q: wp.quat, softening: wp.vec3, mass: float, scratch_out: Scratch):
-    """Subtract ``mass`` times the square of ``softening``, in joint axes, from the inertia of root k, as the arm
-    twists.
+    """Subtract ``mass`` times the outer square of ``softening``, in joint axes, from the implicit inertia of root k,
+    because its arm twists.
 
-    The body on which a root stands has no acceleration, so this has the same effect as less stiffness.
+    The frame to which a root is attached has no acceleration, so this is equivalent to a smaller stiffness of the
+    root's spring.
     """
     s, excess, v = middle_axes_scale(q)
     gradient = wp.quat_rotate(axes * half_rotation(q), in_middle_axes(s, excess, v, softening))
@@ -106,17 +108,21 @@ def residual_motion(
     distance_out: wp.array(dtype=float),
     is_free_out: wp.array(dtype=wp.bool),
 ):
-    """One thread measures one tree: the fastest end of its bodies, and the one that is furthest from where it will rest.
+    """One thread per tree. Find the largest speed of a body's end, and the largest distance of a body's end from its
+    rest position.
 
-    Contacts count as forces that stay as they were in the last step. What a floating component does as a whole is in
-    its speed, not in its distance: it may rest anywhere.
+    Contact forces of the last step are assumed to stay constant. The speed includes the motion of a floating component
+    as a whole; the distance does not, because the component may rest anywhere.
 
-    p: with :data:`REST_STEP` as its step. model: without joint damping. body_length: [body] m. tie_axis, tie_softening:
-    [tie] see :class:`vinesim.plants.ties.TieTable`. root_softening: [tree] (N m/rad)^(1/2), see :class:`vinesim.plants.ties.RootRests`. trees: [thread] which tree. forces: with the contact wrenches of the last step. joints: at its end; joints_still: the same without
-    rates. forces_static: with ``static_load_out`` as the load and no contact wrenches. prediction_out: its
-    ``joint_qd_free`` times T / 4 is the displacement of each joint. speed_out, distance_out: [tree] m/s, m.
-    is_free_out: [tree] whether nothing touches it and none of it floats, so that all of its displacement is known. All
-    else that is written is scratch.
+    p: parameters with ``dt`` = :data:`REST_STEP`. model: model without joint damping. body_length: [body] m. tie_axis,
+    tie_softening: [tie] see :class:`vinesim.plants.ties.TieTable`. root_softening: [tree] (N m/rad)^(1/2), see
+    :class:`vinesim.plants.ties.RootRests`. trees: [thread] index of the tree. forces: forces with the contact wrenches
+    of the last step. joints: joints at the end of the last step; joints_still: the same joints with zero rates.
+    forces_static: forces with ``static_load_out`` as the load and no contact wrenches. prediction_out:
+    ``joint_qd_free`` times T / 4 is the displacement [rad] of each joint.
+    speed_out, distance_out: [tree] m/s, m.
+    is_free_out: [tree] whether the tree has no contacts and no floating root, so that its displacement is complete. All
+    other outputs are scratch.
     """
     if wp.tid() >= count[0]:
         return

@@ -1,19 +1,12 @@
 """Arguments of the articulation kernels, grouped: parameters, model, joints, bodies, forces, factors, scratch, prediction.
 
-Arrays named ``tree_`` have one element for each tree, ``tie_`` for each tie, all others one for each body. Bodies are
-numbered as :mod:`vinesim.plants.device_buffers` places them: those of a tree ``pitch`` apart, from
-``tree_first`` on, parents before children. All vectors are in world axes unless said otherwise. Blocks of a spatial
-inertia and of its factors are about the body's origin; see :mod:`vinesim.kernels.plants`.
+Arrays named ``tree_`` have one element for each tree, ``tie_`` for each tie, all others one for each body. The index of
+a body is its place in the device's arrays (:mod:`vinesim.plants.device_buffers`): the bodies of a tree are ``pitch``
+places apart, from ``tree_first`` on, parents before children. All vectors are in world axes unless said otherwise.
+Blocks of a spatial inertia and of its factors are about the body's origin; see :mod:`vinesim.kernels.plants`.
 """
 
-from typing import Any
-
 import warp as wp
-
-
-def fields(struct: Any) -> dict[str, Any]:
-    """Returns the names of a struct's fields, with Warp's variables that hold their types."""
-    return struct.vars
 
 
 @wp.struct
@@ -21,11 +14,11 @@ class SolverParameters:
     """Parameters that hold for all trees."""
 
     dt: float  # [s] duration of a step
-    fast_rate: float  # [rad/s] faster joints: phi = 1; faster bodies feel drag
+    fast_rate: float  # [rad/s] a faster joint: phi = 1; a faster body: drag
     max_rate: float  # [rad/s] no joint is integrated faster
     fault_rate: float  # [rad/s] a tree with a faster joint is not integrated
-    contact_steps: int  # a count of backward Euler steps above this is not from a contact
-    geometric_stiffness: float  # 1: the implicit solve includes the stiffness that loads lend to levers; 0: it does not
+    contact_steps: int  # a larger count of backward Euler steps was not set by a contact
+    geometric_stiffness: float  # 1: the implicit solve includes geometric stiffness; 0: it does not
     gravity: wp.vec3  # [m/s^2]
 
 
@@ -50,12 +43,12 @@ class ArticulationModel:
     pitch: int  # distance in memory from one body of a tree to the next
     tree_first: wp.array(dtype=wp.int32)  # index of the tree's first body
     tree_size: wp.array(dtype=wp.int32)  # number of bodies
-    tree_moving: wp.array(dtype=wp.int32)  # number of bodies that move: without the berry clusters of a coarse tree
-    tree_pose: wp.array(dtype=wp.transform)  # [m, xyzw] pose on which the bodies without a parent stand
+    tree_moving: wp.array(dtype=wp.int32)  # number of bodies, without the berry clusters of a coarse tree
+    tree_pose: wp.array(dtype=wp.transform)  # [m, xyzw] pose of the frame of bodies without a parent
     body_tree: wp.array(dtype=wp.int32)
     body_parent: wp.array(dtype=wp.int32)  # -1: none
-    body_root: wp.array(dtype=wp.int32)  # the floating root that the body moves with; -1 for bodies that stand
-    body_falls: wp.array(dtype=wp.bool)  # whether it moves with a floating root and no tie holds any body of this root
+    body_root: wp.array(dtype=wp.int32)  # floating root of the body's component; -1 for bodies on a fixed root
+    body_falls: wp.array(dtype=wp.bool)  # whether the body is in a floating component that no tie holds
     body_offset: wp.array(dtype=wp.vec3)  # [m] body's origin in the parent's frame
     body_rest: wp.array(dtype=wp.quat)  # joint frame in the parent's frame
     body_mass: wp.array(dtype=float)  # [kg]
@@ -65,7 +58,7 @@ class ArticulationModel:
     body_drag: wp.array(dtype=float)  # [m^2] drag area Cd A
     joint_stiffness: wp.array(dtype=wp.vec3)  # [N m/rad] in joint axes
     joint_damping: wp.array(dtype=wp.vec3)  # [N m s/rad] in joint axes
-    tie_span: wp.array(dtype=wp.vec2i)  # [body] first tie of a body, and the one after its last
+    tie_span: wp.array(dtype=wp.vec2i)  # [body] first tie of a body, and the tie after its last
     tie_point: wp.array(dtype=wp.vec3)  # [m] in the body's frame
     tie_stiffness: wp.array(dtype=float)  # [N/m]
     tie_damping: wp.array(dtype=float)  # [N s/m]
@@ -73,7 +66,7 @@ class ArticulationModel:
 
 @wp.struct
 class JointState:
-    """Generalized coordinates: ball joints, and the free translation of floating roots."""
+    """Generalized coordinates of ball joints, and of the free translation of floating roots."""
 
     joint_x: wp.array(dtype=wp.vec3)  # [m] origin of a floating root
     joint_xd: wp.array(dtype=wp.vec3)  # [m/s]
@@ -91,12 +84,12 @@ class BodyState:
 
 @wp.struct
 class AppliedForces:
-    """External forces on bodies, and motions that are imposed on them."""
+    """External forces on bodies, and prescribed motions of air, arms and anchors."""
 
     tree_air: wp.array(dtype=wp.vec3)  # [m/s] velocity of the air
-    root_turn: wp.array(dtype=wp.vec3)  # [tree] rad by which the arm turns the root spring's rest, joint axes
+    root_turn: wp.array(dtype=wp.vec3)  # [tree] rad, rotation of the root spring's rest pose by the arm, joint axes
     root_turn_rate: wp.array(dtype=wp.vec3)  # [tree] rad/s
-    tie_anchor: wp.array(dtype=wp.vec3)  # [m] point at which the tie is held
+    tie_anchor: wp.array(dtype=wp.vec3)  # [m] fixed end of the tie in the world
     tie_anchor_velocity: wp.array(dtype=wp.vec3)  # [m/s] velocity of that point
     body_load: wp.array(dtype=wp.spatial_vector)  # [N, N m] lasting load, at the body's origin
     body_wrench: wp.array(dtype=wp.spatial_vector)  # [N, N m] wrench of contacts, at the body's origin
@@ -111,7 +104,7 @@ class Factors:
     D: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (J + metric)^-1
     DJ: wp.array(dtype=wp.mat33)  # [1]
     DH: wp.array(dtype=wp.mat33)  # [1/m]
-    root_inverse_mass: wp.array(dtype=wp.mat33)  # [1/kg] acceleration of a floating root by force; 0 if it stands
+    root_inverse_mass: wp.array(dtype=wp.mat33)  # [1/kg] acceleration of a floating root per force; 0 for other bodies
 
 
 @wp.struct
@@ -122,13 +115,13 @@ class Scratch:
     H: wp.array(dtype=wp.mat33)  # [kg m]
     M: wp.array(dtype=wp.mat33)  # [kg]
     bias: wp.array(dtype=wp.spatial_vector)  # [N, N m]
-    tension: wp.array(dtype=wp.vec3)  # [N] steady force of the subtree on its lever
-    Du: wp.array(dtype=wp.vec3)  # [rad/s^2] D times the torque that drives the joint
+    tension: wp.array(dtype=wp.vec3)  # [N] steady force of the subtree that pulls on the body's lever
+    Du: wp.array(dtype=wp.vec3)  # [rad/s^2] D times the joint's driving torque
 
 
 @wp.struct
 class Prediction:
-    """Motion of the tree over the step if nothing more touches it."""
+    """Motion of the bodies over the step without the contacts of this step."""
 
     body_acceleration: wp.array(dtype=wp.spatial_vector)  # [m/s^2, rad/s^2] mean over the step
     joint_xd_free: wp.array(dtype=wp.vec3)  # [m/s]
@@ -138,21 +131,23 @@ class Prediction:
 
 @wp.struct
 class EnergyBudget:
-    """Energy that each tree may have. [tree] unless said otherwise; see :mod:`vinesim.kernels.plants.energy_budget`."""
+    """Largest energy that each tree may have, and its bookkeeping. Arrays are [tree] unless said otherwise; see
+    :mod:`vinesim.kernels.plants.energy_budget`."""
 
     limit: wp.array(dtype=float)  # [J] least energy since an external force last did work on the tree
     last: wp.array(dtype=float)  # [J] energy after the last check
     scale: wp.array(dtype=float)  # [J] largest kinetic energy of the last checks
     mark: wp.array(dtype=wp.int32)  # checksum of the state after the last step
-    held: wp.array(dtype=float)  # checksum of the points at which the tree's ties are held
-    watch: wp.array(dtype=wp.int32)  # steps left that are all checked, or minus the steps since the last check
-    filtered: wp.array(dtype=wp.int32)  # number of steps so far at whose end energy was removed
+    held: wp.array(dtype=float)  # checksum of the anchors of the tree's ties
+    watch: wp.array(dtype=wp.int32)  # number of next steps to check; if negative, -(steps since the last check)
+    filtered: wp.array(dtype=wp.int32)  # number of steps so far that removed energy
     start_q: wp.array(dtype=wp.quat)  # [body] rotations of joints at the start of the step, for trees watched closely
 
 
 @wp.struct
 class ResponseColumns:
-    """Velocities of the bodies on a path by unit impulses [slot * stride + body]. Each matrix holds three impulses."""
+    """Velocity changes of the bodies on a path by unit impulses [slot * stride + body]. Each matrix has one column for
+    each of three unit impulses."""
 
     a_by_force: wp.array(dtype=wp.mat33)  # [1/kg]
     a_by_moment: wp.array(dtype=wp.mat33)  # [1/(kg m)]

@@ -1,4 +1,4 @@
-"""Sway of trees in the wind: the drawn pose of a tree that is not simulated, computed from its rest pose.
+"""Sway of trees in the wind: the drawn pose of trees on which wind is not simulated, computed from their rest poses.
 
 Each joint turns by its angle in the steady wind, plus a linear response to the pressure of the gusts. Gusts reach the
 tree through the transfer function of an oscillator, as a sum over the plane waves of the wind.
@@ -9,12 +9,13 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 JOINT_GAP = wp.constant(0.005)
-"""[m] A body farther than this from its joint was cut off, and keeps its pose."""
+"""[m] Distance of a body from its joint above which the body was cut off, and does not sway."""
 
 
 @wp.func
 def steady_share(pressure: wp.vec3, mean: wp.vec3):
-    """Returns the share of the mean wind's deflection for a pressure v |v| [m^2/s^2]: its component along the mean's."""
+    """Returns the share of the mean wind's deflection for a pressure v |v| [m^2/s^2]: its component along the mean
+    pressure, relative to the mean pressure."""
     square = wp.dot(mean, mean)
     share = float(0.0)
     if square > 0.0:
@@ -24,7 +25,7 @@ def steady_share(pressure: wp.vec3, mean: wp.vec3):
 
 @wp.func
 def small_turn(turn: wp.vec3):
-    """Rotation by a vector [rad]; a half angle h has the sine h and is then made exact to third order."""
+    """Returns the quaternion of a small rotation vector [rad], exact to fifth order in its angle."""
     square = wp.dot(turn, turn)
     half = 0.5 - square / 48.0 + square * square / 3840.0
     w = 1.0 - square / 8.0 + square * square / 384.0
@@ -53,13 +54,14 @@ def sway_trees(
     turned_out: wp.array(dtype=wp.quat),
     body_q_out: wp.array(dtype=wp.transform),
 ):
-    """One thread draws one tree.
+    """One thread per tree. Compute the drawn poses of the tree's bodies.
 
-    body_steady: [body] rad, world axes, turn of its joint in the mean wind. body_gain: [body] rad per m^2/s^2, how it
-    turns when the pressure v |v| changes. tree_steady: [tree] m/s, the mean wind at the tree; tree_gust: [tree, term]
-    m/s, filtered gusts as factors of ``waves`` [term], the cosines, then the sines of the waves at this instant. trees:
-    [thread] which tree. strength: of the wind. tree_air: [tree] m/s, air in which ``body_q`` rests; tree_drawn: [tree]
-    share that is drawn. turned_out: [body] how far each body is turned, scratch. body_q_out: [body] poses as drawn.
+    body_steady: [body] rad, world axes, rotation of the body's joint in the mean wind. body_gain: [body] rad per
+    m^2/s^2, change of this rotation per change of the pressure v |v|. tree_steady: [tree] m/s, mean wind at the tree.
+    tree_gust: [tree, term] m/s, filtered gusts as factors of ``waves`` [term], which are the cosines and then the sines
+    of the waves at this instant. trees: [thread] index of the tree. strength: [1] factor of the wind speed. tree_air:
+    [tree] m/s, air velocity for which ``body_q`` is the simulated pose. tree_drawn: [tree] share of the sway that is
+    drawn, 0 to 1. turned_out: [body] scratch, rotation of each body. body_q_out: [body] drawn poses.
     """
     tree = trees[wp.tid()]
     first = tree_first[tree]

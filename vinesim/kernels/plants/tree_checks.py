@@ -1,8 +1,9 @@
-"""Checks of trees after a step: how fast they are, how long they have been slow, and for how long peduncles carry too much."""
+"""Checks of trees after a step: their largest rates, the number of steps for which they have been slow, and the number
+of steps for which peduncles have been overloaded."""
 
 import warp as wp
 
-# How long the joints of trees have been slow.
+# Number of steps for which the joints of trees have been slow.
 
 
 wp.set_module_options({"enable_backward": False})
@@ -21,11 +22,11 @@ def count_quiet_steps(
     seen_tick_out: wp.array(dtype=wp.int64),
     longest_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per listed tree. Count a step in which it was slow; restart from 0 if a joint reached the limit or is
-    NaN.
+    """One thread per listed tree. Count the successive steps in which the tree was slow; restart from 0 if its rate is
+    NaN or not below the limit.
 
-    limit: [1] rad/s. tree_rate: [tree] rad/s. A tree that moves is not at rest, and was not seen still (-1) before.
-    longest_out: [1] the largest count of all trees.
+    limit: [1] rad/s. tree_rate: [tree] rad/s. is_at_rest_out, seen_tick_out: [tree] reset to false and -1 for a tree
+    that moves. longest_out: [1] largest count of all trees.
     """
     if wp.tid() >= count[0]:
         return
@@ -51,7 +52,7 @@ def find_fastest(
     # out
     fastest_out: wp.array(dtype=float),
 ):
-    """One thread per listed tree. Find the largest rate of all, infinite if one is not a number.
+    """One thread per listed tree. Find the largest rate of all listed trees; infinity if one is NaN.
 
     tree_rate: [tree] rad/s. fastest_out: [1] rad/s, raised to the largest rate.
     """
@@ -63,7 +64,7 @@ def find_fastest(
     wp.atomic_max(fastest_out, 0, rate)
 
 
-# How long peduncles have carried more than they can.
+# Number of steps for which peduncles have been overloaded.
 
 
 @wp.kernel
@@ -83,11 +84,13 @@ def count_overloaded_steps(
     overloaded_steps_out: wp.array(dtype=wp.int32),
     longest_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per listed bunch. Count a step in which its peduncle is overloaded; restart from 0 if it is not.
+    """One thread per listed bunch. Count the successive steps in which its peduncle is overloaded; restart from 0 if it
+    is not.
 
     A peduncle is overloaded if it is pulled or bent beyond its strength. bunch_pull, bunch_bend: [bunch] N, N m.
-    carried: [thread] force and moment of its joint, N, N m. is_attached: [bunch]. is_remote: [tree]. Picked bunches and
-    those of remote trees are left out. longest_out: [1] the largest count of all bunches.
+    carried: [thread] wrench in the peduncle's joint, N, N m. is_attached: [bunch] whether the bunch hangs on its vine.
+    is_remote: [tree] whether another client owns the tree. Picked bunches and bunches of remote trees are left out.
+    longest_out: [1] the largest count of all bunches.
     """
     i = wp.tid()
     if i >= count[0]:

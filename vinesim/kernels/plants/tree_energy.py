@@ -13,7 +13,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def spring_energy(stiffness: wp.vec3, q: wp.quat):
-    """theta^T K theta / 2 [J], with theta the rotation vector of q."""
+    """Returns theta^T K theta / 2 [J], with theta the rotation vector of q and K the diagonal matrix of
+    ``stiffness``."""
     v = wp.vec3(q[0], q[1], q[2])
     square = wp.dot(v, v)
     s = 1.0 + square * (1.0 / 6.0 + square * (3.0 / 40.0 + square * (5.0 / 112.0)))  # asin(|v|) / |v|
@@ -34,9 +35,10 @@ def body_energy(
     pose: wp.transform,
     motion: wp.spatial_vector,
 ):
-    """Returns kinetic and potential energy of one body, the size of the terms of their sums [J], and a checksum.
+    """Returns kinetic and potential energy of one body, the sum of the absolute values of their terms [J], and a
+    checksum.
 
-    The checksum is of the points at which the body's ties are held. The potential energy is that of its weight, its
+    The checksum is computed from the anchors of the body's ties. The potential energy is that of its weight, its
     joint's spring and its ties. pose: [m] relative to ``origin`` [m], world axes.
     """
     com = model.body_com[k]
@@ -75,7 +77,7 @@ def tree_energy(
     tree: int,
     bodies_out: BodyState,
 ):
-    """Returns :func:`body_energy` of a whole tree, with its bodies placed according to the joints.
+    """Returns the sums of :func:`body_energy` over the bodies of a tree, in the pose of ``joints``.
 
     Positions are relative to the tree's origin, so that no digits are lost far from the world's origin.
     """
@@ -157,5 +159,5 @@ def is_pushed(
     count: int,
     pitch: int,
 ) -> bool:
-    """Returns whether a load or a contact acts on one of ``count`` bodies: any bit other than a sign is set."""
+    """Returns whether a load or a contact acts on one of ``count`` bodies: whether a component is not zero."""
     ...

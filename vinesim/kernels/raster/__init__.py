@@ -1,1 +1,2 @@
-"""Which primitive each pixel or ray meets: rasterisers for cameras and lidars, and the ray caster they are held to."""
+"""Kernels that find the primitive in each pixel or ray: rasterisers for cameras, and the ray caster that verifies
+them."""

@@ -1,7 +1,7 @@
-"""Finds the primitive that each pixel of a pinhole camera sees: culling, boxes and meshes, depth and labels from keys.
+"""Rasteriser of a pinhole camera on a CPU: culling of clusters, solids and triangles, depth and labels from keys.
 
-Each primitive visits the pixels inside a conservative bound of its outline, intersects each pixel's ray in closed form
-and keeps the nearest hit (:mod:`vinesim.kernels.raster.pinhole`).
+For each primitive, a thread visits the pixels inside a conservative bound of the primitive's outline, intersects each
+pixel's ray in closed form and keeps the nearest hit (:mod:`vinesim.kernels.raster.pinhole`).
 """
 
 import warp as wp
@@ -45,9 +45,10 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread bounds one cluster: its least distance [m] to the eye, or FAR if no pixel can see it.
+    """One thread tests one cluster against the view.
 
-    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] m.
+    ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] least distance to the camera [m], or
+    FAR if the cluster is out of view.
     """
     i = wp.tid()
     r = ball[i][3]
@@ -62,15 +63,16 @@ def cull_clusters(
 
 @wp.func
 def tangent(across: float, ahead: float, behind: float) -> float:
-    """Returns across / ahead, or ``behind`` for a direction that is not ahead."""
+    """Returns across / ahead for a direction in front of the camera (``ahead`` > 0), else the value ``behind``."""
     return wp.where(ahead > 0.0, across / wp.max(ahead, 1.0e-9), behind)
 
 
 @wp.func
 def hull_tangents(box: OrientedBox, k: int) -> wp.vec2:
-    """Least and greatest tangent of the directions to a box, across (``k`` 0) or down (1) over ahead.
+    """Returns the least and greatest x / z (``k`` 0) or y / z (``k`` 1) of directions from the camera to a box.
 
-    A bounding sphere would hold the eye for what is mounted beside it, as its own housing is.
+    The box is in the optical frame. A bounding sphere would be too coarse: the sphere around a part next to the camera,
+    such as its housing, contains the camera.
     """
     across = box.centre[k]
     ahead = box.centre[2]
@@ -111,7 +113,7 @@ def raster_solids(
 ):
     """One thread draws every ``lanes``-th box, ellipsoid or cylinder of one visible cluster.
 
-    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
     """
     k, lane = wp.tid()
@@ -135,7 +137,7 @@ def raster_solids(
         if kind != CYLINDER:
             eye = wp.quat_rotate_inv(q, lens.eye - xyz(a4))
         if kind == BOX and wp.max(wp.cw_div(wp.abs(eye), half)) < 1.0:
-            continue  # from inside nothing is seen of it
+            continue  # a box that contains the camera is not drawn
         if box[0] < box[1] and box[2] < box[3]:
             p = lens.rotation * (xyz(a4) - lens.eye)
             end = lens.rotation * (xyz(b4) - lens.eye)
@@ -175,7 +177,7 @@ def raster_triangles(
 ):
     """One thread draws every ``lanes``-th triangle of one visible cluster.
 
-    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
     """
     k, lane = wp.tid()
@@ -211,7 +213,7 @@ def raster_triangles(
 
 @wp.func
 def ground_depth(lens: Pinhole, x: int, y: int) -> float:
-    """Depth at which a pixel's ray meets the ground, z = 0."""
+    """Returns the depth [m] at which the ray of pixel (x, y) meets the ground (z = 0), or FAR."""
     d = pixel_ray(lens, x, y)
     fall = lens.rotation[0, 2] * d[0] + lens.rotation[1, 2] * d[1] + lens.rotation[2, 2]
     meets = fall < -1.0e-6 and lens.eye[2] > 0.0
@@ -237,7 +239,12 @@ def resolve_keys(
     depth_out: wp.array(dtype=wp.float32),
     labels_out: wp.array(dtype=wp.int32),
 ):
-    """One thread reads ``run`` pixels' keys, from the first row drawn on, into depth [m], label and primitive (-1 sky, -2 ground)."""
+    """One thread converts the keys of ``run`` neighbouring pixels to primitive, depth and label.
+
+    Threads begin at row ``lens.first_row``. label: [primitive]; keys: [pixel] see
+    :mod:`vinesim.kernels.raster.pinhole`; too_near, too_far: depth reported below ``nearest`` [m] and above
+    ``farthest`` [m]; primitive: [pixel] -1 the sky, -2 the ground; depth: [pixel] m; labels: [pixel].
+    """
     first = lens.first_row * lens.width + wp.tid() * run
     column = first % lens.width
     row = first // lens.width

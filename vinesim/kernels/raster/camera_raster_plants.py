@@ -1,6 +1,6 @@
-"""Berries, canes and leaves drawn into the keys of a pinhole camera.
+"""Rasteriser of a pinhole camera on a CPU: berries, canes and leaves.
 
-Pixels are taken in runs, and loops over a run are written without branches, so that LLVM takes eight at a time.
+Pixels of a row are tested in runs. Loops over a run have no branches, so that LLVM takes eight pixels at a time.
 """
 
 import warp as wp
@@ -52,7 +52,7 @@ def raster_spheroids(
 ):
     """One thread draws every ``lanes``-th spheroid of one visible cluster.
 
-    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
     """
     k, lane = wp.tid()
@@ -97,27 +97,30 @@ def raster_spheroids(
 
 @wp.struct
 class ConeBounds:
-    """Region of the picture that contains a cone: a box and, if ``banded``, a slanted band of every row."""
+    """Region of the picture that contains a cone: a box and, if ``banded``, a slanted band within the box."""
 
     box: wp.vec4i
-    """First and last + 1 column, first and last + 1 row."""
+    """Box in pixels: first and last + 1 column, first and last + 1 row."""
     banded: int
     x: float
     y: float
-    """[pixel] ``x`` and ``y``: a point of the band's middle line."""
+    """Point (``x``, ``y``) [px] on the band's middle line."""
     slope: float
-    """Slope of the band, columns per row."""
+    """Slope of the band [columns per row]."""
     half_width: float
-    """[pixel] Half of the band's width."""
+    """Half of the band's width along a row [px]."""
 
 
 @wp.func
 def cone_bounds(lens: Pinhole, a: wp.vec3, ra: float, b: wp.vec3, rb: float) -> ConeBounds:
-    """Bounds of the hull of two spheres, given in the optical frame."""
+    """Returns the picture's region that contains a cone with rounded ends: the convex hull of two spheres.
+
+    ``a``, ``b``: centres in the optical frame [m]; ``ra``, ``rb``: radii [m].
+    """
     o = ConeBounds()
     r = wp.max(ra, rb)
-    # What reaches no farther than NEAR_DEPTH is in view only within a small ball around the eye. An axis that
-    # stays clear of that ball may be cut there: a wire that passes the camera keeps a narrow bound.
+    # The part of the view nearer than NEAR_DEPTH is inside a small ball around the camera. If the cone stays
+    # clear of that ball, its axis may be cut at NEAR_DEPTH: a wire that passes the camera keeps a narrow bound.
     ca = a
     cb = b
     ba = b - a
@@ -173,7 +176,7 @@ def raster_cones(
 ):
     """One thread draws every ``lanes``-th cone of one visible cluster.
 
-    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
     """
     k, lane = wp.tid()
@@ -224,20 +227,24 @@ def raster_cones(
 
 @wp.struct
 class LeafBounds:
-    """An octagon around the picture of a blade [pixel]: lowest and highest x and y, x + y and x - y."""
+    """An octagon [px] around a leaf in the picture: bounds of x, y, x + y and x - y."""
 
     xy: wp.vec4
     sums: wp.vec4
-    """Lowest and highest x + y, lowest and highest x - y."""
+    """Lowest and highest x + y, lowest and highest x - y [px]."""
     depth: float
-    """[m] Lower bound of the depth of the blade's points."""
+    """Lower bound of the depth of the leaf's points [m]."""
 
 
 @wp.func
 def leaf_bounds(
     lens: Pinhole, shapes: Shapes, i: int, p: wp.vec3, side: wp.vec3, rib: wp.vec3, up: wp.vec3
 ) -> LeafBounds:
-    """Bounds of blade ``i`` with its petiole's end ``p`` and axes in the optical frame."""
+    """Returns the octagon around leaf ``i`` in the picture.
+
+    ``p``: end of the petiole [m]; ``side``, ``rib``, ``up``: unit axes across the leaf, along its midrib and along its
+    normal; all in the optical frame.
+    """
     size = shapes.a[i][3]
     bend = shapes.d[i]
     number = int(shapes.b[i][3])
@@ -278,7 +285,8 @@ def leaf_bounds(
 
 @wp.struct
 class LeafPixelFrame:
-    """Rays of pixels (x, y) in the frame and unit of a blade: from ``eye`` along dz + dx x + dy y."""
+    """Rays of pixels (x, y) in a leaf's own frame and unit: they start at ``eye`` and have the direction
+    dz + x dx + y dy."""
 
     eye: wp.vec3
     dx: wp.vec3
@@ -290,7 +298,10 @@ class LeafPixelFrame:
 def leaf_pixel_frame(
     lens: Pinhole, p: wp.vec3, side: wp.vec3, rib: wp.vec3, up: wp.vec3, size: float
 ) -> LeafPixelFrame:
-    """Frame of a blade with its petiole's end ``p`` [m] and axes in the optical frame."""
+    """Returns the pixels' rays in the frame of a leaf of length ``size`` [m].
+
+    ``p``: end of the petiole [m]; ``side``, ``rib``, ``up``: unit axes of the leaf; all in the optical frame.
+    """
     inv = 1.0 / size
     o = LeafPixelFrame()
     o.eye = wp.vec3(-wp.dot(p, side), -wp.dot(p, rib), -wp.dot(p, up)) * inv
@@ -314,7 +325,7 @@ def raster_leaves(
 ):
     """One thread draws every ``lanes``-th leaf of one visible cluster.
 
-    visible: [thread] clusters; lanes: threads that share one cluster; keys: [pixel] see
+    visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
     """
     k, lane = wp.tid()

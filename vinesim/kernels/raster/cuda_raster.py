@@ -1,9 +1,10 @@
-"""The rasteriser for GPUs: primitives are cut into pieces of a few pixels, and every piece is drawn by some threads.
+"""The rasteriser for GPUs: primitives are cut into tiles of a few pixels, and a few threads draw each tile.
 
 One leaf may fill the picture while a thousand berries cover one pixel each. With one thread for each primitive the
-whole GPU would wait for that leaf. So a first kernel only bounds primitives and lists pieces of at most SIDE x SIDE
-pixels of their bounds, and a second kernel draws the pieces, which all take about the same work. Intersections are
-computed as in the ray caster. No kernel asks the host for the length of the lists: a frame is two launches.
+whole GPU would wait for that leaf. So a first kernel only bounds primitives and lists tiles (``pieces``): rectangles of
+at most TILE_SIZE x TILE_SIZE pixels that cover each bound. A second kernel draws the tiles, which all take about the
+same work. Intersections are computed as in the ray caster. The host never reads the lengths of the lists: a frame is
+two launches.
 """
 
 import warp as wp
@@ -38,35 +39,41 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 TILE_SIZE = wp.constant(16)
-"""[pixel] Side of a piece.
+"""Width and height of a tile [px].
 
-It is twice that for primitives larger than LARGE, as one thread lists a primitive's pieces.
+Tiles of primitives larger than LARGE_PRIMITIVE are twice as wide and high, because one thread lists all tiles of a
+primitive.
 """
 LARGE_PRIMITIVE = wp.constant(256)
 TILE_LISTS = wp.constant(64)
-"""Number of lists in which pieces are kept. Threads that append to the same list must take turns."""
+"""Number of lists of tiles. Several lists reduce contention, because threads append to a list one at a time."""
 EMPTY_BOUNDS = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
-"""[pixel] Bounds of a primitive that is not in the picture."""
+"""Bounds [px] of no pixels, from which bounds of a primitive are extended: lowest and highest x, lowest and highest y.
+"""
 UNBOUNDED_STRIP = wp.constant(wp.vec3(0.0, -1.0e6, 1.0e6))
-"""A strip that contains every pixel: slope, low, high."""
+"""A strip low <= x - slope y <= high [px] that contains every pixel: slope, low, high."""
 
 
 @wp.struct
 class Outline:
-    """Region of the picture that contains a primitive: a box and two strips ``low <= x - slope y <= high``."""
+    """Region of the picture that contains a primitive: the intersection of a box and two slanted strips
+    ``low <= x - slope y <= high`` [px]."""
 
     box: wp.vec4i
     """First and last + 1 column, first and last + 1 row."""
     rising: wp.vec3
-    """Slope, low, high [pixel]."""
+    """Slope, low, high [px] of a strip; ``falling`` is the other strip."""
     falling: wp.vec3
     depth: float
-    """[m] Lower bound of the depth of the primitive's points."""
+    """Lower bound of the depth of the primitive's points [m]."""
 
 
 @wp.func
 def extend_bounds(lens: Pinhole, bound: wp.vec4, p: wp.vec3) -> wp.vec4:
-    """Returns the lowest and highest x and y [pixel], widened to include the image of a point in front of the camera."""
+    """Returns ``bound`` (lowest and highest x, lowest and highest y [px]), extended to the image of point ``p`` [m].
+
+    ``p`` is in the optical frame, in front of the camera.
+    """
     x = p[0] / p[2] * lens.fx + lens.cx
     y = p[1] / p[2] * lens.fy + lens.cy
     return wp.vec4(wp.min(bound[0], x), wp.max(bound[1], x), wp.min(bound[2], y), wp.max(bound[3], y))
@@ -94,7 +101,7 @@ def leaf_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
     heights = leaf_heights(s.d[i])
     depth = float(FAR)
     bound = EMPTY_BOUNDS
-    turned = bound  # of x - y and x + y
+    turned = bound  # bounds of x - y and x + y
     for n in range(16):
         corner = s.hull[int(b4[3]), n >> 1]
         q = p + (side * corner[0] + rib * corner[1] + up * heights[n & 1]) * size
@@ -123,8 +130,8 @@ def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
     bound = EMPTY_BOUNDS
     strip = UNBOUNDED_STRIP
     if wp.max(a[2], b[2]) > -r:
-        # What reaches no farther than CLOSE is in view only within a small ball around the eye. An axis that
-        # stays clear of that ball may be cut there: a wire that passes the camera keeps a narrow bound.
+        # The part of the view nearer than NEAR_DEPTH is inside a small ball around the camera. If the cone stays
+        # clear of that ball, its axis may be cut at NEAR_DEPTH: a wire that passes the camera keeps a narrow bound.
         axis = b - a
         cut = NEAR_DEPTH - r
         start = a
@@ -143,7 +150,7 @@ def cone_outline(s: Shapes, i: int, lens: Pinhole) -> Outline:
         if clear:
             bound = wp.vec4(wp.min(f[0], g[0]), wp.max(f[1], g[1]), wp.min(f[2], g[2]), wp.max(f[3], g[3]))
             rise = 0.5 * (g[2] + g[3] - f[2] - f[3])
-            if wp.min(start[2], end[2]) - r > 0.01 and wp.abs(rise) > 2.0:  # a slanted one covers only a strip
+            if wp.min(start[2], end[2]) - r > 0.01 and wp.abs(rise) > 2.0:  # a slanted cone covers only a strip
                 slope = 0.5 * (g[0] + g[1] - f[0] - f[1]) / rise
                 middle = 0.5 * (f[0] + f[1] - slope * (f[2] + f[3]))
                 half = 0.5 * (wp.max(f[1] - f[0], g[1] - g[0]) + wp.abs(slope) * wp.max(f[3] - f[2], g[3] - g[2]))
@@ -199,7 +206,7 @@ def solid_outline(s: Shapes, i: int, kind: int, lens: Pinhole) -> Outline:
 
 @wp.func
 def outline_of(s: Shapes, i: int, lens: Pinhole) -> Outline:
-    """Returns the region that contains primitive ``i``; its box is empty if it is behind the camera or off the picture."""
+    """Returns the picture's region that contains primitive ``i``; its box is empty if the primitive is out of view."""
     kind = s.kind[i]
     o = Outline()
     if kind == LEAF:
@@ -215,7 +222,7 @@ def outline_of(s: Shapes, i: int, lens: Pinhole) -> Outline:
 
 @wp.func
 def column_span(o: Outline, top: int, bottom: int) -> wp.vec2i:
-    """First and last + 1 column of an outline within the rows from ``top`` up to ``bottom``, not included."""
+    """Returns the first and last + 1 column of an outline within the rows from ``top`` to ``bottom`` - 1."""
     first = float(o.box[0])
     last = float(o.box[1])
     y = float(top)
@@ -229,7 +236,10 @@ def column_span(o: Outline, top: int, bottom: int) -> wp.vec2i:
 
 @wp.func
 def draw_tile(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, keys_out: wp.array(dtype=wp.int64)):
-    """Draw every ``lanes``-th pixel of a piece: primitive, corner and size (x + 65536 y), least depth [um]."""
+    """Draw every ``lanes``-th pixel of a tile, from pixel ``lane`` on.
+
+    ``piece``: the tile's primitive, upper left pixel (x + 65536 y), size (width + 65536 height), least depth [um].
+    """
     i = piece[0]
     left = piece[1] & 0xFFFF
     top = piece[1] >> 16
@@ -266,9 +276,11 @@ def list_tiles(
     pieces_out: wp.array2d(dtype=wp.vec4i),
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread lists the pieces of every ``lanes``-th primitive of a cluster.
+    """One thread lists the tiles of every ``lanes``-th primitive of a cluster, and draws tiles for which the list is
+    full.
 
-    It draws pieces for which there is no room.
+    ball: [cluster] centre and radius [m]; which: clusters to draw; count: [list] number of tiles; pieces: [list, slot]
+    tiles, see :func:`draw_tile`; keys: [pixel].
     """
     k, lane = wp.tid()
     cluster = which[k]
@@ -319,9 +331,9 @@ def draw_tiles(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One of ``lanes`` threads draws its share of the pixels of every ``groups``-th tile of one list.
+    """One thread draws every ``lanes``-th pixel of every ``groups``-th tile of one list.
 
-    count: [list] tiles in each list; pieces: [list, slot] tiles, see :func:`draw_tile`; keys: [pixel].
+    count: [list] number of tiles; pieces: [list, slot] tiles, see :func:`draw_tile`; keys: [pixel].
     """
     group = wp.tid() // lanes
     lane = wp.tid() % lanes

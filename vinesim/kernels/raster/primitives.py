@@ -14,10 +14,11 @@ CYLINDER   centre of one end, r    centre of the other, -  distance along, seed,
 TRIANGLE   corner, normal          corner, normal          corner, normal               carrier's quaternion
 ========== ======================= ======================= ============================ =====================
 
-A primitive that encloses the ray's origin is not hit, and triangles are seen from outside only (counter-clockwise):
-a camera inside the housing of its robot looks out. Rays may have any length; ``t`` counts in lengths of ``d``.
+A ray does not hit a primitive that contains the ray's origin, and hits triangles only from outside (counter-clockwise):
+a camera inside a robot's housing looks out. The direction ``d`` of a ray may have any length; ``t`` counts in lengths
+of ``d``.
 
-Primitives lie in *clusters*: at most some dozens of one kind, close together, on one tree, bunch or link.
+Primitives are grouped in *clusters*: at most some dozens of one kind, close together, on one tree, bunch or link.
 """
 
 import warp as wp
@@ -35,12 +36,12 @@ TRIANGLE = wp.constant(6)
 FAR = wp.constant(1.0e30)
 TINY = wp.constant(1.0e-20)
 HIDDEN_HEIGHT = wp.constant(-1.0e6)
-"""[m] Height at which removed primitives are placed for the ray caster."""
+"""Height [m] at which removed primitives are placed, so that no ray of the ray caster hits them."""
 
 
 @wp.struct
 class Shapes:
-    """All primitives, posed in the world."""
+    """All primitives, each as four vectors ``a b c d`` in the world frame (meaning by kind: see the module)."""
 
     a: wp.array(dtype=wp.vec4)
     b: wp.array(dtype=wp.vec4)
@@ -48,20 +49,20 @@ class Shapes:
     d: wp.array(dtype=wp.vec4)
     kind: wp.array(dtype=wp.int32)
     outline: wp.array3d(dtype=wp.int8)
-    """[outline, 256, 256] signed distance to the leaf's edge, positive inside, 1/400 leaf unit."""
+    """[outline, 256, 256] Signed distance to the leaf's edge, positive inside [1/400 leaf unit]."""
     hull: wp.array2d(dtype=wp.vec2)
-    """[outline, 8] corners of an octagon around each outline, leaf units."""
+    """[outline, 8] Corners of an octagon around each outline [leaf units]."""
 
 
 @wp.struct
 class Clusters:
-    """Runs of primitives of one kind."""
+    """Clusters: runs of neighbouring primitives of one kind; each array is [cluster]."""
 
     first: wp.array(dtype=wp.int32)
     size: wp.array(dtype=wp.int32)
     kind: wp.array(dtype=wp.int32)
     shown: wp.array(dtype=wp.int32)
-    """[cluster] 0 if the cluster was removed, such as a picked bunch."""
+    """[cluster] 0 if the cluster was removed, for example because its bunch was picked."""
 
 
 @wp.func
@@ -81,25 +82,29 @@ def as_quat(v: wp.vec4) -> wp.quat:
 
 @wp.func
 def scale_along(v: wp.vec3, axis: wp.vec3, k: float) -> wp.vec3:
-    """``v`` scaled by 1 + k along ``axis``: a spheroid becomes a sphere."""
+    """Returns ``v`` scaled by 1 + k along the unit vector ``axis``, for example to turn a spheroid into a sphere."""
     return v + axis * (k * wp.dot(v, axis))
 
 
-# Leaf blades: two quadratic half surfaces hinged at the midrib, cut out by an outline; their bounds, and rays that hit.
+# Leaf blades: two quadratic half surfaces that meet at the midrib, cut out by an outline. Their bounds and ray hits.
 #
-# A blade lives in its own frame and unit: u across, v along the midrib (from petiole, 0, to tip, 1), w along the
-# normal; w = a u^2 + b v^2 + c |u| with the curvatures ``bend`` = (a, b, c, age).
+# A blade has its own frame and unit: u across, v along the midrib (from petiole, 0, to tip, 1), w along the normal;
+# w = a u^2 + b v^2 + c |u| with the curvatures ``bend`` = (a, b, c, age).
 
 
 OUTLINE_TEXELS = wp.constant(128.0)
-"""Texels of a leaf's outline per leaf unit: 256 texels over u in [-1, 1], v in [-0.75, 1.25]."""
+"""Number of texels of a leaf's outline per leaf unit: 256 texels cover u in [-1, 1] and v in [-0.75, 1.25]."""
 LEAF_BOUND_MARGIN = wp.constant(1.0e-3)
-"""Margin that is added to the bounds of a blade, leaf units."""
+"""Margin that is added to the bounds of a leaf blade [leaf units]."""
 
 
 @wp.func
 def leaf_heights(bend: wp.vec4) -> wp.vec2:
-    """Lowest and highest w of a blade, leaf units (|u| <= 0.95, |v| <= 1.05)."""
+    """Returns bounds of a leaf blade's height w above its plane [leaf units]: lowest, highest (|u| <= 0.95, |v| <=
+    1.05).
+
+    ``bend``: curvatures a, b, c of w = a u^2 + b v^2 + c |u|, and age.
+    """
     low = wp.min(0.0, bend[0] * 0.9) + wp.min(0.0, bend[1] * 1.1) + wp.min(0.0, bend[2] * 0.95)
     high = wp.max(0.0, bend[0] * 0.9) + wp.max(0.0, bend[1] * 1.1) + wp.max(0.0, bend[2] * 0.95)
     return wp.vec2(low, high)
@@ -107,14 +112,18 @@ def leaf_heights(bend: wp.vec4) -> wp.vec2:
 
 @wp.func
 def leaf_height(bend: wp.vec4, u: float, v: float) -> float:
-    """Height w of a blade, leaf units."""
+    """Returns the height w of a leaf blade above its plane at (u, v) [leaf units].
+
+    ``bend``: curvatures a, b, c of w = a u^2 + b v^2 + c |u|, and age.
+    """
     return bend[0] * u * u + bend[1] * v * v + bend[2] * wp.abs(u)
 
 
 @wp.func
 def leaf_extent(hull: wp.array2d(dtype=wp.vec2), number: int) -> wp.vec3:
-    """Largest |u|, lowest and highest v of an outline: corners 1 and 5 of its octagon lie at the sides, 3 and 7 at the
-    ends.
+    """Returns bounds of leaf outline ``number`` [leaf units]: largest |u|, lowest and highest v.
+
+    hull: [outline, 8] octagon around each outline; corners 1 and 5 are at the sides, 3 and 7 at the ends.
     """
     return wp.vec3(
         wp.max(wp.abs(hull[number, 1][0]), wp.abs(hull[number, 5][0])), hull[number, 3][1], hull[number, 7][1]
@@ -123,11 +132,11 @@ def leaf_extent(hull: wp.array2d(dtype=wp.vec2), number: int) -> wp.vec3:
 
 @wp.func
 def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> wp.vec2:
-    """Returns how far a blade rises above, and falls below, the hull of its points over the octagon's corners, leaf
-    units.
+    """Returns how far a leaf blade rises above, and falls below, the convex hull of its eight points over the corners
+    of its outline's octagon [leaf units].
 
-    A quadratic deviates from its interpolation by at most its curvature times (range / 2)^2. Each half of a blade is a
-    quadratic; corners 3 and 7 are at the midrib, or near it.
+    A quadratic deviates from its linear interpolation by at most its curvature times (range / 2)^2. Each half of a
+    blade is a quadratic; corners 3 and 7 are at the midrib or near it. ``bend``: curvatures a, b, c, and age.
     """
     extent = leaf_extent(hull, number)
     wide = 0.5 * extent[0]
@@ -142,7 +151,10 @@ def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> w
 
 @wp.func
 def inside_outline(outline: wp.array3d(dtype=wp.int8), number: int, u: float, v: float, smooth: int) -> bool:
-    """Returns whether a point of the leaf's plane belongs to the blade."""
+    """Returns whether point (u, v) [leaf units] of a leaf's plane is inside leaf outline ``number``.
+
+    ``smooth``: 1 to interpolate between texels of the outline.
+    """
     x = (u + 1.0) * OUTLINE_TEXELS - 0.5
     y = (v + 0.75) * OUTLINE_TEXELS - 0.5
     i = wp.clamp(int(x), 0, 254)
@@ -160,7 +172,12 @@ def inside_outline(outline: wp.array3d(dtype=wp.int8), number: int, u: float, v:
 def hit_leaf(
     outline: wp.array3d(dtype=wp.int8), number: int, bend: wp.vec4, o: wp.vec3, d: wp.vec3, smooth: int
 ) -> float:
-    """First hit with a blade in its own frame and unit: two half surfaces w = a u^2 + b v^2 + c |u|, hinged at u = 0."""
+    """Returns ``t`` of a ray's first hit with a leaf blade, or FAR; ray and blade are in the blade's own frame and
+    unit.
+
+    The blade is two half surfaces w = a u^2 + b v^2 + c |u| that meet at u = 0, cut out by outline ``number``. ``o``,
+    ``d``: origin and direction of the ray; ``smooth``: 1 to interpolate between texels of the outline.
+    """
     best = FAR
     q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
     linear = d[2] - 2.0 * (bend[0] * o[0] * d[0] + bend[1] * o[1] * d[1])
@@ -189,7 +206,10 @@ def hit_leaf(
 
 @wp.func
 def within_leaf_rectangle(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> float:
-    """Returns ``t`` if the ray is then over the half of a blade's rectangle given by ``sign``, else :data:`FAR`."""
+    """Returns ``t`` if the ray o + t d is there within one half of a leaf's bounding rectangle, else :data:`FAR`.
+
+    ``sign``: side of the midrib, 1 or -1; ``extent``: largest |u|, lowest and highest v [leaf units].
+    """
     u = sign * (o[0] + t * d[0])
     v = o[1] + t * d[1]
     return wp.where(u >= -1.0e-5 and u < extent[0] and v > extent[1] and v < extent[2] and t > 0.0, t, FAR)
@@ -197,7 +217,10 @@ def within_leaf_rectangle(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, 
 
 @wp.func
 def leaf_surface_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, d: wp.vec3) -> wp.vec2:
-    """Both hits with one half of a blade's rectangle; :data:`FAR` for none."""
+    """Returns ``t`` of both hits of a ray with one half of a leaf's curved bounding rectangle; :data:`FAR` for no hit.
+
+    ``sign``: side of the midrib, 1 or -1; ``extent``: largest |u|, lowest and highest v [leaf units].
+    """
     q2 = -(bend[0] * d[0] * d[0] + bend[1] * d[1] * d[1])
     q1 = d[2] - 2.0 * (bend[0] * o[0] * d[0] + bend[1] * o[1] * d[1]) - bend[2] * sign * d[0]
     q0 = o[2] - bend[0] * o[0] * o[0] - bend[1] * o[1] * o[1] - bend[2] * sign * o[0]
@@ -211,15 +234,16 @@ def leaf_surface_roots(bend: wp.vec4, extent: wp.vec3, sign: float, o: wp.vec3, 
 
 @wp.func
 def hit_leaf_rectangle(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -> float:
-    """Returns the first hit with the rectangle |u| < x, y < v < z that contains a blade; negative if there are several
-    hits.
+    """Returns ``t`` of a ray's first hit with the curved rectangle that contains a leaf blade, negated if there are
+    several hits; FAR for none.
 
-    The code has no branch, so that a compiler can vectorise it over several rays.
+    ``extent``: largest |u|, lowest and highest v [leaf units]. The code has no branch, so that a compiler can vectorise
+    it over several rays.
     """
     right = leaf_surface_roots(bend, extent, 1.0, o, d)
     left = leaf_surface_roots(bend, extent, -1.0, o, d)
     first = wp.min(wp.min(right[0], right[1]), wp.min(left[0], left[1]))
-    # several, if the nearest two differ: max-min of each pair, and of the pairs
+    # there are several hits if the second smallest of the four roots exists: max-min of each pair, and of the pairs
     second = wp.min(
         wp.max(wp.min(right[0], right[1]), wp.min(left[0], left[1])),
         wp.min(wp.max(right[0], right[1]), wp.max(left[0], left[1])),
@@ -227,18 +251,19 @@ def hit_leaf_rectangle(bend: wp.vec4, extent: wp.vec3, o: wp.vec3, d: wp.vec3) -
     return wp.where(second < FAR, -first, first)
 
 
-# Where a ray meets a primitive, in closed form, and the normal there.
+# Closed-form intersections of a ray with each kind of primitive, and the normal at the hit.
 #
-# A ray starts at the origin unless said otherwise; ``d`` is its direction, of any length, and results count in
-# lengths of ``d``; FAR where the ray misses.
+# A ray starts at the origin unless an argument ``o`` gives its start; ``d`` is its direction, of any length. Results
+# are in lengths of ``d``, or FAR where the ray misses.
 
 
 @wp.func
 def hit_sphere(centre: wp.vec3, r: float, d: wp.vec3) -> float:
-    """First hit of a ray from the origin with a sphere that does not hold the origin."""
+    """Returns the first hit of a ray from the origin with a sphere, in lengths of ``d``; FAR if the ray misses or the
+    sphere contains the origin."""
     dd = wp.dot(d, d)
     along = wp.dot(d, centre) / dd
-    miss = centre - d * along  # the perpendicular: r^2 - |miss|^2 loses no digits far away
+    miss = centre - d * along  # perpendicular from the ray to the centre: r^2 - |miss|^2 stays precise far away
     h = (r * r - wp.dot(miss, miss)) / dd
     t = along - wp.sqrt(wp.max(h, 0.0))
     return wp.where(h >= 0.0 and t > 0.0, t, FAR)
@@ -246,11 +271,15 @@ def hit_sphere(centre: wp.vec3, r: float, d: wp.vec3) -> float:
 
 @wp.func
 def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
-    """First hit of a ray from the origin with the hull of two spheres (Quilez, "round cone"), without a branch."""
+    """Returns the first hit of a ray from the origin with a cone with rounded ends, in lengths of ``d``, or FAR.
+
+    The cone is the convex hull of spheres around ``a`` and ``b`` with radii ``ra`` and ``rb`` [m] (Quilez, "round
+    cone"). The code has no branch, so that it vectorises.
+    """
     ba = b - a
     slope = ra - rb
     dd = wp.dot(d, d)
-    # measured from the foot of the perpendicular onto the axis' middle, so that float32 keeps micrometres
+    # t is measured from the ray's point nearest to the middle of the axis, so that float32 resolves micrometres
     shift = wp.dot((a + b) * 0.5, d) / dd
     o = d * shift
     oa = o - a
@@ -271,8 +300,8 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
     t2 = (root - k1) * per
     y1 = m1 - ra * slope + t1 * m2
     y2 = m1 - ra * slope + t2 * m2
-    wide = d2 > 0.0 and h >= 0.0  # neither sphere holds the other, and the ray meets the infinite cone
-    steep = k2 < 0.0  # than the slope, as when looking along the axis: either root may be the first hit
+    wide = d2 > 0.0 and h >= 0.0  # neither sphere contains the other, and the ray meets the infinite cone
+    steep = k2 < 0.0  # the ray is steeper than the cone's slope, as along the axis: either root may be the first hit
     best = wp.where(wide and y1 > 0.0 and y1 < d2 and (t1 + shift > 0.0 or not steep), t1 + shift, FAR)
     best = wp.min(best, wp.where(wide and steep and y2 > 0.0 and y2 < d2 and t2 + shift > 0.0, t2 + shift, FAR))
     h1 = m3 * m3 - dd * (m5 - ra * ra)
@@ -285,7 +314,10 @@ def hit_cone(a: wp.vec3, ra: float, b: wp.vec3, rb: float, d: wp.vec3) -> float:
 
 @wp.func
 def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
-    """First hit of a ray from the origin with a solid cylinder with flat ends, without a branch."""
+    """Returns the first hit of a ray from the origin with a solid cylinder with flat ends, in lengths of ``d``, or FAR.
+
+    ``a``, ``b``: centres of the ends [m]; ``r``: radius [m]. The code has no branch, so that it vectorises.
+    """
     ba = b - a
     length2 = wp.dot(ba, ba)
     m = wp.dot(ba, d)
@@ -296,7 +328,7 @@ def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
     k1 = length2 * wp.dot(oa, d) - n * m
     k0 = length2 * wp.dot(oa, oa) - n * n - r * r * length2
     h = k1 * k1 - k2 * k0
-    meets = k2 > 1.0e-12 * length2 and h >= 0.0  # not along the axis
+    meets = k2 > 1.0e-12 * length2 and h >= 0.0  # the ray is not along the axis and meets the infinite cylinder
     t = (-k1 - wp.sqrt(wp.max(h, 0.0))) / wp.where(meets, k2, 1.0)
     y = n + t * m
     best = wp.where(meets and t + shift > 0.0 and y > 0.0 and y < length2, t + shift, FAR)
@@ -309,7 +341,11 @@ def hit_cylinder(a: wp.vec3, b: wp.vec3, r: float, d: wp.vec3) -> float:
 
 @wp.func
 def hit_box(o: wp.vec3, d: wp.vec3, half: wp.vec3) -> float:
-    """First hit with a box around the origin of its own frame."""
+    """Returns the first hit of the ray from ``o`` along ``d`` with a box of half sizes ``half`` [m], in lengths of
+    ``d``, or FAR.
+
+    Ray and box are in the box's frame, whose origin is the box's centre.
+    """
     tiny = 1.0e-12
     m = wp.vec3(
         1.0 / wp.where(wp.abs(d[0]) > tiny, d[0], tiny),
@@ -325,7 +361,10 @@ def hit_box(o: wp.vec3, d: wp.vec3, half: wp.vec3) -> float:
 
 @wp.func
 def hit_triangle(p: wp.vec3, q: wp.vec3, r: wp.vec3, d: wp.vec3) -> float:
-    """Hit of a ray from the origin with the front of a triangle (edge functions: neighbours leave no gap)."""
+    """Returns the hit of a ray from the origin with the front of triangle p q r [m], in lengths of ``d``, or FAR.
+
+    The test uses edge functions, so that triangles with a common edge leave no gap.
+    """
     u = wp.dot(d, wp.cross(r, q))
     v = wp.dot(d, wp.cross(p, r))
     w = wp.dot(d, wp.cross(q, p))
@@ -339,7 +378,10 @@ def hit_triangle(p: wp.vec3, q: wp.vec3, r: wp.vec3, d: wp.vec3) -> float:
 
 @wp.func
 def hit_primitive(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> float:
-    """First hit of a world ray with primitive ``i``; :data:`FAR` if there is none."""
+    """Returns the first hit of the world ray from ``o`` along ``d`` with primitive ``i``, in lengths of ``d``, or FAR.
+
+    ``smooth``: 1 to interpolate between texels of a leaf's outline.
+    """
     kind = s.kind[i]
     a4 = s.a[i]
     b4 = s.b[i]
@@ -378,7 +420,8 @@ def hit_primitive(s: Shapes, i: int, o: wp.vec3, d: wp.vec3, smooth: int) -> flo
 
 @wp.func
 def normal_at(s: Shapes, i: int, p: wp.vec3) -> wp.vec3:
-    """Outward normal of primitive ``i`` at a point of its surface; of a leaf, its upper side."""
+    """Returns the outward unit normal of primitive ``i`` at point ``p`` [m] of its surface; for a leaf, of its upper
+    side."""
     kind = s.kind[i]
     a4 = s.a[i]
     b4 = s.b[i]
@@ -420,12 +463,12 @@ def normal_at(s: Shapes, i: int, p: wp.vec3) -> wp.vec3:
     return wp.normalize(n)
 
 
-# The box around a primitive, in the frame of the camera or lidar: bounds that stay narrow next to the eye.
+# The box around a primitive, in the frame of the camera or lidar: a bound that stays narrow next to the sensor.
 
 
 @wp.struct
 class OrientedBox:
-    """A centre and three half axes [m]."""
+    """A box: its centre and three half axes [m]."""
 
     centre: wp.vec3
     x: wp.vec3
@@ -435,8 +478,10 @@ class OrientedBox:
 
 @wp.func
 def oriented_box(shapes: Shapes, i: int, kind: int, eye: wp.vec3, rotation: wp.mat33) -> OrientedBox:
-    """The box around box, ellipsoid, cylinder or leaf ``i``, seen from ``eye`` [m]; rows of ``rotation``: the axes of the
-    frame in the world."""
+    """Returns the bounding box of box, ellipsoid, cylinder or leaf ``i`` in the frame of a sensor.
+
+    ``eye``: position of the sensor in the world [m]; ``rotation``: rotation from the world to the sensor's frame.
+    """
     a4 = shapes.a[i]
     b4 = shapes.b[i]
     c4 = shapes.c[i]

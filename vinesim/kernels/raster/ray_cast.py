@@ -1,7 +1,7 @@
-"""Rays against the primitives through a bounding volume hierarchy: lidars, and the oracle of the rasteriser.
+"""Ray caster: intersects rays with the primitives by bounding volume hierarchies; reference of the rasterisers.
 
-Plants and links have one hierarchy each, and a ray is tested against both. Plants only sway, so refits never degrade
-their hierarchy, and a robot that drives through the rows does not stretch it.
+Plants and robot links have one hierarchy each, and each ray is tested against both. Plants only sway, so refitting
+never degrades their hierarchy, and a robot that drives through the rows does not stretch it.
 """
 
 import warp as wp
@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Hierarchies:
-    """Bounding volumes of plants (primitives from 0) and of links (primitives from ``first_rigid``)."""
+    """Ids of two Warp BVHs: of plants (primitives 0 to ``first_rigid`` - 1) and of rigid links (the following ones)."""
 
     plants: wp.uint64
     rigid: wp.uint64
@@ -26,12 +26,15 @@ class Hierarchies:
 class Hit:
     t: float
     primitive: int
-    """Index of the primitive that was hit; -2 the ground, -1 nothing."""
+    """Index of the primitive that was hit; -2: the ground, -1: no hit."""
 
 
 @wp.func
 def needs_smooth_outline(s: Shapes, i: int, depth_scale: float, forward: wp.vec3, eye: wp.vec3) -> int:
-    """Returns whether a leaf's outline is interpolated, by the rasteriser's rule. False without a focal length."""
+    """Returns 1 if leaf ``i`` is so large in the picture that the rasteriser interpolates its outline, else 0.
+
+    ``depth_scale``: focal length [px], 0 for rays without a camera; ``forward``: optical axis; ``eye``: [m].
+    """
     a4 = s.a[i]
     smooth = wp.int32(0)
     if s.kind[i] == LEAF and depth_scale > 0.0:
@@ -42,7 +45,11 @@ def needs_smooth_outline(s: Shapes, i: int, depth_scale: float, forward: wp.vec3
 
 @wp.func
 def first_hit(h: Hierarchies, s: Shapes, o: wp.vec3, d: wp.vec3, reach: float, focal: float, forward: wp.vec3) -> Hit:
-    """Nearest primitive or ground along a ray; ``t`` in lengths of ``d``."""
+    """Returns the nearest hit with a primitive or the ground along the ray from ``o`` in direction ``d``.
+
+    ``reach``: farthest hit, like ``Hit.t`` in lengths of ``d``; ``focal`` and ``forward``: focal length [px] and
+    optical axis of a camera, for :func:`needs_smooth_outline`.
+    """
     best = Hit()
     best.t = reach
     best.primitive = -1
@@ -84,8 +91,8 @@ def cast_rays(
 ):
     """One thread finds the nearest hit of one ray.
 
-    origin: [ray] m; direction: [ray] of any length; reach: farthest hit and distance: [ray] nearest hit, both in lengths
-    of the direction; primitive: [ray] -2 the ground, -1 nothing.
+    origin: [ray] m; direction: [ray] vectors of any length; reach: farthest hit that counts, and distance: [ray]
+    nearest hit, both in lengths of the direction; primitive: [ray] index, -2 the ground, -1 no hit.
     """
     i = wp.tid()
     best = first_hit(hierarchies, shapes, origin[i], direction[i], reach, 0.0, direction[i])
@@ -104,9 +111,9 @@ def cast_camera(
     depth_out: wp.array(dtype=wp.float32),
     primitive_out: wp.array(dtype=wp.int32),
 ):
-    """One thread finds the nearest hit of the ray of one pixel, which the rasteriser must find too.
+    """One thread finds the nearest hit of one pixel's ray; the result is the reference for the rasteriser.
 
-    depth: [pixel] m along the optical axis, FAR for nothing; primitive: [pixel] -2 the ground, -1 nothing.
+    depth: [pixel] m along the optical axis, FAR without a hit; primitive: [pixel] index, -2 the ground, -1 no hit.
     """
     pixel = wp.tid()
     back = wp.transpose(lens.rotation)

@@ -1,4 +1,4 @@
-"""Transforms primitives from the frames of their bodies into the world, and bounds them and their clusters."""
+"""Kernels that transform primitives from their bodies' frames into the world, and bound primitives and clusters."""
 
 import warp as wp
 
@@ -23,7 +23,8 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class PosedPrimitive:
-    """The four vectors of one primitive in the world, and a box around it [m]."""
+    """The four vectors ``a b c d`` of one primitive in the world, and the corners of its axis-aligned bounding box
+    [m]."""
 
     a: wp.vec4
     b: wp.vec4
@@ -35,9 +36,9 @@ class PosedPrimitive:
 
 @wp.func
 def pose_leaf(local: Shapes, i: int, pose: wp.transform) -> PosedPrimitive:
-    """Returns blade ``i`` moved by ``pose``.
+    """Returns leaf ``i``, given in the frame of its body, transformed by the body's ``pose``, with its bounding box.
 
-    Its box contains the octagon around its outline, raised by its curvatures.
+    The box contains the octagon around the leaf's outline, raised by the leaf's curvatures.
     """
     q = wp.transform_get_rotation(pose)
     s = PosedPrimitive()
@@ -64,7 +65,8 @@ def pose_leaf(local: Shapes, i: int, pose: wp.transform) -> PosedPrimitive:
 
 @wp.func
 def pose_solid(local: Shapes, i: int, kind: int, pose: wp.transform) -> PosedPrimitive:
-    """Returns primitive ``i``, of any kind but a leaf, moved by ``pose``."""
+    """Returns primitive ``i``, which is not a leaf, transformed from its body's frame by ``pose``, with its bounding
+    box."""
     q = wp.transform_get_rotation(pose)
     s = PosedPrimitive()
     a = wp.transform_point(pose, xyz(local.a[i]))
@@ -119,11 +121,11 @@ def pose_clusters(
     upper_out: wp.array(dtype=wp.vec3),
     ball_out: wp.array(dtype=wp.vec4),
 ):
-    """One thread per dirty cluster. Transform it from its bodies' frames into the world, and bound it.
+    """One thread transforms the primitives of one cluster from their bodies' frames into the world, and bounds them.
 
-    local: [primitive] in the frames of their carriers; carrier: [primitive] row of ``poses``; dirty: [thread] clusters
-    to transform; lower, upper: [primitive] m; ball: [cluster] centre and radius [m], radius -1 where the cluster is
-    hidden.
+    local: [primitive] in the frame of its body; carrier: [primitive] row of the body in ``poses``; dirty: clusters
+    whose bodies moved; lower, upper: [primitive] bounding box [m]; ball: [cluster] centre and radius of the bounding
+    sphere [m], radius -1 for a hidden cluster.
     """
     cluster = dirty[wp.tid()]
     kind = clusters.kind[cluster]

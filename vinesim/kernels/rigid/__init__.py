@@ -1,1 +1,1 @@
-"""Kernels of rigid bodies: posture of people, and the servos of robots."""
+"""Kernels of rigid bodies: postures of people, and joint servos of robots."""

@@ -1,4 +1,5 @@
-"""Posture of human models from tracked head, hips, feet and hands; differences of poses."""
+"""Inverse kinematics of people from tracked head, hips, feet and hands; differences of poses. Poses are [7]: m,
+xyzw."""
 
 import warp as wp
 
@@ -12,32 +13,32 @@ RIGHT_FOOT = wp.constant(3)
 
 @wp.func
 def position(poses: wp.array2d(dtype=wp.float64), i: int):
-    """Position of a pose."""
+    """Returns the position [m] of row ``i`` of ``poses`` [row, 7]."""
     return wp.vec3d(poses[i, 0], poses[i, 1], poses[i, 2])
 
 
 @wp.func
 def orientation(poses: wp.array2d(dtype=wp.float64), i: int):
-    """Rotation of a pose."""
+    """Returns the orientation (quaternion, xyzw) of row ``i`` of ``poses`` [row, 7]."""
     return wp.quatd(poses[i, 3], poses[i, 4], poses[i, 5], poses[i, 6])
 
 
 @wp.func
 def perpendicular(v: wp.vec3d, axis: wp.vec3d):
-    """Returns the unit vector along the part of ``v`` that is perpendicular to the unit vector ``axis``."""
+    """Returns the component of ``v`` perpendicular to the unit vector ``axis``, normalised."""
     return wp.normalize(v - wp.dot(v, axis) * axis)
 
 
 @wp.func
 def rotation_from_axes(x: wp.vec3d, z: wp.vec3d):
-    """Rotation of axes x and z to these perpendicular unit vectors."""
+    """Returns the rotation that turns the x and z axes into the perpendicular unit vectors ``x`` and ``z``."""
     y = wp.cross(z, x)
     return wp.normalize(wp.quat_from_matrix(wp.matrix_from_cols(x, y, z)))
 
 
 @wp.func
 def write_pose(at: wp.vec3d, q: wp.quatd, i: int, poses_out: wp.array2d(dtype=wp.float64)):
-    """Write a pose into its row."""
+    """Write position ``at`` [m] and orientation ``q`` into row ``i`` of ``poses_out`` [row, 7]."""
     for k in range(3):
         poses_out[i, k] = at[k]
     for k in range(4):
@@ -56,14 +57,19 @@ def pose_torso_and_legs(
     # out
     parts_out: wp.array2d(dtype=wp.float64),
 ):
-    """Pose one leg (thread 0: left, 1: right) or the rest (2) of a person: head, chest, hips, then thigh, shank, foot."""
+    """One thread poses the left leg (thread 0), the right leg (1), or head, chest and hips (2) of a person.
+
+    thigh, shank: lengths [m]; hip: distance of a hip joint from the middle [m]; neck: position of the neck in the
+    head's frame [m]; tracked: [point, 7] head, hips, feet; parts: [part, 7] head, chest, hips, then thigh, shank and
+    foot of each leg.
+    """
     side = wp.tid()
     zero = wp.float64(0.0)
     x = wp.vec3d(wp.float64(1.0), zero, zero)
     hips = position(tracked, HIPS)
     ahead = wp.quat_rotate(orientation(tracked, HIPS), x)
     if side == 2:
-        for k in range(7):  # bit by bit
+        for k in range(7):  # copied, so that the pose is exactly the tracked one
             parts_out[0, k] = tracked[HEAD, k]
             parts_out[2, k] = tracked[HIPS, k]
         up = wp.normalize(position(tracked, HEAD) + wp.quat_rotate(orientation(tracked, HEAD), neck) - hips)
@@ -91,7 +97,7 @@ def pose_torso_and_legs(
 
 @wp.func
 def rotate_by_pose(poses: wp.array2d(dtype=wp.float64), i: int, v: wp.vec3d):
-    """Returns a vector, given in a pose's frame, in the world frame."""
+    """Returns vector ``v``, given in the frame of pose ``i``, rotated into the world frame."""
     return wp.quat_rotate(orientation(poses, i), v)
 
 
@@ -114,9 +120,13 @@ def pose_arms_and_fingers(
     # out
     limbs_out: wp.array2d(dtype=wp.float64),
 ):
-    """One thread hangs the neck (0), the left or right arm (1, 2) or a finger (3 to 12) between chest, head and hands."""
-    # ``held``: chest, head, left and right hand. Left shapes are given; right ones mirror them. A shoulder gives way
-    # when the hand is out of the arm's reach, by a fifth of the upper arm at most.
+    """One thread poses the neck (thread 0), the left or right arm (1, 2) or one finger (3 to 12) of a person.
+
+    held: [4, 7] poses of chest, head, left and right hand; closed: [10] bend of each finger, 0 to 1; upper, lower:
+    lengths of the arm [m]; other lengths [m] and positions [m] are of the left side, the right side mirrors them;
+    limbs: [part, 7].
+    """
+    # If the hand is out of the arm's reach, the shoulder moves towards it, by at most a fifth of the upper arm.
     thread = wp.tid()
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -165,7 +175,11 @@ def pose_difference(
     turn_out: wp.array2d(dtype=wp.float64),
     turn_within_out: wp.array2d(dtype=wp.float64),
 ):
-    """One thread finds way [m] and turn [rad] from one pose to another, the turn in axes of the world and of the first."""
+    """One thread computes the motion from one pose in ``start`` to the pose of the same row in ``goal`` [row, 7].
+
+    way: [row, 3] translation [m]; turn, turn_within: [row, 3] rotation vector [rad] in the world's axes, and in the
+    axes of ``start``.
+    """
     i = wp.tid()
     way = position(goal, i) - position(start, i)
     q = orientation(start, i)

@@ -1,4 +1,4 @@
-"""Servos of a robot: set-points within the limits of position, velocity and effort, and MuJoCo's controls."""
+"""Servos of a robot: set-points that respect limits of position, velocity and effort, and MuJoCo's controls."""
 
 import warp as wp
 
@@ -6,25 +6,25 @@ wp.set_module_options({"enable_backward": False})
 
 VELOCITY = wp.constant(1)
 EFFORT = wp.constant(2)
-"""Command interfaces in which a set-point does not follow a position; see ``CommandInterface``."""
+"""Codes of the velocity and effort interfaces, as in ``CommandInterface``; all other joints follow a position."""
 MIN_INERTIA = wp.constant(wp.float64(1e-9))
-"""[kg m^2 or kg] Inertia is taken to be at least this where it divides."""
+"""Least inertia [kg m^2 or kg] by which the code divides."""
 
 
 @wp.struct
 class ServoLimits:
-    """Limits of each joint [joint]."""
+    """Limits of a robot's joint servos; each array is [joint]."""
 
     lower: wp.array(dtype=wp.float64)
-    """[rad or m]"""
+    """Lowest position [rad or m]."""
     upper: wp.array(dtype=wp.float64)
-    """[rad or m]"""
+    """Highest position [rad or m]."""
     velocity: wp.array(dtype=wp.float64)
-    """[rad/s or m/s]"""
+    """Largest speed [rad/s or m/s]."""
     tracking_error: wp.array(dtype=wp.float64)
-    """[rad or m] Largest distance of a set-point from the joint: beyond it the servo gives no more."""
+    """Largest distance of a set-point from the joint's position [rad or m]; there the servo's effort saturates."""
     impulse: wp.array(dtype=wp.float64)
-    """[N m s or N s] Most that the drive may spend on acceleration in one step."""
+    """Largest impulse [N m s or N s] that the drive may use to accelerate the joint in one step."""
 
 
 @wp.kernel
@@ -44,18 +44,24 @@ def advance_setpoints(
     rate_out: wp.array(dtype=wp.float64),
     target_velocity_out: wp.array(dtype=wp.float64),
 ):
-    """One thread advances the set-point of one joint by a step, and the rate at which it moves."""
+    """One thread advances the set-point of one joint by a step of ``dt`` [s], within the joint's limits.
+
+    All arrays are [joint], in rad or m, rad/s or m/s. interface: command interface; command: commanded position or
+    velocity; position, velocity: state of the joint; middle: position from which the tracking error is measured;
+    inertia: kg m^2 or kg; setpoint, rate: set-point and the rate at which it moves; target_velocity: velocity for the
+    servo.
+    """
     i = wp.tid()
     zero = wp.float64(0.0)
     fastest = limits.velocity[i]
     kind = int(interface[i])
-    # a saturated servo gives no more when its error grows, but would overshoot when released: bound the error
+    # more error does not increase the effort of a saturated servo, but would make it overshoot: bound the error
     reach = limits.tracking_error[i]
     start = wp.min(wp.max(setpoint_out[i], middle[i] - reach), middle[i] + reach)
     wanted = (command[i] - start) / dt
     if kind == VELOCITY:
         wanted = command[i]
-    # nor may the set-point accelerate faster than the drive can: a saturated servo would exceed the velocity
+    # the set-point must not accelerate faster than the drive can: a saturated servo would exceed the velocity limit
     gain = limits.impulse[i] / wp.max(inertia[i], MIN_INERTIA)
     least = wp.max(wp.min(rate_out[i], zero) - gain, -fastest)
     most = wp.min(wp.max(rate_out[i], zero) + gain, fastest)
@@ -74,35 +80,35 @@ def advance_setpoints(
 
 @wp.struct
 class JointDrives:
-    """Servos of the joints [joint]."""
+    """Gains, targets and MuJoCo indices of a robot's joint servos; each array is [joint]."""
 
     stiffness: wp.array(dtype=wp.float64)
     damping_at_start: wp.array(dtype=wp.float64)
-    """[N m s/rad or N s/m] on the velocity at the start of the step."""
+    """Explicit damping [N m s/rad or N s/m], which acts on the velocity at the start of the step."""
     damping_at_end: wp.array(dtype=wp.float64)
-    """[N m s/rad or N s/m] on the velocity at its end, by MuJoCo."""
+    """Implicit damping [N m s/rad or N s/m], which MuJoCo applies to the velocity at the end of the step."""
     target: wp.array(dtype=wp.float64)
     target_velocity: wp.array(dtype=wp.float64)
     feedforward: wp.array(dtype=wp.float64)
-    """[N m or N]"""
+    """Effort that is added to the servo's [N m or N]."""
     v: wp.array(dtype=wp.int64)
-    """index in MuJoCo's ``qvel``."""
+    """Index of the joint in MuJoCo's ``qvel``."""
     actuator: wp.array(dtype=wp.int64)
-    """index in MuJoCo's ``ctrl``."""
+    """Index of the servo in MuJoCo's ``ctrl``."""
 
 
 @wp.struct
 class BaseDrive:
-    """Servos of the planar base [3]: x, y, yaw."""
+    """Servos of a robot's planar base; each array is [3] for x, y and yaw, unless stated otherwise."""
 
     stiffness: wp.array(dtype=wp.float64)
     damping: wp.array(dtype=wp.float64)
     velocity: wp.array(dtype=wp.float64)
-    """[m/s, m/s, rad/s] wanted, in the axes of the base."""
+    """Commanded velocity [m/s, m/s, rad/s] in the axes of the base."""
     slip: wp.array(dtype=wp.float64)
-    """[1] m or rad, farthest that the target goes ahead of the base."""
+    """[1] Largest distance of the target from the base [m or rad]."""
     q: wp.array(dtype=wp.int64)
-    """index in MuJoCo's ``qpos``."""
+    """Index of the coordinate in MuJoCo's ``qpos``."""
     actuator: wp.array(dtype=wp.int64)
 
 
@@ -120,9 +126,11 @@ def apply_controls(
     base_target_out: wp.array(dtype=wp.float64),
     ctrl_out: wp.array(dtype=wp.float64),
 ):
-    """One thread in all: turn the targets of a robot into MuJoCo's controls; the target of its base moves on.
+    """The only thread converts the targets of a robot to MuJoCo's controls and advances the target of its base by
+    ``dt``.
 
-    control_out: [joint] the controls of the joints once more.
+    qpos, qvel, ctrl: MuJoCo's arrays; control: [joint] copy of the joints' controls; base_target: [3] x, y, yaw [m, m,
+    rad].
     """
     for i in range(drives.target.shape[0]):
         damping = drives.damping_at_end[i] + drives.damping_at_start[i]
@@ -141,7 +149,7 @@ def apply_controls(
             velocity = c * base.velocity[0] - s * base.velocity[1]
         if i == 1:
             velocity = s * base.velocity[0] + c * base.velocity[1]
-        position = qpos[base.q[i]]  # held back too far, the base slips: its target comes along
+        position = qpos[base.q[i]]  # if the base is held back too far, its wheels slip: the target stays near the base
         target = wp.clamp(base_target_out[i] + dt * velocity, position - slip, position + slip)
         base_target_out[i] = target
         actuator = base.actuator[i]

@@ -1,8 +1,9 @@
 """Differential inverse kinematics of one arm: joint rates that fulfil tasks in order of priority, within bounds.
 
-A task asks for velocities along the rows of a Jacobian. Its damped pseudo-inverse acts only in the null space of the
-tasks before it (Siciliano and Slotine 1991). The singular value decomposition of its few rows is a one-sided Jacobi
-iteration (Hestenes 1958): rotations make the rows orthogonal, then their lengths are the singular values.
+A task consists of wanted velocities along the rows of a Jacobian. The damped pseudo-inverse of each task acts only in
+the null space of the tasks of higher priority (Siciliano and Slotine 1991). The singular value decomposition of a
+task's few rows is a one-sided Jacobi iteration (Hestenes 1958): rotations make the rows orthogonal; their lengths then
+are the singular values.
 """
 
 import warp as wp
@@ -10,38 +11,38 @@ import warp as wp
 wp.set_module_options({"enable_backward": False})
 
 MAX_SWEEPS = wp.constant(30)
-"""Sweeps of Jacobi rotations; three rows need four to six."""
+"""Largest number of sweeps of Jacobi rotations; three rows need four to six."""
 ORTHOGONAL = wp.constant(wp.float64(1e-14))
-"""Cosine of the angle of two rows below which they count as orthogonal."""
+"""Cosine of the angle between two rows below which the rows count as orthogonal."""
 NEGLIGIBLE_SQUARE = wp.constant(wp.float64(1e-24))
-"""Squared length of a row that is nothing but rounding errors."""
+"""Squared length below which a row counts as zero, because it consists of rounding errors."""
 RANK_TOLERANCE = wp.constant(wp.float64(1e-3))
-"""Directions whose singular value is below this share of ``min_singular_value`` are left to the tasks that follow."""
+"""Share of ``min_singular_value``; a direction with a smaller singular value stays free for tasks of lower priority."""
 BOUND_TOLERANCE = wp.constant(wp.float64(1e-9))
-"""[rad/s or m/s] Excess over a bound that is ignored."""
+"""Excess of a joint rate over its bound that is ignored [rad/s or m/s]."""
 
 
 @wp.struct
 class IkScratch:
-    """Work space for one arm; n joints, m rows of all tasks."""
+    """Work arrays of the solver for one arm, with n joints and m rows of all tasks together."""
 
     weights: wp.array(dtype=wp.float64)
-    """[n] weights of the joints that may move, zero for those that are fixed."""
+    """[n] Weights of the joints that may move; zero for joints that are fixed at a bound."""
     fixed: wp.array(dtype=wp.float64)
-    """[n] rates of the joints that are fixed at a bound."""
+    """[n] Rates of the joints that are fixed at a bound [rad/s or m/s]."""
     solution: wp.array(dtype=wp.float64)
-    """[n] rates divided by weights."""
+    """[n] Joint rates divided by their weights."""
     basis: wp.array2d(dtype=wp.float64)
-    """[m, n] rows of the scaled Jacobian, made orthogonal: unit vectors where ``is_used``."""
+    """[m, n] Rows of the weighted Jacobian, made orthogonal; unit vectors where ``is_used``."""
     residual: wp.array(dtype=wp.float64)
-    """[m] what is missing of the velocities asked for."""
+    """[m] Wanted velocities minus the velocities of the solution so far."""
     is_used: wp.array(dtype=wp.int32)
-    """[m] whether a row of ``basis`` is taken from the null space."""
+    """[m] 1 if a row of ``basis`` is used by its task, so that tasks of lower priority must not change it."""
 
 
 @wp.func
 def row_dot(a: wp.array2d(dtype=wp.float64), i: int, j: int, n: int):
-    """Inner product of rows i and j."""
+    """Returns the inner product of rows ``i`` and ``j`` of matrix ``a`` with ``n`` columns."""
     total = wp.float64(0.0)
     for k in range(n):
         total += a[i, k] * a[j, k]
@@ -50,7 +51,8 @@ def row_dot(a: wp.array2d(dtype=wp.float64), i: int, j: int, n: int):
 
 @wp.func
 def orthogonalize_rows(first: int, end: int, n: int, scratch_out: IkScratch):
-    """Rotate rows ``first`` to ``end`` of basis, and with them the residual, until they are orthogonal."""
+    """Make rows ``first`` to ``end`` - 1 of ``scratch.basis`` orthogonal by Jacobi rotations, which also turn the
+    residual."""
     one = wp.float64(1.0)
     two = wp.float64(2.0)
     for _ in range(MAX_SWEEPS):
@@ -81,7 +83,7 @@ def orthogonalize_rows(first: int, end: int, n: int, scratch_out: IkScratch):
 
 @wp.func
 def project_out(vector_row: int, last: int, n: int, scratch_out: IkScratch):
-    """Remove from a row of basis its components along the used rows before ``last``."""
+    """Remove from row ``vector_row`` of ``scratch.basis`` its components along all used rows before row ``last``."""
     for r in range(last):
         if scratch_out.is_used[r] == 1:
             along = row_dot(scratch_out.basis, vector_row, r, n)
@@ -98,7 +100,10 @@ def solve_task(
     velocity: wp.array(dtype=wp.float64),
     scratch_out: IkScratch,
 ):
-    """Add to the solution what one task, rows ``first`` to ``end``, asks for in the null space of those before it."""
+    """Add to ``scratch.solution`` the joint rates of one task, in the null space of the tasks of higher priority.
+
+    The task has rows ``first`` to ``end`` - 1 of ``jacobian`` [m, n] and of the wanted ``velocity`` [m].
+    """
     n = scratch_out.solution.shape[0]
     half = wp.float64(0.5)
     one = wp.float64(1.0)
@@ -130,7 +135,7 @@ def solve_task(
 
 @wp.func
 def add_posture(rows: int, posture_rates: wp.array(dtype=wp.float64), scratch_out: IkScratch):
-    """Approach ``posture_rates`` as far as the tasks leave the joints free."""
+    """Add to ``scratch.solution`` the part of ``posture_rates`` [n] in the null space of all tasks (``rows`` rows)."""
     n = scratch_out.solution.shape[0]
     for k in range(n):
         wanted = wp.float64(0.0)
@@ -157,9 +162,11 @@ def solve_prioritized_ik(
     scratch_out: IkScratch,
     rates_out: wp.array(dtype=wp.float64),
 ):
-    """One thread finds the joint rates for tasks in order, then for a posture. Task t has the rows up to ``task_end[t]``.
+    """The only thread computes joint rates that fulfil tasks in order of priority, and then approach a posture.
 
-    Joints that would leave their bounds are fixed there, the worst first, and the others do the tasks.
+    A joint whose rate exceeds its bounds is fixed at the bound, the largest excess first, and the tasks are solved
+    again with the other joints. task_end: [task] row after the task's last row; jacobian: [m, n]; velocity: [m] wanted;
+    posture_rates, min_rates, max_rates, rates: [n] rad/s or m/s; joint_weights: [n].
     """
     n = rates_out.shape[0]
     tasks = task_end.shape[0]

@@ -1,8 +1,9 @@
-"""Deferred shading of the seen primitives: sun, sky, canopy and ground light, then exposure and tone.
+"""Deferred shading of the primitives that the rasteriser found: light of sun, sky, canopy and ground, then exposure and
+tone.
 
-Linear light, RGB. Ambient light has three parts: sky through the gaps of the canopy (baked leaf area, Beer-Lambert),
-green light through leaves, and the bounce of the ground. A leaf shows the sun through its blade; a berry carries
-bloom, lets light through when it is pale, and darkens where it touches its neighbours.
+Light is linear RGB. Ambient light has three parts: sky light through the gaps of the canopy (baked leaf area,
+Beer-Lambert), green light through leaves, and light that the ground reflects. Leaves transmit sunlight. Berries have
+bloom, transmit light when they are pale, and are darker where they touch other berries.
 """
 
 import warp as wp
@@ -26,36 +27,36 @@ from vinesim.kernels.shading.solid_materials import solid_surface
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 WHITE_POINT = wp.constant(3.0)
-"""Radiance, after exposure, that the tone curve shows as nearly white."""
+"""Exposed radiance (relative, linear) that the tone curve maps to nearly white; larger radiance is clipped to it."""
 MIN_METERED_LUMINANCE = wp.constant(0.02)
 MAX_METERED_LUMINANCE = wp.constant(2.0)
-"""Limits of the luminance in light metering: darker pixels count as the first, brighter pixels as the second."""
+"""Limits of luminance for the exposure meter: it clips darker pixels to the minimum, brighter ones to the maximum."""
 
 
 @wp.struct
 class Light:
-    """Colours and directions of sun and sky light, shadow sampling, and exposure."""
+    """Colours of sun, sky, ground and canopy light (linear RGB), the direction to the sun, and shadow sampling."""
 
     sun: wp.vec3
     sun_colour: wp.vec3
     sky_colour: wp.vec3
     ground_colour: wp.vec3
-    """Colour of the light from the ground."""
+    """Linear RGB of the light that the ground reflects."""
     canopy_colour: wp.vec3
-    """Colour of the light through the canopy."""
+    """Linear RGB of the green light that leaves transmit."""
     haze_colour: wp.vec3
     shadow_taps: int
-    """Number of shadow samples for each pixel. 0: a smooth filter of two widths; -1: a smooth filter of one width."""
+    """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
     sample_spiral: wp.array(dtype=wp.vec2)
-    """[taps] Vogel's spiral in the unit disc."""
+    """[taps] offsets of shadow samples: Vogel's spiral in the unit disc."""
     sample_rotations: wp.array(dtype=wp.vec2)
-    """[64] cosine and sine of 64 angles."""
+    """[64] cosine and sine of the angles by which pixels turn the spiral of shadow samples."""
     sky_table: wp.array2d(dtype=wp.vec3)
 
 
 @wp.func
 def fast_atan2(y: float, x: float) -> float:
-    """atan2 to 1e-4 rad, without a branch."""
+    """Returns atan2(y, x) [rad] with an error below 1e-4 rad; it has no branch, so that it vectorises."""
     ax = wp.abs(x)
     ay = wp.abs(y)
     a = wp.min(ax, ay) / wp.max(wp.max(ax, ay), 1.0e-9)
@@ -83,7 +84,10 @@ def sky_radiance(light: Light, d: wp.vec3) -> wp.vec3:
 
 @wp.func
 def ambient_light(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
-    """Cool sky through the gaps, green light through leaves, warm bounce from the ground."""
+    """Returns the ambient light (linear RGB) on a surface with normal ``n`` that can see the share ``sky`` of the sky.
+
+    It is the sum of sky light through the gaps of the canopy, green light through leaves, and light from the ground.
+    """
     up = 0.5 + 0.5 * n[2]
     above = light.sky_colour * (sky * sky) + light.canopy_colour * (1.0 - sky)
     return above * (0.25 + 0.75 * up) + light.ground_colour * ((1.0 - up) * (0.35 + 0.65 * sky))
@@ -91,7 +95,10 @@ def ambient_light(light: Light, n: wp.vec3, sky: float) -> wp.vec3:
 
 @wp.func
 def reflected_light(materials: Materials, light: Light, r: wp.vec3, sky: float) -> wp.vec3:
-    """Returns the radiance that a glossy surface mirrors: holes of sky in a dark canopy above, ground below."""
+    """Returns the radiance that a glossy surface mirrors in the direction ``r``; ``sky`` is the share of visible sky.
+
+    The surroundings are a model: above the horizon a dark canopy with gaps of sky, below it the ground.
+    """
     t = sample_bilinear(materials.noise_texture, r[0] * 0.16 + r[2] * 0.09, r[1] * 0.16 - r[2] * 0.07)
     hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, t[1])
     above = mix(light.canopy_colour * 0.4, light.sky_colour * 1.3, hole)
@@ -102,9 +109,11 @@ def reflected_light(materials: Materials, light: Light, r: wp.vec3, sky: float) 
 def specular_light(
     materials: Materials, light: Light, s: Surface, kind: int, d: wp.vec3, n: wp.vec3, ndl: float, lit: float
 ) -> wp.vec3:
-    """Highlight of the sun and reflection of the surroundings (Schlick's Fresnel term) against the unit ray ``d``.
+    """Returns the sun's highlight plus the mirrored surroundings (Schlick's Fresnel term), seen along the unit ray
+    ``d``.
 
-    ``n`` faces the ray, ``ndl`` is its cosine to the sun, ``lit`` the share of the sun's disc that is seen.
+    ``n``: unit normal that faces the camera; ``ndl``: cosine between ``n`` and the direction to the sun; ``lit``:
+    visible share of the sun's disc.
     """
     colour = wp.vec3(0.0, 0.0, 0.0)
     grazing = 1.0 - wp.max(-wp.dot(n, d), 0.0)
@@ -133,7 +142,11 @@ def specular_light(
 def sun_share(
     light: Light, near: ShadowMap, far: ShadowMap, s: Surface, p: wp.vec3, plain: wp.vec3, turn: wp.vec2
 ) -> float:
-    """Share of the sun's disc that a surface at ``p`` with the geometric normal ``plain`` sees."""
+    """Returns the share of the sun's disc that is visible from a surface at ``p`` [m] with geometric normal ``plain``.
+
+    ``near`` and ``far`` are shadow maps; outside both, the share of visible sky decides. ``turn``: see
+    :func:`shadow_turn`.
+    """
     away = plain
     if wp.dot(plain, light.sun) < 0.0:
         away = -plain
@@ -158,7 +171,11 @@ def shade_surface(
     t: float,
     turn: wp.vec2,
 ) -> wp.vec3:
-    """Light that leaves a surface at ``p`` against the unit ray ``d``."""
+    """Returns the radiance (linear RGB) of surface ``s`` at ``p`` [m] towards a camera that looks along the unit ray
+    ``d``.
+
+    ``t`` [m] is the distance to the camera, for haze; ``turn``: see :func:`shadow_turn`.
+    """
     n = s.normal
     plain = s.geometric_normal
     if kind == LEAF and wp.dot(plain, d) > 0.0:
@@ -179,7 +196,7 @@ def shade_surface(
         + ambient_light(light, n, s.sky) * s.occlusion,
     )
     if s.transmission[0] > 0.0:
-        if kind == SPHEROID:  # a long way through the berry: saturated, brightest at the rim
+        if kind == SPHEROID:  # light passes a long way through the berry: saturated, brightest at the rim
             rim = wp.clamp(0.55 - 0.75 * ndl, 0.0, 1.0)
             sunny = rim * rim * 0.30 * (0.15 + 0.85 * lit) * s.occlusion * (0.25 + 0.75 * s.sky)
             colour += wp.cw_mul(
@@ -201,7 +218,7 @@ def shade_surface(
 def seen_surface(
     shapes: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3, footprint: float, slant: float
 ) -> Surface:
-    """Returns the surface of primitive ``i`` (-2: the ground) at ``p``, seen along the unit ray ``d``.
+    """Returns the material properties of primitive ``i`` (-2: the ground) at ``p`` [m], seen along the unit ray ``d``.
 
     ``footprint`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m].
     """
@@ -221,8 +238,8 @@ def seen_surface(
 
 @wp.func
 def shadow_turn(light: Light, left: int, top: int) -> wp.vec2:
-    """Cosine and sine of the angle by which the shadow samples are turned at a pixel: interleaved gradient noise
-    (Jimenez 2014)."""
+    """Returns cosine and sine of the angle by which pixel (left, top) turns its shadow samples: interleaved gradient
+    noise (Jimenez 2014)."""
     f = 0.06711056 * float(left) + 0.00583715 * float(top)
     f = 52.9829189 * (f - wp.floor(f))
     return light.sample_rotations[int((f - wp.floor(f)) * 64.0) & 63]
@@ -243,7 +260,10 @@ def surface_light(
     top: int,
     block: int,
 ) -> wp.vec3:
-    """Light from primitive ``i`` (-2: the ground) at depth ``z`` [m] along ``ray``, for the block at (left, top) [px]."""
+    """Returns the radiance (linear RGB) of primitive ``i`` (-2: the ground) at depth ``z`` [m] along ``ray``.
+
+    (left, top) [px] is the upper left pixel, ``block`` [px] the width of the square of pixels that share this light.
+    """
     scale = wp.length(ray)
     d = ray / scale
     p = lens.eye + ray * z
@@ -273,10 +293,11 @@ def shade_pixels(
     # out
     radiance_out: wp.array(dtype=wp.vec3),
 ):
-    """One thread lights ``run`` neighbouring blocks, 1 or 2 pixels wide; there each primitive is lit once, at its middle.
+    """One thread shades ``run`` neighbouring blocks of 1 x 1 or 2 x 2 pixels; within a block each visible primitive is
+    shaded once, in the mean of its pixels.
 
     primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; near, far: shadow maps;
-    block: [px]; radiance: [pixel] linear RGB.
+    block: width of a block [px]; radiance: [pixel] linear RGB.
     """
     half = block - 1  # corners are numbered by bits: divisions would cost as much as the shading
     across = (lens.width + half) >> half
@@ -293,7 +314,7 @@ def shade_pixels(
             y = top + (c >> half)
             if x < lens.width and y < lens.height:
                 i = primitive[y * lens.width + x]
-                for k in range(c):  # the first corner that shows a primitive stands for all corners that show it
+                for k in range(c):  # skip primitives that an earlier corner of the block has already shaded
                     if primitive[(top + (k >> half)) * lens.width + left + (k & half)] == i:
                         i = -3
             if i != -3:
@@ -339,9 +360,10 @@ def meter_luminance(
     # out
     sum_out: wp.array(dtype=wp.int64),
 ):
-    """One thread adds the log2 luminance of one pixel in ``step`` squared to a sum of integers, the same in any order.
+    """One thread adds the log2 luminance of the middle pixel of a ``step`` x ``step`` block to a sum.
 
-    radiance: [pixel] linear RGB; sum: sum of log2 luminance times 65536, and number of pixels.
+    The sum is of integers, so that it does not depend on the order of threads. radiance: [pixel] linear RGB; step:
+    [px]; sum: [2] sum of log2 luminance times 65536, and number of pixels.
     """
     i = wp.tid()
     across = width // step
@@ -367,10 +389,11 @@ def update_exposure(
     sum_out: wp.array(dtype=wp.int64),
     exposure_out: wp.array(dtype=wp.float32),
 ):
-    """One thread updates the exposure: ``share`` of the stops from the usual one to the key value's, smoothed in time.
+    """The only thread updates the exposure: from ``usual`` it goes ``share`` of the way, in stops, to the exposure that
+    the picture's luminance asks for, limited to [least, most] and smoothed in time.
 
-    key: exposed geometric mean of the luminance that is aimed at (Reinhard et al. 2002); keep: weight of the old exposure,
-    in stops; sum: as from :func:`meter_luminance`, set to 0; exposure: [1].
+    key: wanted geometric mean of the exposed luminance (Reinhard et al. 2002); keep: weight of the old exposure in the
+    smoothing, in stops; sum: [2] from :func:`meter_luminance`, set to 0 here; exposure: [1] factor on radiance.
     """
     mean = float(sum_out[0]) / (65536.0 * float(wp.max(sum_out[1], wp.int64(1))))
     wanted = wp.clamp(usual * wp.pow(key * wp.pow(2.0, -mean) / usual, share), least, most)
@@ -394,10 +417,12 @@ def tone_map(
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread turns the light of ``run`` pixels, each of ``samples`` squared samples, into 8-bit sRGB.
+    """One thread converts the radiance of ``run`` pixels, each averaged over ``samples`` x ``samples`` samples, to
+    sRGB.
 
-    radiance: [sample] linear RGB; balance: white balance, factors; tone: [4096] sRGB of sqrt(light / 4); first_pixel:
-    of the first thread; rgb: [pixel, 3].
+    radiance: [sample] linear RGB; width: of the picture [px]; balance: white balance, a factor for each colour;
+    exposure: [1] factor; tone: [4096] 8-bit sRGB for sqrt(radiance / 4); first_pixel: first pixel of thread 0; rgb:
+    [pixel, 3].
     """
     first = first_pixel + wp.tid() * run
     per = 1.0 / float(samples * samples)
@@ -408,7 +433,7 @@ def tone_map(
         colour = wp.vec3(0.0, 0.0, 0.0)
         for k in range(samples * samples):
             c = wp.cw_mul(gain, radiance[(top + k // samples) * width * samples + left + k % samples])
-            # what is brighter than white counts as white: edges against the sky stay smooth
+            # clip samples to white before the mean: edges against the sky stay smooth
             colour += wp.min(c, wp.vec3(WHITE_POINT, WHITE_POINT, WHITE_POINT))
         for k in range(3):
             rgb_out[pixel, k] = tone[wp.clamp(int(wp.sqrt(wp.max(colour[k] * per, 0.0)) * 1024.0), 0, 4095)]

@@ -1,7 +1,7 @@
-"""Illumination of what each pixel sees, without its colour, for cameras whose bands are not red, green and blue.
+"""Illumination of the surface in each pixel, for multispectral cameras, whose bands are not red, green and blue.
 
-It is the light of the RGB picture, averaged over its three colours, relative to the light on a level white panel in the
-open.
+The illumination is the light of the RGB renderer, averaged over its three colours and without the surface's albedo. Its
+unit is the light on a level white panel in the open.
 """
 
 import warp as wp
@@ -16,9 +16,9 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SOIL_RATIO = wp.constant(0.72)
 SOD_RATIO = wp.constant(1.45)
-"""Ratio of green to red of the picture's ground.
+"""Ratio of green to red albedo of the ground: up to SOIL_RATIO the ground is bare soil, from SOD_RATIO on it is sod.
 
-Up to the first value it is bare soil, from the second on sod. GUESSED.
+Between the values the share of sod is linear in the ratio. GUESSED.
 """
 
 
@@ -45,12 +45,12 @@ def illuminate_pixels(
     light_out: wp.array(dtype=wp.float32),
     sod_out: wp.array(dtype=wp.float32),
 ):
-    """One thread computes the light on what ``run`` neighbouring pixels see, from the first row that ``lens`` draws on.
+    """One thread computes the illumination of the surfaces in ``run`` neighbouring pixels.
 
-    primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; near, far: shadow maps;
-    transmission: light that a leaf lets through divided by the light that it reflects; light: [pixel] relative to the
-    light on a level white panel in the open, 1 for the sky; sod: [pixel] share of sod where the ground is seen, 0
-    elsewhere.
+    Threads begin at row ``lens.first_row``. primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in
+    the upper 32 bits; near, far: shadow maps; transmission: transmittance of a leaf divided by its reflectance; light:
+    [pixel] illumination relative to that of a level white panel in the open, 1 for the sky; sod: [pixel] share of sod
+    on the ground, 0 elsewhere.
     """
     panel = grey(light.sun_colour) * wp.max(light.sun[2], 0.05) + grey(light.sky_colour)
     back = wp.transpose(lens.rotation)

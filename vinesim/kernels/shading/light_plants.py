@@ -1,4 +1,4 @@
-"""Light of leaves, grass, berries and ground in live pictures, eight points at once
+"""Shading of leaves, grass, berries and ground in live pictures on a CPU, eight points at once
 (:mod:`vinesim.kernels.shading.light_points`)."""
 
 import warp as wp
@@ -33,7 +33,7 @@ def row3(table: wp.array2d(dtype=wp.float32), i: int) -> wp.vec3:
 
 @wp.struct
 class Texels:
-    """Four texels of a table around a place, and their shares."""
+    """The four texels around a point of a table (indices a, b, c, d) and their bilinear weights (wa, wb, wc, wd)."""
 
     a: int
     b: int
@@ -47,7 +47,8 @@ class Texels:
 
 @wp.func
 def texels_around(x: float, y: float) -> Texels:
-    """Bilinear sample of a 256 x 256 table of period 1."""
+    """Returns the texels and weights for a bilinear sample at (x, y) of a 256 x 256 table that repeats with period
+    1."""
     fx = (x - wp.floor(x)) * 256.0
     fy = (y - wp.floor(y)) * 256.0
     i = int(fx) & 255
@@ -70,7 +71,7 @@ def texels_around(x: float, y: float) -> Texels:
 
 @wp.func
 def sampled(table: wp.array2d(dtype=wp.float32), t: Texels, channel: int) -> float:
-    """One channel of a table [texel, channel], mixed from four texels."""
+    """Returns one channel of a table [texel, channel], interpolated between the four texels ``t``."""
     return (
         table[t.a, channel] * t.wa
         + table[t.b, channel] * t.wb
@@ -81,7 +82,10 @@ def sampled(table: wp.array2d(dtype=wp.float32), t: Texels, channel: int) -> flo
 
 @wp.func
 def autumn_colour(tables: FloatTables, albedo: wp.vec3, i: int, u: float, v: float, share: float) -> wp.vec3:
-    """Colour of leaf ``i`` at (u, v) as it turns yellow from the edge, then brown; ``share`` 0 leaves it as it is."""
+    """Returns the albedo of leaf ``i`` at (u, v) [leaf units] in autumn: yellow from the edge inwards, then brown.
+
+    ``share`` (0 to 1) is the weight of the autumn colour; 0 returns ``albedo`` unchanged.
+    """
     age = wp.max(tables.d[i, 3] - 0.42, 0.0) * 1.7 * share
     seed = tables.c[i, 3]
     x = u * 0.13 + seed * 5.3
@@ -108,7 +112,11 @@ def blade_light(
     points: Points,
     slot: int,
 ) -> wp.vec3:
-    """Light of a point of a leaf; reason: one body for eight lanes. See ``leaf_surface`` and ``shade_surface``."""
+    """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on a leaf or on grass.
+
+    The function follows ``leaf_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's. It
+    is long because one body without calls keeps eight points in SIMD lanes.
+    """
     i = points.primitive[slot]
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = points.z[slot]
@@ -158,7 +166,7 @@ def blade_light(
     albedo = autumn_colour(tables, albedo, i, u, v, 1.0 - grass)
     passing = mix(wp.vec3(2.3, 2.0, 0.75) * (1.0 - 0.7 * vein), wp.vec3(0.7, 0.7, 0.7), grass)
     transmission = wp.cw_mul(albedo, passing)
-    # from below: paler, felted, veins stand out
+    # the lower side is paler, felted, with raised veins
     under = wp.where(wp.dot(plain, d) > 0.0, 1.0, 0.0)
     below = under * (1.0 - grass)
     above = (1.0 - under) * (1.0 - grass)
@@ -205,7 +213,10 @@ def ground_light(
     points: Points,
     slot: int,
 ) -> wp.vec3:
-    """Light of one point of the ground; see ``ground_surface`` and ``shade_surface``."""
+    """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on the ground.
+
+    The function follows ``ground_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's.
+    """
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = -lens.eye[2] / ray[2]
     scale = wp.length(ray)
@@ -223,7 +234,7 @@ def ground_light(
     tone = 0.5 + (sampled(tables.soil, t, 0) - 0.5) * detail
     sod = 0.5 + (sampled(tables.soil, t, 1) - 0.5) * detail
     n = unit(wp.vec3(sampled(tables.soil, t, 2) * detail, sampled(tables.soil, t, 3) * detail, 1.0))
-    # the sky that is seen, and how far inside the vineyard
+    # the share of visible sky, and whether the point is inside the vineyard (0 to 1)
     x = (p[0] - materials.ground_x) / materials.ground_cell
     y = (p[1] - materials.ground_y) / materials.ground_cell
     columns = materials.ground_sky.shape[1]
@@ -272,7 +283,10 @@ def berry_light(
     points: Points,
     slot: int,
 ) -> wp.vec3:
-    """Light of one point of a berry; see ``berry_surface`` and ``shade_surface``."""
+    """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on a berry.
+
+    The function follows ``berry_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's.
+    """
     number = points.primitive[slot]
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = points.z[slot]

@@ -1,8 +1,9 @@
-"""Points of a live picture sorted by what they lie on, and their light: eight points at once on a CPU.
+"""Shading of live pictures on a CPU: points are sorted by class of surface, then shaded eight at once.
 
-In 2 x 2 pixels each primitive is lit once, in the mean of its pixels. Points are sorted into lists of one class, and a
-loop over a list has no branch, so that LLVM takes eight points at a time (docs/decisions/raster.md). The look is that of
-:mod:`vinesim.kernels.shading.deferred`; what is left (wood, robots, people, crates) is lit by it.
+Within each block of 2 x 2 pixels, a visible primitive is shaded once: at one point, the mean of its pixels. Points are
+sorted into lists of one class. A loop over a list has no branch, so that LLVM vectorises it by eight
+(docs/decisions/raster.md). The result approximates :mod:`vinesim.kernels.shading.deferred`, which also shades the class
+of all other surfaces (wood, robots, people, crates).
 """
 
 import warp as wp
@@ -22,12 +23,12 @@ BLADES = wp.constant(2)
 BERRIES = wp.constant(3)
 OTHERS = wp.constant(4)
 CLASS_COUNT = 5
-"""Number of classes of points: the sky, the ground, leaves and grass, berries, all others."""
+"""Number of classes of points that are shaded separately: sky, ground, leaves and grass, berries, all others."""
 
 
 @wp.struct
 class Points:
-    """Points to be lit, in lists: [list, class, place]."""
+    """Points to be shaded, in lists; the arrays are flattened from [list, class, place in the list]."""
 
     u: wp.array(dtype=wp.float32)
     """Mean column of the pixels of a point [px]."""
@@ -37,17 +38,17 @@ class Points:
     """Mean depth [m]."""
     primitive: wp.array(dtype=wp.int32)
     pixels: wp.array(dtype=wp.int32)
-    """Upper left pixel of the block times 16, plus one bit for each pixel of the block to which the point's light goes.
-    """
+    """Index of the block's upper left pixel times 16, plus one bit for each of the block's four pixels that show the
+    point's primitive."""
     count: wp.array2d(dtype=wp.int32)
     """[list, class] Number of points."""
     capacity: int
-    """Number of points of each class for which a list has room."""
+    """Largest number of points of one class in one list."""
 
 
 @wp.struct
 class FloatTables:
-    """Arrays of primitives and materials as plain numbers: LLVM takes eight of these at once, but no vectors."""
+    """Arrays of primitives and materials as scalars, because LLVM vectorises loads of scalars but not of vectors."""
 
     a: wp.array2d(dtype=wp.float32)
     b: wp.array2d(dtype=wp.float32)
@@ -55,32 +56,34 @@ class FloatTables:
     d: wp.array2d(dtype=wp.float32)
     tint: wp.array2d(dtype=wp.float32)
     outline: wp.array(dtype=wp.int8)
-    """[outline * 256 * 256]"""
+    """[outline * 256 * 256] signed distance to the leaf's edge, as in ``Shapes.outline``."""
     leaf_texture: wp.array2d(dtype=wp.float32)
-    """[texel, 4]"""
+    """[texel, 4] Vein strength, slopes of the relief and tone of leaves."""
     noise: wp.array2d(dtype=wp.float32)
-    """[texel, 4]"""
+    """[texel, 4] Four octaves of noise."""
     soil: wp.array2d(dtype=wp.float32)
-    """[texel, 4]"""
+    """[texel, 4] Tone, sod and slopes of the ground."""
     sky_table: wp.array2d(dtype=wp.float32)
-    """[texel, 3]"""
+    """[texel, 3] Radiance of the sky, linear RGB."""
     ground_sky: wp.array(dtype=wp.float32)
-    """[cell] Share of the sky that the ground sees, flattened."""
+    """[cell] Share of the sky that is visible from the ground; flattened from rows and columns."""
 
 
 @wp.struct
 class ShadowMaps:
-    """The near and the far shadow map, in one array of depths, so that each of eight points may look at another."""
+    """The near and the far shadow map with their depths in one array, so that eight SIMD lanes can read different
+    maps."""
 
     near: ShadowMap
     far: ShadowMap
     depth: wp.array(dtype=wp.float32)
-    """[near texels, then far texels] m"""
+    """Depths [m] of the near map's texels, followed by those of the far map's."""
 
 
 @wp.func
 def point_class(shapes: Shapes, materials: Materials, i: int) -> int:
-    """Returns the class of a point on primitive ``i`` (-1: the sky, -2: the ground)."""
+    """Returns the shading class (0 to :data:`CLASS_COUNT` - 1) of a point on primitive ``i`` (-1: the sky, -2: the
+    ground)."""
     if i < 0:
         return wp.where(i == -1, SKY, GROUND)
     kind = shapes.kind[i]
@@ -110,10 +113,10 @@ def sort_points(
     pixels_out: wp.array(dtype=wp.int32),
     count_out: wp.array2d(dtype=wp.int32),
 ):
-    """One thread sorts the points of ``rows`` rows of blocks of 2 x 2 pixels into one list.
+    """One thread sorts the points of ``rows`` rows of 2 x 2 pixel blocks by class into one list.
 
-    primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; first_list: of the
-    first thread; points: only its capacity; the others are the arrays of :class:`Points`.
+    primitive: [pixel] -1 the sky, -2 the ground; keys: [pixel] depth [um] in the upper 32 bits; first_list: list of
+    thread 0; points: only ``capacity`` is read; the outputs are the arrays of :class:`Points`.
     """
     number = first_list + wp.tid()
     counts = wp.types.vector(length=8, dtype=wp.int32)
@@ -121,7 +124,7 @@ def sort_points(
     for top in range(number * rows * 2, last_row, 2):
         for left in range(0, lens.width, 2):
             pixel = top * lens.width + left
-            done = wp.int32(0)  # a bit for each pixel that a point stands for, or that lies outside
+            done = wp.int32(0)  # one bit for each pixel of the block that already has a point or is outside the picture
             if left + 1 >= lens.width:
                 done = 10
             if top + 1 >= lens.height:
@@ -159,19 +162,22 @@ def sort_points(
 
 @wp.func
 def point_ray(lens: Pinhole, back: wp.mat33, u: float, v: float) -> wp.vec3:
-    """Ray through a point of the picture in the world, 1 along the axis."""
+    """Returns the ray through image point (u, v) [px], in the world's frame, with length 1 along the optical axis.
+
+    ``back`` is the rotation from the optical frame to the world.
+    """
     return back * wp.vec3((u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, 1.0)
 
 
 @wp.func
 def unit(v: wp.vec3) -> wp.vec3:
-    """``v`` at length 1; unlike Warp's, without a branch."""
+    """Returns ``v`` normalised to length 1; unlike Warp's ``normalize`` it has no branch, so that it vectorises."""
     return v * (1.0 / wp.sqrt(wp.dot(v, v) + 1.0e-20))
 
 
 @wp.func
 def write_light(code: int, width: int, colour: wp.vec3, radiance_out: wp.array(dtype=wp.vec3)):
-    """Write a point's light to the pixels that it stands for (:attr:`Points.pixels`)."""
+    """Write a point's radiance ``colour`` to its pixels; ``code`` is an element of :attr:`Points.pixels`."""
     first = code >> 4
     if code & 1 != 0:
         radiance_out[first] = colour
@@ -185,7 +191,8 @@ def write_light(code: int, width: int, colour: wp.vec3, radiance_out: wp.array(d
 
 @wp.func
 def falling_exp(x: float) -> float:
-    """exp(-x) for x >= 0 to 0.012: LLVM has no exp for eight numbers."""
+    """Returns exp(-x) for x >= 0 with an error up to 0.012, by arithmetic that LLVM can vectorise (it cannot
+    ``exp``)."""
     y = wp.max(1.0 - x * 0.0625, 0.0)
     y = y * y
     y = y * y
@@ -195,9 +202,10 @@ def falling_exp(x: float) -> float:
 
 @wp.func
 def sun_share(maps: ShadowMaps, p: wp.vec3, n: wp.vec3, sky: float) -> float:
-    """Share of the sun's disc seen from ``p`` with the normal ``n`` towards the sun, by a box of two texels.
+    """Returns the visible share of the sun's disc at ``p`` [m], by a box filter of two texels of a shadow map.
 
-    From the near map, else the far map; outside both by the share of the sky that is seen.
+    The near map is read where it covers the point, else the far map; outside both, ``sky``, the share of visible sky,
+    decides. ``n``: unit normal on the side of the sun.
     """
     side = float(maps.near.side)
     e = p - maps.near.corner
@@ -240,7 +248,10 @@ def sun_share(maps: ShadowMaps, p: wp.vec3, n: wp.vec3, sky: float) -> float:
 
 @wp.func
 def sun_row(depth: wp.array(dtype=wp.float32), at: int, z: float, a: float) -> float:
-    """Lit texels among three, the outer ones weighed by 1 - a and a."""
+    """Returns the weighted number of lit texels among the three around index ``at``; the outer weights are 1 - a and a.
+
+    A texel is lit if its depth [m] exceeds ``z``.
+    """
     left = wp.where(depth[at - 1] > z, 1.0 - a, 0.0)
     middle = wp.where(depth[at] > z, 1.0, 0.0)
     return left + middle + wp.where(depth[at + 1] > z, a, 0.0)
@@ -248,7 +259,7 @@ def sun_row(depth: wp.array(dtype=wp.float32), at: int, z: float, a: float) -> f
 
 @wp.func
 def haze(light: Light, colour: wp.vec3, distance: float) -> wp.vec3:
-    """``colour`` through ``distance`` [m] of air."""
+    """Returns the radiance ``colour`` as it appears through ``distance`` [m] of hazy air."""
     return mix(colour, light.haze_colour, 0.6 * (1.0 - falling_exp(distance * 0.006)))
 
 
@@ -267,9 +278,9 @@ def light_others(
     # out
     radiance_out: wp.array(dtype=wp.vec3),
 ):
-    """One thread lights the points of one list that are in no other class, one by one.
+    """One thread shades the points of one list that are in the class of all other surfaces, one by one.
 
-    first_list: of the first thread; radiance: [pixel] linear RGB.
+    first_list: list of thread 0; radiance: [pixel] linear RGB.
     """
     number = first_list + wp.tid()
     first = (number * CLASS_COUNT + OTHERS) * points.capacity
@@ -282,7 +293,10 @@ def light_others(
 
 
 def point_kernel(module: str, name: str, kind: int, light_point: wp.Function) -> wp.Kernel:
-    """A kernel of a ``module`` that lights the points of one class with ``light_point``, eight at a time."""
+    """Returns a kernel that shades the points of class ``kind`` with the function ``light_point``, eight at a time.
+
+    ``module``: Warp module of the kernel; ``name``: key of the kernel within the module.
+    """
     kind = wp.constant(kind)
 
     def light_list(
@@ -298,9 +312,9 @@ def point_kernel(module: str, name: str, kind: int, light_point: wp.Function) ->
         # out
         radiance_out: wp.array(dtype=wp.vec3),
     ):
-        """One thread lights the points of one list.
+        """One thread shades the points of one class in one list.
 
-        first_list: of the first thread; radiance: [pixel] linear RGB.
+        first_list: list of thread 0; radiance: [pixel] linear RGB.
         """
         number = first_list + wp.tid()
         start = (number * CLASS_COUNT + kind) * points.capacity
@@ -337,7 +351,7 @@ def sky_light(
     points: Points,
     slot: int,
 ) -> wp.vec3:
-    """Light of one point of the sky."""
+    """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which shows the sky."""
     rows = light.sky_table.shape[0]
     columns = light.sky_table.shape[1]
     d = unit(point_ray(lens, back, points.u[slot], points.v[slot]))

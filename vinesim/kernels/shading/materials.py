@@ -1,4 +1,5 @@
-"""Materials: their tables, the surface that light meets at one point, and ground, berries and leaves. Linear RGB."""
+"""Materials (linear RGB): tables of textures, the class of a shaded surface, and surfaces of ground, berries,
+leaves."""
 
 import warp as wp
 
@@ -28,12 +29,12 @@ GLASS = wp.constant(17)
 
 @wp.struct
 class Materials:
-    """Materials of all primitives and the tables they draw on."""
+    """Material and tint of each primitive, and the textures that materials sample."""
 
     material: wp.array(dtype=wp.int32)
     tint: wp.array(dtype=wp.vec3)
     sky: wp.array(dtype=wp.float32)
-    """[primitive] Share of the sky that the primitive sees through the canopy."""
+    """[primitive] Share of the sky that is visible from the primitive through the canopy, 0 to 1."""
     leaf_texture: wp.array3d(dtype=wp.vec4)
     noise_texture: wp.array2d(dtype=wp.vec4)
     soil_texture: wp.array2d(dtype=wp.vec4)
@@ -58,7 +59,7 @@ def mix(a: wp.vec3, b: wp.vec3, t: float) -> wp.vec3:
 
 @wp.func
 def sample_bilinear(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
-    """Bilinear sample of a 256 x 256 table of period 1."""
+    """Returns the bilinear sample at (x, y) of a 256 x 256 table that repeats with period 1."""
     fx = (x - wp.floor(x)) * 256.0
     fy = (y - wp.floor(y)) * 256.0
     i = int(fx) & 255
@@ -74,22 +75,22 @@ def sample_bilinear(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.
 
 @wp.func
 def sample_nearest(table: wp.array2d(dtype=wp.vec4), x: float, y: float) -> wp.vec4:
-    """Nearest sample of a 256 x 256 table of period 1."""
+    """Returns the texel nearest to (x, y) of a 256 x 256 table that repeats with period 1."""
     return table[int((y - wp.floor(y)) * 256.0) & 255, int((x - wp.floor(x)) * 256.0) & 255]
 
 
 @wp.struct
 class Surface:
-    """Reflection properties of a surface at one point."""
+    """Reflection properties of a surface at one point, for shading."""
 
     normal: wp.vec3
     geometric_normal: wp.vec3
-    """Normal of the shape, without relief."""
+    """Unit normal of the primitive's shape, without the relief of the material."""
     albedo: wp.vec3
     transmission: wp.vec3
     """Colour of the light that passes through the surface."""
     wrap: wp.vec3
-    """How far light reaches beyond the terminator, for each colour."""
+    """Wrap lighting: share by which diffuse light reaches beyond the terminator, for each colour."""
     sky: float
     occlusion: float
     specular: float
@@ -119,8 +120,11 @@ def diffuse_surface(n: wp.vec3, albedo: wp.vec3, sky: float) -> Surface:
 
 @wp.func
 def ground_surface(materials: Materials, p: wp.vec3, pixel: float, slant: float) -> Surface:
-    """Soil and sod at ``p``; ``slant`` is the length that one pixel covers along the line of sight [m]."""
-    # seen at a grazing angle, spots would be drawn out into bands: far away only their mean is left
+    """Returns the surface of the ground, a mix of soil and sod, at ``p`` [m].
+
+    ``pixel`` and ``slant`` are the lengths that one pixel covers across and along the line of sight [m].
+    """
+    # at grazing angles spots of the texture would become bands: far away only the texture's mean is used
     blur = 1.0 / (1.0 + slant * slant * 1.5)
     mean = wp.vec4(0.5, 0.5, 0.5, 0.5)
     coarse = mean
@@ -171,8 +175,10 @@ def ground_surface(materials: Materials, p: wp.vec3, pixel: float, slant: float)
 
 @wp.func
 def row_greenness(rows: wp.vec2, y: float) -> float:
-    """How much greener than elsewhere the ground is across rows (first row [m], spacing [m]): bare under the vines and
-    in the tracks of wheels, green between.
+    """Returns the change of the ground's share of sod at ``y`` [m], across the rows of vines.
+
+    It is negative (bare) under the vines and in wheel tracks, positive (green) between them. ``rows``: y of the first
+    row and spacing of rows [m].
     """
     lane = (y - rows[0]) / rows[1]
     away = wp.abs(lane - wp.floor(lane + 0.5)) * rows[1]
@@ -192,9 +198,9 @@ def berry_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: fl
     n = wp.normalize(scale_along(e, axis, stretch))
     tint = materials.tint[i]
     s = diffuse_surface(n, tint, materials.sky[i])
-    # neighbours: a baked cosine lobe of what stands around
+    # occlusion by neighbouring berries: a baked cosine lobe
     s.occlusion = wp.clamp(1.0 - block[3] - wp.dot(xyz(block), n), 0.12, 1.0) * (0.4 + 0.6 * c4[1])
-    light = tint[1] * 2.2  # pale berries let light through, dark ones carry the bloom
+    light = tint[1] * 2.2  # pale berries transmit light, dark ones show bloom
     pale = wp.clamp(light, 0.0, 1.0)
     red = wp.clamp((tint[0] - tint[1]) * 4.0, 0.0, 1.0) * (1.0 - pale)
     s.wrap = wp.vec3(0.12, 0.06, 0.08) + wp.vec3(0.33, 0.34, 0.12) * pale + wp.vec3(0.2, 0.05, 0.02) * red
@@ -249,7 +255,7 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
         s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, v)
     else:
         vein = float(0.0)
-        age = wp.max(bend[3] - 0.42, 0.0) * 1.7  # a leaf turns late
+        age = wp.max(bend[3] - 0.42, 0.0) * 1.7  # leaves younger than 0.42 keep their colour
         near = size > pixel * 10.0
         number = int(b4[3])
         if near:
@@ -288,7 +294,7 @@ def leaf_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, d: wp.vec3
             brown = smoothstep(0.03, 0.0, edge - 0.05 * spot[2] * age) * smoothstep(0.35, 0.6, age)
             s.albedo = mix(s.albedo, wp.vec3(0.16, 0.085, 0.03), brown)
         s.transmission = wp.cw_mul(s.albedo, wp.vec3(2.3, 2.0, 0.75)) * (1.0 - 0.7 * vein)
-        if wp.dot(plain, d) > 0.0:  # from below: paler, felted, veins stand out
+        if wp.dot(plain, d) > 0.0:  # the lower side is paler, felted, with raised veins
             s.albedo = mix(s.albedo * 1.05, wp.vec3(0.22, 0.27, 0.16), 0.42)
             s.albedo = mix(s.albedo, wp.vec3(0.34, 0.38, 0.20), vein * 0.7)
             s.specular = 0.012

@@ -1,4 +1,5 @@
-"""Visibility of sun and sky: depths seen from the sun, and the share of the sky's light that passes through the leaves."""
+"""Visibility of sun and sky: shadow maps drawn from the sun, and the share of sky light that passes through the
+leaves."""
 
 import warp as wp
 
@@ -25,16 +26,20 @@ from vinesim.kernels.raster.primitives import (
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 SUN_DISTANCE = wp.constant(100.0)
-"""[m] Depths of a shadow map are measured from a point this far from the map's corner towards the sun."""
+"""Distance [m] from a shadow map's corner, towards the sun, of the plane from which its depths are measured."""
 SHADOW_MARGIN = wp.constant(2.0)
-"""[texel] How far a drawn primitive may extend beyond the bound of its cluster."""
+"""Largest distance [texel] by which a drawn primitive may extend beyond the bounding sphere of its cluster."""
 SUN_RADIUS = wp.constant(0.0047)
-"""[rad] Half of the angle that the sun subtends."""
+"""Half of the angle that the sun's disc subtends [rad]."""
 
 
 @wp.struct
 class ShadowMap:
-    """Depth seen from the sun over a square."""
+    """A shadow map: ``side`` x ``side`` depths [m] along the sunlight over a square across it.
+
+    ``corner``: position of texel (0, 0) [m]; ``right``, ``up``: unit vectors of its columns and rows; ``sun``: unit
+    vector towards the sun; ``texel``: width of a texel [m].
+    """
 
     depth: wp.array(dtype=wp.float32)
     corner: wp.vec3
@@ -56,7 +61,8 @@ def sky_visibility(
     # out
     sky_out: wp.array(dtype=wp.float32),
 ):
-    """One thread finds the share of the sky light that reaches one point through leaves (Beer-Lambert, 13 directions).
+    """One thread computes the share of the sky light that reaches one point through leaves (Beer-Lambert, 13
+    directions).
 
     density: [x, y, z] leaf area per volume [1/m] in cells of ``cell`` [m] from ``corner`` on; position: [point] m;
     sky: [point] 0 to 1.
@@ -100,7 +106,11 @@ def shadow_spheroid(
     window: wp.vec4i,
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """Draw a sphere of radius ``r`` [m] at texel (x, y) and depth ``z`` [m] from the sun; every ``slices``-th row."""
+    """Draw a sphere of radius ``r`` [m] at texel (x, y) and depth ``z`` [m] into the shadow map.
+
+    Only every ``slices``-th row of texels is drawn, from row ``part`` of the sphere on, and only inside ``window``
+    (first and last + 1 column, first and last + 1 row).
+    """
     rt = r / m.texel
     for py in range(wp.max(int(y - rt), window[2]) + part, wp.min(int(y + rt) + 2, window[3]), slices):
         for px in range(wp.max(int(x - rt), window[0]), wp.min(int(x + rt) + 2, window[1])):
@@ -125,7 +135,11 @@ def shadow_cone(
     window: wp.vec4i,
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """Draw cone or cylinder ``i`` that begins at texel (x, y) and depth ``z`` [m], if it is thicker than ``smallest`` texels."""
+    """Draw cone or cylinder ``i`` into the shadow map if its radius exceeds ``smallest`` texels.
+
+    Its start is at texel (x, y) and depth ``z`` [m]. Only every ``slices``-th row is drawn, from row ``part`` on, and
+    only inside ``window`` (first and last + 1 column, first and last + 1 row).
+    """
     kind = shapes.kind[i]
     r = shapes.a[i][3]
     b4 = shapes.b[i]
@@ -161,16 +175,19 @@ def shadow_cone(
 
 @wp.struct
 class LeafShadow:
-    """An octagon around a blade as the sun sees it [texel]: lowest and highest x and y, x + y and x - y."""
+    """An octagon [texel] around a leaf's shadow: bounds of x, y, x + y and x - y in the shadow map."""
 
     xy: wp.vec4
     sums: wp.vec4
-    """Lowest and highest x + y, lowest and highest x - y."""
+    """Lowest and highest x + y, lowest and highest x - y [texel]."""
 
 
 @wp.func
 def leaf_shadow(m: ShadowMap, shapes: Shapes, i: int, x: float, y: float, per_leaf: float) -> LeafShadow:
-    """Bounds of blade ``i`` whose petiole's end is at texel (x, y); ``per_leaf`` is one texel in leaf units."""
+    """Returns the octagon around the shadow of leaf ``i``; the end of the leaf's petiole is at texel (x, y).
+
+    ``per_leaf`` is the width of a texel in leaf units (1: length of the midrib).
+    """
     number = int(shapes.b[i][3])
     bend = shapes.d[i]
     rib = xyz(shapes.b[i])
@@ -220,7 +237,11 @@ def shadow_leaf(
     window: wp.vec4i,
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """Draw blade ``i`` whose petiole's end is at texel (x, y) and depth ``z`` [m]; edge-on blades are left out."""
+    """Draw leaf ``i`` into the shadow map, unless the leaf is edge-on to the sun.
+
+    The end of its petiole is at texel (x, y) and depth ``z`` [m]. Only every ``slices``-th row is drawn, from row
+    ``part`` on, and only inside ``window`` (first and last + 1 column, first and last + 1 row).
+    """
     texels = IntBatch()
     depths = FloatBatch()
     r = shapes.a[i][3]
@@ -231,7 +252,7 @@ def shadow_leaf(
     across = wp.cross(rib, up)
     slant = wp.dot(m.sun, up)
     if wp.abs(slant) > 0.1:
-        # sun rays are parallel: leaf coordinates are affine in the texel, then one step for the curvature
+        # sun rays are parallel: leaf coordinates are affine in the texel, plus one correction for the leaf's curvature
         bend = shapes.d[i]
         number = int(b4[3])
         per_leaf = m.texel / r
@@ -255,7 +276,7 @@ def shadow_leaf(
                 run = wp.min(last_x - start, BATCH)
                 whole = (run + 7) // 8 * 8
                 lot = wp.int32(0)
-                while lot < whole:  # without a branch: eight texels at once
+                while lot < whole:  # no branch, so that LLVM takes eight texels at once
                     fx = float(start + lot) - x
                     u0 = ux * fx + uy * (row - y)
                     v0 = vx * fx + vy * (row - y)
@@ -265,7 +286,7 @@ def shadow_leaf(
                     over = u > -0.99 and u < 0.99 and v > -0.74 and v < 1.24
                     over = over and u0 > -1.2 and u0 < 1.2 and v0 > -1.0 and v0 < 1.5
                     texel = int((v + 0.75) * 128.0) * 256 + int((u + 1.0) * 128.0)
-                    texels[lot] = wp.where(over, texel, 0)  # no blade has its corner
+                    texels[lot] = wp.where(over, texel, 0)  # texel 0, a corner, is outside of every leaf
                     depths[lot] = z - (su * u + sv * v + slant * leaf_height(bend, u, v)) * r
                     lot += 1
                 for lot in range(run):
@@ -284,7 +305,12 @@ def shadow_solid(
     window: wp.vec4i,
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """Draw box, ellipsoid or triangle ``i``: one ray from the sun for each texel of its bounding sphere."""
+    """Draw box, ellipsoid or triangle ``i`` into the shadow map, by one ray from the sun for each texel of a sphere
+    that bounds it.
+
+    Only every ``slices``-th row is drawn, from row ``part`` on, and only inside ``window`` (first and last + 1 column,
+    first and last + 1 row).
+    """
     kind = shapes.kind[i]
     a4 = shapes.a[i]
     b4 = shapes.b[i]
@@ -335,11 +361,11 @@ def raster_shadow_map(
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster as the sun sees it.
+    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster into a shadow map.
 
-    ball: [cluster] centre and radius [m]; which: [thread] clusters; smallest: thinner canes are left out [texel];
-    window: first and last + 1 column, first and last + 1 row that are drawn;
-    depth: [side * side] from SUN_DISTANCE above the map's corner along the sunlight [m], the least is kept.
+    ball: [cluster] centre and radius [m]; which: clusters to draw; smallest: least radius [texel] of canes that are
+    drawn; window: first and last + 1 column, first and last + 1 row to draw; depth: [side * side] least distance [m]
+    along the sunlight from a plane SUN_DISTANCE above the map's corner.
     """
     k, lane, part = wp.tid()
     cluster = which[k]
@@ -361,7 +387,7 @@ def raster_shadow_map(
             x = wp.dot(p, m.right) / m.texel
             y = wp.dot(p, m.up) / m.texel
             z = SUN_DISTANCE - wp.dot(p, m.sun)
-            blade = 1.8 * a4[3] / m.texel + 2.0  # beyond that a leaf does not reach
+            blade = 1.8 * a4[3] / m.texel + 2.0  # largest reach of a leaf from its petiole [texel]
             beside = x < left - blade or y < low - blade or x > right + blade or y > high + blade
             if kind == LEAF and beside:
                 continue
@@ -379,7 +405,11 @@ def raster_shadow_map(
 def sun_visibility(
     m: ShadowMap, p: wp.vec3, n: wp.vec3, turn: wp.vec2, spiral: wp.array(dtype=wp.vec2), taps: int
 ) -> float:
-    """Share of the sun's disc seen from ``p``; -1 outside the map. Soft by the distance of what stands between."""
+    """Returns the visible share of the sun's disc at ``p`` [m] with normal ``n``, or -1 outside the shadow map.
+
+    The shadow's edge is the softer, the farther away the object that casts the shadow. ``spiral``: [taps] offsets of
+    samples in the unit disc, turned by ``turn`` (cosine, sine); ``taps``: see ``Light.shadow_taps``.
+    """
     facing = wp.abs(wp.dot(n, m.sun))
     e = p + n * (m.texel * (1.0 + 1.6 * (1.0 - facing))) - m.corner
     x = wp.dot(e, m.right) / m.texel + 0.5
@@ -396,7 +426,7 @@ def sun_visibility(
         if gap > 0.0:
             spread = wp.clamp(SUN_RADIUS * gap / m.texel, 1.0, 6.0)
         z -= spread * m.texel * 0.3
-        if taps <= 0:  # a box of two texels, or of four where what casts the shadow is far; smooth without noise
+        if taps <= 0:  # a box of two texels, or of four if the shadow comes from far away; smooth without noise
             i = int(x)
             j = int(y)
             a = x - float(i)

@@ -33,7 +33,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.func
 def unpack_normal(code: float) -> wp.vec3:
-    """A unit vector from one float: octahedral, two times eleven bits, plus one."""
+    """Returns the unit vector packed in one float: octahedral coordinates of eleven bits each, plus one."""
     k = int(code) - 1
     x = float(k % 2047) * (2.0 / 2046.0) - 1.0
     y = float(k / 2047) * (2.0 / 2046.0) - 1.0
@@ -44,7 +44,7 @@ def unpack_normal(code: float) -> wp.vec3:
 
 @wp.func
 def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
-    """Normal at ``p`` of the smooth surface that a triangle stands for, mixed from those of its corners."""
+    """Returns the shading normal of triangle ``i`` at ``p`` [m], interpolated between the normals at its corners."""
     a4 = g.a[i]
     b4 = g.b[i]
     c4 = g.c[i]
@@ -63,18 +63,18 @@ def smooth_normal(g: Shapes, i: int, p: wp.vec3) -> wp.vec3:
 
 @wp.struct
 class SolidPoint:
-    """Properties of one point of a solid that its material uses."""
+    """Properties of one point of a solid that materials need: normal, position along the grain, visible sky."""
 
     normal: wp.vec3
     grain: wp.vec3
     """Position across (x, y) and along (z) the grain of the material [m]."""
     sky: float
-    """Share of the sky that is seen."""
+    """Share of the sky that is visible from the point."""
 
 
 @wp.func
 def solid_point(g: Shapes, materials: Materials, i: int, p: wp.vec3) -> SolidPoint:
-    """Normal, position in the grain and visible sky at point ``p`` [m] of primitive ``i``, of any kind but a leaf."""
+    """Returns normal, position in the grain and visible sky at ``p`` [m] of primitive ``i``, which is not a leaf."""
     kind = g.kind[i]
     a4 = g.a[i]
     b4 = g.b[i]
@@ -133,7 +133,11 @@ def solid_point(g: Shapes, materials: Materials, i: int, p: wp.vec3) -> SolidPoi
 def woody_surface(
     materials: Materials, s: Surface, material: int, grain: wp.vec3, seed: float, p: wp.vec3, pixel: float
 ) -> Surface:
-    """Canes, bark and posts: relief and colour by noise along the grain; ``pixel`` is the size of a pixel there [m]."""
+    """Returns surface ``s`` with the look of a cane, bark or a post: relief and colour by noise along the grain.
+
+    ``grain``: position across (x, y) and along (z) the grain [m]; ``p``: position in the world [m]; ``pixel``: size of
+    a pixel on the surface [m].
+    """
     tint = s.albedo
     n = s.normal
     near = pixel < 0.004
@@ -172,7 +176,10 @@ def woody_surface(
 
 @wp.func
 def made_surface(materials: Materials, s: Surface, material: int, grain: wp.vec3, seed: float, pixel: float) -> Surface:
-    """Returns the surface of manufactured things, and of skin: gloss, colour and folds by material."""
+    """Returns surface ``s`` with the look of a manufactured material or of skin: gloss, colour and folds.
+
+    ``grain``: position across (x, y) and along (z) the grain [m]; ``pixel``: size of a pixel on the surface [m].
+    """
     tint = s.albedo
     n = s.normal
     near = pixel < 0.004
@@ -233,7 +240,8 @@ def made_surface(materials: Materials, s: Surface, material: int, grain: wp.vec3
 
 @wp.func
 def solid_surface(g: Shapes, materials: Materials, i: int, p: wp.vec3, pixel: float) -> Surface:
-    """Surface of primitive ``i``, of any kind but a leaf or a berry, at ``p`` [m]; ``pixel`` [m] as seen there."""
+    """Returns the surface of primitive ``i``, neither leaf nor berry, at ``p`` [m]; ``pixel`` [m] is a pixel's size
+    there."""
     o = solid_point(g, materials, i, p)
     material = materials.material[i]
     seed = g.c[i][1]

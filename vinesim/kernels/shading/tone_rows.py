@@ -1,4 +1,5 @@
-"""Light into 8-bit colours on a CPU, eight pixels at once: the arithmetic of ``deferred.tone_map`` for one sample a pixel."""
+"""Tone mapping to 8-bit sRGB on a CPU, eight pixels at once: ``deferred.tone_map`` for pictures of one sample a
+pixel."""
 
 import warp as wp
 
@@ -10,7 +11,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.func
 def tone_entry(light: float) -> int:
-    """Entry of the tone table for an exposed light."""
+    """Returns the index into the tone table [4096] for an exposed radiance of one colour."""
     seen = wp.clamp(light, 0.0, WHITE_POINT)
     return wp.clamp(int(wp.sqrt(seen) * 1024.0), 0, 4095)
 
@@ -27,10 +28,10 @@ def tone_map_rows(
     # out
     rgb_out: wp.array2d(dtype=wp.uint8),
 ):
-    """One thread turns the light of one row of pixels into 8-bit sRGB.
+    """One thread converts the radiance of one row of pixels to 8-bit sRGB.
 
-    radiance: [pixel, 3] linear RGB; balance: white balance, factors; tone: [4096] sRGB of sqrt(light / 4); first_row:
-    of the first thread; rgb: [pixel, 3].
+    radiance: [pixel, 3] linear RGB; width: of a row [px]; balance: white balance, a factor for each colour; exposure:
+    [1] factor; tone: [4096] 8-bit sRGB for sqrt(radiance / 4); first_row: row of thread 0; rgb: [pixel, 3].
     """
     start = (first_row + wp.tid()) * width
     gain = balance * exposure[0]

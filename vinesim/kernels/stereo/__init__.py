@@ -1,1 +1,1 @@
-"""Kernels that compute a sensor's measurements from exact depth: stereo matching."""
+"""Kernels of stereo cameras: the depth that stereo matching would measure, computed from exact depth."""

@@ -1,6 +1,7 @@
-"""Depth measured by a stereo camera: disparity by windows, areas the second imager misses, noise, steps.
+"""Model of a stereo camera's depth: matching by windows, occlusion in the second imager, noise and quantisation.
 
-Disparity d = f B / z, in pixels of the imagers, which may be coarser than the picture that the depth is aligned to.
+Disparity d = f B / z (focal length, baseline, depth) is in pixels of the imagers. The imagers may have fewer pixels
+than the picture to which the depth is aligned.
 """
 
 import warp as wp
@@ -10,9 +11,10 @@ from vinesim.kernels.raster.pinhole import Pinhole, pixel_ray
 wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 25})
 
 WindowDisparities = wp.types.vector(length=25, dtype=wp.float32)
-"""Disparities [px] at 5 x 5 points of a window. First 3 x 3 are evaluated, which is enough where there is no edge."""
+"""Disparities [px] at 5 x 5 points of a matching window. They are read only at edges; elsewhere 3 x 3 points suffice.
+"""
 SURFACE_GAP = wp.constant(1.0)
-"""[px] The matcher separates two surfaces whose disparities differ by more than this and by more than slant explains.
+"""Difference of disparity [px], beyond the change that slant explains, from which the matcher separates two surfaces.
 """
 
 
@@ -24,9 +26,9 @@ class Stereo:
     """Focal length times baseline [px m]: disparity = focal_baseline / depth."""
     baseline: float
     scale: float
-    """Imager pixels along one pixel of the picture, at most 1: a picture may be finer than what is measured."""
+    """Width of a pixel of the picture in pixels of the imager, at most 1 (the picture may have more pixels)."""
     stride: int
-    """Distance between two points of a window [px of the picture]."""
+    """Distance between neighbouring points of a matching window [px of the picture]."""
     sigma: float
     """Standard deviation of the disparity's noise [px]."""
     step: float
@@ -36,11 +38,11 @@ class Stereo:
     fattening: float
     support: float
     slant_kept: float
-    """Cosine of the angle between ray and normal from which on every surface is measured."""
+    """Cosine between ray and normal; above it slant never prevents a match."""
     slant_lost: float
-    """Cosine of the angle between ray and normal up to which no surface is measured."""
+    """Cosine between ray and normal; below it no surface is matched."""
     slope: float
-    """Relative change of disparity within a window on a surface that is just measured for certain."""
+    """Relative change of disparity within a window on a surface with the slant ``slant_kept``."""
     contrast: float
     projector: float
     saturation: float
@@ -48,31 +50,34 @@ class Stereo:
 
 @wp.func
 def surface_gap(slope: float, d: float) -> float:
-    """Returns the difference [px] from which on two disparities near ``d`` belong to two surfaces."""
+    """Returns the least difference [px] of two disparities near ``d`` [px] that belong to different surfaces.
+
+    ``slope`` is the largest relative change of disparity on one slanted surface.
+    """
     return SURFACE_GAP + slope * d
 
 
 @wp.func
 def normal_cdf(z: float) -> float:
-    """Share of a normal distribution below ``z``, to 0.01."""
+    """Returns the standard normal cumulative distribution at ``z``, with an error up to 0.01 (logistic function)."""
     return 1.0 / (1.0 + wp.exp(-1.702 * z))
 
 
 @wp.func
 def linear_step(low: float, high: float, x: float) -> float:
-    """0 below ``low``, 1 above ``high``, straight between them."""
+    """Returns 0 for ``x`` below ``low``, 1 above ``high``, and a linear interpolation between."""
     return wp.clamp((x - low) / wp.max(high - low, 1.0e-6), 0.0, 1.0)
 
 
 @wp.func
 def first_pixel(cell: int, scale: float) -> int:
-    """First pixel of the picture in an imager's pixel."""
+    """Returns the first column (or row) of the picture within column (or row) ``cell`` of the imager."""
     return int(wp.ceil(float(cell) / scale))
 
 
 @wp.struct
 class WindowStatistics:
-    """What 3 x 3 places of a window show."""
+    """Statistics of disparity and grey level over 3 x 3 points of a matching window."""
 
     nearest: float
     """Largest disparity [px]."""
@@ -81,11 +86,11 @@ class WindowStatistics:
     total: float
     """Sum of the disparities [px]."""
     across: float
-    """Sum of the right column minus the left one [px]."""
+    """Sum of disparities of the right column minus those of the left one [px]."""
     down: float
-    """Sum of the lowest row minus the uppermost one [px]."""
+    """Sum of disparities of the lowest row minus those of the uppermost one [px]."""
     brightness: float
-    """Mean grey level."""
+    """Mean grey level, 0 to 255."""
     darkest: float
     brightest: float
 
@@ -94,7 +99,10 @@ class WindowStatistics:
 def window_statistics(
     disparity: wp.array(dtype=wp.float32), grey: wp.array(dtype=wp.uint8), lens: Pinhole, x: int, y: int, stride: int
 ) -> WindowStatistics:
-    """Statistics of the window around pixel (x, y): disparity and grey level [pixel], places ``2 stride`` apart."""
+    """Returns the statistics of 3 x 3 points, ``2 stride`` pixels apart, around pixel (x, y) of the picture.
+
+    disparity: [pixel] px; grey: [pixel] 0 to 255.
+    """
     o = WindowStatistics()
     own = disparity[y * lens.width + x]
     o.nearest = own
@@ -119,15 +127,19 @@ def window_statistics(
 
 @wp.func
 def is_edge(stereo: Stereo, own: float, nearest: float, farthest: float) -> bool:
-    """Whether a window shows more surfaces than its own: disparities [px] of its middle, largest and smallest."""
+    """Returns whether a window contains more than one surface.
+
+    ``own``, ``nearest`` and ``farthest`` are the disparities [px] at the window's middle, the largest and the smallest.
+    """
     return not (wp.max(nearest - own, own - farthest) < surface_gap(stereo.slope, own))
 
 
 @wp.func
 def surface_slant(stereo: Stereo, lens: Pinhole, across: float, down: float, x: int, y: int, own: float) -> float:
-    """Cosine between ray and normal of the surface in a window; see :class:`WindowStatistics`.
+    """Returns the cosine between the ray of pixel (x, y) and the normal of the surface in its matching window.
 
-    1 / z is linear in the picture: its slopes are those of the surface.
+    On a plane 1 / z is linear in the pixel coordinates, so differences of disparity determine the normal. ``across``
+    and ``down``: see :class:`WindowStatistics` [px]; ``own``: disparity at the middle [px].
     """
     ray = pixel_ray(lens, x, y)
     per = 1.0 / (12.0 * float(stereo.stride) * stereo.focal_baseline)
@@ -148,9 +160,11 @@ def match_window(
     x: int,
     y: int,
 ) -> wp.vec2:
-    """Disparity [px] of the surface that fills most of a window at an edge, and the share of the window it fills.
+    """Returns the disparity [px] of the surface that covers most of a matching window at an edge, and its share of the
+    window (0 to 1).
 
-    Without a branch, so that a compiler can take several windows at once.
+    Candidates are the nearest surface, the one at the middle pixel (x, y) and the farthest; ``window_nearest`` and
+    ``window_farthest`` [px] are the window's extreme disparities. The code has no branch, so that it vectorises.
     """
     disparities = WindowDisparities()
     own = disparity[y * lens.width + x]
@@ -193,8 +207,10 @@ def seen_by_second(
     x: int,
     own: float,
 ) -> bool:
-    """Whether the second imager sees the surface of disparity ``own`` [px] in the column x of the picture, which its
-    ``row`` shows: in view and not occluded.
+    """Returns whether a surface with disparity ``own`` [px] in column ``x`` of the picture is in the second imager's
+    view and not occluded there.
+
+    ``row``: row of the second imager; second_depth: [pixel of the second imager] m.
     """
     column = int(wp.round((float(x) - lens.cx) / lens.fx * second.fx - own + second.cx))
     if column < 0 or column >= second.width:
@@ -205,14 +221,18 @@ def seen_by_second(
 
 @wp.func
 def second_row(lens: Pinhole, second: Pinhole, y: int) -> int:
-    """Row of the second imager that shows the row ``y`` of the picture."""
+    """Returns the row of the second imager that corresponds to row ``y`` of the picture."""
     row = int(wp.round((float(y) - lens.cy) / lens.fy * second.fy + second.cy))
     return wp.clamp(row, 0, second.height - 1)
 
 
 @wp.func
 def loss_probability(stereo: Stereo, brightness: float, contrast: float, slant: float, own: float) -> float:
-    """How likely a window is not matched: too slanted, without texture, or overexposed (grey levels)."""
+    """Returns the probability that a window finds no match: too slanted, without texture, or overexposed.
+
+    ``brightness``, ``contrast``: mean and range of grey levels, 0 to 255; ``slant``: cosine between ray and normal;
+    ``own``: disparity [px].
+    """
     lost = 1.0 - linear_step(stereo.slant_lost, stereo.slant_kept, slant)
     if contrast < stereo.contrast:
         lost = wp.max(lost, linear_step(stereo.projector, 2.0 * stereo.projector, stereo.focal_baseline / own))
@@ -223,7 +243,10 @@ def loss_probability(stereo: Stereo, brightness: float, contrast: float, slant: 
 
 @wp.func
 def reported_depth(stereo: Stereo, disparity: float, is_matched: bool, noise: float) -> float:
-    """Depth [m] by REP-118 of a disparity [px] with a standard normal ``noise``."""
+    """Returns the depth [m], as REP-118 defines it, for a ``disparity`` [px] with added noise and quantisation.
+
+    ``noise`` is a standard normal number; the result is NaN without a match, infinite beyond the range.
+    """
     z = float(wp.inf)
     if disparity > 0.0:
         noisy = disparity + stereo.sigma * noise
@@ -255,9 +278,9 @@ def measure_depth(
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread measures ``run`` pixels of the imager for the picture.
+    """One thread measures depth in ``run`` pixels of the imager and writes it to the pixels of the picture.
 
-    disparity: [pixel] px of the imager, exact; grey: [pixel] 0 to 255; second_depth: [pixel of the second imager] m;
+    disparity: [pixel] exact, px of the imager; grey: [pixel] 0 to 255; second_depth: [pixel of the second imager] m;
     noise: [2, row, column] standard normal, of the disparity and of the match; depth: [pixel] m, REP-118: NaN where no
     match is found, infinite beyond the range of the sensor.
     """

@@ -1,6 +1,6 @@
-"""What a stereo measurement needs beside the picture, made where the picture is: disparity, grey levels and noise.
+"""Kernels that compute the inputs of a stereo measurement on a GPU: disparity, grey levels and noise.
 
-For GPUs; on a CPU NumPy and OpenCV do the same in less time.
+On a CPU, NumPy and OpenCV compute these inputs in less time.
 """
 
 import warp as wp
@@ -18,9 +18,10 @@ def convert_picture(
     disparity_out: wp.array(dtype=wp.float32),
     grey_out: wp.array(dtype=wp.uint8),
 ):
-    """One thread converts one pixel: exact depth [m] to disparity [px of the imager], colour to a grey level.
+    """One thread converts one pixel: exact depth [m] to disparity [px of the imager], and colour to a grey level.
 
-    rgb: [pixel, 3]; focal_baseline: [px m]. Grey levels are those of OpenCV (Rec. 601, in 15 bits), bit for bit.
+    rgb: [pixel, 3]; focal_baseline: focal length times baseline [px m]. Grey levels equal those of OpenCV (Rec. 601,
+    15-bit fixed point) bit for bit.
     """
     i = wp.tid()
     disparity_out[i] = focal_baseline / depth[i]
@@ -35,7 +36,7 @@ def draw_normals(
     # out
     normal_out: wp.array(dtype=wp.float32),
 ):
-    """One thread draws one normal number, which follows from the seed and the number of the thread."""
+    """One thread draws one standard normal number, determined by ``seed`` and the thread's index."""
     i = wp.tid()
     normal_out[i] = wp.randn(wp.rand_init(seed, i))
 
@@ -48,7 +49,8 @@ def correlate(
     # out
     noise_out: wp.array3d(dtype=wp.float32),
 ):
-    """One thread sums the normal numbers of one window, over its width: variance 1, alike within a window.
+    """One thread sums ``window`` x ``window`` normal numbers and divides by ``window``: noise of variance 1 that is
+    correlated over the width of a matching window.
 
     normal: [field, row + window - 1, column + window - 1]; noise: [field, row, column].
     """

@@ -1,7 +1,7 @@
-"""Stereo matching for CPUs: eight pixels of the imager at once, and a second view out of the first one.
+"""Stereo matching for CPUs: eight pixels of the imager at once, and a second view computed from the first one.
 
-The same arithmetic as :mod:`vinesim.kernels.stereo.stereo_depth`, which takes one pixel a thread and suits GPUs; bit
-for bit the same depth. Loops are written as docs/decisions/raster.md tells.
+The arithmetic is that of :mod:`vinesim.kernels.stereo.stereo_depth`, which suits GPUs (one pixel a thread); depths are
+equal bit for bit. docs/decisions/raster.md explains how loops must be written to vectorise.
 """
 
 import warp as wp
@@ -23,17 +23,17 @@ from vinesim.kernels.stereo.stereo_depth import (
 wp.set_module_options({"enable_backward": False, "fast_math": False, "max_unroll": 25})
 
 _NOTHING = wp.constant(1.0e9)
-"""Depth [m] where the second imager sees nothing."""
+"""Depth [m] of pixels of the second imager without a surface."""
 
 
 @wp.struct
 class ImagerPixels:
-    """Where the pixels of the first imager lie in the picture."""
+    """Mapping from the first imager's columns and rows to columns and rows of the picture."""
 
     first_column: wp.array(dtype=wp.int32)
-    """[imager's column + 1] first column of the picture in each."""
+    """[imager's columns + 1] First column of the picture within each column of the imager."""
     middle_column: wp.array(dtype=wp.int32)
-    """[imager's column] the column of the picture that stands for it."""
+    """[imager's column] Column of the picture at which the imager's column is sampled."""
     first_row: wp.array(dtype=wp.int32)
     middle_row: wp.array(dtype=wp.int32)
 
@@ -51,10 +51,10 @@ def warp_to_second(
     # out
     second_depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread moves the pixels of one row of the picture to where the second imager sees them; the nearest is kept.
+    """One thread projects the pixels of one row of the picture into the second imager and keeps the nearest depth.
 
-    disparity: [pixel] px of the imager; second_depth: [row, column of the second imager] m, one row for each row of
-    the first imager.
+    disparity: [pixel] px of the imager; first_row: imager's row of thread 0; second_depth: [row of the first imager,
+    column of the second imager] m.
     """
     row = first_row + wp.tid()
     y = pixels.middle_row[row]
@@ -87,10 +87,11 @@ def measure_depth_rows(
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread measures one row as ``measure_depth`` does; reason: batches of eight stay in registers.
+    """One thread measures depth in one row of the imager, eight pixels at once, with the result of ``measure_depth``.
 
-    second_depth: [row, column of the second imager] m; is_warped: 1 if it is from :func:`warp_to_second`; the other
-    arguments are those of :func:`vinesim.kernels.stereo.stereo_depth.measure_depth`.
+    second_depth: [row, column of the second imager] m; is_warped: 1 if ``second_depth`` is from :func:`warp_to_second`;
+    first_row: imager's row of thread 0; other arguments:
+    :func:`vinesim.kernels.stereo.stereo_depth.measure_depth`. The function is long so that batches stay in registers.
     """
     row = first_row + wp.tid()
     columns = noise.shape[2]

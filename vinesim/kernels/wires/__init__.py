@@ -1,1 +1,1 @@
-"""Kernels of wires and arms: the coupling of their shoots, the contacts with wires, and the shapes of deflected wires."""
+"""Kernels of trellis wires and cordon arms: coupling of the shoots on them, contacts with wires, shapes of wires."""

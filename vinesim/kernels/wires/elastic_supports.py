@@ -1,19 +1,21 @@
-"""Elastic supports of shoots: taut wires, which their ties deflect, and arms of a cordon, which they twist.
+"""Elastic supports of shoots: taut wires, which the ties of shoots deflect, and arms of a cordon, which shoots twist.
 
-A support is light compared with the shoots, or far stiffer than a step can follow, so it is always in balance. Its
-nodes are the places where shoots hold it, with springs in series between them: T / l for a wire, with tension T and
-free length l; G J / l for an arm. In balance K u = f, where K is tridiagonal and u are the deflections. The force of
-node i is f_i = k_i (s_i - u_i). For a wire, k is the stiffness of a tie and s the displacement of its point across the
-wire. For an arm, f is the moment along the arm of the spring of a root's joint. With the rest of that spring turned by
-u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint (theta - u e) / 2, so that k =
-e^T K_joint e and k s = e^T K_joint (theta - theta_drawn). The shoots feel the force (K^-1 + k^-1)^-1 s: its stiffness
-is symmetric and less than that of ties and joints alone. Other forces on a wire (*loads*) add to f. A wire does not
-stretch along itself. It ends at posts; an arm is clamped at the trunk and free at its end.
+A support is light compared with the shoots, or far stiffer than a step can resolve, so it is kept in static balance.
+Its nodes are the places where shoots are attached. Between nodes are springs in series, of stiffness T / l for a wire
+with tension T and free length l, and G J / l for an arm. In balance K u = f, where K is tridiagonal and u are the
+deflections. The force of node i is f_i = k_i (s_i - u_i). For a wire, k is the stiffness of a tie and s the
+displacement of its point across the wire. For an arm, f is the moment along the arm of the spring of a root's joint.
+With the rest of that spring turned by u e in the joint's axes, e along the arm, its energy is (theta - u e)^T K_joint
+(theta - u e) / 2, so that k = e^T K_joint e and k s = e^T K_joint (theta - theta_drawn). The shoots feel the force
+(K^-1 + k^-1)^-1 s: its stiffness is symmetric and less than that of ties and joints alone. Other forces on a wire
+(*loads*) add to f. A wire does not stretch along its axis, and its ends are fixed at posts. An arm is clamped at the
+trunk and free at its other end.
 
-Ties and joints are implicit in the prediction of each tree, with anchors and rests on the support. The support follows
-the trees' state at the start of the step, and moves on as fast as they do. Compared with a solve of all trees of a
-support at once, only k K'^-1 k times the acceleration is left out, K' = K + k. This is a positive semidefinite mass,
-(phi dt)^2 k at most, with which the scheme stays as stable as without supports, whatever K and k are.
+The prediction of each tree treats its ties and joints implicitly, with the anchors of ties and the rest angles of
+joints on the support. The support's deflection follows from the trees' state at the start of the step; within the step
+it changes at the rate that follows from the trees' velocities. Compared with a solve of all trees of a support at once,
+this neglects only k K'^-1 k times the acceleration, with K' = K + k. That term is a positive semidefinite mass, at most
+(phi dt)^2 k, so the scheme stays as stable as without supports for all K and k.
 """
 
 import warp as wp
@@ -26,12 +28,19 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class SupportNodes:
-    """Places where shoots hold supports, support by support from its start to its end. [node] unless said otherwise."""
+    """Places where shoots are attached to supports, ordered by support and from its start to its end.
+
+    Arrays are [node] unless stated otherwise.
+    """
 
     first: wp.array(dtype=wp.int32)  # [support + 1] the support's first node
     is_arm: wp.array(dtype=wp.bool)  # [support] whether the support is an arm
-    last_stiffness: wp.array(dtype=wp.float64)  # [support] N/m, N m/rad: stiffness behind its last node; 0: a free end
-    stiffness: wp.array(dtype=wp.float64)  # [N/m, N m/rad] stiffness between this node and the one before, or the start
+    last_stiffness: wp.array(
+        dtype=wp.float64
+    )  # [support] N/m, N m/rad: stiffness between last node and end; 0: free end
+    stiffness: wp.array(
+        dtype=wp.float64
+    )  # [N/m, N m/rad] stiffness between the previous node (or the support's start) and this node
     axis: wp.array(dtype=wp.vec3d)  # unit vector along a wire, in the world; along an arm, in joint axes
     body: wp.array(dtype=wp.int32)  # body that the tie holds; on an arm, the root
     tree: wp.array(dtype=wp.int32)  # tree of that body
@@ -45,9 +54,9 @@ class SupportNodes:
 
 @wp.struct
 class SupportState:
-    """Deflections of the supports, and intermediate values of the solve. [node]"""
+    """Deflections of the supports, and intermediate values of the solve. Arrays are [node]."""
 
-    load: wp.array(dtype=wp.vec3d)  # [N] force on a wire at the node, without the ties; in the world
+    load: wp.array(dtype=wp.vec3d)  # [N] force on a wire at the node, except the ties' forces; in the world
     deflection: wp.array(dtype=wp.vec3d)  # [m] in the world; [rad, 0, 0] for an arm
     reference: wp.array(dtype=wp.vec3d)  # the deflection when the node's tree was last awake or was last placed
     ratio: wp.array(dtype=wp.float64)  # [1] ratio of a node's deflection to that of the next node
@@ -57,7 +66,7 @@ class SupportState:
 
 @wp.struct
 class Wires:
-    """Pieces of wire under tension. [piece], of all fixed pieces, unless said otherwise."""
+    """Wires under tension. Arrays are [piece] over all fixed pieces of the scene, unless stated otherwise."""
 
     tension: wp.array(dtype=wp.float64)  # [N] tension
     length: wp.array(dtype=wp.float64)  # [m] length
@@ -67,7 +76,7 @@ class Wires:
 
 @wp.struct
 class SupportedBodies:
-    """Bodies and joints at the start of the step. [body]"""
+    """State of plant bodies and their joints at the start of the step. Arrays are [body]."""
 
     body_q: wp.array(dtype=wp.transform)  # [m, xyzw]
     body_qd: wp.array(dtype=wp.spatial_vector)  # [m/s, rad/s]
@@ -78,7 +87,10 @@ class SupportedBodies:
 
 @wp.struct
 class SupportedSprings:
-    """Ties and rests of root springs that the kernels of supports write. They only read ``span`` and ``stiffness``."""
+    """Anchors of ties and rest angles of root joints, written by the kernels of supports.
+
+    Those kernels only read ``span`` and ``stiffness``.
+    """
 
     span: wp.array(dtype=wp.vec2i)  # [body] first tie of the body, and the one after the last
     stiffness: wp.array(dtype=float)  # [tie] N/m
@@ -92,20 +104,21 @@ class SupportedSprings:
 
 @wp.func
 def vec3d(v: wp.vec3):
-    """Returns the vector in double precision."""
+    """Returns ``v`` converted to double precision."""
     return wp.vec3d(wp.float64(v[0]), wp.float64(v[1]), wp.float64(v[2]))
 
 
 @wp.func
 def vec3f(v: wp.vec3d):
-    """Returns the vector in single precision."""
+    """Returns ``v`` converted to single precision."""
     return wp.vec3(wp.float32(v[0]), wp.float32(v[1]), wp.float32(v[2]))
 
 
 @wp.func
 def pull_of_tie(i: int, stiffness: wp.float64, nodes: SupportNodes, bodies: SupportedBodies):
-    """Returns a tie's stiffness k [N/m], and k s [N] and its rate [N/s], with s the displacement of its point across
-    the wire.
+    """Returns the stiffness k [N/m] of the tie at node ``i`` of a wire, its force k s [N] and the force's rate [N/s].
+
+    s is the displacement of the tied point of the shoot across the wire.
     """
     axis = nodes.axis[i]
     body = nodes.body[i]
@@ -122,9 +135,10 @@ def pull_of_tie(i: int, stiffness: wp.float64, nodes: SupportNodes, bodies: Supp
 
 @wp.func
 def pull_of_root(i: int, nodes: SupportNodes, bodies: SupportedBodies):
-    """Returns the stiffness k [N m/rad] of a root's spring about the arm, and k s [N m, 0, 0] and its rate.
+    """Returns the stiffness k [N m/rad] of the root joint at node ``i`` about its arm, the moment k s [N m, 0, 0] and
+    its rate.
 
-    s is the turn of the shoot.
+    s is the rotation [rad] of the shoot about the arm.
     """
     body = nodes.body[i]
     s, excess, v = middle_axes_scale(bodies.joint_q[body])
@@ -146,7 +160,10 @@ def turn_rest(
     bodies: SupportedBodies,
     springs_out: SupportedSprings,
 ):
-    """Turn the rest of a root's spring with its arm, by ``deflection`` [rad]."""
+    """Turn the rest angle of the root joint at node ``i`` with the twist of its arm, by ``deflection`` [rad].
+
+    ``velocity`` [rad/s]: rate of the twist; ``share``: see ``SupportState.share``.
+    """
     tree = nodes.tree[i]
     axis = nodes.axis[i]
     gradient = wp.cw_mul(vec3d(bodies.joint_stiffness[nodes.body[i]]), axis)
@@ -172,12 +189,12 @@ def balance_supports(
     is_moved_out: wp.array(dtype=wp.bool),
     moved_count_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per support. Bring it to balance with the trees that it holds, by elimination along it.
+    """One thread solves the static balance of one support with the trees on it, by tridiagonal elimination.
 
-    supports: [thread] index of the support. is_placed: [tree] sleeping trees that were placed since the last step.
-    state_out, springs_out: of this support's nodes. is_moved_out: [tree] set for sleeping trees under which the support
-    has moved further than ``wake_distance`` since they fell asleep; moved_count_out: [1] raised by one for each of
-    them.
+    count: [1] number of supports; supports: [thread] index of the support; is_placed: [tree] sleeping trees that were
+    placed since the last step; state, springs: results at this support's nodes; is_moved: [tree] set for sleeping trees
+    whose support has moved further than ``wake_distance`` since they fell asleep; moved_count: [1] number of such
+    trees.
     """
     if wp.tid() >= count[0]:
         return
@@ -242,7 +259,8 @@ def balance_supports(
 
 @wp.func
 def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: SupportedSprings):
-    """Returns the stiffness k [N/m] of the tie of a wire's node, and k s [N]; see :func:`pull_of_tie`."""
+    """Returns the stiffness k [N/m] of the tie at node ``i`` of a wire, and its force k s [N]; see
+    :func:`pull_of_tie`."""
     stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
     stiffness, moved, _ = pull_of_tie(i, stiffness, nodes, bodies)
     return stiffness, moved
@@ -250,7 +268,7 @@ def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: 
 
 @wp.func
 def in_series(a: wp.float64, b: wp.float64):
-    """Returns the stiffness of two springs in series."""
+    """Returns the stiffness of two springs in series with stiffnesses ``a`` and ``b``."""
     return a * b / (a + b)
 
 
@@ -265,11 +283,12 @@ def wire_spring(
     springs: SupportedSprings,
     loads: wp.array(dtype=wp.vec3d),
 ):
-    """Returns the spring with which a wire resists, ``x`` [m] from its start, while its shoots stay where they are.
+    """Returns the spring by which a wire resists a force at its point ``x`` [m] from its start, while its shoots stand
+    still.
 
-    Its stiffness across the wire [N/m]; the offset of the point without loads [m] from its undeflected position; and by
-    how much the ``loads`` [node] N move it from there [m], without the loads between its own two nodes.
-    ``least_share``: least distance from a post or a node, as a share of the length.
+    Returns the stiffness across the wire [N/m]; the displacement of the point by the ties alone [m, world]; and the
+    further displacement by ``loads`` [node] N [m, world], except loads between the two nodes next to the point.
+    ``least_share``: least distance of the point from a post or node, as a share of the wire's length.
     """
     tension = wires.tension[piece]
     length = wires.length[piece]
@@ -283,7 +302,7 @@ def wire_spring(
     left = tension / wp.max(x, least)
     left_rest = wp.vec3d()
     left_deflection = wp.vec3d()
-    behind = wp.float64(0.0)  # stiffness of all springs up to a node, its tie included
+    behind = wp.float64(0.0)  # stiffness of all springs up to and including a node's tie
     right_first = end
     for i in range(first, end):
         if wires.node_along[i] < x:

@@ -1,6 +1,6 @@
-"""Contacts with wires that deflect: their springs, the forces that press on wires, and the positions of wire geoms.
+"""Contacts with wires that deflect: springs of the contacts, forces on wires (presses), and positions of wire geoms.
 
-Each kernel is run by one thread: few contacts are with wires, and each of them depends on all other contacts of its
+Each kernel runs with one thread: few contacts are with wires, and each of them depends on all other contacts of its
 wire. :mod:`vinesim.wires.deflected_wires` describes the model.
 """
 
@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class WireNumbers:
-    """Parameters of the model; see :mod:`vinesim.wires.deflected_wires`."""
+    """Parameters of contacts with wires; :mod:`vinesim.wires.deflected_wires` describes each of them."""
 
     dt: wp.float64
     followed: wp.float64
@@ -33,12 +33,12 @@ class WireNumbers:
 
 @wp.struct
 class WireGeoms:
-    """Shapes of the wires. [piece], of all fixed pieces."""
+    """Positions of the wires' collision geoms. Arrays are [piece] over all fixed pieces, unless stated otherwise."""
 
     start: wp.array(dtype=wp.vec3d)  # [m] start, undeflected
     axis: wp.array(dtype=wp.vec3d)  # unit vector to the end
     offset: wp.array2d(dtype=wp.vec3d)  # [piece, 2] m, displacement of both ends from their undeflected positions
-    is_held: wp.array(dtype=wp.bool)  # whether something presses on it, or is near
+    is_held: wp.array(dtype=wp.bool)  # whether a body presses on the wire or is near it
     deflected: wp.array(dtype=wp.int32)  # [k] pieces whose offset is not 0, in the order in which they were pressed
     count: wp.array(dtype=wp.int32)  # [2] number of deflected pieces, and number of loaded supports
     loaded: wp.array(dtype=wp.int32)  # [k] supports that are loaded, in the order in which they were pressed
@@ -46,7 +46,7 @@ class WireGeoms:
 
 @wp.struct
 class WireContacts:
-    """Contacts with wires in one solve. [contact]"""
+    """Contacts with wires in one contact solve. Arrays are [contact]."""
 
     count: wp.array(dtype=wp.int32)  # [1]
     piece: wp.array(dtype=wp.int32)
@@ -63,7 +63,7 @@ class WireContacts:
     shift: wp.array(dtype=wp.float64)  # [m] gap at which the spring is at rest, minus the gap to the geom
     geom: wp.array(dtype=wp.vec3d)  # [m] displacement of the geom at this point from its undeflected position
     place: wp.array(dtype=wp.vec3d)  # [m] displacement of the wire at this point, under the forces of the last step
-    last: wp.array(dtype=wp.int32)  # index of the same press in the last step, -1 if it is new
+    last: wp.array(dtype=wp.int32)  # index of the contact's press in the last step, -1 for a new contact
     last_force: wp.array(dtype=wp.float64)  # [N] force of that press, extrapolated
     weight: wp.array(dtype=wp.float64)  # [N] mean of that force
     others: wp.array(dtype=wp.float64)  # [m] mean deflection by the other presses, along the normal
@@ -71,7 +71,7 @@ class WireContacts:
 
 @wp.struct
 class WirePresses:
-    """Forces that press on wires, one for each contact. [press]"""
+    """Presses: forces on wires, one for each contact of the last step. Arrays are [press]."""
 
     count: wp.array(dtype=wp.int32)  # [1]
     piece: wp.array(dtype=wp.int32)
@@ -87,8 +87,8 @@ class WirePresses:
 
 @wp.func
 def interval_of(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes):
-    """Returns the node behind a point of a wire, and where [m] the stretch between its two nodes, or posts, begins and
-    ends.
+    """Returns the index of the first node beyond point ``x`` [m] of a wire, and the positions [m] of the two nodes (or
+    posts) next to the point.
     """
     low = wp.float64(0.0)
     high = wires.length[piece]
@@ -107,7 +107,8 @@ def interval_of(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes):
 
 @wp.func
 def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNodes, presses: WirePresses):
-    """Returns the deflection [m] of a point from the line between its two nodes by the loads between these nodes."""
+    """Returns the deflection [m] of a wire's point ``x`` [m] from the line between the two nodes next to it, which
+    presses between these nodes cause."""
     zero = wp.float64(0.0)
     _, low, high = interval_of(piece, x, wires, nodes)
     found = wp.vec3d()
@@ -122,7 +123,8 @@ def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNo
 
 @wp.func
 def last_press(i: int, same_place: wp.float64, contacts: WireContacts, presses: WirePresses):
-    """Returns the index of a contact's press in the last step, the nearest of those with its key; -1 if it is new."""
+    """Returns the index of the last step's press of contact ``i``: the nearest press with the contact's key; -1 if
+    there is none within ``same_place`` [m]."""
     best = int(-1)
     nearest = same_place
     for j in range(presses.count[0]):
@@ -136,7 +138,8 @@ def last_press(i: int, same_place: wp.float64, contacts: WireContacts, presses: 
 
 @wp.func
 def string_ratio(x: wp.float64, y: wp.float64, length: wp.float64):
-    """Returns the deflection of a string at x by a force at y, divided by the deflection at x by the same force at x."""
+    """Returns the deflection of a taut string at ``x`` by a force at ``y``, divided by the deflection at ``x`` by an
+    equal force at ``x`` (positions and ``length`` in m)."""
     least = wp.float64(1.0e-3) * length
     here = wp.clamp(x, least, length - least)
     ratio = y / here
@@ -147,13 +150,14 @@ def string_ratio(x: wp.float64, y: wp.float64, length: wp.float64):
 
 @wp.func
 def is_reached(i: int, numbers: WireNumbers, contacts: WireContacts):
-    """Returns whether a new contact closes before the step ends."""
+    """Returns whether contact ``i`` is new and closes before the step ends."""
     return contacts.last[i] < 0 and contacts.gap[i] - numbers.dt * contacts.closing[i] < numbers.touching
 
 
 @wp.func
 def sharing(i: int, numbers: WireNumbers, wires: Wires, contacts: WireContacts, presses: WirePresses):
-    """Returns the factor by which a wire is softer for a contact than it would be for that contact alone."""
+    """Returns the factor by which a wire is softer for contact ``i`` because other contacts press on the wire at the
+    same time (1 without others)."""
     zero = wp.float64(0.0)
     piece = contacts.piece[i]
     x = contacts.along[i]
@@ -190,7 +194,10 @@ def find_wire_springs(
     # out
     contacts_out: WireContacts,
 ):
-    """One thread in all. Find the springs of the contacts. loads: [node] N. presses: those of the last step."""
+    """The only thread computes the springs of all contacts with wires.
+
+    loads: [node] forces on the wires' nodes [N]; presses: presses of the last step; contacts: springs are written here.
+    """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     count = contacts_out.count[0]
@@ -205,7 +212,7 @@ def find_wire_springs(
         weight = wp.float64(1.0e-9)
         if last >= 0:
             weight = presses.weight[last]
-        else:  # assumed to press as hard as the hardest of the others
+        else:  # a new contact is assumed to press as hard as the hardest press on its wire
             for j in range(presses.count[0]):
                 if presses.piece[j] == piece:
                     weight = wp.max(weight, presses.weight[j])
@@ -221,7 +228,8 @@ def find_wire_springs(
         force = zero
         if last >= 0:
             force = presses.force[last]
-        now = wp.dot(deflection, normal) + force / stiffness  # by the others, and by the force shared with them
+        # deflection by other presses, plus deflection by this contact's own force
+        now = wp.dot(deflection, normal) + force / stiffness
         mean = now
         if last >= 0:
             mean = presses.others[last] + numbers.forgetting * (now - presses.others[last])
@@ -229,9 +237,9 @@ def find_wire_springs(
         geom = (one - share) * geoms.offset[piece, 0] + share * geoms.offset[piece, 1]
         shift = wp.dot(geom - rest, normal) - numbers.followed * now - (one - numbers.followed) * mean
         if contacts_out.gap[i] > numbers.touching:
-            shift = zero  # another press holds the wire away from it
+            shift = zero  # another press holds the wire away from this contact
         if wp.abs(wp.dot(normal, geoms.axis[piece])) > numbers.max_normal_along_wire:
-            # with its axis inside a box, the nearest way out may be along it, where a wire does not push
+            # if the wire's axis is inside a box, the normal may be along the wire, where a wire does not push
             shift = numbers.out_of_reach
         contacts_out.stiffness[i] = stiffness
         contacts_out.shift[i] = shift
@@ -250,7 +258,10 @@ def add_presses(
     # out
     found_out: WirePresses,
 ):
-    """One thread in all. Add the forces and velocities that a solve found for its contacts, as far as there is room."""
+    """The only thread appends the forces and velocities that a contact solve found to the list of presses.
+
+    Contacts for which the list has no room are left out.
+    """
     zero = wp.float64(0.0)
     for i in range(contacts.count[0]):
         k = found_out.count[0]
@@ -280,7 +291,7 @@ def add_presses(
 
 @wp.func
 def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
-    """Copy press ``j`` to place ``k`` of another list."""
+    """Copy press ``j`` of the list ``presses`` to place ``k`` of the list ``presses_out``."""
     presses_out.piece[k] = presses.piece[j]
     presses_out.key[k] = presses.key[j]
     presses_out.tree[k] = presses.tree[j]
@@ -302,9 +313,9 @@ def load_nodes(
     loads_out: wp.array(dtype=wp.vec3d),
     is_loaded_out: wp.array(dtype=wp.bool),
 ):
-    """Add a press to the loads of its two neighbouring nodes, by the lever rule.
+    """Add press ``j`` to the loads [N] of the two nodes next to it, by the lever rule, times ``sign``.
 
-    ``sign`` 0: clear these nodes instead.
+    With ``sign`` 0 the loads of these nodes are cleared instead.
     """
     piece = presses.piece[j]
     support = wires.support[piece]
@@ -321,9 +332,10 @@ def load_nodes(
 
 @wp.func
 def rod_through(piece: int, first: int, numbers: WireNumbers, wires: Wires, presses: WirePresses, geoms_out: WireGeoms):
-    """Move the geom of a wire like a rod through the points that the presses displace.
+    """Place the straight geom of a wire through the points that presses displaced.
 
-    If these points are near each other, the geom moves by their mean. ``first``: one of the wire's presses.
+    If these points are near each other, the geom moves by their mean displacement. ``first``: index of the wire's first
+    press.
     """
     zero = wp.float64(0.0)
     presses_hard = bool(False)
@@ -370,10 +382,11 @@ def deflect_wires(
     is_loaded_out: wp.array(dtype=wp.bool),
     geoms_out: WireGeoms,
 ):
-    """One thread in all. Keep the presses of sleeping trees, load the supports, and move the geoms.
+    """The only thread replaces the list of presses, keeping presses of sleeping trees, and updates loads and wire
+    geoms.
 
-    rigid_asleep: [kinematic tree] not negative while the tree sleeps. found_out: presses of this step; their count is
-    cleared. presses_out: presses of the last step at first, then of this step. loads_out: [node] N. is_loaded_out:
+    rigid_asleep: [kinematic tree of MuJoCo] not negative while the tree sleeps; found: presses of this step, whose
+    count is cleared; presses: list of the last step, replaced by that of this step; loads: [node] N; is_loaded:
     [support].
     """
     zero = wp.float64(0.0)
@@ -402,7 +415,7 @@ def deflect_wires(
                 loaded = loaded + 1
         load_nodes(j, one, wires, nodes, presses_out, loads_out, is_loaded_out)
     kept = int(0)
-    for k in range(geoms_out.count[0]):  # decay; the wires that are held follow below
+    for k in range(geoms_out.count[0]):  # released wires return; wires that are still pressed are placed below
         piece = geoms_out.deflected[k]
         for end in range(2):
             geoms_out.offset[piece, end] = numbers.recovery * geoms_out.offset[piece, end]

@@ -1,4 +1,4 @@
-"""Positions of the wires' segments for pictures and scans, between their shoots and deflected by contacts."""
+"""Poses of the wires' visible segments, deflected by shoots and contacts, for cameras and lidars."""
 
 import warp as wp
 
@@ -8,15 +8,15 @@ from vinesim.kernels.wires.wire_contacts import WireGeoms, WirePresses, deflecti
 wp.set_module_options({"enable_backward": False})
 
 LEAST_SHOWN = wp.constant(wp.float64(1.0e-4))
-"""[m] A segment is not moved if both its ends are displaced by less than this."""
+"""Displacement [m] of both ends below which a segment is drawn undeflected."""
 
 
 @wp.struct
 class SegmentShapes:
-    """Segments of wires, piece by piece, and their poses. [segment]"""
+    """Visible segments of wires and their poses, ordered by wire. Arrays are [segment] unless stated otherwise."""
 
     first: wp.array(dtype=wp.int32)  # [piece + 1] first segment of each fixed piece
-    start: wp.array(dtype=wp.float64)  # [1] where the segment begins on its piece, as a share of the piece's length
+    start: wp.array(dtype=wp.float64)  # [1] start of the segment on its piece, as a share of the piece's length
     end: wp.array(dtype=wp.float64)
     rest_q: wp.array(dtype=wp.transformd)  # pose of the segment's middle, undeflected
     q: wp.array(dtype=wp.transformf)
@@ -32,7 +32,7 @@ def deflection_at(
     deflection: wp.array(dtype=wp.vec3d),
     presses: WirePresses,
 ):
-    """Returns the displacement [m] of a wire's point, ``x`` [m] from its start, from its undeflected position."""
+    """Returns the displacement [m, world] of a wire's point ``x`` [m] from the wire's start, by ties and presses."""
     node, low, high = interval_of(piece, x, wires, nodes)
     at_low = wp.vec3d()
     at_high = wp.vec3d()
@@ -61,7 +61,11 @@ def pose_wire_segments(
     # out
     segments_out: SegmentShapes,
 ):
-    """One thread per listed piece of wire. deflection: [node] m."""
+    """One thread poses the segments of one wire.
+
+    count: [1] number of wires to update; pieces: [thread] fixed piece of the wire; deflection: [node] m; segments: the
+    poses are written here.
+    """
     if wp.tid() >= count[0]:
         return
     piece = pieces[wp.tid()]

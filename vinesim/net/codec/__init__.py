@@ -1,1 +1,2 @@
-"""Wire formats: one module for each group of messages; ``messages`` lists every kind and every family of keys."""
+"""Wire formats: one module for each group of messages. ``messages`` lists all kinds of messages and families of
+keys."""

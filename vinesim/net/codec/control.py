@@ -1,4 +1,4 @@
-"""Wire format of rare messages in msgpack: hello, welcome, claims, retained records, clock."""
+"""Wire formats of rare messages, in msgpack: hello, welcome, claims, retained records, clock."""
 
 from __future__ import annotations
 
@@ -32,22 +32,22 @@ RETAINED = 4
 HELLO = 16
 CLOCK = 17
 WELCOME = 18
-"""Kinds of the messages."""
+"""Numbers of the kinds of messages, the fourth byte of each message."""
 
 MAX_RECORDS = 4096
-"""Retained records in one message."""
+"""Largest number of retained records in one message."""
 
 MAX_CAUSE = 120
-"""Letters in the cause of a real-time factor: a name and some words."""
+"""Largest number of letters in the text that names what limits the real-time factor of a world."""
 
 HEIGHT_RANGE = (1.0, 2.5)
-"""Shortest and tallest person [m]. GUESSED."""
+"""Smallest and largest height of a person [m]. GUESSED."""
 
 MAX_SEED = (1 << 63) - 1
 """Largest seed of a scene."""
 
 ACTOR_KINDS = ("robot", "human", "spectator")
-"""Kinds of actors."""
+"""Values of :attr:`Hello.kind`."""
 
 
 class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -64,76 +64,81 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     sidecar: str = ""
     """What a URDF cannot express, as JSON: see :func:`vinesim.robot.description.sidecar.encode_sidecar`."""
     scene: str = ""
-    """Name of its scene."""
+    """Name of the actor's scene."""
     digest: str = ""
-    """``Model.digest()`` of its scene: equal digests mean equal object ids."""
+    """``Model.digest()`` of the actor's scene. Clients whose digests are equal use equal object ids."""
     protocol: int = PROTOCOL
     index: int = 0
-    """Instance index of its label in label images, below :data:`vinesim.scene.ids.LABEL_STRIDE`."""
+    """Instance index of the actor in label images, below :data:`vinesim.scene.ids.LABEL_STRIDE`."""
     joints: int = -1
-    """Number of joints in its poses, at most :data:`MAX_JOINTS`; -1: that of its first pose."""
+    """Number of joints in the actor's poses, at most :data:`MAX_JOINTS`; -1: as many as its first pose has."""
     seed: int = -1
-    """Seed of its scene, from which others can generate the same; -1: not given."""
+    """Seed from which the actor's scene was generated, so that others can generate an equal one; -1: not given."""
     height: float = 1.75
     """Height of a person [m], in :data:`HEIGHT_RANGE`."""
     outfit: str = ""
-    """Name of the outfit that a person has chosen; empty: the one that follows from its own name."""
+    """Name of the outfit that a person has chosen; empty: the outfit is derived from the person's name."""
 
 
 class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The server's reply to a :class:`Hello`."""
 
     refused: str = ""
-    """Empty, or the reason of the rejection and its remedy."""
+    """Empty if the actor is admitted, else why it is not and what to do about that."""
     scene: str = ""
     """Name of the world's scene."""
     digest: str = ""
-    """``Model.digest()`` of that scene."""
+    """``Model.digest()`` of the world's scene."""
     spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE
     """Who hears spectators in this world."""
     protocol: int = PROTOCOL
 
 
 class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Lasting state of one object, valid when its author has left: a pose at rest, or which bodies were cut off a tree.
+    """Lasting state of one object: a pose at rest, or which bodies were cut off a tree. Stays valid when its author
+    leaves.
 
-    Records travel once, reliably. The server keeps, for each object, the record with the greatest claim
-    (:mod:`vinesim.net.replication.retained`) for clients that join later. An array on the wire: field names are not
-    sent.
+    Records are sent once, reliably. For clients that join later, the server keeps the record with the greatest claim of
+    each object (:mod:`vinesim.net.replication.retained`). On the wire a record is an array without field names.
     """
 
     object: int
-    """Object id, :func:`vinesim.scene.ids.object_id`."""
+    """Id of the object, by :func:`vinesim.scene.ids.object_id`."""
     ownership: int
     authority: int
-    """The author's claim when the record was published, two u16 sequences."""
+    """Sequence numbers (u16) of the author's claim when the record was published."""
     author: str
     pose: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
-    """Pose of a bunch or a box [m, 1] in the frame of ``parent``."""
+    """Pose of a bunch or a box in the frame of ``parent``: position [m], quaternion xyzw."""
     parent: str = ""
-    """Frame of ``pose``: ``box/3`` or ``actor/link`` of a robot; empty: the world."""
+    """Frame of ``pose``: a box as ``box/3``, or a robot's link as ``actor/link``; empty: the world."""
     cut: tuple[int, ...] = ()
     """Bodies of the tree that were cut off their parents, in increasing order."""
     trees: bytes = b""
-    """State of the tree as a message of one tree (:func:`vinesim.net.codec.trees.encode_trees`)."""
+    """State of the tree, encoded by :func:`vinesim.net.codec.trees.encode_trees`; empty for other objects."""
     moving: bool = False
-    """The object was falling or carried when this was published; states follow for clients nearby."""
+    """Whether the object was falling or carried when the record was published. Clients nearby then receive its
+    states."""
     place: tuple[float, float, float, float, float, float, float] | None = None
-    """On a link of an actor: pose in the world [m, 1] when this was published, for those who come when it has left."""
+    """Pose in the world of an object that rests on a link of a robot, when the record was published: position [m],
+    quaternion xyzw. Clients use it if the robot has left."""
 
     @property
     def claim(self) -> Claim:
-        """The claim by which records of one object are ordered."""
+        """The claim that orders the records of one object: the record with the greatest claim is valid."""
         return Claim(self.ownership, self.authority, self.author)
 
 
 def pack(kind: int, value: Any) -> bytes:
-    """A message of this kind in msgpack."""
+    """Encode a value in msgpack as a message of this ``kind``."""
     return MAGIC + bytes((PROTOCOL, kind)) + _encoder.encode(value)
 
 
 def unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decoder) -> Any:
-    """The value of a message, which must be of this kind; ``name``: what it is, for :class:`MessageError`."""
+    """Decode a message in msgpack. ``name``: what to call the message in errors.
+
+    Raises :class:`MessageError` if the message is of another ``kind`` or cannot be decoded.
+    """
     if (found := kind_of(payload)) != kind:
         raise MessageError(f"message of kind {found} where {name} (kind {kind}) was expected")
     try:
@@ -143,8 +148,8 @@ def unpack(payload: bytes, kind: int, name: str, decoder: msgspec.msgpack.Decode
 
 
 def encode_hello(hello: Hello) -> bytes:
-    """Encode a hello; :class:`MessageError` if its name cannot be part of a key, a number is out of its range, or it
-    is too large."""
+    """Encode a hello. Raises :class:`MessageError` if its name cannot be part of a key, a number is out of its range,
+    or the message is too large."""
     if not is_valid_name(hello.name):
         raise MessageError(f"actor name {hello.name!r}: use 1 to 48 letters, digits, '_', '-' or '.'")
     _check_hello(hello)
@@ -155,7 +160,8 @@ def encode_hello(hello: Hello) -> bytes:
 
 
 def decode_hello(payload: bytes) -> Hello:
-    """Decode a hello; :class:`MessageError`, or :class:`WrongVersion` for another protocol version."""
+    """Decode a hello. Raises :class:`WrongVersion` for another protocol version, and :class:`MessageError` if the hello
+    is invalid."""
     hello = unpack(payload, HELLO, "greeting", _hello_decoder)
     if not is_valid_name(hello.name):
         raise MessageError(f"greeting of an actor named {hello.name[:60]!r}")
@@ -166,7 +172,8 @@ def decode_hello(payload: bytes) -> Hello:
 
 
 def _check_hello(hello: Hello) -> None:
-    """Raise :class:`MessageError` unless the kind exists and every number is in its range."""
+    """Raise :class:`MessageError` unless the kind of actor exists, the outfit is a name, and each number is in its
+    range."""
     if hello.kind not in ACTOR_KINDS:
         raise MessageError(f"greeting of {hello.name!r} with kind {hello.kind[:60]!r}, not {', '.join(ACTOR_KINDS)}")
     if hello.outfit and not is_valid_name(hello.outfit):
@@ -189,19 +196,20 @@ def encode_welcome(welcome: Welcome) -> bytes:
 
 
 def decode_welcome(payload: bytes) -> Welcome:
-    """Decode a welcome; :class:`WrongVersion` from a server of another protocol version."""
+    """Decode a welcome. Raises :class:`WrongVersion` if the server has another protocol version."""
     return unpack(payload, WELCOME, "welcome", _welcome_decoder)
 
 
 def encode_claims(claims: list[tuple[int, Claim, bool]]) -> bytes:
-    """Encode claims: (object id, claim, whether the owner is in contact with the object)."""
+    """Encode claims, each given as (object id, claim, whether the owner is in contact with the object)."""
     return pack(CLAIMS, [(int(object_id), *claim, touching) for object_id, claim, touching in claims])
 
 
 def decode_claims(payload: bytes, counts: tuple[int, ...] | None = None) -> list[tuple[int, Claim, bool]]:
-    """Decode claims and check each: object id, u16 sequences, a valid owner name or none.
+    """Decode claims: (object id, claim, whether the owner is in contact with the object).
 
-    ``counts``: number of objects of each kind in the scene.
+    Checks each object id, sequence number (u16) and owner name. ``counts``: number of objects of each kind in the
+    scene; None: unknown.
     """
     rows = unpack(payload, CLAIMS, "claims", _claims_decoder)
     if len(rows) > MAX_TREES:
@@ -224,8 +232,8 @@ def encode_records(records: list[RetainedRecord]) -> bytes:
 def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> list[RetainedRecord]:
     """Decode retained records and check ids, sequences, names, poses and sizes.
 
-    ``counts``: number of objects of each kind in the scene, if known. Records of trees are not checked against the
-    model.
+    ``counts``: number of objects of each kind in the scene; None: unknown. Whether the states of trees fit the model is
+    not checked here.
     """
     records = unpack(payload, RETAINED, "retained records", _records_decoder)
     if len(records) > MAX_RECORDS:
@@ -245,20 +253,20 @@ def decode_records(payload: bytes, counts: tuple[int, ...] | None = None) -> lis
 
 
 class ClockMessage(NamedTuple):
-    """A question for the server's clock, or its reply."""
+    """A query for the time of the world, or the server's reply to it."""
 
     asked: float
-    """Real time of the client's clock when it asked [s]; the reply repeats it."""
+    """Real time of the client's clock when it sent the query [s]; the reply repeats it."""
     world: float = 0.0
     """Time of the world when the server replied [s]."""
     factor: float = 1.0
-    """How many times as fast as real time the world's time passes then."""
+    """Real-time factor of the world when the server replied."""
     real: float = 0.0
     """Real time of the server's clock when it replied [s]."""
     cause: str = ""
-    """What limits the factor; empty if nothing does."""
+    """Text that names what limits the factor, like "picker: sensors"; empty if nothing limits it."""
     report: PaceReport | None = None
-    """In a question: how fast the client can follow; None of a client that slows no world."""
+    """In a query: how fast the client can simulate. None if the client does not simulate, and in replies."""
 
 
 def encode_time(
@@ -269,8 +277,8 @@ def encode_time(
     cause: str = "",
     report: PaceReport | None = None,
 ) -> bytes:
-    """Encode a :class:`ClockMessage`. ``real``: the ``world``'s time unless given, as in a world that runs in real
-    time."""
+    """Encode the fields of a :class:`ClockMessage`. ``real`` is by default equal to ``world``, as in a world that runs
+    in real time."""
     real = world if real is None else real
     return pack(
         CLOCK,
@@ -279,18 +287,20 @@ def encode_time(
 
 
 def _plain(report: PaceReport) -> tuple[float, float, str]:
+    """Returns a report as built-in values that msgpack can encode."""
     return float(report.time), float(report.factor), report.cause[:MAX_CAUSE]
 
 
 def decode_time(payload: bytes) -> ClockMessage:
-    """Decode a question or a reply of the clock; all numbers are finite, and factors possible."""
+    """Decode a query of the clock or a reply. Raises :class:`MessageError` unless all numbers are finite and in
+    range."""
     asked, world, factor, real, cause, report = unpack(payload, CLOCK, "clock", _time_decoder)
     if not all(map(math.isfinite, (asked, world, real, *(report or ())[:2]))):
         raise MessageError(f"clock message ({asked}, {world}, {real}) that is not finite")
     if not MIN_FACTOR <= factor <= 1.0:
         raise MessageError(f"clock message with the real-time factor {factor}, from {MIN_FACTOR:g} to 1")
     if report is not None and report[1] < 0.0:
-        raise MessageError(f"clock message of a client that follows the real-time factor {report[1]}, which is below 0")
+        raise MessageError(f"clock message with the report of a real-time factor of {report[1]}, which is below 0")
     if max(len(cause), len(report[2]) if report else 0) > MAX_CAUSE:
         raise MessageError(f"clock message with a cause of more than {MAX_CAUSE} letters")
     return ClockMessage(asked, world, factor, real, cause, None if report is None else PaceReport(*report))
@@ -315,7 +325,7 @@ HELLO_FIELDS = {
 
 
 def describe_hello(payload: bytes, _: str) -> dict[str, Any]:
-    """A hello for JSON."""
+    """Decode a hello for the JSON of a recording."""
     return msgspec.to_builtins(decode_hello(payload))
 
 
@@ -324,7 +334,7 @@ CLAIMS_FIELDS = {"claims": list_of(object_of("claim", "who says to own a thing",
 
 
 def describe_claims(payload: bytes, _: str) -> dict[str, Any]:
-    """Claims for JSON."""
+    """Decode claims for the JSON of a recording."""
     return {
         "claims": [
             {
@@ -350,7 +360,7 @@ RECORDS_FIELDS = {
 
 
 def describe_records(payload: bytes, _: str) -> dict[str, Any]:
-    """Retained records for JSON."""
+    """Decode retained records for the JSON of a recording."""
     return {
         "facts": [
             {

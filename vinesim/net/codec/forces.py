@@ -1,7 +1,7 @@
-"""Wire formats of forces that an actor applies to what another client simulates: wrenches, and virtual couplings.
+"""Wire formats of forces on objects that another client simulates: wrenches, and virtual couplings.
 
-Wrenches are those of a person's hands on the links of a robot. Couplings are the forces on bodies of trees that another
-actor owns, as springs.
+A wrench is the force and moment of a person's hands on one link of a robot. A coupling is the force of an actor on one
+body of a tree that another actor owns, sent as a spring.
 """
 
 from __future__ import annotations
@@ -17,30 +17,33 @@ from vinesim.net.codec.json_values import COUNT, NUMBER, TEXT, list_of, object_o
 
 WRENCHES = 7
 COUPLINGS = 8
-"""Kinds of the messages."""
+"""Numbers of the kinds of messages, the fourth byte of each message."""
 
 MAX_WRENCH = 2000.0
-"""Largest component of a wrench [N, N m]; a message with a larger one is refused. GUESSED."""
+"""Largest magnitude of a component of a wrench [N, N m]. A message with a larger one is refused. GUESSED."""
 
 MAX_LINKS = 64
-"""Links of one robot in one message."""
+"""Largest number of links in one message of wrenches."""
 
 _WRENCH = struct.Struct("<6f")
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class WrenchMessage:
-    """Mean wrenches of one person on the links of one robot over one sending period (1/60 s)."""
+    """Wrenches of one person on the links of one robot, each averaged over one sending period (1/60 s)."""
 
     time: float
     """Network time [s]."""
     wrenches: dict[str, np.ndarray]
-    """Link name: force [N] and moment about its centre of mass [N m], world axes [6]. Empty: the contact has ended."""
+    """By link name: force [N] and moment about the link's centre of mass [N m], world axes [6]. Empty: the contact
+    ended."""
 
 
 def encode_wrenches(message: WrenchMessage) -> bytes:
-    """Encode wrenches: 14 bytes, and for each link 25 bytes and its name. Raises :class:`MessageError` beyond the
-    limits."""
+    """Encode wrenches in 14 bytes and, for each link, 25 bytes and the link's name.
+
+    Raises :class:`MessageError` for too many links, too long a name, or a wrench that is too large or not finite.
+    """
     if len(message.wrenches) > MAX_LINKS:
         raise MessageError(f"wrenches on {len(message.wrenches)} links, at most {MAX_LINKS}")
     payload = [pack_header(WRENCHES, len(message.wrenches), message.time)]
@@ -53,7 +56,7 @@ def encode_wrenches(message: WrenchMessage) -> bytes:
 
 
 def decode_wrenches(payload: bytes) -> WrenchMessage:
-    """Decode wrenches and check every number; whether the robot has such links is for the caller to check."""
+    """Decode wrenches and check every number. The caller has to check that the robot has these links."""
     count, time = unpack_header(payload, WRENCHES, "wrenches")
     if count > MAX_LINKS:
         raise MessageError(f"wrenches on {count} links, at most {MAX_LINKS}")
@@ -90,47 +93,48 @@ WRENCHES_FIELDS = {
 
 
 def describe_wrenches(payload: bytes, _: str) -> dict[str, Any]:
-    """Wrenches for JSON."""
+    """Decode wrenches for the JSON of a recording."""
     wrenches = decode_wrenches(payload).wrenches
     return {"links": [{"link": link, "wrench": wrench.tolist()} for link, wrench in sorted(wrenches.items())]}
 
 
 MAX_COUPLINGS = 8
-"""Couplings in one message: bodies of one owner's trees that one actor touches."""
+"""Largest number of couplings in one message, one for each body that the actor touches."""
 
 MAX_LEVER = 10.0
-"""Farthest point of a body from its origin [m]."""
+"""Largest coordinate of a coupling's point in the frame of its body [m]."""
 
 _COUPLING = np.dtype([("body", "<u4"), ("point", "<f4", 3), ("anchor", "<f4", 3)])
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Coupling:
-    """Force of an actor on one body of a tree that another client owns, as a spring of fixed stiffness.
+    """Force of an actor on one body of a tree that another client owns, sent as the anchor of a spring.
 
-    Where both clients hold the body at the same place the spring pulls with just the force of the contact.
+    The stiffness of the spring is fixed. If the body is at the same place in both simulations, the spring pulls with
+    the force of the actor's contact.
     """
 
     body: int
-    """Plant body in the model."""
+    """Index of the plant body in the model."""
     point: np.ndarray
-    """[3] m where the force acts, in the body's frame."""
+    """Point [3] m at which the spring is attached, in the body's frame."""
     anchor: np.ndarray
-    """[3] m where the spring pulls that point, world."""
+    """Position [3] m to which the spring pulls ``point``, in the world."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CouplingMessage:
-    """All couplings of one actor to the trees of one owner."""
+    """All couplings of one actor to the trees that one other actor owns."""
 
     time: float
     """Network time [s]."""
     couplings: tuple[Coupling, ...]
-    """In increasing order of bodies; empty: the contact has ended."""
+    """The couplings, in increasing order of ``body``. Empty: the contact ended."""
 
 
 def encode_couplings(message: CouplingMessage) -> bytes:
-    """Encode couplings: 14 bytes, and 28 for each. Raises :class:`MessageError` beyond the limits."""
+    """Encode couplings in 14 bytes and 28 for each coupling. Raises :class:`MessageError` if they are invalid."""
     rows = np.zeros(len(message.couplings), _COUPLING)
     for row, coupling in zip(rows, message.couplings, strict=True):
         row["body"], row["point"], row["anchor"] = coupling.body, coupling.point, coupling.anchor
@@ -139,11 +143,11 @@ def encode_couplings(message: CouplingMessage) -> bytes:
 
 
 def decode_couplings(payload: bytes) -> CouplingMessage:
-    """Decode couplings and check every number; whether there are such bodies is for the caller to check."""
+    """Decode couplings and check every number. The caller has to check that the model has these bodies."""
     count, time = unpack_header(payload, COUPLINGS, "couplings")
     if len(payload) != HEADER.size + count * _COUPLING.itemsize:
         raise MessageError(f"{count} couplings in {len(payload)} B")
-    with np.errstate(invalid="ignore"):  # of signalling NaNs, which are refused below
+    with np.errstate(invalid="ignore"):  # signalling NaNs would warn; they are refused below
         rows = np.frombuffer(payload, _COUPLING, count, HEADER.size)
         _check_couplings(rows)
         points = rows["point"].astype(float)
@@ -152,6 +156,7 @@ def decode_couplings(payload: bytes) -> CouplingMessage:
 
 
 def _check_couplings(rows: np.ndarray) -> None:
+    """Raise :class:`MessageError` unless couplings, as rows of their wire format, are within all limits."""
     if len(rows) > MAX_COUPLINGS:
         raise MessageError(f"{len(rows)} couplings, at most {MAX_COUPLINGS}")
     if not ((np.abs(rows["point"]) <= MAX_LEVER).all() and (np.abs(rows["anchor"]) < MAX_COORDINATE).all()):
@@ -175,7 +180,7 @@ COUPLINGS_FIELDS = {
 
 
 def describe_couplings(payload: bytes, _: str) -> dict[str, Any]:
-    """Couplings for JSON."""
+    """Decode couplings for the JSON of a recording."""
     return {
         "couplings": [
             {"body": one.body, "point": one.point.tolist(), "anchor": one.anchor.tolist()}

@@ -1,8 +1,8 @@
 """Header of every network message: protocol version and kind, and for frequent kinds a count and a time; errors.
 
-Every message starts with four bytes: ``VS``, the protocol version, the kind
-(:data:`vinesim.net.codec.messages.MESSAGES` lists all). Kinds that are sent often go on with a u16 count and the
-network time as f64, little-endian (:data:`HEADER`); rare kinds continue in msgpack. A decoder raises
+Every message starts with four bytes: ``VS``, the protocol version and the kind
+(:data:`vinesim.net.codec.messages.MESSAGES` lists all kinds). In messages of frequent kinds a u16 count and the network
+time as f64 follow, little-endian (:data:`HEADER`). Messages of rare kinds continue in msgpack. A decoder raises
 :class:`MessageError` and nothing else for a message that is malformed, truncated, too large, of another version or not
 finite.
 """
@@ -18,20 +18,22 @@ PROTOCOL = 7
 MAGIC = b"VS"
 
 MAX_DATAGRAM = 1100
-"""Largest message of an unreliable stream [B], so that it fits one UDP datagram; a single large tree may exceed it."""
+"""Largest size of a best-effort message [B], so that it fits one UDP datagram. A single large tree may exceed this."""
 
 MAX_MESSAGE = 1 << 20
-"""Largest message that is decoded [B]; a larger one is refused unread."""
+"""Largest size of a message that is decoded [B]. Larger messages are refused unread."""
 
 MAX_COORDINATE = 1e5
-"""Magnitude that positions stay below [m]."""
+"""Bound for the magnitude of each coordinate of a position [m]. Messages with larger ones are refused."""
 
 LARGEST_COORDINATE = MAX_COORDINATE - 1.0
-"""Positions are clipped to this magnitude before they are sent [m]. Without the margin an actor could accept an object
-near the bound and move it beyond, and all others would refuse it."""
+"""Magnitude to which the coordinates of positions are clipped before they are sent [m].
 
-HEADER = struct.Struct("<2sBBHd")  # magic, version, kind, count, time
-"""Magic, version, kind, count, time [s]: 14 bytes."""
+The margin to :data:`MAX_COORDINATE` is needed: without it an actor could accept an object near the bound and move it
+beyond, and all other actors would refuse the new state."""
+
+HEADER = struct.Struct("<2sBBHd")
+"""Header of a message of a frequent kind: magic bytes, version, kind, count, network time [s]; 14 bytes."""
 
 
 class MessageError(ValueError):
@@ -39,7 +41,7 @@ class MessageError(ValueError):
 
 
 class WrongVersion(MessageError):
-    """The message has another protocol version, ``theirs``."""
+    """A message has another protocol version than this program. ``theirs``: that version."""
 
     def __init__(self, theirs: int) -> None:
         super().__init__(f"message of protocol version {theirs}, this program speaks {PROTOCOL}: use the same release")
@@ -47,16 +49,16 @@ class WrongVersion(MessageError):
 
 
 def pack_header(kind: int, count: int, time: float) -> bytes:
-    """Header of a timestamped message; :class:`MessageError` if ``time`` [s] is not finite."""
+    """Encode the header of a message with a ``time`` [s]. Raises :class:`MessageError` if the time is not finite."""
     if not math.isfinite(time):
         raise MessageError(f"time {time} is not finite")
     return HEADER.pack(MAGIC, PROTOCOL, kind, count, time)
 
 
 def kind_of(payload: bytes) -> int:
-    """Check the size and the first four bytes of a message and return its kind (perhaps one that is unknown).
+    """Check the size and the first four bytes of a message and return its kind, which may be unknown to this program.
 
-    Raises :class:`MessageError`, or :class:`WrongVersion` for another protocol version.
+    Raises :class:`WrongVersion` for another protocol version, and :class:`MessageError` for other faults.
     """
     if len(payload) > MAX_MESSAGE:
         raise MessageError(f"message of {len(payload)} B, at most {MAX_MESSAGE} B are read")
@@ -70,7 +72,11 @@ def kind_of(payload: bytes) -> int:
 
 
 def unpack_header(payload: bytes, kind: int, name: str) -> tuple[int, float]:
-    """Count and time [s] of a timestamped message; :class:`MessageError` if it is not of ``kind`` (called ``name``)."""
+    """Return count and time [s] of a message of a frequent ``kind``; raise :class:`MessageError` if it is of another
+    kind.
+
+    ``name``: what to call messages of this kind in the error.
+    """
     if (found := kind_of(payload)) != kind:
         raise MessageError(f"message of kind {found} where {name} (kind {kind}) was expected")
     if len(payload) < HEADER.size:
@@ -82,5 +88,6 @@ def unpack_header(payload: bytes, kind: int, name: str) -> tuple[int, float]:
 
 
 def is_valid_name(name: str) -> bool:
-    """Whether a name can be one chunk of a Zenoh key: 1 to 48 ASCII letters, digits, ``_``, ``-`` or ``.``."""
+    """Whether a name can be one chunk of a Zenoh key: 1 to 48 characters of ASCII letters, digits, ``_``, ``-``,
+    ``.``."""
     return 1 <= len(name) <= 48 and all(c.isascii() and (c.isalnum() or c in "_-.") for c in name)

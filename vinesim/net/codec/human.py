@@ -1,9 +1,9 @@
 """Wire format of a person's pose, and encoding of any actor's pose.
 
-A person is transmitted as the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet,
-the flexion of ten fingers, six flags, the intention and the velocities of all points: always 162 bytes. Positions
-except the root are relative to the root in steps of 0.2 mm, up to 6.5 m; rotations are rotation vectors of 3 i16;
-velocities are i8 of two scales of the message.
+A person's pose consists of the root, the tracked points (head, two hands; CANOPIES D6.4, section 5.3), hips and feet,
+the flexion of ten fingers, six flags, the intention, and the velocities of all points: always 162 bytes. All positions
+but the root's are relative to the root, in steps of 0.2 mm, up to 6.5 m. Rotations are rotation vectors of 3 i16.
+Velocities are i8, in steps of two scales that the message states: one for linear, one for angular velocities.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ from vinesim.net.codec.rotation import TURN_LSB, quaternion, rotation_vector
 from vinesim.scene.values import INTENTIONS, POINT_NAMES, HumanPose, HumanUpdate, RobotUpdate
 
 HUMAN = 6
-"""Kind of the message."""
+"""Number of the kind of message with a person's pose, the fourth byte of the message."""
 
 POSITION_LSB = 2e-4
-"""Quantisation step of a position relative to the root [m]; clipped at 6.5 m."""
+"""Quantisation step of a position relative to the root [m]. Positions are clipped at 6.5 m."""
 
 VELOCITY_LSB = 1e-5
-"""Quantisation step of the two velocity scales [m/s, rad/s]; velocities are clipped at 83."""
+"""Quantisation step of the scales of linear and angular velocity [m/s, rad/s]. Velocities are clipped at 83."""
 
 FINGER_SCALE = 255.0
-"""Quantisation steps from a straight finger (0) to a fully bent one (1)."""
+"""Number of quantisation steps from a straight finger (0) to a fully bent one (1)."""
 
 MAX_REACH = 2.5
-"""Farthest head, hand or foot from the hips [m]: a person of 2.2 m reaches 1.5 m. GUESSED."""
+"""Largest distance of head, hands and feet from the hips [m]. A person of 2.2 m reaches 1.5 m. GUESSED."""
 
 MAX_SPEED = 40.0
-"""Fastest point of a person [m/s]; the hand of one who throws reaches 25 m/s. GUESSED."""
+"""Largest speed of a point of a person [m/s]. The hand of a person that throws reaches 25 m/s. GUESSED."""
 
 _POINTS = len(POINT_NAMES)
 _HIPS = POINT_NAMES.index("hips")
@@ -55,12 +55,12 @@ _FLAGS = ("left_closed", "right_closed", "left_busy", "right_busy", "left_shears
 
 
 def encode_pose(update: RobotUpdate | HumanUpdate) -> bytes:
-    """Encode the pose of any actor; inverse of :func:`decode_pose`."""
+    """Encode the pose of a robot, a person or a spectator. Inverse of :func:`decode_pose`."""
     return encode_human(update) if isinstance(update, HumanUpdate) else robot.encode_robot(update)
 
 
 def decode_pose(payload: bytes, actor: str) -> RobotUpdate | HumanUpdate:
-    """Decode the pose of ``actor``, a name that is taken from the key, never from the payload."""
+    """Decode the pose of a robot, a person or a spectator. ``actor``: name of the actor, which the key states."""
     human = kind_of(payload) == HUMAN
     return decode_human(payload, actor) if human else robot.decode_robot(payload, actor)
 
@@ -79,7 +79,7 @@ POSE_FIELDS = {
 
 
 def describe_pose(payload: bytes, _: str) -> dict[str, Any]:
-    """The pose of a robot or of a person for JSON."""
+    """Decode the pose of any actor for the JSON of a recording."""
     update = decode_pose(payload, "")
     here = {"frame_id": "map", "pose": pose_value(update.base_q)}
     if isinstance(update, HumanUpdate):
@@ -94,8 +94,8 @@ def describe_pose(payload: bytes, _: str) -> dict[str, Any]:
 
 
 def encode_human(update: HumanUpdate) -> bytes:
-    """Encode a person's pose; :class:`MessageError` for wrong shapes, values that are not finite, or no unit
-    quaternion."""
+    """Encode a person's pose. Raises :class:`MessageError` for wrong shapes, values that are not finite, quaternions
+    that are not of unit length, and an unknown intention."""
     points = update.pose.points
     velocity = np.asarray(update.velocity, float)
     fingers = (*update.pose.left_fingers, *update.pose.right_fingers)
@@ -132,7 +132,7 @@ def encode_human(update: HumanUpdate) -> bytes:
 
 
 def decode_human(payload: bytes, actor: str) -> HumanUpdate:
-    """Decode a person's pose; :class:`MessageError` if that is impossible."""
+    """Decode the pose of the person ``actor``. Raises :class:`MessageError` if the message is invalid."""
     count, time = unpack_header(payload, HUMAN, "human pose")
     if count != _POINTS or len(payload) != HEADER.size + _HUMAN.size:
         raise MessageError(
@@ -183,10 +183,10 @@ def decode_human(payload: bytes, actor: str) -> HumanUpdate:
 
 
 def quantise_pose(pose: HumanPose) -> HumanPose:
-    """A pose as every copy decodes it, bit by bit. Errors: positions 0.1 mm, rotations 0.003 degrees."""
+    """Returns a pose as all receivers decode it, bit by bit. Errors: positions 0.1 mm, rotations 0.003 degrees."""
     return decode_human(encode_human(HumanUpdate("", 0.0, pose, np.zeros((_POINTS, 6)))), "").pose
 
 
 def _to_integers(values: np.ndarray, limit: int) -> list[int]:
-    """Values rounded and clipped to whole numbers from ``-limit`` to ``limit``, flattened."""
+    """Round values, clip them to -``limit`` to ``limit``, and return them as a flat list."""
     return np.clip(np.rint(values), -limit, limit).astype(int).ravel().tolist()

@@ -1,7 +1,7 @@
-"""Values and schemas of JSON from which codecs compose what a recording says of a message.
+"""JSON values and JSON schemas of which codecs compose the description of a message in a recording.
 
-The text of the schemas is part of the file format. Poses carry the fields of ``foxglove.PoseInFrame``, so that Foxglove
-draws them.
+The text of the schemas is part of the file format. Poses have the fields of ``foxglove.PoseInFrame``, so that Foxglove
+can draw them.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from vinesim.scene.ids import ObjectKind, split_object_id
 
 
 def stamp(seconds: float) -> dict[str, int]:
-    """A time [s] in whole seconds and nanoseconds."""
+    """Returns a time [s] as a JSON object of whole seconds and nanoseconds."""
     nanoseconds = round(seconds * 1e9)
     return {"sec": nanoseconds // 1_000_000_000, "nsec": nanoseconds % 1_000_000_000}
 
 
 def pose_value(pose: np.ndarray) -> dict[str, dict[str, float]]:
-    """A pose [7] m, 1."""
+    """Returns a pose [7] (position in m, quaternion xyzw) as a JSON object."""
     x, y, z, qx, qy, qz, qw = pose.tolist()
     return {"position": {"x": x, "y": y, "z": z}, "orientation": {"x": qx, "y": qy, "z": qz, "w": qw}}
 
 
 def named(object_id: int) -> dict[str, Any]:
-    """Kind and index of an object."""
+    """Returns the kind and the index of an object as JSON fields."""
     kind, index = split_object_id(object_id)
     return {"kind": kind.name.lower(), "index": index}
 
 
 def object_of(title: str, description: str, **properties: Any) -> dict[str, Any]:
-    """Schema of an object."""
+    """Returns the JSON schema of an object with these properties, given as schemas by name."""
     return {"type": "object", "title": title, "description": description, "properties": properties}
 
 
 def list_of(items: Any, description: str = "") -> dict[str, Any]:
-    """Schema of a list."""
+    """Returns the JSON schema of a list. ``items``: schema of each item."""
     return {"type": "array", "items": items} | ({"description": description} if description else {})
 
 
@@ -54,4 +54,4 @@ _XYZ = object_of("position", "m, world axes", x=NUMBER, y=NUMBER, z=NUMBER)
 _XYZW = object_of("orientation", "unit quaternion", x=NUMBER, y=NUMBER, z=NUMBER, w=NUMBER)
 
 POSE = object_of("pose", "in the world, of a fact in its parent's frame", position=_XYZ, orientation=_XYZW)
-"""Schema of :func:`pose_value`."""
+"""JSON schema of what :func:`pose_value` returns."""

@@ -1,7 +1,7 @@
-"""Wire format of meshes in msgpack: questions for parts of one, and parts of one that an actor offers the server.
+"""Wire formats, in msgpack, for requests of meshes from the server and for meshes that an actor offers the server.
 
-Both go in parts of at most :data:`MAX_PART`, one question each. A mesh is named by its digest
-(:func:`vinesim.scene.triangles.digest_of`) alone.
+A mesh travels in parts of at most :data:`MAX_PART`, one query and one reply for each. Its only name is its digest
+(:func:`vinesim.scene.triangles.digest_of`).
 """
 
 from __future__ import annotations
@@ -15,25 +15,27 @@ from vinesim.scene.triangles import MAX_BYTES, is_digest
 MESH_PART = 19
 MESH_REQUEST = 20
 MESH_WANTED = 21
-"""Kinds of the messages."""
+"""Numbers of the kinds of messages, the fourth byte of each message."""
 
 MAX_PART = 64_000
-"""Largest part of a mesh in one message [B]."""
+"""Largest size of the part of a mesh in one message [B]."""
 
 
 class MeshPart(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """A part of a mesh: the server's reply to a :class:`MeshRequest`, or what an actor offers it."""
+    """A part of a mesh, which the server sends in reply to a :class:`MeshRequest`, or which an actor offers the
+    server."""
 
     digest: str
     size: int
-    """Of the whole mesh [B]; 0: the server has none of this digest."""
+    """Size of the whole mesh [B]; 0: the server has no mesh with this digest."""
     offset: int = 0
-    """Where ``data`` begins [B]."""
+    """Position of ``data`` in the mesh [B]."""
     data: bytes = b""
 
 
 class MeshRequest(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """Asks for the part of a mesh that begins at ``offset`` [B]; the key has its digest."""
+    """Request for the part of a mesh that begins at ``offset`` [B]. The key of the query contains the digest of the
+    mesh."""
 
     offset: int
 
@@ -42,18 +44,20 @@ class MeshWanted(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     """The server's reply to a :class:`MeshPart` that an actor offers."""
 
     offset: int
-    """Where the next part must begin [B]; the size of the mesh: the server has all of it."""
+    """Position in the mesh of the part that the actor shall send next [B]. Equal to the size of the
+    mesh if the server has all parts."""
     refused: str = ""
-    """Empty, or why the server does not take the mesh now."""
+    """Why the server does not take the mesh now; empty if it takes it."""
 
 
 def encode_part(part: MeshPart) -> bytes:
-    """Encode a part."""
+    """Encode a part of a mesh."""
     return pack(MESH_PART, part)
 
 
 def decode_part(payload: bytes) -> MeshPart:
-    """Decode a part that lies within a mesh of an allowed size; :class:`MessageError`."""
+    """Decode a part of a mesh. Raises :class:`MessageError` if the part is outside of the mesh, or anything is too
+    large."""
     part = unpack(payload, MESH_PART, "part of a mesh", _part_decoder)
     if not is_digest(part.digest):
         raise MessageError(f"part of a mesh with the digest {part.digest[:60]!r}")
@@ -65,12 +69,12 @@ def decode_part(payload: bytes) -> MeshPart:
 
 
 def encode_request(offset: int) -> bytes:
-    """Encode a request for the part that begins at ``offset`` [B]."""
+    """Encode a request for the part of a mesh that begins at ``offset`` [B]."""
     return pack(MESH_REQUEST, MeshRequest(offset))
 
 
 def decode_request(payload: bytes) -> int:
-    """The offset [B] of a request; :class:`MessageError`."""
+    """Decode a request for a part of a mesh. Returns its offset [B]; raises :class:`MessageError` if it is invalid."""
     offset = unpack(payload, MESH_REQUEST, "request for a mesh", _request_decoder).offset
     if not 0 <= offset <= MAX_BYTES:
         raise MessageError(f"request for a mesh from {offset} B on")
@@ -78,12 +82,12 @@ def decode_request(payload: bytes) -> int:
 
 
 def encode_wanted(wanted: MeshWanted) -> bytes:
-    """Encode the reply to an offer."""
+    """Encode the server's reply to a part that an actor offers."""
     return pack(MESH_WANTED, wanted)
 
 
 def decode_wanted(payload: bytes) -> MeshWanted:
-    """Decode the reply to an offer; :class:`MessageError`."""
+    """Decode the server's reply to a part that an actor offers. Raises :class:`MessageError` if it is invalid."""
     wanted = unpack(payload, MESH_WANTED, "reply to an offered mesh", _wanted_decoder)
     if not 0 <= wanted.offset <= MAX_BYTES:
         raise MessageError(f"reply that asks for a mesh from {wanted.offset} B on")

@@ -1,10 +1,10 @@
-"""Every kind of network message, every family of keys, and the counters of both: one row for each.
+"""Tables of all kinds of network messages and of all families of keys, and the traffic counters.
 
-:data:`MESSAGES` says for each kind under which keys it travels, and how a recording describes it. :data:`FAMILIES` says
-for each family of keys whose keys they are, who may publish under them, and where they are counted and recorded. The
-formats themselves stand in the modules beside this one: ``robot``, ``human``, ``trees``, ``objects``, ``forces`` and
-``voice`` hold packed binary messages that travel many times a second; ``control`` and ``meshes`` hold the rare messages
-in msgpack.
+A row of :data:`MESSAGES` names the keys under which messages of a kind travel, and the function that describes them in
+a recording. A row of :data:`FAMILIES` has the key patterns of a family, who may publish under them, and where their
+messages are counted and recorded. The formats are defined in the other modules of this package. ``robot``, ``human``,
+``trees``, ``objects``, ``forces`` and ``voice`` are packed binary messages that are sent many times a second.
+``control`` and ``meshes`` are rare messages in msgpack.
 """
 
 from __future__ import annotations
@@ -24,18 +24,19 @@ from vinesim.net.codec.json_values import TIME, YES, object_of, stamp
 
 
 class Message(NamedTuple):
-    """A kind of message."""
+    """A kind of network message: a row of :data:`MESSAGES`."""
 
     kind: int
-    """Fourth byte of the message."""
+    """Number of the kind, the fourth byte of each of its messages."""
     families: tuple[str, ...]
-    """First chunks of the keys under which it travels."""
+    """Names of the families of keys under which messages of this kind travel."""
     has_time: bool = False
-    """Whether its header holds the network time [s] at which the content was sampled."""
+    """Whether the header contains the network time [s] at which the content was sampled."""
     describe: Callable[[bytes, str], dict[str, Any]] | None = None
-    """What a message under a key says, for JSON; raises ValueError if it cannot be decoded. None: not recorded."""
+    """Function of payload and key that decodes a message for the JSON of a recording, and raises ValueError if it
+    cannot. None: a recording has only the bytes of the message."""
     fields: Mapping[str, Any] = {}
-    """JSON schemas of what ``describe`` returns. Their text is part of the file format."""
+    """JSON schemas of the fields that ``describe`` returns. Their text is part of the file format."""
 
 
 _ROWS = (
@@ -57,29 +58,31 @@ _ROWS = (
 )
 
 MESSAGES = {row.kind: row for row in _ROWS}
-"""By kind."""
+"""All kinds of messages, by number."""
 
 assert len(MESSAGES) == len(_ROWS), "two kinds of messages have the same number"
 
 
 class Family(NamedTuple):
-    """Keys of a world, relative to its prefix, that begin with the same chunk; ``docs/network.md`` explains each."""
+    """A family of keys: all keys that begin with the same chunk after the world's prefix. ``docs/network.md`` lists
+    them."""
 
     keys: tuple[str, ...]
-    """Patterns of all its keys: ``{actor}`` is the name of the actor that publishes, ``*`` any chunk."""
+    """Patterns of the keys. ``{actor}`` stands for the name of the actor that publishes, ``*`` for any chunk."""
     traffic: str
-    """Field of :class:`Counters` in which its messages are counted."""
+    """Field of :class:`Counters` that counts the messages under these keys."""
     schema: str = "vinesim.Message"
     purpose: str = ""
-    """Name and description of the JSON schema of its messages."""
+    """Name (``schema``) and description (``purpose``) of the JSON schema of the messages under these keys."""
     recorded_with: str = ""
-    """Choice of ``vinesim record --only`` that records it; empty: none does, or the recorder asks for it always."""
+    """Value of ``vinesim record --only`` that selects this family; empty: the family is recorded always or never."""
     is_published: bool = True
-    """Whether actors publish under it. If not, its messages reply to queries or are made by a recorder."""
+    """Whether actors publish under these keys. If not, the messages are replies to queries, or a recorder makes
+    them."""
     is_reliable: bool = False
-    """Whether it is published in order and without loss."""
+    """Whether messages under these keys are sent reliably, in order and without loss."""
     by_spectators: bool = False
-    """Whether spectators publish under it, too."""
+    """Whether spectators publish under these keys, too."""
 
 
 FAMILIES = {
@@ -125,13 +128,13 @@ FAMILIES = {
         ("live/{actor}", "live/{actor}/*"), "control", "vinesim.Live", "An actor came or went.", is_published=False
     ),
 }
-"""By first chunk: all families that are published or recorded."""
+"""All families of keys that are published or recorded, by the first chunk of their keys."""
 
 _OTHER = Family((), "event")
 
 
 def family_of(key: str) -> Family:
-    """The family of a key."""
+    """Returns the family of a key; for an unknown key, one that is counted as events."""
     return FAMILIES.get(key.partition("/")[0], _OTHER)
 
 
@@ -141,7 +144,7 @@ _OF_NO_ACTOR = frozenset(name for name, family in FAMILIES.items() if "{actor}" 
 
 
 def sender_of(key: str) -> str:
-    """Name of the actor that published under a key; empty for the server and for a key that names no actor."""
+    """Returns the name of the actor that published under a key; empty for the server and for keys without an actor."""
     family, *rest = key.split("/")
     if not rest or family in _OF_NO_ACTOR:
         return ""
@@ -152,7 +155,7 @@ def sender_of(key: str) -> str:
 
 
 def time_of(payload: bytes) -> float | None:
-    """Network time [s] in the header of a message; None if its kind has none."""
+    """Returns the network time [s] in the header of a message; None if this kind of message has no time."""
     row = MESSAGES.get(kind_of(payload))
     if row is None or not row.has_time or len(payload) < HEADER.size:
         return None
@@ -161,7 +164,7 @@ def time_of(payload: bytes) -> float | None:
 
 
 def shift_time(payload: bytes, shift: float) -> bytes:
-    """Copy of a message with ``shift`` [s] added to its time; the message itself if its kind has no time."""
+    """Returns a message with ``shift`` [s] added to its time, or unchanged if this kind of message has no time."""
     time = time_of(payload)
     return (
         payload
@@ -180,7 +183,7 @@ _COMMON = {
 
 
 def schema_of(key: str) -> tuple[str, bytes]:
-    """Name and JSON schema of the messages under a key."""
+    """Returns the name and the JSON schema of the messages under a key, for a recording."""
     name = key.partition("/")[0]
     family = family_of(key)
     fields: dict[str, Any] = {"live": YES} if name == "live" else {}
@@ -191,8 +194,11 @@ def schema_of(key: str) -> tuple[str, bytes]:
 
 
 def describe_message(key: str, payload: bytes) -> dict[str, Any]:
-    """The JSON object of one message, with its bytes in base64 under ``raw``; of undecodable bytes only those and the
-    error."""
+    """Returns the JSON object that describes a message in a recording.
+
+    ``raw`` contains the bytes of the message in base64. For a message that cannot be decoded, ``error`` contains the
+    reason instead of the content.
+    """
     raw = base64.b64encode(payload).decode()
     actor = sender_of(key)
     if key.startswith("live/"):
@@ -204,7 +210,7 @@ def describe_message(key: str, payload: bytes) -> dict[str, Any]:
         described = row.describe(payload, key)
         time = time_of(payload)
         return {"actor": actor, **({} if time is None else {"timestamp": stamp(time)}), **described, "raw": raw}
-    except ValueError as error:  # a key that names no cell among them
+    except ValueError as error:  # also raised for a key without a cell
         return {"actor": actor, "error": str(error), "raw": raw}
 
 
@@ -213,7 +219,7 @@ def describe_message(key: str, payload: bytes) -> dict[str, Any]:
 
 @dataclasses.dataclass(slots=True)
 class Traffic:
-    """Messages and payload bytes of one family of keys, each way."""
+    """Number of messages and of payload bytes that were received and sent under some families of keys."""
 
     messages_in: int = 0
     bytes_in: int = 0
@@ -233,7 +239,7 @@ class Traffic:
 
 @dataclasses.dataclass(slots=True)
 class Counters:
-    """Traffic by family, and rejected messages."""
+    """Counters of one client's traffic and of messages that were rejected or lost."""
 
     actor: Traffic = dataclasses.field(default_factory=Traffic)
     """Poses of robots and humans."""
@@ -242,37 +248,37 @@ class Counters:
     event: Traffic = dataclasses.field(default_factory=Traffic)
     """Claims, corrections and states at rest."""
     retained: Traffic = dataclasses.field(default_factory=Traffic)
-    """Retained records: these leave even if no peer is near, because the server keeps them."""
+    """Retained records. They are sent even if no peer is near, because the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
-    """Wrenches of hands on robots of other clients, and couplings of two actors to one tree."""
+    """Wrenches of people's hands on robots of other clients, and couplings of two actors to one tree."""
     voice: Traffic = dataclasses.field(default_factory=Traffic)
-    """Frames of sound."""
+    """Frames of sound: voices, and loudspeakers of robots."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
     """Hellos, clock replies and snapshots (received only)."""
     malformed: int = 0
-    """Messages that could not be decoded."""
+    """Number of messages that could not be decoded."""
     dropped: int = 0
-    """Valid messages and states that were not used: outdated, of an unknown peer, too far away, or of a lesser claim.
-    """
+    """Number of valid messages and states that were not used, because they were outdated, from an unknown peer, about
+    an object too far away, or because a greater claim on the object is known."""
     wrenches_refused: int = 0
-    """Wrenches of peers on links that their hands do not reach, or that there are not."""
+    """Number of refused wrenches of peers: their hands do not reach the link, or the link does not exist."""
     wrenches_limited: int = 0
-    """Messages and steps whose wrenches were reduced to what hands can do."""
+    """Number of messages and steps in which wrenches were reduced to what hands can exert."""
 
     couplings_refused: int = 0
-    """Couplings of peers to trees that neither side owns, or that their arms do not reach."""
+    """Number of refused couplings of peers: neither side owns the tree, or the peer's arms do not reach it."""
 
     foreign: int = 0
-    """Messages and answers that the bus dropped: of a session that does not hold the name they came under."""
+    """Number of messages and replies that the bus dropped because their session does not hold the name in their key."""
     lost: int = 0
-    """Received samples that the bus discarded: its store was full, or the sample too large."""
+    """Number of received samples that the bus discarded because its store was full or the sample too large."""
     network_failures: int = 0
-    """Puts, declarations and queries of the bus that the network refused."""
+    """Number of puts, declarations and queries that the network refused."""
 
     def of(self, family: str) -> Traffic:
-        """Traffic of a family of keys."""
+        """Returns the counters for a family of keys, given by the first chunk of its keys."""
         return getattr(self, FAMILIES[family].traffic)
 
     def to_report(self) -> dict[str, Any]:
-        """All counters under the keys of ``report.json``, where retained records are called ``fact``."""
+        """Returns all counters under the keys of ``report.json``, where :attr:`retained` is called ``fact``."""
         return {"fact" if name == "retained" else name: value for name, value in dataclasses.asdict(self).items()}

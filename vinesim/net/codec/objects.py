@@ -1,7 +1,7 @@
 """Wire format of moving rigid objects: boxes and free bunches, 26 bytes each, with positions relative to a cell.
 
-Position: 3 i16 in steps of 0.1 mm from the middle of the interest cell in the key. Rotation: 32 bits (error 0.28
-degrees). Linear and angular velocity: i8 with an exponent of two for each.
+Position: 3 i16 in steps of 0.1 mm from the middle of the interest cell that the key names. Rotation: 32 bits (error
+0.28 degrees). Linear and angular velocity: 3 i8 each, in steps of a power of two that the record states.
 """
 
 from __future__ import annotations
@@ -20,19 +20,20 @@ from vinesim.scene.ids import OBJECT_STRIDE, ObjectKind
 from vinesim.scene.values import ObjectUpdate
 
 OBJECTS = 5
-"""Kind of the message."""
+"""Number of the kind of message with states of boxes and bunches, the fourth byte of the message."""
 
 POSITION_LSB = 1e-4
-"""Quantisation step of a position in its cell [m]; beyond 3.2 m from :data:`CELL_ORIGIN_OFFSET` it is clipped."""
+"""Quantisation step of a position in its cell [m]. Positions are clipped at 3.2 m from the cell's origin."""
 
 CELL_ORIGIN_OFFSET = np.array([0.5 * CELL_SIZE, 0.5 * CELL_SIZE, 2.5])
-"""From a cell's lower corner on the ground to the origin of its quantised positions [3] m."""
+"""Vector [3] m from the lower corner of a cell on the ground to the origin of the quantised positions in the cell."""
 
 MIN_VELOCITY_LSB = np.array([2.0**-10, 2.0**-8])
-"""Smallest quantisation steps of velocity [m/s] and angular velocity [rad/s]; a record scales them by powers of two."""
+"""Smallest quantisation steps of linear [m/s] and angular velocity [rad/s]. A record scales each by a power of two."""
 
 MAX_EXPONENT = 9
-"""Largest such power: what is faster than 64 m/s or 254 rad/s is clipped. Twice as fast as anything that is thrown."""
+"""Largest exponent of two that scales a quantisation step of velocity. So velocities are clipped at 64 m/s and 254
+rad/s, twice the speed of anything that is thrown."""
 
 _OBJECT = np.dtype(
     [
@@ -56,20 +57,20 @@ class ObjectStates:
     time: float
     """Network time [s]."""
     object: np.ndarray
-    """[k] :func:`vinesim.scene.ids.object_id`"""
+    """[k] object ids, by :func:`vinesim.scene.ids.object_id`"""
     ownership: np.ndarray
-    """[k] u16 sequences"""
+    """[k] ownership sequences (u16) of the owner's claims"""
     authority: np.ndarray
-    """[k] u16 sequences"""
+    """[k] authority sequences (u16) of the owner's claims"""
     flags: np.ndarray
-    """[k] :data:`TOUCHED` or 0"""
+    """[k] :data:`TOUCHED` if the owner is in contact with the object, else 0"""
     pose: np.ndarray
-    """[k, 7] m, 1; world"""
+    """[k, 7] poses in the world: position [m], quaternion xyzw"""
     velocity: np.ndarray
-    """[k, 6] m/s, rad/s; of the origin, world axes"""
+    """[k, 6] velocities of the origins [m/s] and angular velocities [rad/s], world axes"""
 
     def updates(self, owner: str) -> list[ObjectUpdate]:
-        """One update per object; its arrays are views of this batch."""
+        """Returns one update per object. The arrays of an update are views of this batch's arrays."""
         columns = (self.object, self.ownership, self.authority)
         rows = zip(*(column.tolist() for column in columns), self.pose, self.velocity, strict=True)
         return [
@@ -79,7 +80,7 @@ class ObjectStates:
 
 
 def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], ObjectStates]:
-    """Encode objects that are published under ``cell``; return the messages and the batch as receivers decode it.
+    """Encode objects that are published under ``cell``. Returns the messages, and the batch as receivers decode it.
 
     A message has at most :data:`MAX_DATAGRAM` bytes. Raises :class:`MessageError` if ids do not increase or a value is
     not finite.
@@ -107,9 +108,9 @@ def encode_objects(objects: ObjectStates, cell: Cell) -> tuple[list[bytes], Obje
 
 
 def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
-    """Decode objects that were published under ``cell``; :class:`MessageError` if that is impossible.
+    """Decode objects that were published under ``cell``. Raises :class:`MessageError` if the message is invalid.
 
-    Whether the scene has such objects is for the caller to check (:func:`check_object_id`).
+    The caller has to check that the scene has these objects (:func:`check_object_id`).
     """
     count, time = unpack_header(payload, OBJECTS, "objects")
     if not 1 <= count <= MAX_TREES or len(payload) != HEADER.size + count * _OBJECT.itemsize:
@@ -126,6 +127,7 @@ def decode_objects(payload: bytes, cell: Cell) -> ObjectStates:
 
 
 def _read_objects(time: float, records: np.ndarray, cell: Cell) -> ObjectStates:
+    """Decode the valid records of a message about objects in ``cell``."""
     pose = np.empty((len(records), 7))
     pose[:, :3] = records["position"] * POSITION_LSB + _cell_origin(cell)
     pose[:, 3:] = unpack_quaternions(records["turn"])
@@ -145,7 +147,7 @@ OBJECTS_FIELDS = {
 
 
 def describe_objects(payload: bytes, key: str) -> dict[str, Any]:
-    """Objects for JSON; ValueError if the key names no cell."""
+    """Decode objects for the JSON of a recording. Raises ValueError if the key names no cell."""
     _, x, y, _ = key.split("/")
     objects = decode_objects(payload, (int(x), int(y)))
     return {
@@ -164,12 +166,15 @@ def describe_objects(payload: bytes, key: str) -> dict[str, Any]:
 
 
 def _cell_origin(cell: Cell) -> np.ndarray:
-    """Origin of the quantised positions of a cell [3] m, world."""
+    """Returns the origin of the quantised positions in a cell: a position [3] m in the world."""
     return np.array([cell[0] * CELL_SIZE, cell[1] * CELL_SIZE, 0.0]) + CELL_ORIGIN_OFFSET
 
 
 def check_object_id(object_id: int, counts: tuple[int, ...] | None = None) -> None:
-    """Raise :class:`MessageError` unless an object of this id can exist; ``counts``: number of objects of each kind."""
+    """Raise :class:`MessageError` unless an object with this id can exist.
+
+    ``counts``: number of objects of each kind in the scene; None: unknown.
+    """
     kind, index = divmod(object_id, OBJECT_STRIDE)
     if not 0 <= kind < len(ObjectKind):
         raise MessageError(f"object {object_id} is of no kind")

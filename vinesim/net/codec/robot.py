@@ -1,8 +1,8 @@
 """Wire format of a robot's pose: base pose and twist, joint positions and velocities.
 
-Base: position 3 f4 [m], rotation vector 3 i2, linear and angular velocity 6 i2, scale of joint velocities u2; pattern
-and colour of the lights 4 u1. Then all joint positions as i2, all joint velocities as i1 of that scale, and an f4 for
-each position that an i2 cannot hold.
+Base: position 3 f4 [m], rotation vector 3 i2, linear and angular velocity 6 i2; scale of the joint velocities u2;
+pattern and colour of the lights 4 u1. Then all joint positions as i2, all joint velocities as i1 in steps of the scale,
+and an f4 for each joint position that is too large for an i2.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quatern
 from vinesim.scene.values import LightPattern, Lights, RobotUpdate
 
 ROBOT = 1
-"""Kind of the message."""
+"""Number of the kind of message with a robot's pose, the fourth byte of the message."""
 
 JOINT_RATE_LSB = 1e-5
-"""Quantisation step of the scale of joint velocities [rad/s, m/s]; with i1 values joints reach 83 rad/s."""
+"""Quantisation step of the scale of joint velocities [rad/s, m/s]. The largest scale encodes up to 83 rad/s or m/s."""
 
 JOINT_POSITION_LSB = 2e-4
 """Quantisation step of a joint position [rad, m]."""
 
 BASE_VELOCITY_LSB = 1e-3
-"""Quantisation step of base velocities [m/s, rad/s]; beyond 32.7 they are clipped."""
+"""Quantisation step of base velocities [m/s, rad/s]. Velocities are clipped at 32.7."""
 
 MAX_JOINTS = 256
-"""Joints of one robot."""
+"""Largest number of joints of one robot."""
 
 _BASE = struct.Struct("<3f3h6hH4B")  # position, turn, velocity, scale of joint velocities, lights; then joints
 
 _PATTERNS = frozenset(map(int, LightPattern))
 
 _SOUND = 128
-"""Added to a pattern of lights that sounds."""
+"""Flag that is added to the pattern of lights if the lights have a sound."""
 
-_OUT_OF_RANGE = -32768  # a joint position that no i2 holds; it follows as f4
-"""Marks a joint position that i2 cannot hold; it follows as f4."""
+_OUT_OF_RANGE = -32768
+"""Value in place of a joint position that is too large for an i2. The position follows as f4."""
 
 
 def _to_lsb(values: list[float], unit: float) -> list[int]:
-    """Values in whole quantisation steps ``unit``, clipped to i16."""
+    """Returns values as whole numbers of quantisation steps of size ``unit``, clipped to i16."""
     return [min(max(round(value / unit), -32767), 32767) for value in values]
 
 
@@ -94,7 +94,10 @@ def encode_robot(update: RobotUpdate) -> bytes:
 
 
 def decode_robot(payload: bytes, actor: str) -> RobotUpdate:
-    """Decode the pose of ``actor``, a name that is taken from the key, never from the payload."""
+    """Decode a robot's pose. ``actor``: name of the robot, which the key states.
+
+    Raises :class:`MessageError` if the message is invalid.
+    """
     count, time = unpack_header(payload, ROBOT, "actor pose")
     joints = HEADER.size + _BASE.size
     rest = len(payload) - joints - 3 * count

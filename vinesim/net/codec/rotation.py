@@ -1,7 +1,7 @@
-"""Rotations as they are quantised on the wire: rotation vectors, and "smallest three" quaternions in 32 bits.
+"""Quantisation of rotations on the wire: rotation vectors, and "smallest three" quaternions in 32 bits.
 
-Quaternions are xyzw as in :mod:`vinesim.core.frames`. The conversions here repeat two of its functions without their
-checks, because they run for every moving joint in every step, and their bits are part of the wire format.
+Quaternions are xyzw as in :mod:`vinesim.core.frames`. Two conversions of that module are repeated here without checks,
+because they run for every moving joint in every step, and because their exact results are part of the wire format.
 
 Source of "smallest three": G. Fiedler, Snapshot Compression, Gaffer on Games 2015.
 """
@@ -13,17 +13,17 @@ import numpy as np
 from vinesim.net.codec.header import MessageError
 
 TURN_LSB = np.pi / 32767.0
-"""Quantisation step of a rotation vector component [rad]: i16 from -pi to pi, error 0.003 degrees."""
+"""Quantisation step of a component of a rotation vector [rad]: i16 for -pi to pi, error 0.003 degrees."""
 
 _MAX_ANGLE_SQUARED = (np.pi + 2.0 * TURN_LSB) ** 2
-"""Longest rotation vector, squared [rad^2]: half a turn and two steps of rounding."""
+"""Largest squared length of a rotation vector [rad^2]: half a turn and two quantisation steps for rounding."""
 
 _COMPONENT_STEPS = 1023.0 / np.sqrt(2.0)
-"""Steps per unit of the three smallest quaternion components: 10 bits from -1/sqrt(2) to 1/sqrt(2)."""
+"""Quantisation steps per unit of the three smallest components of a quaternion: 10 bits for -1/sqrt(2) to 1/sqrt(2)."""
 
 
 def rotation_vector(q: np.ndarray) -> np.ndarray:
-    """Rotation vectors [..., 3] rad of unit quaternions [..., 4], of at most half a turn."""
+    """Convert unit quaternions [..., 4] to rotation vectors [..., 3] rad of at most half a turn."""
     v = q[..., :3]
     w = q[..., 3]
     sine = np.maximum(np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)
@@ -31,7 +31,7 @@ def rotation_vector(q: np.ndarray) -> np.ndarray:
 
 
 def quaternion(v: np.ndarray) -> np.ndarray:
-    """Unit quaternions [..., 4] of rotation vectors [..., 3] rad."""
+    """Convert rotation vectors [..., 3] rad to unit quaternions [..., 4]."""
     half = np.maximum(0.5 * np.sqrt(np.einsum("...i,...i->...", v, v)), 1e-12)
     q = np.empty((*v.shape[:-1], 4), v.dtype)
     np.multiply(v, (0.5 * np.sin(half) / half)[..., None], out=q[..., :3])
@@ -40,9 +40,9 @@ def quaternion(v: np.ndarray) -> np.ndarray:
 
 
 def check_rotation_vectors(turn: np.ndarray, name: str) -> np.ndarray:
-    """Return ``turn`` [..., 3] rad; :class:`MessageError` if one is longer than half a turn.
+    """Return the rotation vectors ``turn`` [..., 3] rad. Raises :class:`MessageError` if one exceeds half a turn.
 
-    So every rotation has exactly one encoding.
+    So every rotation has exactly one encoding. ``name``: what to call the message in the error.
     """
     if turn.size and np.einsum("...i,...i->...", turn, turn).max() > _MAX_ANGLE_SQUARED:
         raise MessageError(f"{name} with a rotation of more than half a turn")
@@ -50,7 +50,7 @@ def check_rotation_vectors(turn: np.ndarray, name: str) -> np.ndarray:
 
 
 def pack_quaternions(q: np.ndarray) -> np.ndarray:
-    """Encode unit quaternions [k, 4] as u32 [k]: 2 bits for the index of the largest component, 10 for each other.
+    """Encode unit quaternions [k, 4] as u32 [k]: 2 bits for the index of the largest component, 10 for each other one.
 
     Error: 0.28 degrees.
     """
@@ -63,9 +63,9 @@ def pack_quaternions(q: np.ndarray) -> np.ndarray:
 
 
 def unpack_quaternions(bits: np.ndarray) -> np.ndarray:
-    """Decode what :func:`pack_quaternions` wrote to unit quaternions [k, 4]; the mapping is one to one.
+    """Decode ``bits`` [k] u32 of :func:`pack_quaternions` to unit quaternions [k, 4].
 
-    Raises :class:`MessageError` if the three components leave too little for the largest one.
+    Raises :class:`MessageError` if the three smallest components are too large for a unit quaternion.
     """
     largest = (bits >> 30).astype(np.int64)
     three = (np.stack([bits >> 20, bits >> 10, bits], -1) & 1023).astype(float) - 511.0

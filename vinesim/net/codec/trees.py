@@ -1,9 +1,10 @@
 """Wire format of moving trees: joint rotations and rates of all bodies, and detached bodies with their positions.
 
-A batch holds several trees of one owner at one instant. Joint rotations travel as rotation vectors of 3 i16, joint
-rates as i8 of a scale of each tree (error 0.4 % of its fastest joint): 9 bytes a body, 13 a tree. A body that was cut
-off its parent has a floating root: its position [m] as f4 and its velocity as i2 follow, 20 bytes each. An owner that
-wants to have the same bits as all copies applies what :func:`quantise_tree` or :func:`encode_trees` returns.
+A batch contains several trees of one owner at one instant. Joint rotations are rotation vectors of 3 i16. Joint rates
+are i8 in steps of a scale of the tree (error 0.4 % of the fastest joint). A tree takes 13 bytes, and 9 for each of its
+bodies. A body that was cut off its parent has a floating root: its position [m] as f4 and its velocity as i2 follow, in
+20 bytes. To have the same bits as all copies, an owner applies the values that :func:`quantise_tree` or
+:func:`encode_trees` returns.
 """
 
 from __future__ import annotations
@@ -28,23 +29,24 @@ from vinesim.net.codec.rotation import TURN_LSB, check_rotation_vectors, quatern
 from vinesim.scene.values import TreeUpdate
 
 TREES = 2
-"""Kind of the message."""
+"""Number of the kind of message with states of trees, the fourth byte of the message."""
 
 TOUCHED = 1
 RESTING = 2
-"""Flags of a tree or an object: its owner is in contact with it; it is at rest and no further messages follow."""
+"""Flags of a tree or an object. TOUCHED: its owner is in contact with it. RESTING: it is at rest, so that no further
+messages follow."""
 
 DETACHED_COUNT_UNIT = 4
-"""The flags of a tree, divided by this, are the number of its detached bodies."""
+"""Unit in which the flags of a tree count its detached bodies: their number is ``flags // DETACHED_COUNT_UNIT``."""
 
 MAX_DETACHED = 255 // DETACHED_COUNT_UNIT
-"""Detached bodies of one tree in a message."""
+"""Largest number of detached bodies of one tree in a message."""
 
 MAX_TREES = 4096
-"""Trees, objects or claims in one message."""
+"""Largest number of trees, objects or claims in one message."""
 
 MAX_BODIES = 1 << 16
-"""Bodies of all trees in one message."""
+"""Largest number of bodies of all trees in one message."""
 
 _TREE = np.dtype(
     [("tree", "<u4"), ("ownership", "<u2"), ("authority", "<u2"), ("flags", "u1"), ("bodies", "<u2"), ("scale", "<u2")]
@@ -59,35 +61,36 @@ _NO_ROOTS = np.zeros(0, np.int64)
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class TreeStates:
-    """States of several trees of one owner at one instant, as flat arrays; tree ids strictly increase."""
+    """States of several trees of one owner at one instant, as flat arrays. Tree ids strictly increase."""
 
     time: float
     """Network time [s]."""
     tree: np.ndarray
-    """[k] ids"""
+    """[k] tree ids"""
     ownership: np.ndarray
-    """[k] u16 sequences"""
+    """[k] ownership sequences (u16) of the owner's claims"""
     authority: np.ndarray
-    """[k] u16 sequences"""
+    """[k] authority sequences (u16) of the owner's claims"""
     flags: np.ndarray
-    """[k] sum of :data:`TOUCHED` and :data:`RESTING`"""
+    """[k] flags: sum of :data:`TOUCHED` and :data:`RESTING`, or 0"""
     bodies: np.ndarray
-    """[k] bodies of each tree; their joints follow tree by tree in the arrays below"""
+    """[k] number of bodies of each tree; ``joint_q`` and ``joint_qd`` list the joints of all bodies tree by tree"""
     joint_q: np.ndarray
-    """[sum of bodies, 4] xyzw"""
+    """[sum of bodies, 4] joint rotations, quaternions xyzw"""
     joint_qd: np.ndarray
-    """[sum of bodies, 3] rad/s"""
+    """[sum of bodies, 3] joint rates [rad/s]"""
     roots: np.ndarray = dataclasses.field(default_factory=lambda: _NO_ROOTS)
-    """[k] detached bodies of each tree, or empty if no tree has any; the arrays below list them tree by tree"""
+    """[k] number of detached bodies of each tree, or empty if no tree has any; ``root``, ``root_x`` and ``root_xd``
+    list the detached bodies tree by tree"""
     root: np.ndarray = dataclasses.field(default_factory=lambda: _NO_ROOTS)
-    """[sum of roots] index of the body within its tree"""
+    """[sum of roots] index of each detached body within its tree"""
     root_x: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[sum of roots, 3] m, world"""
+    """[sum of roots, 3] positions of the detached bodies in the world [m]"""
     root_xd: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[sum of roots, 3] m/s, world"""
+    """[sum of roots, 3] velocities of the detached bodies in the world [m/s]"""
 
     def updates(self, owner: str) -> list[TreeUpdate]:
-        """One update per tree; its arrays are views of this batch."""
+        """Returns one update per tree. The arrays of an update are views of this batch's arrays."""
         ends = np.cumsum(self.bodies).tolist()
         lasts = np.cumsum(self.roots).tolist() if len(self.roots) else [0] * len(ends)
         columns = (self.tree, self.ownership, self.authority, self.flags)
@@ -114,8 +117,11 @@ class TreeStates:
 
 
 def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Rotation and rate steps [n, 3] each (whole numbers as floats), rate scales [k], rate units [n, 1] of the
-    bodies."""
+    """Quantise the joints of ``k`` trees with ``n`` bodies in all.
+
+    Returns rotation steps and rate steps [n, 3] (whole numbers as floats), the rate scale of each tree [k], and the
+    quantisation step of the rates of each body [n, 1] rad/s.
+    """
     if not (np.isfinite(joint_q).all() and np.isfinite(joint_qd).all()):
         raise MessageError("joint state of a tree is not finite")
     fastest = np.maximum.reduceat(np.abs(joint_qd).ravel(), 3 * (np.cumsum(bodies) - bodies))
@@ -127,21 +133,22 @@ def _quantise(bodies: np.ndarray, joint_q: np.ndarray, joint_qd: np.ndarray) -> 
 
 
 def _rate_units(bodies: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """Quantisation step of the joint rates of each body [n, 1] rad/s."""
+    """Returns the quantisation step of the joint rates of each body [n, 1] rad/s, from the rate scale of each tree
+    [k]."""
     return np.repeat(scale * JOINT_RATE_LSB, bodies)[:, None]
 
 
 def quantise_tree(joint_q: np.ndarray, joint_qd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Joint rotations [n, 4] and rates [n, 3] rad/s of one tree as every copy decodes them, bit by bit.
+    """Returns joint rotations [n, 4] and rates [n, 3] rad/s of one tree as all receivers decode them, bit by bit.
 
-    Errors: rotations 0.005 degrees; rates 0.4 % of the fastest joint (clipped at 83 rad/s).
+    Errors: rotations 0.005 degrees, rates 0.4 % of the fastest joint. Rates are clipped at 83 rad/s.
     """
     turn, rate, _, unit = _quantise(np.array([len(joint_q)]), np.asarray(joint_q, float), np.asarray(joint_qd, float))
     return quaternion(turn * TURN_LSB), rate * unit
 
 
 def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
-    """Encode a batch; return its messages and the batch as receivers decode it.
+    """Encode a batch. Returns its messages, and the batch as receivers decode it.
 
     A message has at most :data:`MAX_DATAGRAM` bytes unless a single tree needs more. Raises :class:`MessageError` if
     ids do not increase, sizes disagree or a value is not finite.
@@ -213,9 +220,9 @@ def encode_trees(trees: TreeStates) -> tuple[list[bytes], TreeStates]:
 
 
 def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeStates:
-    """Decode a batch; ``tree_size`` [tree] of the model, if given, checks ids and numbers of bodies.
+    """Decode a batch. Raises :class:`MessageError` for anything that :func:`encode_trees` cannot have written.
 
-    Raises :class:`MessageError` for anything that :func:`encode_trees` cannot have written.
+    ``tree_size``: number of bodies of each tree in the model, to check ids and sizes; None: not checked.
     """
     count, time = unpack_header(payload, TREES, "trees")
     at = HEADER.size + count * _TREE.itemsize
@@ -256,7 +263,7 @@ def decode_trees(payload: bytes, tree_size: np.ndarray | None = None) -> TreeSta
     if not cuts.any():
         return TreeStates(*known)
     roots = np.frombuffer(payload, _ROOT, int(cuts.sum()), after)
-    with np.errstate(invalid="ignore"):  # of signalling NaNs, which are refused below
+    with np.errstate(invalid="ignore"):  # signalling NaNs would warn; they are refused below
         root = roots["body"].astype(np.int64)
         root_x = roots["position"].astype(float)
     if (root >= np.repeat(bodies, cuts)).any() or not (np.abs(root_x) < MAX_COORDINATE).all():
@@ -273,7 +280,7 @@ TREES_FIELDS = {
 
 
 def describe_trees(payload: bytes, _: str) -> dict[str, Any]:
-    """Trees for JSON, without their joints."""
+    """Decode trees, without their joints, for the JSON of a recording."""
     trees = decode_trees(payload)
     columns = (trees.tree, trees.ownership, trees.authority, trees.flags, trees.bodies)
     rows = zip(*(column.tolist() for column in columns), strict=True)

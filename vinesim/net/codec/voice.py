@@ -1,4 +1,4 @@
-"""Wire format of a frame of sound: header with the speaker's count of frames and the time it began, codec, sound."""
+"""Wire format of a frame of sound: header with the number of the frame and its start time, codec, encoded sound."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ from vinesim.audio.frame import Codec, find_fault
 from vinesim.net.codec.header import HEADER, MessageError, pack_header, unpack_header
 
 VOICE = 9
-"""Kind of the message."""
+"""Number of the kind of message with a frame of sound, the fourth byte of the message."""
 
 
 class VoiceFrame(NamedTuple):
-    """20 ms of an actor's voice, or of a robot's loudspeaker."""
+    """A frame of sound: 20 ms of an actor's voice or of a robot's loudspeaker."""
 
     number: int
-    """Counted by the speaker, modulo 65,536."""
+    """Number of the frame, which the speaker counts modulo 65,536."""
     time: float
-    """Network time when it began [s]."""
+    """Network time at which the frame began [s]."""
     codec: Codec
     data: bytes
 
 
 def encode_voice(frame: VoiceFrame) -> bytes:
-    """Encode a frame: 15 bytes and the sound. Raises :class:`MessageError` for what :func:`find_fault` finds."""
+    """Encode a frame in 15 bytes and the sound. Raises :class:`MessageError` if codec and data do not fit together."""
     if fault := find_fault(frame.codec, frame.data):
         raise MessageError(fault)
     header = pack_header(VOICE, frame.number % 65536, frame.time)
@@ -31,7 +31,7 @@ def encode_voice(frame: VoiceFrame) -> bytes:
 
 
 def decode_voice(payload: bytes) -> VoiceFrame:
-    """Decode a frame; whether the sound itself can be decoded shows when it is played."""
+    """Decode a frame, but not its sound. Raises :class:`MessageError` if codec and data do not fit together."""
     number, time = unpack_header(payload, VOICE, "frame of sound")
     if len(payload) <= HEADER.size:
         raise MessageError(f"frame of sound of {len(payload)} B without a codec")

@@ -1,4 +1,4 @@
-"""Recordings are read: all messages of an MCAP file in memory, as far as the file is undamaged."""
+"""Reads recordings: all messages of an MCAP file into memory, up to the first damage."""
 
 from __future__ import annotations
 
@@ -17,36 +17,37 @@ from vinesim.net.codec.header import PROTOCOL
 from vinesim.net.codec.messages import sender_of
 
 METADATA_NAME = "vinesim"
-"""Name of the MCAP metadata record with the metadata of the world; the last one holds."""
+"""Name of the MCAP metadata records that describe the recorded world. A later record replaces entries of earlier
+ones."""
 
 MAX_RECORD_LENGTH = 1 << 26
-"""Largest MCAP record that is read [B]."""
+"""Largest size of an MCAP record that is read [B]."""
 
 
 class InvalidRecording(ValueError):
-    """The file cannot be replayed; the text gives the reason."""
+    """A file cannot be replayed as a recording. The text gives the reason and what to do."""
 
 
 class RecordedMessage(NamedTuple):
-    """One message of a recording."""
+    """One network message of a recording."""
 
     time: float
-    """Network time [s] at which the recorder received it."""
+    """Network time at which the recorder received the message [s]."""
     key: str
     payload: bytes
 
 
 @dataclasses.dataclass(frozen=True)
 class Recording:
-    """A recording in memory."""
+    """A recording, read into memory."""
 
     path: pathlib.Path
     metadata: dict[str, str]
-    """What the recorder knew of the world: release, protocol, world, scene, seed, digest."""
+    """Description of the recorded world: release, protocol, world, scene, seed, digest."""
     messages: list[RecordedMessage]
-    """All messages in order of time."""
+    """All messages, sorted by time."""
     damage: str
-    """Empty, or in one line why the file ends early; everything before the damage was read."""
+    """Why the messages end early, in one line; empty if the file is whole. Everything before the damage was read."""
 
     @property
     def start(self) -> float:
@@ -65,9 +66,9 @@ class Recording:
 
 
 def read_recording(path: pathlib.Path) -> Recording:
-    """Read a recording as far as it is undamaged.
+    """Read a recording up to its end or to the first damage.
 
-    Raises :class:`InvalidRecording` if the file cannot be opened, is no recording of vinesim or has another protocol
+    Raises :class:`InvalidRecording` if the file cannot be opened, is no recording of vinesim, or has another protocol
     version.
     """
     metadata: dict[str, str] = {}
@@ -94,7 +95,7 @@ def read_recording(path: pathlib.Path) -> Recording:
                 damage = "it ends in the middle"
             except OSError:
                 raise
-            except Exception as error:  # a damaged byte can break anything that reads it
+            except Exception as error:  # damaged bytes can raise anything while they are decoded
                 damage = f"it is damaged: {error}" if str(error) else "it is damaged"
     except OSError as error:
         raise InvalidRecording(
@@ -115,6 +116,7 @@ def read_recording(path: pathlib.Path) -> Recording:
 
 
 def _raw(data: bytes) -> bytes:
+    """Returns the bytes of the network message in a recorded JSON object. Raises ValueError if there are none."""
     try:
         return base64.b64decode(_body.decode(data).raw, validate=True)
     except (msgspec.MsgspecError, binascii.Error) as error:
@@ -122,6 +124,8 @@ def _raw(data: bytes) -> bytes:
 
 
 class _Body(msgspec.Struct):
+    """The field of a recorded JSON object that a replay needs."""
+
     raw: str
 
 

@@ -1,8 +1,9 @@
-"""Writes recordings: every network message of a world, in an MCAP file that any MCAP reader opens.
+"""Writes recordings: the network messages of a world, in an MCAP file that any MCAP reader opens.
 
-One channel for each key. A message is a JSON object (:func:`~vinesim.net.codec.messages.describe_message`) that holds
-the decoded content and, in ``raw``, the bytes that crossed the network, for replays. Log time is the network time at
-which the recorder received it [ns], publish time the one in its header.
+The file has one channel for each key. A recorded message is a JSON object
+(:func:`~vinesim.net.codec.messages.describe_message`) with the decoded content. Its field ``raw`` has the bytes that
+crossed the network, for replays. The log time is the network time [ns] at which the recorder received the message. The
+publish time is the network time in the header of the message.
 """
 
 from __future__ import annotations
@@ -13,30 +14,30 @@ import pathlib
 import queue
 import threading
 import time
-import zlib
-from collections.abc import Iterator
 
 import msgspec
-from mcap.data_stream import RecordBuilder
-from mcap.records import ChunkIndex
-from mcap.writer import Writer
 
 from vinesim.core.errors import WriteError
 from vinesim.core.version import __version__
 from vinesim.net.codec.header import PROTOCOL, MessageError
 from vinesim.net.codec.messages import describe_message, schema_of, time_of
+from vinesim.net.recording.mcap_file import McapFile
 from vinesim.net.recording.mcap_reader import METADATA_NAME
 
 FLUSH_PERIOD = 0.5
-"""Time after which recorded messages are on the disk [s]: a recorder that is killed loses no more."""
+"""Time after which recorded messages are on the disk [s]. A recorder that is killed loses the messages of this time."""
 
 
 class RecordingStopped(WriteError):
-    """Nothing more can be written; the text gives the reason and what was kept."""
+    """A recording cannot be created or continued. The text gives the reason and how much of the file is kept."""
 
 
 def free_path(path: pathlib.Path) -> pathlib.Path:
-    """The path; if the file exists, NAME-2, NAME-3 ... before the suffix. No recording is ever overwritten."""
+    """Returns ``path`` if no such file exists, else the first free one of NAME-2, NAME-3 and so on, with the same
+    suffix.
+
+    So no recording is ever overwritten.
+    """
     number = 1
     free = path
     while free.exists():
@@ -45,79 +46,55 @@ def free_path(path: pathlib.Path) -> pathlib.Path:
     return free
 
 
-class _ChunkIndexes:
-    """The index of all chunks, which MCAP writes last: as compressed bytes of the records that it becomes.
-
-    Stands in for the list of objects in the library's writer. With 30 keys that took 16 MB an hour, this takes 1.
-    """
-
-    def __init__(self) -> None:
-        self._compressor = zlib.compressobj()
-        self._compressed = bytearray()
-
-    def append(self, index: ChunkIndex) -> None:
-        """Add the index of one chunk."""
-        builder = RecordBuilder()
-        index.write(builder)
-        self._compressed += self._compressor.compress(builder.end())
-
-    def __iter__(self) -> Iterator[_ChunkIndexes]:
-        """All of them as one that writes itself."""
-        yield self
-
-    def write(self, stream: RecordBuilder) -> None:
-        """Write all records."""
-        self._compressed += self._compressor.flush()
-        stream.write(zlib.decompress(self._compressed))
-
-
 _Work = tuple[int, str, bytes] | dict[str, str]
 
 
 class RecordingWriter:
-    """A growing recording: :meth:`put` does not block, a thread writes. A context manager; :meth:`close` completes the
-    file."""
+    """A recording that is being written. :meth:`put` does not block: a thread of the writer writes the file.
+
+    A context manager. :meth:`close` completes the file.
+    """
 
     def __init__(self, path: pathlib.Path, metadata: dict[str, str] | None = None) -> None:
-        """Create the file; :class:`RecordingStopped` if that fails. ``metadata``: see :meth:`add_metadata`."""
+        """Create the file. Raises :class:`RecordingStopped` if that fails. ``metadata``: first entries of
+        :attr:`metadata`."""
         self.path = path
         self.metadata = {"release": __version__, "protocol": str(PROTOCOL)} | (metadata or {})
-        """What is known of the recorded world: scene, seed, digest, release, protocol."""
+        """Description of the recorded world: release, protocol, and what was added, like scene, seed and digest."""
         self.count = 0
-        """Messages taken."""
+        """Number of messages that :meth:`put` has taken."""
         self.size = 0
-        """Bytes on the disk."""
+        """Size of the file on the disk [B], up to the last complete chunk."""
         self._work: queue.SimpleQueue[_Work | None] = queue.SimpleQueue()
         self._error: RecordingStopped | None = None
         try:
             self._file = path.open("xb")
         except OSError as error:
             raise RecordingStopped(f"cannot record into {path}: {error.strerror}; choose another file") from error
-        self._writer = Writer(self._file)
-        vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndexes()
+        self._writer = McapFile(self._file)
         self._channels: dict[str, int] = {}
         self._schemas: dict[tuple[str, bytes], int] = {}
         self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
         self._thread.start()
 
     def add_metadata(self, **metadata: str) -> None:
-        """Add entries to :attr:`metadata` and write it."""
+        """Add entries to :attr:`metadata` and write all entries to the file again."""
         self.metadata |= metadata
         self._work.put(dict(self.metadata))
 
     def put(self, at: int, key: str, payload: bytes) -> None:
-        """Record a message that was received at network time ``at`` [ns]; raises an earlier error of the file."""
+        """Record a message that was received at network time ``at`` [ns]. Raises what :meth:`check` raises."""
         self.check()
         self.count += 1
         self._work.put((at, key, payload))
 
     def check(self) -> None:
-        """Raise :class:`RecordingStopped` if the file can no longer be written."""
+        """Raise :class:`RecordingStopped` if an error has ended the recording."""
         if self._error is not None:
             raise self._error
 
     def close(self) -> None:
-        """Write what is left and the index. Idempotent. Raises an earlier error of the file."""
+        """Write the messages that wait and the index of the file. Idempotent. Raises what :meth:`check` raises."""
         if self._thread.is_alive():
             self._work.put(None)
             self._thread.join()
@@ -133,6 +110,7 @@ class RecordingWriter:
     # ------------------------------------------------------------ the thread
 
     def _run(self) -> None:
+        """Body of the thread that writes the file."""
         try:
             self._writer.start(library=f"vinesim {__version__}")
             self._write(dict(self.metadata))
@@ -153,10 +131,11 @@ class RecordingWriter:
             self._file.close()
         except OSError as error:
             self._error = RecordingStopped(self._truncate(error.strerror or str(error)))
-        except Exception as error:  # else the recorder would go on without a file
+        except Exception as error:  # otherwise the recorder would continue without a file
             self._error = RecordingStopped(self._truncate(f"{type(error).__name__}: {error}"))
 
     def _write(self, work: _Work) -> None:
+        """Write a message (time of arrival [ns], key, payload) or, if ``work`` is a dictionary, metadata."""
         if isinstance(work, dict):
             self._writer.add_metadata(METADATA_NAME, work)
             return
@@ -172,19 +151,20 @@ class RecordingWriter:
         self._writer.add_message(channel, at, msgspec.json.encode(describe_message(key, payload)), published)
 
     def _schema_id(self, key: str) -> int:
+        """Returns the id of the JSON schema of the messages under a key; adds the schema to the file if it is new."""
         schema = schema_of(key)
         if schema not in self._schemas:
             self._schemas[schema] = self._writer.register_schema(schema[0], "jsonschema", schema[1])
         return self._schemas[schema]
 
     def _flush(self) -> None:
-        """Complete the chunk and force it to the disk."""
+        """Complete the MCAP chunk in progress and force it to the disk."""
         self._writer.flush()
         os.fsync(self._file.fileno())
         self.size = self._file.tell()
 
     def _truncate(self, reason: str) -> str:
-        """Cut the file to its last complete state, or remove it if there is none; the text of the error."""
+        """Cut the file after its last complete chunk, or remove it if it has none. Returns the text of the error."""
         with contextlib.suppress(OSError):
             self._file.close()
         with contextlib.suppress(OSError):

@@ -1,12 +1,13 @@
-"""The total order on claims by which all clients agree who owns an object, in whatever order messages arrive; pure.
+"""The total order of claims, by which all clients agree who owns an object, in whatever order messages arrive. No I/O.
 
-A claim is (ownership, authority, owner). The newer ownership wins (grab, pick, cut: +1), then the newer authority
-(contact: +1), then the lowest actor name; no owner, the empty name, precedes all names, so that "at rest" ends its own
-sequence number and a later contact starts the next one. Every client keeps the greatest claim: a join of a semilattice,
-independent of order, duplication and delay. After a loss one newer message restores agreement.
+A claim is (ownership, authority, owner). Of two claims the one with the newer ownership wins (each grab, pick or cut
+increments it), then the one with the newer authority (each contact increments it), then the one with the lowest actor
+name. The empty name stands for no owner and precedes all names. So the claim "at rest" wins over the owner's claim with
+the same sequences, and a later contact increments the authority. Every client keeps the greatest claim. This is a join
+of a semilattice, independent of order, duplication and delay. After a loss, one newer message restores agreement.
 
-Sequences are u16 and wrap (serial number arithmetic, RFC 1982); the order holds while the claims in flight span less
-than 32,768 numbers. Source of ownership and authority sequences: G. Fiedler, Networked Physics in Virtual Reality,
+Sequences are u16 and wrap around (serial number arithmetic, RFC 1982). The order holds while all claims in use span
+less than 32,768 numbers. Source of ownership and authority sequences: G. Fiedler, Networked Physics in Virtual Reality,
 2018.
 """
 
@@ -17,15 +18,15 @@ from typing import NamedTuple
 import numpy as np
 
 SEQUENCE_COUNT = 1 << 16
-"""Sequence numbers before they wrap."""
+"""Number of sequence numbers; after the largest one follows 0."""
 _HALF = SEQUENCE_COUNT >> 1
 
 NO_OWNER = ""
-"""Owner of an object at rest or without an owner."""
+"""Owner in the claim on an object that is at rest or has no owner."""
 
 
 class Claim(NamedTuple):
-    """Who claims an object, and with which sequences."""
+    """A claim on an object: its sequence numbers (u16) and the name of the actor that claims the object."""
 
     ownership: int = 0
     authority: int = 0
@@ -37,13 +38,16 @@ UNTOUCHED = Claim()
 
 
 def is_newer(a: int, b: int) -> bool:
-    """Whether sequence ``a`` follows ``b`` around the u16 circle; at exactly half a circle the greater number does."""
+    """Whether the u16 sequence number ``a`` is newer than ``b``, with wrap-around.
+
+    If they are exactly half the range apart, the greater number is newer.
+    """
     ahead = (a - b) % SEQUENCE_COUNT
     return a > b if ahead == _HALF else 0 < ahead < _HALF
 
 
 def wins(claim: Claim, held: Claim) -> bool:
-    """Whether ``claim`` replaces ``held``. Of two different claims exactly one wins over the other."""
+    """Whether ``claim`` is greater than ``held`` and so replaces it. Of two different claims exactly one wins."""
     if claim.ownership != held.ownership:
         return is_newer(claim.ownership, held.ownership)
     if claim.authority != held.authority:
@@ -52,16 +56,20 @@ def wins(claim: Claim, held: Claim) -> bool:
 
 
 def is_outdated(claim: Claim, held: Claim) -> bool:
-    """Whether ``claim`` has an older sequence than ``held``: its author has missed a message (no mere tie of names)."""
+    """Whether ``claim`` has older sequences than ``held``, so that its author must have missed a message.
+
+    False if only the names differ.
+    """
     if claim.ownership != held.ownership:
         return is_newer(held.ownership, claim.ownership)
     return claim.authority != held.authority and is_newer(held.authority, claim.authority)
 
 
 def claim_by_touch(held: Claim, me: str, owner_touches: bool) -> Claim:
-    """Claim of ``me`` by contact: the next authority, unless I own it or a live owner is in contact with it, too.
+    """Returns the claim of the actor ``me`` on an object that it touches: the next authority.
 
-    That condition keeps two actors that press the same cane from taking it from each other for ever.
+    Returns ``held`` unchanged if ``me`` is the owner, or if a live owner is in contact with the object, too
+    (``owner_touches``). Otherwise two actors that press the same cane would take it from each other for ever.
     """
     if held.owner == me or (held.owner != NO_OWNER and owner_touches):
         return held
@@ -69,17 +77,20 @@ def claim_by_touch(held: Claim, me: str, owner_touches: bool) -> Claim:
 
 
 def claim_by_grab(held: Claim, me: str) -> Claim:
-    """Claim of ``me`` by grabbing, picking or cutting: the next ownership."""
+    """Returns the claim of the actor ``me`` on an object that it grabs, picks or cuts: the next ownership."""
     return Claim((held.ownership + 1) % SEQUENCE_COUNT, held.authority, me)
 
 
 def release(held: Claim) -> Claim:
-    """The same sequences without an owner: the object is at rest, or its owner has left."""
+    """Returns the claim ``held`` without its owner, for an object that is at rest or whose owner has left."""
     return Claim(held.ownership, held.authority, NO_OWNER)
 
 
 def choose_successor(position: np.ndarray, actors: dict[str, np.ndarray]) -> str:
-    """Name of the actor nearest to ``position`` [m] on the ground, then the lowest name; empty without ``actors``."""
+    """Returns the name of the actor that is nearest to ``position`` [m] on the ground; if several are, the lowest name.
+
+    ``actors``: positions [m] by name. Returns the empty name if there are none.
+    """
     if not actors:
         return NO_OWNER
     return min((float(np.hypot(*(where[:2] - position[:2]))), name) for name, where in actors.items())[1]

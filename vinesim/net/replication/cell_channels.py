@@ -1,4 +1,4 @@
-"""Subscriptions and publishers of one actor in the cells around it and around the objects that it owns."""
+"""Subscriptions and publishers of one actor, for the cells around the actor and those of the objects that it owns."""
 
 from __future__ import annotations
 
@@ -12,38 +12,44 @@ from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_64, Bus, Publisher, Su
 
 OPEN_MARGIN = 0.3
 CLOSE_MARGIN = 0.8
-"""[m] A cell is opened within the distance of its layer plus OPEN_MARGIN, and closed beyond that distance plus
-CLOSE_MARGIN. Others know this actor's position late, and an actor that walks along an edge must not open and close
-cells in turn."""
+"""Margins [m] at which the channels of a cell are opened and closed.
+
+A cell is opened within the distance of its layer plus OPEN_MARGIN, and closed beyond that distance plus CLOSE_MARGIN.
+OPEN_MARGIN is needed because peers know this actor's position late. The difference keeps an actor that walks along the
+edge of a cell from opening and closing it in turn."""
 
 STEP = 0.1
-"""[m] The cells are chosen again after the actor has moved this far."""
+"""Distance that the actor moves before its cells are chosen again [m]."""
 
 
 class CellChannels:
-    """The channels of boxes, bunches and events that are open now, and the position that they follow.
+    """The open publishers and subscriptions of one actor for boxes, bunches and events, which follow its position.
 
     Keys: ``c/<x>/<y>/<actor>`` for states of boxes and bunches that move (best effort), ``own/<x>/<y>/<actor>`` for
     claims and states at rest (reliable).
     """
 
     def __init__(self, bus: Bus, interest_radius: float) -> None:
-        """``interest_radius`` [m]: distance within which others see what moves (:func:`interest.check_radius`)."""
+        """``interest_radius`` [m]: distance from an object within which peers receive its states. Checked by
+        :func:`interest.check_radius`."""
         self._bus = bus
         self.interest_radius = interest.check_radius(interest_radius)
         self.position = np.zeros(3)
         """Position of the actor in the world [m]."""
         self.centre: Cell | None = None
-        """Cell in the middle of the window; None before the first :meth:`update`."""
+        """Cell in the middle of the window of 3x3 cells around the actor; None before the first :meth:`update`."""
         self.subscriptions: dict[Cell, tuple[Subscription, Subscription]] = {}
         """Subscriptions to states and to events, by cell."""
         self.publishers: dict[Cell, tuple[Publisher, Publisher]] = {}
         """Publishers of states and of events, by cell."""
         self.changes = 0
-        """How often channels were opened or closed."""
+        """Number of times that channels were opened or closed."""
 
     def update(self, owned_cells: set[Cell]) -> None:
-        """Move the 3x3 window to the position and keep the cells in which an owned object is."""
+        """Open the channels of the 3x3 cells around :attr:`position` and of ``owned_cells``, and close all others.
+
+        ``owned_cells``: cells with objects that this actor owns.
+        """
         centre = interest.move_window(self.centre, self.position)
         if centre == self.centre and owned_cells <= self.subscriptions.keys() and len(self.subscriptions) <= 9:
             return
@@ -65,11 +71,12 @@ class CellChannels:
             )
 
     def event_publisher(self, cell: Cell | None) -> Publisher | None:
-        """The reliable publisher of a cell; None outside of the window."""
+        """Returns the publisher of events of a cell; None if the channels of the cell are not open."""
         return self.publishers[cell][1] if cell in self.publishers else None
 
     def is_within_radius(self, positions: np.ndarray) -> np.ndarray:
-        """Which positions [k, 3] m are within the interest radius, with the hysteresis of cells: [k] bool."""
+        """Returns which of the positions [k, 3] m are within the interest radius plus the hysteresis of cells: [k]
+        bool."""
         if self.centre is None:
             return np.zeros(len(positions), bool)
         offset = positions[:, :2] - self.position[:2]
@@ -77,16 +84,16 @@ class CellChannels:
 
 
 class TreeChannels:
-    """The channels of states of moving trees that are open now, layer by layer.
+    """The open publishers and subscriptions of one actor for states of moving trees, by layer and cell.
 
     Keys: ``tree/<x>/<y>/<actor>`` for all actors within the interest radius, ``near/<x>/<y>/<actor>`` for additional
     states that only actors near the tree need (:data:`vinesim.net.replication.interest.TREE_LAYERS`). An actor
-    subscribes to the cells within the distance of a layer, not to a window: a tree that is farther away is not
-    received.
+    subscribes to the cells within the distance of a layer instead of a window of 3x3 cells, so that it does not receive
+    trees that are farther away.
     """
 
     def __init__(self, bus: Bus, interest_radius: float) -> None:
-        """``interest_radius`` [m]: distance of the first layer, and the largest of all."""
+        """``interest_radius`` [m]: distance of the first layer, and upper bound of the distances of all layers."""
         self._bus = bus
         self.distances = tuple(min(layer.distance, interest_radius) for layer in TREE_LAYERS)
         """Distance of each layer [m]."""
@@ -96,9 +103,9 @@ class TreeChannels:
         self._owned: set[Cell] = set()
 
     def update(self, position: np.ndarray, owned: set[Cell]) -> None:
-        """Follow the actor's ``position`` [3] m and the cells of the trees that it owns (``owned``).
+        """Open and close channels for the actor's ``position`` [3] m and for the cells ``owned`` of trees that it owns.
 
-        Publishers are open in the cells where the actor owns a tree or could touch one.
+        Publishers are open in these cells, and in those where the actor could touch a tree.
         """
         moved = self._position is None or _distance(position, self._position) > STEP
         if not moved and owned == self._owned:
@@ -124,5 +131,5 @@ class TreeChannels:
 
 
 def _distance(a: np.ndarray, b: np.ndarray) -> float:
-    """Distance on the ground between two positions [3] m."""
+    """Returns the distance [m] on the ground between two positions [3] m."""
     return math.hypot(a[0] - b[0], a[1] - b[1])

@@ -1,7 +1,8 @@
-"""Dead reckoning: extrapolation of states between messages, when to send the next one, and error smoothing; pure.
+"""Dead reckoning: extrapolation of states between messages, decision when to send a state, and error smoothing. No I/O.
 
-Sender and receiver extrapolate with the same :func:`extrapolate`, so that the sender knows the error of the copies and
-sends nothing while it is small (IEEE 1278.1, dead reckoning). Distances in metres, angles in radians, times in seconds.
+Sender and receiver extrapolate with the same function, :func:`extrapolate`. So the sender knows the error of the copies
+and sends nothing while the error is small (IEEE 1278.1, dead reckoning). Distances in metres, angles in radians, times
+in seconds.
 """
 
 from __future__ import annotations
@@ -9,39 +10,41 @@ from __future__ import annotations
 import numpy as np
 
 MAX_EXTRAPOLATION = 0.150
-"""States are extrapolated by at most this time [s]; then the copy stands still. GUESSED."""
+"""Longest time by which a state is extrapolated [s]. After this time a copy stands still. GUESSED."""
 
 TREE_VELOCITY_DECAY = 0.080
-"""Time in which the velocity of a tree, as others extrapolate it, falls to 37 % [s]. TUNED on a bunch that is pushed:
-from 60 to 120 ms the errors differ by 4 %."""
+"""Time in which the velocity that is used to extrapolate a tree falls to 37 % [s].
+
+TUNED on a bunch that is pushed: from 60 to 120 ms the errors differ by 4 %."""
 
 POSITION_ERROR = 0.005
-"""A state is published if copies are wrong by more than this [m] (see also the next two constants)."""
+"""Position error of the copies of an object above which its state is published [m]."""
 
 ANGLE_ERROR = float(np.radians(1.0))
-"""A state is published if copies are wrong by more than this [rad]."""
+"""Angle error of the copies of an object above which its state is published [rad]."""
 
 HEARTBEAT_PERIOD = 1.0
-"""A state is published if nothing was published for this long [s] while the object is awake."""
+"""Longest time between two published states of an object that is awake [s]."""
 
 MAX_CLOCK_SKEW = 1.0
-"""Largest time by which the stamp of a state may be in the future [s]. A later stamp is reduced to this, because the
-state would otherwise be newer than all later ones."""
+"""Longest time by which the time in a message may be in the future [s].
+
+A later time is reduced to this. Otherwise the state would count as newer than all states that follow."""
 
 BLEND_TIME = 0.100
-"""Time in which 95 % of a correction is blended into what is shown [s]; velocities are taken at once."""
+"""Time in which 95 % of a correction is blended into a shown pose [s]. Velocities are corrected at once."""
 
 
 def normalize(q: np.ndarray) -> np.ndarray:
-    """Quaternions [..., 4] scaled to unit length (none may be zero)."""
+    """Scale quaternions [..., 4] to unit length. None of them may be zero."""
     return q / np.sqrt(np.einsum("...i,...i->...", q, q))[..., None]
 
 
 def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
-    """Time derivative [..., 4] of unit quaternions ``q`` [..., 4] xyzw at the angular velocity ``omega`` [..., 3]
-    rad/s.
+    """Returns the time derivative [..., 4] of unit quaternions ``q`` [..., 4] xyzw.
 
-    ``omega`` is given in the frame that ``q`` rotates into (world axes for a base, joint-frame axes for a body).
+    ``omega`` [..., 3] rad/s: angular velocity, in the frame into which ``q`` rotates (world axes for a base, axes of
+    the joint's frame for a body).
     """
     x = q[..., 0]
     y = q[..., 1]
@@ -59,36 +62,45 @@ def quaternion_rate(q: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
-    """Time [s] by which a state of ``age`` [s] is extrapolated, :data:`MAX_EXTRAPOLATION` at most: forwards, or
-    backwards where the steps of the sender are ahead of those of the receiver."""
+    """Returns the time [s] by which a state of ``age`` [s] is extrapolated, at most :data:`MAX_EXTRAPOLATION`.
+
+    The age is negative if the steps of the sender are ahead of those of the receiver. The state is then extrapolated
+    backwards.
+    """
     return np.minimum(np.maximum(age, -MAX_EXTRAPOLATION), MAX_EXTRAPOLATION)
 
 
 def faded_age(age: float | np.ndarray) -> float | np.ndarray:
-    """Time [s] by which the joints of a tree are extrapolated after ``age`` [s]: the integral of a velocity that decays
-    with :data:`TREE_VELOCITY_DECAY`, for a hand stops a branch, and a branch swings back."""
+    """Returns the time [s] by which the joints of a tree are extrapolated at the velocity in a state of ``age`` [s].
+
+    The velocity decays with :data:`TREE_VELOCITY_DECAY`, because hands stop branches and branches swing back. The
+    returned time is the integral of this decay.
+    """
     return TREE_VELOCITY_DECAY * -np.expm1(-clamp_age(age) / TREE_VELOCITY_DECAY)
 
 
 def faded_share(age: float) -> float:
-    """Share of its velocity that a tree still has when it is extrapolated by ``age`` [s]; 0 from
-    :data:`MAX_EXTRAPOLATION` on."""
+    """Returns the share of the sent velocity that a tree still has when a state of ``age`` [s] is extrapolated.
+
+    The share is 0 from :data:`MAX_EXTRAPOLATION` on.
+    """
     return float(np.exp(-max(age, 0.0) / TREE_VELOCITY_DECAY)) if age < MAX_EXTRAPOLATION else 0.0
 
 
 def extrapolate(q: np.ndarray, rate: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
-    """Quaternions [..., 4] after ``dt`` [s] (a number, or with a trailing axis) at a :func:`quaternion_rate`.
+    """Returns quaternions ``q`` [..., 4] after ``dt`` [s] at the ``rate`` [..., 4] 1/s of :func:`quaternion_rate`.
 
-    First order and normalised: turns by 2 atan(|omega| dt / 2), within 0.4 degrees of exact at 3 rad/s and 150 ms.
+    ``dt``: a number, or an array with a trailing axis of length 1. First order and normalised: the rotation by
+    2 atan(|omega| dt / 2) is exact within 0.4 degrees at 3 rad/s and 150 ms.
     """
     return normalize(q + rate * dt)
 
 
 def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Angle [...] rad between the rotations ``a`` and ``b`` [..., 4].
+    """Returns the angle [...] rad between the rotations ``a`` and ``b``, quaternions [..., 4].
 
-    Computed from the chord: the arccosine of the dot product would turn the rounding of single-precision states into
-    0.04 degrees, and a chain of bodies sums that up to an unnecessary message.
+    Computed from the chord between the quaternions. With the arccosine of their dot product, the rounding of
+    single-precision states would become 0.04 degrees, and the sum over a chain of bodies would cause needless messages.
     """
     same = a - b
     opposite = a + b
@@ -99,15 +111,19 @@ def angle_between(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def needs_update(
     position_error: np.ndarray, angle_error: np.ndarray, silence: np.ndarray, tolerance: float = 1.0
 ) -> np.ndarray:
-    """[k] bool Whether the state of each object must be published: its copies are wrong by more than 5 mm or 1 degree,
-    each times ``tolerance``, or its ``silence`` [k] s exceeds a heartbeat."""
+    """Returns which of ``k`` objects need to be published: [k] bool.
+
+    An object needs it if its copies are wrong by more than ``tolerance`` times 5 mm or 1 degree, or if its last state
+    was sent a :data:`HEARTBEAT_PERIOD` ago. ``position_error`` [k] m, ``angle_error`` [k] rad: errors of the copies.
+    ``silence`` [k] s: time since the last state.
+    """
     wrong = (position_error > tolerance * POSITION_ERROR) | (angle_error > tolerance * ANGLE_ERROR)
     return wrong | (silence >= HEARTBEAT_PERIOD - 1e-9)
 
 
 def blend_weight(age: float | np.ndarray) -> float | np.ndarray:
-    """Share of a correction that is still hidden ``age`` [s] after it: 1, falling to 5 % in 100 ms.
+    """Returns the share of a correction that is not shown yet ``age`` [s] after it: 1 at first, 5 % after 100 ms.
 
-    The share decays exponentially. So it does not matter that every 17 ms a new pose arrives and blending restarts.
+    The share decays exponentially. So blending may restart with every new pose, every 17 ms.
     """
     return np.exp(-3.0 * np.maximum(age, 0.0) / BLEND_TIME)

@@ -1,20 +1,20 @@
-"""Messages that actors send each other directly, apart from poses and states of objects: forces so far.
+"""Direct messages: what actors send each other apart from poses and states of objects. This module has the forces.
 
-Each kind of message has a :class:`MessageSync`, which sends and receives it. :func:`make_syncs` makes them all. The
-receiver passes the messages of a kind to its sync, and the replicator passes the values of each step to publish. The
-inbox of each step has the present value of each sync under its kind.
+Each kind of message has a :class:`MessageSync`, which sends and receives messages of this kind. :func:`make_syncs`
+makes the syncs of forces. The receiver passes the messages of a kind to its sync. The replicator passes the values of
+each step to the syncs, which publish them. The inbox of each step contains the present value of each sync, by kind.
 
 The client of the actor that pushes computes the forces, and the client that owns the pushed robot or tree applies them.
 Keys: ``force/<to>/<from>`` (``docs/decisions/forces-between-clients.md``).
 
-Wrenches: the mean wrench of a person's hands on each link of a robot over a sixtieth of a second, best effort, during
-contact. The robot's client applies the last message for :data:`WRENCH_MAX_AGE`, and in its simulation copies of
-people's hands do not collide with robots: no contact counts twice. Only people push, only what their hands reach, and
-no harder than two hands can.
+Wrenches: forces and moments of a person's hands on each link of a robot, averaged over a sixtieth of a second, sent
+best effort during contact. The robot's client applies the last message for :data:`WRENCH_MAX_AGE`. In its simulation
+copies of people's hands do not collide with robots, so that no contact counts twice. Only people push, only links that
+their hands reach, and no harder than two hands can.
 
 Couplings: the virtual couplings (:class:`vinesim.net.codec.forces.Coupling`) of one actor to all trees of one owner,
-while the actor touches them. The owner replies with the couplings of its own contacts, for the copies of these trees.
-If only one actor is at a tree, nothing is sent.
+sent while the actor touches these trees. The owner replies with the couplings of its own contacts, which act on the
+copies of the trees. If only one actor touches a tree, nothing is sent.
 """
 
 from __future__ import annotations
@@ -46,80 +46,85 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 SEND_PERIOD = 1.0 / 60.0
-"""Time between two forces that are sent to one actor [s]."""
+"""Time between two messages with forces to the same actor [s]."""
 
 MAX_POSE_AGE = 1.0
-"""An actor whose last pose is older than this pushes nothing [s]."""
+"""Largest age of the last pose of an actor whose forces are applied [s]."""
 
 WRENCH_MAX_AGE = 0.1
-"""Time for which a wrench is applied after its arrival [s], unless a newer one arrives."""
+"""Time for which a wrench is applied after its arrival, unless a newer one arrives [s]."""
 
 HAND_FORCE = 100.0
 """Largest force of one hand [N] (CANOPIES D6.4, section 3.1.1)."""
 
 HAND_LEVER = 1.0
-"""Lever of that force about the centre of mass of a link [m], which bounds the moment. GUESSED."""
+"""Lever arm of a hand's force about the centre of mass of a link [m], which limits the moment. GUESSED."""
 
 MAX_PUSHING_PEOPLE = 4
-"""All people together push a robot no harder than this number of people could. GUESSED."""
+"""Number of people whose largest forces limit the force of all people together on one robot. GUESSED."""
 
 REACH = 1.2
-"""Farthest centre of mass of a link that a hand touches [m], from the palm: half of a long link, and the way of a
-running person until the pose arrives. GUESSED."""
+"""Largest distance of a palm from the centre of mass of a link that the hand touches [m].
+
+Half the length of a long link, and the way of a running person until the pose arrives. GUESSED."""
 
 COUPLING_MAX_AGE = 0.2
-"""Time for which couplings hold after their arrival [s], unless newer ones arrive. They are springs, which are stable
-also when they are old. Over a link with a delay of 100 +- 40 ms and a loss of 4 %, messages come up to 0.15 s apart; a
-value of 0.1 s let the bunch jump."""
+"""Time for which couplings are applied after their arrival, unless newer ones arrive [s].
+
+Couplings are springs, so old ones are stable, too. Over a link with a delay of 100 +- 40 ms and a loss of 4 %, messages
+arrive up to 0.15 s apart. With a value of 0.1 s the bunch jumped."""
 
 ARM_REACH = 2.5
-"""Farthest anchor of a coupling from the base of its actor on the ground [m]: a long arm. GUESSED."""
+"""Largest distance on the ground of a coupling's anchor from the base of its actor [m]: a long arm. GUESSED."""
 
 LinkCentre = Callable[[str], np.ndarray | None]
-"""Centre of mass [3] m of a link of the own robot; None if it has no such link."""
+"""Function that returns the centre of mass [3] m of a link of the own robot, or None if the robot has no such link."""
 
 
 class MessageSync(abc.ABC):
-    """Messages of one kind to and from one actor."""
+    """Sends and receives the direct messages of one kind for one actor."""
 
     kind: ClassVar[int]
-    """Kind of the messages, a key of :data:`vinesim.net.codec.messages.MESSAGES`."""
+    """Number of the kind of messages, a key of :data:`vinesim.net.codec.messages.MESSAGES`."""
 
     @abc.abstractmethod
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a message of a peer at own time ``now`` and network ``time`` [s]; ``MessageError`` if it is invalid."""
+        """Take a message of a peer at own time ``now`` and network ``time`` [s]. Raises ``MessageError`` if it is
+        invalid."""
 
     def current(self, now: float) -> Any:  # noqa: B027 - optional
-        """Returns the received values that are valid at own time ``now`` [s], for the inbox."""
+        """Returns the received values that are valid at own time ``now`` [s]. They become part of the inbox."""
 
     def publish(self, value: Any, now: float, time: float) -> list[bytes]:
-        """Publish the ``value`` of the own actor in the step at own time ``now`` and network ``time`` [s]; None: it has
-        nothing to say. Returns the messages that were sent."""
+        """Publish the ``value`` of the own actor in the step at own time ``now`` and network ``time`` [s].
+
+        None: the actor has no value. Returns the messages that were sent.
+        """
         return []
 
     def remove_peer(self, name: str) -> None:  # noqa: B027 - optional
-        """An actor has left."""
+        """Forget an actor that has left."""
 
     def shift_time(self, step: float) -> None:  # noqa: B027 - optional
-        """The network clock was set by ``step`` [s]."""
+        """Shift all stored network times, because the network clock was set by ``step`` [s]."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Partner:
-    """An actor to which messages are sent."""
+    """An actor to which a :class:`ForceSync` sends messages."""
 
     publisher: Publisher
     due: float
-    """Own time of the next message [s]."""
+    """Earliest own time of the next message [s]."""
     is_active: bool = False
-    """Whether the last message to it was not empty."""
+    """Whether the last message contained forces, so that an empty one must follow."""
 
 
 class ForceSync(MessageSync):
-    """Messages to single actors: at most 60 a second while there is something to say, then one empty message and
-    silence. The last message of each sender is kept; all have a field ``time``.
+    """Base class of the syncs of forces. Stores the last message of each sender; all messages have a field ``time``.
 
-    :func:`make_syncs` subscribes to their keys, once for all kinds.
+    At most 60 messages a second are sent to an actor while there are forces, then one empty message, then nothing.
+    :func:`make_syncs` subscribes to the keys, once for all kinds of forces.
     """
 
     def __init__(self, bus: Bus, name: str, counters: Counters) -> None:
@@ -128,27 +133,27 @@ class ForceSync(MessageSync):
         self._counters = counters
         self._partners: dict[str, _Partner] = {}
         self._received: dict[str, tuple[float, Any]] = {}
-        """Own time of arrival [s] and message, by sender."""
+        """Own time of arrival [s] and content of the last message, by sender."""
 
     def remove_peer(self, name: str) -> None:
-        """An actor has left."""
+        """Forget an actor that has left."""
         self._received.pop(name, None)
         if (partner := self._partners.pop(name, None)) is not None:
             partner.publisher.close()
 
     def shift_time(self, step: float) -> None:
-        """The network clock was set by ``step`` [s]."""
+        """Shift all stored network times, because the network clock was set by ``step`` [s]."""
         for sender, (arrived, message) in self._received.items():
             self._received[sender] = arrived, dataclasses.replace(message, time=message.time + step)
 
     def _is_outdated(self, sender: str, message: Any) -> bool:
-        """Whether a message is not newer than the last one of its sender. Outdated messages are counted."""
+        """Whether a message is not newer than the last one of its sender. Counts outdated messages as dropped."""
         is_outdated = sender in self._received and message.time <= self._received[sender][1].time
         self._counters.dropped += is_outdated
         return is_outdated
 
     def _recent(self, now: float, max_age: float) -> list[tuple[str, Any]]:
-        """Senders whose last message arrived within the last ``max_age`` [s], and that message."""
+        """Returns the senders whose last message arrived at most ``max_age`` [s] ago, each with this message."""
         return [
             (sender, message)
             for sender, (arrived, message) in sorted(self._received.items())
@@ -156,27 +161,32 @@ class ForceSync(MessageSync):
         ]
 
     def _add_partners(self, names: Iterable[str], now: float) -> None:
-        """Add these actors as partners, to whom messages may be sent from own time ``now`` [s] on."""
+        """Declare publishers to the actors ``names``, unless they exist. Messages may be sent from own time ``now`` [s]
+        on."""
         for name in names:
             if name not in self._partners:
                 self._partners[name] = _Partner(self._bus.publisher(f"force/{name}/{self._name}"), now)
 
     def _send(self, partner: _Partner, payload: bytes, now: float, *, is_empty: bool) -> list[bytes]:
-        """Send a message that is due. Returns the messages that were sent: this one, or none without a subscriber."""
+        """Send a message to a partner. Returns a list with the message, or an empty one if there is no subscriber.
+
+        ``is_empty``: whether the message contains no forces.
+        """
         partner.due = max(partner.due, now - SEND_PERIOD) + SEND_PERIOD
         partner.is_active = not is_empty
         return [payload] if partner.publisher.put(payload) else []
 
 
 def _recent_pose(actor: RemotePose, time: float) -> HumanUpdate | RobotUpdate | None:
-    """The last pose of an actor at network ``time`` [s]; None if it is unknown or older than :data:`MAX_POSE_AGE`."""
+    """Returns the last pose of an actor; None if it is unknown or, at network ``time`` [s], too old."""
     return actor.update if actor.update is not None and time - actor.update.time <= MAX_POSE_AGE else None
 
 
 def limit(wrenches: dict[str, np.ndarray], hands: int, hand_force: float) -> tuple[dict[str, np.ndarray], bool]:
-    """Scale the wrenches [6], by link, with a common factor to what ``hands`` hands of ``hand_force`` [N] can exert.
+    """Reduce wrenches to the force and moment that a number of ``hands`` can exert, by one factor for all links.
 
-    Returns the wrenches, and whether they were reduced.
+    ``wrenches``: [6] by link, force [N] and moment [N m]. ``hand_force``: largest force of one hand [N]. Returns the
+    wrenches, and whether they were reduced.
     """
     force = sum(float(np.linalg.norm(wrench[:3])) for wrench in wrenches.values())
     moment = sum(float(np.linalg.norm(wrench[3:])) for wrench in wrenches.values())
@@ -187,7 +197,10 @@ def limit(wrenches: dict[str, np.ndarray], hands: int, hand_force: float) -> tup
 
 
 def hands_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> frozenset[str]:
-    """Hands of a person that can touch a link with its centre of mass at ``centre`` [3] m; None: there is no link."""
+    """Returns which hands of a person (``left``, ``right``) can touch a link.
+
+    ``centre`` [3] m: centre of mass of the link in the world; None: the link does not exist.
+    """
     if centre is None:
         return frozenset()
     hands = {"left": update.pose.left, "right": update.pose.right}
@@ -197,8 +210,11 @@ def hands_within_reach(update: HumanUpdate, centre: np.ndarray | None) -> frozen
 def limit_by_hands(
     wrenches: dict[str, np.ndarray], reach: dict[str, frozenset[str]], hand_force: float
 ) -> tuple[dict[str, np.ndarray], bool]:
-    """Reduce the wrenches [6], by link, to what the hands within ``reach`` of each link can exert, and all of these
-    hands together. Returns the wrenches, and whether they were reduced."""
+    """Reduce the wrench on each link to what the hands that reach it can exert, and the sum to what all hands can.
+
+    ``wrenches``: [6] by link, force [N] and moment [N m]. ``reach``: hands that reach each link. ``hand_force``:
+    largest force of one hand [N]. Returns the wrenches, and whether they were reduced.
+    """
     is_limited = False
     for link, wrench in wrenches.items():
         reduced, is_reduced = limit({link: wrench}, len(reach[link]), hand_force)
@@ -210,14 +226,15 @@ def limit_by_hands(
 
 @dataclasses.dataclass(slots=True)
 class _Push:
-    """Wrenches of the own hands on one robot since the last message."""
+    """Sum of the wrenches of the own hands on one robot since the last message, by link, and the number of steps."""
 
     total: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
     ticks: int = 0
 
 
 class WrenchSync(ForceSync):
-    """Wrenches of the own hands on others' robots, and of others' hands on the own robot."""
+    """Sends wrenches of the own hands on robots of other clients, and receives those of other people on the own
+    robot."""
 
     kind = WRENCHES
 
@@ -229,15 +246,15 @@ class WrenchSync(ForceSync):
         hand_force: float = HAND_FORCE,
         link_centre: LinkCentre = lambda _: None,
     ) -> None:
-        """``hand_force`` [N]: limit of each hand. ``link_centre(link)``: centre of mass of a link of the own robot;
-        without this function people cannot push the robot."""
+        """``hand_force``: largest force of one hand [N]. ``link_centre(link)``: centre of mass of a link of the own
+        robot. Without this function people cannot push the robot."""
         super().__init__(bus, name, counters)
         self._hand_force = hand_force
         self._link_centre = link_centre
         self._pushes: dict[str, _Push] = {}
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take the wrenches of a person, and count the ones that are not used.
+        """Take a message with the wrenches of a person on the own robot. Refused and reduced wrenches are counted.
 
         Raises :class:`MessageError` if the message is invalid or not from a person.
         """
@@ -258,7 +275,7 @@ class WrenchSync(ForceSync):
         self._received[hello.name] = now, WrenchMessage(message.time, reached)
 
     def current(self, now: float) -> dict[str, np.ndarray]:
-        """Sum of the wrenches [6] of all people on each link of the own robot, by link name. The total is limited."""
+        """Returns the limited sum of the wrenches [6] of all people on each link of the own robot, by link name."""
         links: dict[str, np.ndarray] = {}
         for _, message in self._recent(now, WRENCH_MAX_AGE):
             for link, wrench in message.wrenches.items():
@@ -268,13 +285,15 @@ class WrenchSync(ForceSync):
         return links
 
     def remove_peer(self, name: str) -> None:
-        """An actor has left."""
+        """Forget an actor that has left."""
         super().remove_peer(name)
         self._pushes.pop(name, None)
 
     def publish(self, value: Mapping[str, dict[str, np.ndarray]] | None, now: float, time: float) -> list[bytes]:
-        """Publish the wrenches of this step on others' robots, by robot and link. Returns the messages that were
-        sent."""
+        """Publish the wrenches of the own hands in this step, averaged over the steps since the last message.
+
+        ``value``: wrenches [6] by robot and link. Returns the messages that were sent.
+        """
         wrenches = value or {}
         self._add_partners(wrenches, now)
         sent = []
@@ -295,7 +314,7 @@ class WrenchSync(ForceSync):
 
 
 class CouplingSync(ForceSync):
-    """Couplings of the own actor's contacts, and those of others to the same trees."""
+    """Sends couplings of the own actor's contacts with trees, and receives those of other actors to the same trees."""
 
     kind = COUPLINGS
 
@@ -308,17 +327,18 @@ class CouplingSync(ForceSync):
         owner: Callable[[int], str | None],
         peers: Container[str],
     ) -> None:
-        """``owner(tree)``: name of a tree's owner. ``peers``: names of the actors to which couplings may be sent."""
+        """``owner(tree)``: name of the tree's owner, or None. ``peers``: names of the actors that may receive
+        couplings."""
         super().__init__(bus, name, counters)
         self._model = model
         self._owner = owner
         self._peers = peers
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take the couplings of an actor.
+        """Take a message with the couplings of another actor.
 
-        Couplings to trees that neither side owns, or farther away than an arm reaches, are counted and not used.
-        Raises :class:`MessageError` if the message is invalid, or names bodies that there are not.
+        Couplings to trees that neither actor owns, or that the other actor's arms do not reach, are counted and not
+        used. Raises :class:`MessageError` if the message is invalid or names bodies that do not exist.
         """
         name = sender.hello.name
         message = decode_couplings(payload)
@@ -338,7 +358,7 @@ class CouplingSync(ForceSync):
         self._received[name] = now, CouplingMessage(message.time, used)
 
     def partners(self, tree: int, now: float) -> list[str]:
-        """Actors whose couplings to a tree hold now."""
+        """Returns the other actors whose couplings to a tree are valid at own time ``now`` [s]."""
         return [
             name
             for name, theirs in self.current(now).items()
@@ -346,13 +366,13 @@ class CouplingSync(ForceSync):
         ]
 
     def current(self, now: float) -> dict[str, tuple[Coupling, ...]]:
-        """Couplings of others that hold now, by actor."""
+        """Returns the couplings of other actors that are valid at own time ``now`` [s], by actor."""
         return {
             sender: message.couplings for sender, message in self._recent(now, COUPLING_MAX_AGE) if message.couplings
         }
 
     def publish(self, value: Iterable[Coupling] | None, now: float, time: float) -> list[bytes]:
-        """Publish the couplings of this step. Returns the messages that were sent."""
+        """Publish the own couplings of this step, which are ``value``. Returns the messages that were sent."""
         couplings = self._by_partner(value or (), now)
         self._add_partners(couplings, now)
         sent = []
@@ -364,8 +384,11 @@ class CouplingSync(ForceSync):
         return sent
 
     def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
-        """Couplings by the peer that receives them: the owner of the tree or, for an own tree, each peer that touches
-        it, too."""
+        """Returns the own couplings by the peer that shall receive them.
+
+        This is the owner of the tree. Couplings to an own tree go to each peer whose couplings to it are valid at own
+        time ``now`` [s].
+        """
         found: dict[str, list[Coupling]] = {}
         for coupling in couplings:
             tree = int(self._model.body_tree[coupling.body])
@@ -377,7 +400,7 @@ class CouplingSync(ForceSync):
 
 
 def _check_body(body: int, model: Model) -> None:
-    """Raise :class:`MessageError` unless the index ``body`` exists and the body can be held: it is wood or a bunch."""
+    """Raise :class:`MessageError` unless the index ``body`` exists and the body is no berry cluster."""
     if body >= len(model.body_tree):
         raise MessageError(f"a coupling to body {body}; there are {len(model.body_tree)}")
     tree = int(model.body_tree[body])
@@ -396,9 +419,10 @@ def make_syncs(
     hand_force: float = HAND_FORCE,
     link_centre: LinkCentre = lambda _: None,
 ) -> tuple[MessageSync, ...]:
-    """Make the syncs of all messages, except voices, that actor ``name`` and its ``peers`` send each other directly.
+    """Make the syncs of all direct messages of the actor ``name`` except voices, and subscribe to their keys.
 
-    ``owner(object_id)``: name of the actor that owns an object. For the other arguments see :class:`WrenchSync`.
+    ``owner(object_id)``: name of the actor that owns an object, or None. ``hand_force``, ``link_centre``: see
+    :class:`WrenchSync`.
     """
     bus.subscribe(f"force/{name}/*", KEEP_LAST_64)
     return (

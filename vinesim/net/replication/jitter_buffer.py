@@ -1,9 +1,9 @@
-"""Jitter buffer: poses of a peer are shown after a fixed delay, interpolated between two received ones; pure.
+"""Jitter buffer: shows the poses of a peer after a fixed delay, interpolated between two received poses. No I/O.
 
-Extrapolation shows peers where they should be now, and is wrong if they turn meanwhile. A buffer waits: while every
-sample arrives within its delay, the shown motion is exactly the motion of the peer, however unevenly samples arrive.
-The price is that delay. The buffer is off by default, because a hand that is shown late is touched where it no longer
-is.
+Extrapolation shows a peer where it should be now, and is wrong if the peer has turned meanwhile. A jitter buffer waits
+instead. While every sample arrives within the delay, the shown motion is exactly that of the peer, however unevenly the
+samples arrive. The price is the delay. The buffer is off by default, because contacts with a hand that is shown late
+would happen where the hand no longer is.
 """
 
 from __future__ import annotations
@@ -16,31 +16,34 @@ import numpy as np
 from vinesim.net.replication import dead_reckoning
 
 MAX_DELAY = 0.5
-"""Longest delay [s]."""
+"""Longest delay of a jitter buffer [s]."""
 
 MAX_SAMPLES = 64
-"""Samples that are kept: twice as many as arrive in the longest delay at the full rate."""
+"""Largest number of samples in a buffer: twice as many as arrive during the longest delay at the full rate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class JitterBuffer:
-    """Samples of one peer in the order of their times; immutable."""
+    """A buffer of the last poses of one peer, in order of their times. Immutable."""
 
     delay: float = 0.0
-    """Delay of the shown state [s]; 0 extrapolates to now instead."""
+    """Delay of the shown pose [s]. 0: no buffer, poses are extrapolated to the present."""
     times: tuple[float, ...] = ()
     """Network times of the samples [s], strictly increasing."""
     states: tuple[np.ndarray, ...] = ()
     rates: tuple[np.ndarray, ...] = ()
-    """Time derivatives of the samples [1/s], used after the newest sample."""
+    """Time derivatives of the samples [1/s], with which the newest sample is extrapolated."""
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.delay <= MAX_DELAY:
             raise ValueError(f"jitter buffer of {1e3 * self.delay:g} ms: give 0 to {1e3 * MAX_DELAY:g} ms")
 
     def insert(self, time: float, state: np.ndarray, rate: np.ndarray) -> JitterBuffer:
-        """Returns the buffer with one more sample. Samples may arrive in any order. If two have the same time, the
-        first is kept."""
+        """Returns the buffer with one more sample. Samples may arrive in any order.
+
+        ``time``: network time of the sample [s]. ``state``: flat array of the pose. ``rate``: its time derivative
+        [1/s]. Of two samples with the same time the first one is kept.
+        """
         at = bisect.bisect_left(self.times, time)
         if at < len(self.times) and self.times[at] == time:
             return self
@@ -51,9 +54,10 @@ class JitterBuffer:
         return JitterBuffer(self.delay, put(self.times, time), put(self.states, state), put(self.rates, rate))
 
     def sample(self, now: float) -> np.ndarray:
-        """The state to show at ``now`` [s]: the state at ``now - delay``, interpolated linearly between two samples.
+        """Returns the state to show at network time ``now`` [s]: the state at ``now - delay``.
 
-        Before the first sample it is the first sample. After the newest it is extrapolated as without a buffer.
+        It is interpolated linearly between two samples. Before the first sample and after the newest one, that sample
+        is extrapolated, as without a buffer.
         """
         before, after, share, since = self._between(now)
         if before == after:
@@ -61,15 +65,21 @@ class JitterBuffer:
         return (1.0 - share) * self.states[before] + share * self.states[after]
 
     def rate(self, now: float) -> np.ndarray:
-        """Time derivative of the state shown at ``now`` [1/s], as sent by the peer, not a finite difference."""
+        """Returns the time derivative [1/s] of the state that is shown at network time ``now`` [s].
+
+        It is interpolated between the derivatives that the peer has sent, and is no finite difference.
+        """
         before, after, share, since = self._between(now)
         if before == after:
             return self.rates[before] * float(0.0 <= since <= dead_reckoning.MAX_EXTRAPOLATION)
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:
-        """Indices of the two samples around ``now``, which are equal at an end; the interpolation weight between them;
-        the time since the first of the two [s]."""
+        """Returns the two samples between which the state to show at ``now`` [s] is.
+
+        Returns the index of each, the weight of the second one, and the time since the first one [s]. Before the first
+        and after the newest sample, both indices are equal.
+        """
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)
         if after in (0, len(self.times)):

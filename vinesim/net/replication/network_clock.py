@@ -1,9 +1,9 @@
-"""Network time of one client: the world's time, as the server's replies let the client know it at every moment.
+"""Network time of one client: its estimate of the world's time, from the server's replies to pings.
 
-Pings measure the offset between two real-time clocks, the client's and the server's; whatever the factor of the
-world, that offset stays constant. Each reply also gives a time of the server's clock, the world's time then, and the
-real-time factor. The world's time now follows from both. Own time runs at the factor of the world and is slewed towards
-the world's time.
+Pings measure the offset between two real-time clocks, that of the client and that of the server. This offset stays
+constant whatever the world's real-time factor is. Each reply also contains a time of the server's clock, the time of
+the world at that moment, and the real-time factor. The present time of the world follows from these. Own time runs at
+the real-time factor and is slewed towards the time of the world.
 
 Key: the query ``clock/<actor>``, which also reports how fast the actor's client can follow (:mod:`vinesim.net.pace`).
 """
@@ -22,52 +22,55 @@ from vinesim.net.transport.bus import Bus
 log = logging.getLogger(__name__)
 
 PING_PERIOD = (0.05, 0.2)
-"""Real time between pings [s]: at first, until twice the number of :data:`PING_WINDOW` pings, and after that."""
+"""Real time between two pings [s]: for the first ``2 * PING_WINDOW`` pings, and afterwards."""
 
 SETTLE_TIMEOUT = 2.0
-"""Longest real time for which a client waits for a server's first reply [s]."""
+"""Longest real time for which a client waits for the server's first reply [s]."""
 
 MAX_REPLY_AGE = 2.0
-"""A reply to a ping older than this does not tell the present speed of the world [s]."""
+"""Largest age of a ping whose reply is used for the present real-time factor of the world [s]."""
 
 CURRENT_AGE = 0.75
-"""Network time is current if the server has answered a ping that is not older than this [s]."""
+"""Largest age of the last answered ping with which network time counts as current [s]."""
 
 SLEW_TIME = 0.5
 """Time constant with which own time approaches the world's time [s]."""
 
 MAX_SLEW = 0.25
-"""Largest share by which own time runs faster or slower while it approaches the world's time."""
+"""Largest relative change of the rate of own time while it approaches the world's time."""
 
 
 class NetworkClock:
-    """Pings the server's clock over a bus, and follows the time of its world.
+    """Pings the server's clock over a bus, and estimates the time of the world.
 
-    ``now`` is real time, of any monotonic clock [s]; own time is the same in a world that runs in real time.
+    Arguments ``now`` are real time [s] of one monotonic clock. In a world that runs in real time, own time equals this
+    time. Network time is own time plus :attr:`offset`.
     """
 
     def __init__(self, bus: Bus, now: float | None = None, offset: float = 0.0) -> None:
-        """``now``: real time [s], if known; ``offset``: first estimate of network time minus own time [s]."""
+        """``now``: present real time [s]; None: given by the first :meth:`advance`. ``offset``: first value of
+        :attr:`offset`."""
         self.estimate = ClockEstimate()
-        """Estimate of the server's real time minus the client's [s]."""
+        """Estimate of the server's real time minus the client's real time."""
         self.factor = 1.0
-        """Real-time factor of the world, by the server's last reply."""
+        """Real-time factor of the world, from the server's last reply."""
         self.cause = ""
-        """What limits the factor, by the server's last reply. Empty if nothing limits it."""
+        """What limits the real-time factor, from the server's last reply; empty if nothing limits it."""
         self.offset = offset
         """Network time minus own time [s]."""
         self.report: Callable[[], PaceReport | None] = lambda: None
-        """Returns how fast this client can follow, to be sent with the next ping. None: it does not slow the world."""
+        """Function that returns how fast this client can follow; each ping sends its value. It returns None if the
+        client shall not slow the world."""
         self._bus = bus
         self._now = now
         self._started = now
         self._own = 0.0 if now is None else now
         self._rate = 1.0
-        """Rate at which own time passes, with slewing [s/s]."""
+        """Rate at which own time passes [s/s]: the real-time factor, changed by slewing."""
         self._known: tuple[float, float] | None = None
-        """Real time of the server's clock, and the world's time then [s], by its last reply."""
+        """Real time of the server's clock, and the world's time at that moment [s], from the server's last reply."""
         self._answered = -math.inf
-        """Real time of the last ping that the server has answered [s]."""
+        """Own real time of the last ping that the server has answered [s]."""
         self._pinged = -math.inf
         self._ping_count = 0
 
@@ -78,12 +81,12 @@ class NetworkClock:
         return self._own + self.offset
 
     def own(self, now: float) -> float:
-        """Own time [s] at real time ``now`` [s]."""
+        """Returns own time [s] at real time ``now`` [s]."""
         return now if self._now is None else self._own + self._rate * (now - self._now)
 
     @property
     def round_trip(self) -> float | None:
-        """Shortest of the last pings to the server and back [s]; None without a reply."""
+        """Shortest round trip of the last pings [s]; None before the first reply."""
         return min((ping.round_trip for ping in self.estimate.pings), default=None)
 
     @property
@@ -94,11 +97,11 @@ class NetworkClock:
         return bool(self.estimate.pings) or self._now - self._started > SETTLE_TIMEOUT
 
     def is_current(self, now: float) -> bool:
-        """Whether the server has told the world's time recently."""
+        """Whether the server has answered a recent ping (:data:`CURRENT_AGE`) at real time ``now`` [s]."""
         return now - self._answered <= CURRENT_AGE
 
     def advance(self, now: float) -> float:
-        """Advance to real time ``now`` [s]. Returns the own time then [s]."""
+        """Advance the clock to real time ``now`` [s]. Returns own time at ``now`` [s]."""
         own = self.own(now)
         self.estimate = self.estimate.advanced(now - self._now if self._now is not None else 0.0)
         self._now = now
@@ -108,7 +111,7 @@ class NetworkClock:
         return own
 
     def ping_if_due(self) -> None:
-        """Query the server's clock when the last ping is old enough."""
+        """Send a ping to the server's clock if the last one is older than :data:`PING_PERIOD`."""
         assert self._now is not None
         if self._now - self._pinged >= PING_PERIOD[self._ping_count >= 2 * PING_WINDOW]:
             self._pinged = self._now
@@ -116,7 +119,10 @@ class NetworkClock:
             self._bus.query(f"clock/{self._bus.name}", encode_time(self._now, report=self.report()))
 
     def receive(self, payload: bytes, age: float) -> None:
-        """Take a reply that arrived ``age`` [s] of real time ago; :class:`MessageError` if it cannot be decoded."""
+        """Take a reply to a ping, which arrived ``age`` [s] of real time ago.
+
+        Raises :class:`MessageError` if the reply cannot be decoded.
+        """
         assert self._now is not None
         reply = decode_time(payload)
         received = self._now - age
@@ -126,7 +132,7 @@ class NetworkClock:
         settles = len(self.estimate.pings) < PING_WINDOW
         self.estimate = self.estimate.with_ping(Ping(reply.asked, reply.real, received))
         is_other = len(self.estimate.pings) == 1 and not is_first
-        """Whether another server has replied, or one whose clock was set."""
+        """Whether another server has replied, or the same one after its clock was set."""
         if not (is_first or is_other) and (
             self._now - reply.asked > MAX_REPLY_AGE or (self._known is not None and reply.real < self._known[0])
         ):
@@ -136,14 +142,14 @@ class NetworkClock:
         self._answered = reply.asked
         self.factor = reply.factor
         self.cause = reply.cause
-        # The first estimates are as wrong as their round trips are long, and what was extrapolated through a long
-        # silence may be wrong by seconds: correct both at once.
+        # Estimates from the first pings may be wrong by half their round trips, and time that was extrapolated through
+        # a long silence may be wrong by seconds. Both are corrected at once, without slewing.
         if settles or was_silent:
             self.offset += self._away()
         self._slew()
 
     def _away(self) -> float:
-        """The world's time, as far as it is known, minus network time [s]."""
+        """Returns the world's time, by the server's last reply, minus network time [s]; 0 before the first reply."""
         if self._known is None:
             return 0.0
         assert self._now is not None
@@ -151,8 +157,11 @@ class NetworkClock:
         return world + self.factor * (self._now + self.estimate.offset - real) - self.time
 
     def _slew(self) -> None:
-        """Run faster or slower until network time equals the world's time. If they differ by :data:`STEP_THRESHOLD` or
-        more, the clock is another one, and its time is taken at once."""
+        """Set the rate of own time such that network time approaches the world's time.
+
+        If they differ by :data:`STEP_THRESHOLD` or more, the server or its clock has changed, and network time is set
+        to the world's time at once.
+        """
         away = self._away()
         if abs(away) >= STEP_THRESHOLD:
             self.offset = self.offset + away

@@ -1,4 +1,4 @@
-"""Claims on all objects as one client knows them. They tell who owns an object, who is silent, and what to correct.
+"""Claims on all objects as one actor knows them: who owns an object, which owners are silent, which claims to correct.
 
 The order of claims is defined in :mod:`vinesim.net.replication.authority`. Times are network time [s].
 """
@@ -13,54 +13,54 @@ from vinesim.net.replication import authority, dead_reckoning
 from vinesim.net.replication.authority import NO_OWNER, UNTOUCHED, Claim
 
 CORRECTION_PERIOD = 0.2
-"""Shortest time between two corrections of one object [s]. GUESSED."""
+"""Shortest time between two corrections of claims on one object [s]. GUESSED."""
 
 OWNER_TIMEOUT = 3.0
-"""An owner that has sent nothing about its object for this long no longer counts as the owner [s]: three heartbeats."""
+"""Time without messages about an object after which the sender no longer counts as its owner [s]: three heartbeats."""
 
 LONG_AGO = -1e9
 
 
 @dataclasses.dataclass(slots=True)
 class ObjectRecord:
-    """The claim on one object, and when its state was last sent or received."""
+    """The greatest known claim on one object, and the times at which its state was last sent or received."""
 
     claim: Claim = UNTOUCHED
-    """The greatest claim that was made or received."""
+    """Greatest claim on the object that this actor has made or received."""
     touching: bool = False
     """Whether the owner is in contact with the object."""
     previous: Claim = UNTOUCHED
-    """The claim before this client took the object."""
+    """Claim before this actor took the object."""
     announced: bool = False
-    """Whether the claim was published, so that a peer may know it."""
+    """Whether the claim was published or received, so that a peer may know it."""
     silent: bool = False
-    """Whether the owner has left or timed out. The claim still holds, in case the owner returns, but until then the
-    object has no owner."""
+    """Whether the owner has left or timed out. The object then has no owner. The claim is kept in case the owner
+    returns."""
     published_at: float = LONG_AGO
-    """Time of the newest state."""
+    """Time of the newest state of the object that was sent or accepted."""
     received_at: float = LONG_AGO
     """Time at which the newest message about the object arrived."""
     listener_count: int = 0
     """Number of peers within the interest radius when the object's state was last published."""
     published_to_all_at: float = LONG_AGO
-    """For a tree: time of the newest own state that was published to all listeners."""
+    """For a tree: time of the newest state that this actor published to all peers within the interest radius."""
     near_listener_count: int = 0
-    """For a tree: number of peers near enough for its full rate when its state was last published."""
+    """For a tree: number of peers near enough to receive all layers of its states when it was last published."""
     corrected_at: float = LONG_AGO
-    """Time at which the claim was last repeated as a correction."""
+    """Time at which this actor last published the claim to correct an outdated one."""
 
 
 class Ownership:
-    """The claims on all objects that were ever touched."""
+    """The greatest known claims on all objects that were ever claimed, as one actor knows them."""
 
     def __init__(self, name: str, live: Container[str]) -> None:
-        """``name``: the own actor's name. ``live``: names of the peers that are present; the caller updates it."""
+        """``name``: name of the own actor. ``live``: names of all present peers, which the caller keeps up to date."""
         self.name = name
         self._live = live
         self._known: collections.defaultdict[int, ObjectRecord] = collections.defaultdict(ObjectRecord)
         self.siblings: tuple[Ownership, ...] = ()
-        """Claims of the other actors of the same client. They send no messages about the objects that they own to this
-        actor, so it reads their claims here."""
+        """Claims as known by the other actors of the same client. These actors send this one no messages about the
+        objects that they own, so it reads their claims here."""
         self.owned: set[int] = set()
         self.remote: set[int] = set()
         self._losing_claims: list[tuple[int, Claim]] = []
@@ -76,11 +76,11 @@ class Ownership:
         return self._known[object_id]
 
     def claim(self, object_id: int) -> Claim:
-        """The greatest claim that was made or received."""
+        """Returns the greatest claim on an object that this actor has made or received."""
         return self._known[object_id].claim if object_id in self._known else UNTOUCHED
 
     def owner(self, object_id: int) -> str | None:
-        """Name of the live actor that owns an object now (perhaps the own one), or None."""
+        """Returns the name of the live actor that owns an object now, which may be the own actor, or None."""
         if object_id not in self.owned and (sibling := self._owning_sibling(object_id)) is not None:
             return sibling.name
         if object_id not in self._known:
@@ -92,13 +92,13 @@ class Ownership:
         return owner if owner in self._live and not known.silent else None
 
     def _owning_sibling(self, object_id: int) -> Ownership | None:
-        """The other actor of the same client that owns an object now."""
+        """Returns the claims of the other actor of the same client that owns an object now, or None."""
         return next((sibling for sibling in self.siblings if object_id in sibling.owned), None)
 
     # ------------------------------------------------------------ what I do
 
     def touch(self, object_id: int) -> None:
-        """Claim an object by contact, unless its live owner is in contact with it, too."""
+        """Claim an object that the own actor touches, unless its live owner touches it, too."""
         self._merge_sibling(object_id)
         known = self._known[object_id]
         claim = authority.claim_by_touch(known.claim, self.name, self.owner(object_id) is not None and known.touching)
@@ -106,7 +106,7 @@ class Ownership:
             self._take(object_id, claim)
 
     def grab(self, object_id: int) -> None:
-        """Claim an object by grabbing, picking or cutting it, whatever its owner."""
+        """Claim an object that the own actor grabs, picks or cuts, whoever owns it."""
         self._merge_sibling(object_id)
         self._take(object_id, authority.claim_by_grab(self.claim(object_id), self.name))
 
@@ -115,12 +115,13 @@ class Ownership:
         self._take(object_id, authority.claim_by_touch(self.claim(object_id), self.name, False))
 
     def _merge_sibling(self, object_id: int) -> None:
-        """If another actor of the same client owns the object, adopt its claim, unless a greater claim is known."""
+        """Adopt the claim of another actor of the same client that owns the object, unless a greater claim is known."""
         sibling = None if object_id in self.owned else self._owning_sibling(object_id)
         if sibling is not None and not authority.wins(self.claim(object_id), sibling.claim(object_id)):
             self._adopt(object_id, sibling.claim(object_id), sibling[object_id].touching)
 
     def _take(self, object_id: int, claim: Claim) -> None:
+        """Make the own ``claim`` on an object. The claim is not announced yet."""
         known = self._known[object_id]
         if object_id not in self.owned or known.announced:
             known.previous = known.claim
@@ -136,7 +137,8 @@ class Ownership:
         self.owned.add(object_id)
 
     def release(self, object_id: int) -> Claim:
-        """Release an object at rest. Returns the claim under which to publish its release."""
+        """Give up the ownership of an object that is at rest. Returns the claim with which to publish its state at
+        rest."""
         known = self._known[object_id]
         held = known.claim
         self.owned.discard(object_id)
@@ -145,12 +147,14 @@ class Ownership:
         return held
 
     def increment(self, object_id: int) -> None:
-        """Increment the own claim before a retained record is published, because no two records share a claim."""
+        """Increment the own claim on an object before a retained record is published, so that no two records share a
+        claim."""
         known = self._known[object_id]
         known.claim = known.claim._replace(authority=(known.claim.authority + 1) % authority.SEQUENCE_COUNT)
 
     def rollback(self, object_id: int) -> None:
-        """Undo a claim that no peer knows, so that sequences count only published claims."""
+        """Return to the claim before the own one, which no peer knows. So sequence numbers count only published
+        claims."""
         known = self._known[object_id]
         known.claim = authority.release(known.previous) if known.previous.owner == self.name else known.previous
         known.silent = True
@@ -158,9 +162,10 @@ class Ownership:
     # ------------------------------------------------------------ what others say
 
     def receive_state(self, object_id: int, claim: Claim, touching: bool, published_at: float, time: float) -> bool:
-        """Merge the claim of a received state. Returns whether to accept the state.
+        """Merge the claim in a received state of an object. Returns whether to accept the state.
 
-        ``published_at`` [s]: time in the message; ``time`` [s]: now. If the object is at rest, the claim has no owner.
+        ``touching``: whether the owner touches the object. ``published_at`` [s]: time in the message. ``time`` [s]:
+        present time. If the object is at rest, the claim has no owner.
         """
         known = self._known[object_id]
         published_at = min(published_at, time + dead_reckoning.MAX_CLOCK_SKEW)
@@ -177,7 +182,7 @@ class Ownership:
         return True
 
     def receive_claim(self, object_id: int, claim: Claim, touching: bool, sender: str, time: float) -> None:
-        """Merge a claim that its owner made, or that ``sender`` repeated as a correction."""
+        """Merge a claim on an object that ``sender`` has made, or has repeated to correct an outdated one."""
         known = self._known[object_id]
         if claim == known.claim and claim.owner != sender:
             return
@@ -188,7 +193,7 @@ class Ownership:
             self._losing_claims.append((object_id, claim))
 
     def receive_retained(self, object_id: int, claim: Claim, touching: bool, time: float) -> bool:
-        """Merge the claim of a retained record. Returns whether the pose in the record holds now."""
+        """Merge the claim of a retained record about an object. Returns whether the pose in the record is valid now."""
         known = self._known[object_id]
         if claim != known.claim and not authority.wins(claim, known.claim):
             return False
@@ -197,7 +202,7 @@ class Ownership:
         return True
 
     def _adopt(self, object_id: int, claim: Claim, touching: bool) -> None:
-        """Adopt a claim that a peer made or repeated."""
+        """Store a claim of a peer as the greatest one, and update which objects are owned and remote."""
         known = self._known[object_id]
         known.claim = claim
         known.touching = touching
@@ -213,10 +218,10 @@ class Ownership:
     # ------------------------------------------------------------ what follows
 
     def remove_actor(self, name: str, time: float, successor: Callable[[int], str]) -> None:
-        """Handle an actor that has left: each object that it still moved goes to the actor ``successor(object_id)``.
+        """Handle an actor that has left. Take over the objects that it moved and whose successor is the own actor.
 
-        The claims of the actor that left still hold, in case it returns. They are only marked as silent. Otherwise two
-        clients might never agree again.
+        ``successor(object_id)``: name of the actor that takes over an object. The claims of the actor that left are
+        kept, in case it returns, and only marked as silent. Otherwise two clients might never agree again.
         """
         for object_id in sorted(object_id for object_id, known in self._known.items() if known.claim.owner == name):
             known = self._known[object_id]
@@ -234,14 +239,15 @@ class Ownership:
             known.corrected_at += step
 
     def expire(self, time: float) -> None:
-        """Mark owners that have timed out as silent. Their claims still hold."""
+        """Mark remote owners as silent that have timed out at ``time`` [s]. Their claims are kept."""
         for object_id in self.remote:
             known = self._known[object_id]
             if time - known.received_at > OWNER_TIMEOUT:
                 known.silent = True
 
     def released(self) -> list[int]:
-        """Objects that have lost their remote owner since the last call."""
+        """Returns the objects that have lost their remote owner since the last call, and are not owned by this
+        actor."""
         released = []
         for object_id in sorted(self.remote):
             if object_id in self.owned or self.owner(object_id) is None:
@@ -251,8 +257,11 @@ class Ownership:
         return released
 
     def corrections(self, time: float) -> list[int]:
-        """Objects that a peer claimed with outdated sequences. To publish their claim again restores agreement after a
-        loss."""
+        """Returns the objects that a peer has claimed with a lesser claim, and whose claim this actor shall publish
+        again.
+
+        The peer must have missed a message. The correction restores agreement.
+        """
         losing = self._losing_claims
         self._losing_claims = []
         corrections = []

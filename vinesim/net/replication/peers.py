@@ -1,8 +1,8 @@
-"""The peers of one actor: liveliness, greetings, their poses, and the common clock.
+"""The peers of one actor: which are live, their hellos, their poses, and the common clock.
 
 Keys: the poses of an actor are divided among ``a/<actor>/far``, ``a/<actor>/mid``, ``a/<actor>/near`` and
-``a/<actor>``. A nearer peer subscribes to more of them (:data:`vinesim.net.replication.interest.POSE_LAYERS`). Queries
-use ``hello/<actor>`` and ``clock/<actor>``.
+``a/<actor>``. The nearer a peer is, the more of these keys it subscribes to
+(:data:`vinesim.net.replication.interest.POSE_LAYERS`). Queries use ``hello/<actor>`` and ``clock/<actor>``.
 """
 
 from __future__ import annotations
@@ -35,27 +35,30 @@ _LONG_AGO = -1e9
 
 
 class WorldMismatch(RuntimeError):
-    """Two actors cannot share a world: their scenes or their protocol versions differ."""
+    """Two actors cannot share a world, because their scenes or their protocol versions differ."""
 
     exit_code = 4
 
 
 class PeerRegistry:
-    """All peers in this world."""
+    """All peers of one actor in its world. Constructing it joins the world."""
 
     def __init__(self, bus: Bus, hello: Hello, counters: Counters, jitter_buffer: float = 0.0) -> None:
-        """``jitter_buffer`` [s]: delay with which poses of peers are shown. Joins the world; see :meth:`Bus.join`."""
+        """Join the world and offer the own ``hello`` to peers. Raises what :meth:`Bus.join` raises.
+
+        ``jitter_buffer``: delay with which poses of peers are shown [s]; 0: they are extrapolated.
+        """
         self.bus = bus
         self.hello = hello
         self.counters = counters
         self._jitter_buffer = JitterBuffer(jitter_buffer).delay
         self._local_actors: set[str] = set()
         self._alive: frozenset[str] | None = None
-        """Names that were live when all of them were known or rejected; None while a hello is missing."""
+        """All live names, if each of them is a known, rejected or local actor; None while a hello is missing."""
         self.clock = NetworkClock(bus)
         self.known: dict[str, RemotePose] = {}
         self.seen_names: set[str] = set()
-        """Names of all peers that were ever admitted. Their last retained records may arrive after they have left."""
+        """Names of all peers that were ever accepted. Their last retained records may arrive after they have left."""
         greeting = encode_hello(hello)
         bus.join(greeting)
         bus.declare_queryable(f"hello/{hello.name}", lambda _: greeting)
@@ -64,22 +67,22 @@ class PeerRegistry:
         self._rejected: set[str] = set()
         self._warned: set[str] = set()
         self._unread: tuple[Reply, ...] = ()
-        """Replies that came while only the clock was read."""
+        """Replies that arrived in :meth:`keep_clock` and wait for :meth:`process_replies`."""
         self._layers = [bus.publisher(f"a/{hello.name}{layer.suffix}") for layer in interest.POSE_LAYERS]
         bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_LAST_1)
         self._pose_number: int | None = None
-        """Number of the last pose that was due. None before the first."""
+        """Number of the last pose that was due; None before the first one."""
         self._phase = zlib.crc32(hello.name.encode()) % 1024 / 1024.0 * interest.POSE_LAYERS[0].every
 
     def positions(self) -> dict[str, np.ndarray]:
-        """Positions [3] m of all peers whose pose is known."""
+        """Returns the positions [3] m of all peers whose pose is known, by name."""
         return {name: actor.update.base_q[:3] for name, actor in self.known.items() if actor.update is not None}
 
     # ------------------------------------------------------------ who is here
 
     @property
     def local_actors(self) -> set[str]:
-        """Other actors of the same client, which are no peers."""
+        """Names of the other actors of the same client, which are no peers."""
         return self._local_actors
 
     @local_actors.setter
@@ -88,7 +91,10 @@ class PeerRegistry:
         self._alive = None
 
     def poll_liveliness(self, now: float) -> list[str]:
-        """Query new peers for their hello, and the server for its clock, when due. Returns the peers that have left."""
+        """Send due queries: for the hellos of new peers, and for the server's clock. Returns the peers that have left.
+
+        ``now``: own time [s].
+        """
         live_names = self.bus.alive()
         if live_names == self._alive:
             self.clock.ping_if_due()
@@ -113,8 +119,10 @@ class PeerRegistry:
         return gone
 
     def keep_clock(self, now: float) -> None:
-        """Advance the clock to real time ``now`` [s] between steps that are far apart: ping the server when due, and
-        take its replies. Other replies wait for :meth:`process_replies`."""
+        """Advance the clock to real time ``now`` [s], send a due ping to the server, and take the replies to pings.
+
+        Called between steps that are far apart. Other replies wait for :meth:`process_replies`.
+        """
         self.clock.advance(now)
         self.clock.ping_if_due()
         others: list[Reply] = []
@@ -130,7 +138,7 @@ class PeerRegistry:
         self._unread += tuple(others)
 
     def process_replies(self) -> tuple[list[Hello], list[Reply]]:
-        """Take hellos and clock replies. Returns the peers that joined, and the other replies."""
+        """Take all replies with hellos and from the clock. Returns the hellos of new peers, and all other replies."""
         joined: list[Hello] = []
         others: list[Reply] = []
         answers = (*self._unread, *self.bus.replies())
@@ -151,7 +159,10 @@ class PeerRegistry:
         return joined, others
 
     def _admit(self, name: str, payload: bytes) -> Iterator[Hello]:
-        """Admit a peer unless it has another scene or protocol version."""
+        """Accept a live actor as a peer, and yield its hello, unless it has another scene or protocol version.
+
+        ``payload``: the encoded hello.
+        """
         try:
             hello = decode_hello(payload)
         except WrongVersion as error:
@@ -171,8 +182,11 @@ class PeerRegistry:
         yield hello
 
     def _reject(self, name: str, why: str) -> None:
-        """Ignore a peer that joined after this actor. Raises :class:`WorldMismatch` if the peer was here first, because
-        this actor does not belong to the world then."""
+        """Reject an actor as a peer, if it joined after this actor. ``why``: the reason, without the name.
+
+        Raises :class:`WorldMismatch` if it was live before this actor: then it is this actor that does not belong to
+        the world.
+        """
         text = f"{name!r} {why}: start both with the same scene, seed and release of vinesim"
         if name in self._initial_names:
             raise WorldMismatch(text)
@@ -181,28 +195,29 @@ class PeerRegistry:
         self.seen_names.discard(name)
 
     def is_rejected(self, name: str) -> bool:
-        """Whether a live peer was found to have another scene or protocol version."""
+        """Whether a live actor was rejected as a peer, because it has another scene or protocol version."""
         return name in self._rejected
 
     def may_join(self, name: str) -> bool:
-        """Whether an actor is live and was not rejected."""
+        """Whether an actor is a peer or may become one: it is live and was not rejected."""
         return name in self.bus.alive() and name not in self._rejected
 
     def was_admitted(self, name: str) -> bool:
-        """Whether an actor was ever admitted, or belongs to the same client."""
+        """Whether an actor was ever accepted as a peer, or belongs to the same client."""
         return name in self.seen_names or name in self._local_actors
 
     def count_malformed(self, sender: str, error: MessageError) -> None:
-        """Count an invalid message; log the first of each sender."""
+        """Count an invalid message, and log the first one of each sender."""
         self.counters.malformed += 1
         if sender not in self._warned:
             self._warned.add(sender)
-            log.warning("dropped a message of %r, further ones only counted: %s", sender, error)
+            log.warning("dropped a message of %r, further ones are only counted: %s", sender, error)
 
     # ------------------------------------------------------------ poses
 
     def update_interest(self, position: np.ndarray) -> None:
-        """Receive more of the poses of a peer the nearer it is to ``position`` [m]."""
+        """Subscribe to more layers of the poses of near peers, and to fewer of far ones. ``position`` [3] m: own
+        position."""
         for name, actor in self.known.items():
             if actor.update is None:
                 continue
@@ -214,14 +229,17 @@ class PeerRegistry:
                 actor.near.append(self.bus.subscribe(f"a/{name}{layer.suffix}", KEEP_LAST_1))
 
     def publish_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
-        """Publish the own pose, 60 times a second, each time on one of the layers. It is encoded only if that layer has
-        a subscriber."""
+        """Publish the own pose on one of the layers, if it is due at own time ``now`` [s]: 60 times a second.
+
+        ``time``: network time [s], which becomes the time of the pose. The pose is encoded only if the layer has a
+        subscriber.
+        """
         number = math.floor(now * interest.POSE_RATE + self._phase + 1e-6)
         before = self._pose_number
         if number == before:
             return
         self._pose_number = number
-        if before is None:  # actors that join at the same moment need not publish at the same moments for ever
+        if before is None:  # so actors that join at one moment need not publish at the same moments
             return
         publisher = self._layers[interest.pose_layer(before, number)]
         if publisher.matching:

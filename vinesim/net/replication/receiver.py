@@ -1,4 +1,5 @@
-"""Incoming half of replication: messages from the bus are decoded, checked by their claims and put into an inbox."""
+"""Incoming half of replication: decodes messages from the bus, checks their claims, and puts the content into an
+inbox."""
 
 from __future__ import annotations
 
@@ -31,61 +32,63 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import HumanUpdate, ObjectUpdate, RobotUpdate, TreeUpdate
 
 MAX_EARLY_MESSAGES = 100
-"""Largest number of early messages of one sender."""
+"""Largest number of :class:`EarlyMessages` of one sender."""
 
 MAX_EARLY_BYTES = 1 << 20
-"""Largest size of the early messages of one sender [B]: that of the largest message."""
+"""Largest size of all :class:`EarlyMessages` of one sender [B]: that of the largest single message."""
 
 MAX_EARLY_SENDERS = 64
-"""Largest number of senders with early messages."""
+"""Largest number of senders with :class:`EarlyMessages`."""
 
 MAX_EARLY_TOTAL = 4 << 20
-"""Largest size of the early messages of all senders [B]."""
+"""Largest size of the :class:`EarlyMessages` of all senders [B]."""
 
 
 @dataclasses.dataclass(slots=True)
 class Inbox:
-    """States and messages that arrived for one step. States are extrapolated to now. Times are own times."""
+    """What a step of one actor's client needs from the network. States are extrapolated to the step. Times are own
+    times."""
 
     joined: list[Hello] = dataclasses.field(default_factory=list)
     left: list[str] = dataclasses.field(default_factory=list)
     robots: dict[str, RobotUpdate] = dataclasses.field(default_factory=dict)
-    """Poses of all robots of peers, by name, in every step: extrapolated by at most 150 ms, with corrections blended
-    over 100 ms."""
+    """Poses of all peers that are robots or spectators, by name. They are extrapolated by at most 150 ms, and
+    corrections are blended in over 100 ms."""
     people: dict[str, HumanUpdate] = dataclasses.field(default_factory=dict)
-    """Poses of all people of peers, by name, in every step: extrapolated and blended like those of robots."""
+    """Poses of all peers that are people, by name, extrapolated and blended like :attr:`robots`."""
     messages: dict[int, Any] = dataclasses.field(default_factory=dict)
-    """Direct messages from peers to this actor that are valid now, by kind: the values of
+    """Contents of direct messages to this actor that are valid now, by kind of message: results of
     :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
-    """Trees with a new state: the last state of each, extrapolated by at most 150 ms."""
+    """Trees of which a new state has arrived: the newest state of each, extrapolated by at most 150 ms."""
     objects: list[ObjectUpdate] = dataclasses.field(default_factory=list)
-    """Every box and free bunch that a peer moves, in every step, extrapolated by at most 150 ms."""
+    """All boxes and free bunches that peers move, whether or not a new state has arrived, extrapolated by at most 150
+    ms."""
     records: list[tuple[RetainedRecord, bool]] = dataclasses.field(default_factory=list)
-    """New retained records, and whether the pose in each holds. It does not if a newer claim is known. Cuts always
-    hold."""
+    """New retained records, each with whether the pose in the record is valid. The pose is not valid if a greater claim
+    on the object is known. Cuts are always valid."""
     released: list[int] = dataclasses.field(default_factory=list)
-    """Ids of objects that have lost their remote owner: they are at rest, or the owner has left."""
+    """Ids of objects that have lost their remote owner, because they are at rest or the owner has left."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Step:
-    """One call of :meth:`Receiver.receive`."""
+    """Times and results of one call of :meth:`Receiver.receive`."""
 
     now: float
-    """Own clock [s]."""
+    """Own time [s]."""
     time: float
     """Network time [s]."""
     inbox: Inbox = dataclasses.field(default_factory=Inbox)
     new_trees: dict[int, tuple[TreeStates, str]] = dataclasses.field(default_factory=dict)
-    """The newest accepted batch and its owner, by tree."""
+    """The newest accepted batch that contains a tree, and its owner, by tree."""
 
 
 class EarlyMessages:
-    """Messages (key, payload) of senders that have not been admitted yet. They are kept because records are published
-    only once.
+    """Messages with retained records whose senders have not been accepted as peers yet.
 
-    Their number and size are bounded, and live senders displace those that are not live.
+    The messages are kept until the sender is accepted, because records are published only once. Their number and size
+    are limited. If there is no room, messages of live senders displace those of senders that are not live.
     """
 
     def __init__(self) -> None:
@@ -93,18 +96,18 @@ class EarlyMessages:
         self._sizes: dict[str, int] = {}
 
     def __len__(self) -> int:
-        """Number of senders."""
+        """Number of senders with messages."""
         return len(self._messages)
 
     @property
     def size(self) -> int:
-        """Payload bytes of all messages [B]."""
+        """Size of all payloads [B]."""
         return sum(self._sizes.values())
 
     def put(self, sender: str, key: str, payload: bytes, is_live: Callable[[str], bool]) -> int:
-        """Keep a message if there is room. Returns the number of messages that were discarded, this one or others.
+        """Keep a message if there is room. Returns the number of messages that were discarded, including this one.
 
-        ``is_live(sender)``: whether a sender may be admitted soon.
+        ``is_live(sender)``: whether a sender may be accepted as a peer soon.
         """
         discarded = 0
         if self._has_no_room(sender, len(payload)) and is_live(sender):
@@ -122,6 +125,7 @@ class EarlyMessages:
         return self._messages.pop(sender, [])
 
     def _has_no_room(self, sender: str, size: int) -> bool:
+        """Whether a message of ``size`` [B] would exceed a limit."""
         return (
             len(self._messages.get(sender, ())) >= MAX_EARLY_MESSAGES
             or self._sizes.get(sender, 0) + size > MAX_EARLY_BYTES
@@ -131,15 +135,17 @@ class EarlyMessages:
 
 
 class Receiver:
-    """Applies the messages that peers and the server send."""
+    """Applies the messages from peers and the server to the state of one actor."""
 
     def __init__(self, state: ReplicationState) -> None:
         self._state = state
         self.early = EarlyMessages()
-        """Messages with retained records whose author has not been admitted yet."""
+        """Messages with retained records whose author has not been accepted as a peer yet."""
 
     def receive(self, now: float, offset: float) -> Inbox:
-        """Returns everything that arrived since the last call. ``offset`` [s]: network time minus own time ``now`` [s].
+        """Apply everything that arrived since the last call, and return the inbox for the step at own time ``now`` [s].
+
+        ``offset`` [s]: network time minus own time.
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
@@ -178,7 +184,7 @@ class Receiver:
         return inbox
 
     def _dispatch(self, key: str, payload: bytes, step: _Step) -> None:
-        """Decode and apply one message. Its sender is read from the key, never from the payload."""
+        """Decode and apply one message. The key determines the sender, whatever the payload says."""
         state = self._state
         counters = state.counters
         family, *chunks = key.split("/")
@@ -207,7 +213,7 @@ class Receiver:
             state.peers.count_malformed(sender, error)
 
     def _receive_in_cell(self, kind: int, cell: Cell, payload: bytes, sender: str, step: _Step) -> None:
-        """Apply a message about objects in a cell."""
+        """Decode and apply a message about objects in a cell: records, claims, or states."""
         state = self._state
         if kind == RETAINED:
             for record in decode_records(payload, state.object_counts):
@@ -223,15 +229,15 @@ class Receiver:
             self._receive_trees(decode_trees(payload, state.model.tree_size), sender, step)
 
     def _keep_early(self, sender: str, key: str, payload: bytes) -> int:
-        """Keep a message with records until its sender, who may be admitted soon, is admitted, because records are
-        published only once. Returns the number of messages that were discarded."""
+        """Keep a message with records whose sender is no peer yet, in :attr:`early`. Returns how many were
+        discarded."""
         peers = self._state.peers
         if not is_valid_name(sender) or peers.is_rejected(sender):
             return 1
         return self.early.put(sender, key, payload, peers.may_join)
 
     def _receive_trees(self, trees: TreeStates, sender: str, step: _Step) -> None:
-        """Accept or drop each state by its claim."""
+        """Accept or drop each state in a batch of trees, by its claim and its distance."""
         state = self._state
         check_tree_states(trees, state.model)
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
@@ -246,7 +252,7 @@ class Receiver:
                 state.counters.dropped += 1
 
     def _receive_objects(self, objects: ObjectStates, cell: Cell, sender: str, step: _Step) -> None:
-        """Accept or drop each state by its claim."""
+        """Accept or drop each state in a batch of boxes and bunches, by its claim and its distance."""
         state = self._state
         updates = objects.updates(sender)
         for update in updates:
@@ -264,9 +270,10 @@ class Receiver:
     def _receive_record(
         self, cell: Cell, record: RetainedRecord, sender: str, step: _Step, *, is_remote: bool = True
     ) -> None:
-        """Merge a record. If it changed anything, the client receives it, unless its own actor published it.
+        """Merge a retained record. If it changes anything, add it to the inbox, unless it is not ``is_remote``.
 
-        A record that contradicts the model is dropped. Other records of the same message are kept.
+        A record that contradicts the model is dropped; others in the same message are not affected. ``is_remote``:
+        whether the record comes from another client.
         """
         state = self._state
         try:
@@ -282,7 +289,7 @@ class Receiver:
             step.inbox.records.append((state.retained.state.get(record.object) or record, holds))
 
     def _receive_snapshot(self, reply: Reply, step: _Step) -> None:
-        """Merge the server's records of one cell."""
+        """Merge the server's reply with retained records of one cell."""
         state = self._state
         family, *chunks = reply.key.split("/")
         if family != "snap" or len(chunks) != 2:
@@ -298,7 +305,7 @@ class Receiver:
             self._receive_record(cell, record, "the server", step)
 
     def _publish_correction(self, object_id: int) -> None:
-        """Repeat the winning claim to all subscribers of the object's cell."""
+        """Publish the greatest known claim on an object again, for peers that have missed it."""
         state = self._state
         entry = state.ownership[object_id]
         publisher = state.cells.event_publisher(state.cell_of(object_id))
@@ -311,7 +318,10 @@ class Receiver:
 
 
 def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) -> None:
-    """Raise :class:`MessageError` unless the record can be true of the model; ``counts``: objects of each kind."""
+    """Raise :class:`MessageError` if a retained record contradicts the model.
+
+    ``counts``: number of objects of each kind in the scene.
+    """
     if is_tree(record.object):
         _check_tree_record(record, model)
     elif record.cut or record.trees:
@@ -324,6 +334,7 @@ def check_record(record: RetainedRecord, model: Model, counts: tuple[int, ...]) 
 
 
 def _check_tree_record(record: RetainedRecord, model: Model) -> None:
+    """Raise :class:`MessageError` if the cuts or the state in a record of a tree contradict the model."""
     tree = record.object
     first = int(model.tree_first[tree])
     core = int(model.tree_core[tree])
@@ -338,6 +349,6 @@ def _check_tree_record(record: RetainedRecord, model: Model) -> None:
 
 
 def check_tree_states(states: TreeStates, model: Model) -> None:
-    """Raise :class:`MessageError` unless all bodies that were cut off are wood; berry clusters fall with a bunch."""
+    """Raise :class:`MessageError` if a detached body of a tree is a berry cluster, which never leaves its bunch."""
     if len(states.root) and (states.root >= np.repeat(model.tree_core[states.tree], states.roots)).any():
         raise MessageError("a berry cluster that was cut off its bunch")

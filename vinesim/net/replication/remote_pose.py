@@ -1,4 +1,4 @@
-"""The pose of one peer between two messages: dead reckoning, error smoothing and, if wanted, a jitter buffer."""
+"""The pose of a peer between two messages: dead reckoning and error smoothing, or a jitter buffer."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from vinesim.net.transport.bus import Subscription
 from vinesim.scene.values import POINT_NAMES, HumanUpdate, RobotUpdate
 
 TELEPORT_DISTANCE = 1.0
-"""A correction larger than this is shown at once instead of blended [m]. GUESSED."""
+"""Size of a correction above which it is shown at once instead of blended [m]. GUESSED."""
 
 FAR_SAMPLE_PERIOD = 0.1
-"""Time between two computations of the pose of a peer that is not near [s]. Its messages arrive every 200 ms."""
+"""Time between two computations of the pose of a far peer, whose messages arrive every 200 ms [s]."""
 
 _BASE = np.arange(3, 7)[None]
 _HIPS = slice(7 * POINT_NAMES.index("hips"), 7 * POINT_NAMES.index("hips") + 3)
@@ -25,27 +25,29 @@ _TURNS = 7 * np.arange(len(POINT_NAMES))[:, None] + _BASE
 
 
 class RemotePose:
-    """One peer and the last pose received from it."""
+    """A peer and the last pose that it has sent. Computes the pose to show at a given time."""
 
     def __init__(self, hello: Hello, buffer: float = 0.0) -> None:
-        """``buffer`` [s]: delay of the :class:`JitterBuffer`; 0 extrapolates poses to now."""
+        """``buffer``: delay of the :class:`JitterBuffer` [s]; 0: poses are extrapolated to the present."""
         self.hello = hello
         self._buffer = JitterBuffer(buffer)
         self.joints = hello.joints
         self.update: RobotUpdate | HumanUpdate | None = None
         self.near: list[Subscription] = []
-        """Subscriptions to the faster layers of the peer's poses; empty while it is far."""
+        """Subscriptions to the layers of the peer's poses after the first one; empty while the peer is far."""
         self.moved_at = -1e9
         self._turns = _TURNS if hello.kind == "human" else _BASE
-        """Indices of the quaternions in the flat pose [k, 4]."""
+        """Indices [k, 4] of the quaternions in the flat array of a pose."""
         self._place = _HIPS if hello.kind == "human" else slice(3)
-        """Slice of the flat pose with the position by which a teleport is recognised."""
+        """Slice of the flat array of a pose with the position that is compared with :data:`TELEPORT_DISTANCE`."""
         self._state = self._rate = self._correction = np.zeros(0)
         self._cached: RobotUpdate | HumanUpdate | None = None
 
     def receive(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
-        """Take a pose at network ``time`` [s]. Returns False if it is not newer than the last one. Raises
-        :class:`MessageError` if it does not fit the peer."""
+        """Take a pose of the peer that arrived at network ``time`` [s]. Returns whether it is newer than the last one.
+
+        Raises :class:`MessageError` if the kind of pose or its number of joints does not fit the peer.
+        """
         if (self.hello.kind == "human") != isinstance(update, HumanUpdate):
             raise MessageError(f"pose of a {type(update).__name__} by {update.actor!r}, which is a {self.hello.kind}")
         if update.time > time + dead_reckoning.MAX_CLOCK_SKEW:
@@ -74,8 +76,10 @@ class RemotePose:
         return True
 
     def shift_time(self, step: float) -> None:
-        """Shift all stored times, because the network clock was set by ``step`` [s]. A jitter buffer keeps only the
-        newest pose."""
+        """Shift all stored times, because the network clock was set by ``step`` [s].
+
+        Of a jitter buffer only the newest pose is kept.
+        """
         if self.update is not None:
             self.update = dataclasses.replace(self.update, time=self.update.time + step)
             self.moved_at += step
@@ -84,13 +88,16 @@ class RemotePose:
             self._buffer = JitterBuffer(self._buffer.delay).insert(self.update.time, self._state, self._rate)
 
     def sample(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
-        """The pose at network ``time`` [s], to be shown at own time ``now`` [s]. For a distant peer it may be up to
-        100 ms old."""
+        """Returns the pose to show at network ``time`` [s], with own time ``now`` [s] as its time.
+
+        The pose of a far peer is computed only every 100 ms.
+        """
         if self._cached is None or self.near or not 0.0 <= now - self._cached.time < FAR_SAMPLE_PERIOD:
             self._cached = self._at(time, now)
         return self._cached
 
     def _at(self, time: float, now: float) -> RobotUpdate | HumanUpdate:
+        """Compute the pose to show at network ``time`` [s], with own time ``now`` [s] as its time."""
         update = self.update
         shown = self._shown(time)
         assert update is not None
@@ -119,8 +126,10 @@ class RemotePose:
         )
 
     def _buffer_sample(self, time: float) -> None:
-        """Insert the newest pose into the jitter buffer. Its quaternions get the sign that is nearest to the previous
-        ones."""
+        """Insert the newest pose into the jitter buffer.
+
+        The signs of its quaternions are chosen such that they are nearest to those of the previous pose.
+        """
         if self._buffer.states:
             before = self._buffer.states[-1]
             turns = self._turns
@@ -130,6 +139,7 @@ class RemotePose:
         self._buffer = self._buffer.insert(time, self._state, self._rate)
 
     def _shown(self, time: float) -> np.ndarray:
+        """Returns the flat array of the pose to show at network ``time`` [s]. Its quaternions are not normalised."""
         assert self.update is not None
         if self._buffer.delay > 0.0:
             return self._buffer.sample(time).copy()
@@ -140,7 +150,7 @@ class RemotePose:
 
 
 def _numbers(update: RobotUpdate | HumanUpdate) -> tuple[np.ndarray, np.ndarray]:
-    """A pose as a flat array, and the array of its rates."""
+    """Returns a pose as a flat array, and its time derivative [1/s] as an equal array."""
     if isinstance(update, HumanUpdate):
         points = update.pose.points
         rate = np.concatenate(

@@ -1,4 +1,4 @@
-"""State that receiver and sender share: peers, claims, streams, retained records, channels of the interest cells."""
+"""State that the two halves of replication, receiver and sender, share for one actor."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from vinesim.scene.ids import is_tree
 from vinesim.scene.model import Model
 
 SPECTATOR = "spectator"
-"""Kind of actor that owns nothing and publishes nothing but its pose."""
+"""Kind of actor that owns no objects and publishes only its pose and its voice."""
 
 
 class ReplicationState:
-    """The replicated state as one actor knows it."""
+    """State of replication of one actor: peers, claims, streams, retained records, and channels of cells."""
 
     def __init__(
         self,
@@ -57,9 +57,9 @@ class ReplicationState:
             link_centre=link_centre,
         )
         self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (*direct, self.voices)}
-        """Senders and receivers of the direct messages between actors, by kind of message."""
+        """The syncs of direct messages between actors, by kind of message."""
         self.siblings: tuple[ReplicationState, ...] = ()
-        """Replication states of the other actors of the same client."""
+        """States of replication of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)
         self.tree_stream = TreeStream(model)
         self.object_stream = ObjectStream()
@@ -68,19 +68,19 @@ class ReplicationState:
 
     @property
     def is_spectator(self) -> bool:
-        """Whether this actor owns nothing."""
+        """Whether this actor is a spectator, which owns no objects."""
         return self.hello.kind == SPECTATOR
 
     def position_of(self, object_id: int) -> np.ndarray:
-        """Last known position of an object [3] m."""
+        """Returns the last known position [3] m of an object, for a tree its centre at rest."""
         return self.tree_stream.middle[object_id] if is_tree(object_id) else self.object_stream.position(object_id)
 
     def cell_of(self, object_id: int) -> Cell | None:
-        """Cell under which an object is published; None if it never was."""
+        """Returns the cell under which an object is published; None for an object that never was."""
         return self.tree_stream.cell[object_id] if is_tree(object_id) else self.object_stream.cell(object_id)
 
     def owner_candidates(self) -> dict[str, np.ndarray]:
-        """Positions [3] m of all actors that can own objects: all but spectators."""
+        """Returns the positions [3] m of all actors that can own objects, by name: all but spectators."""
         known = self.peers.known
         positions = self.peers.positions()
         positions = {name: place for name, place in positions.items() if known[name].hello.kind != SPECTATOR}
@@ -90,7 +90,7 @@ class ReplicationState:
         return positions
 
     def successor_of(self, object_id: int) -> str:
-        """The actor that takes over an object whose owner has left."""
+        """Returns the name of the actor that takes over an object whose owner has left."""
         return authority.choose_successor(self.position_of(object_id), self.owner_candidates())
 
     def shift_time(self, step: float) -> None:
@@ -103,13 +103,16 @@ class ReplicationState:
             sync.shift_time(step)
 
     def count_listeners(self, positions: np.ndarray, distance: float | None = None) -> np.ndarray:
-        """Number of peers within ``distance`` [m], by default the interest radius, of each position [k, 3] m: [k]."""
+        """Returns the number of peers near each position [k, 3] m: [k] int.
+
+        ``distance`` [m]: within which a peer is near; None: the interest radius.
+        """
         others = np.array(list(self.peers.positions().values())).reshape(-1, 3)
         return interest.count_listeners(positions, others, distance or self.cells.interest_radius)
 
 
 def put_counted(publisher: Publisher, payload: bytes, traffic: Traffic) -> bool:
-    """Publish and count a message. Without a subscriber, nothing is sent or counted, and the result is False."""
+    """Publish a message and count it in ``traffic``. Returns False, and does nothing, if there is no subscriber."""
     if not publisher.put(payload):
         return False
     traffic.count_out(payload)

@@ -1,8 +1,8 @@
-"""Replication of one actor's world: :meth:`Replicator.receive` before a step of the physics, :meth:`Replicator.send`
-after it.
+"""Replication of the world for one actor: :meth:`Replicator.receive` is called before a step of the physics, and
+:meth:`Replicator.send` after it.
 
-The decisions are pure functions in other modules: who owns an object (:mod:`~vinesim.net.replication.authority`), who
-is near (:mod:`~vinesim.net.replication.interest`), whether copies are wrong
+Pure functions in other modules decide who owns an object (:mod:`~vinesim.net.replication.authority`), which actors are
+near (:mod:`~vinesim.net.replication.interest`), and whether copies are wrong
 (:mod:`~vinesim.net.replication.dead_reckoning`).
 
 Keys: :data:`vinesim.net.codec.messages.FAMILIES`.
@@ -37,9 +37,9 @@ class Replicator:
     """Replicates the objects of a scene for one actor. Call :meth:`receive` and :meth:`send` once a step, from one
     thread.
 
-    ``now`` is any clock of the client in seconds; own time, which runs at the world's real-time factor, and its offset
-    to the server's clock are kept inside. Objects are trees, boxes and free bunches, by
-    :func:`vinesim.scene.ids.object_id`.
+    Arguments ``now`` are times [s] of any one clock of the client. From them follow own time, which runs at the world's
+    real-time factor, and network time, which is own time plus :attr:`offset`. Objects are trees, boxes and free
+    bunches, by :func:`vinesim.scene.ids.object_id`.
     """
 
     def __init__(
@@ -53,11 +53,14 @@ class Replicator:
         hand_force: float = HAND_FORCE,
         link_centre: LinkCentre = lambda _: None,
     ) -> None:
-        """``interest_radius`` [m]: peers nearer than this to an object receive its states; at most 5 m.
+        """Join the world of ``bus`` with the actor that ``hello`` describes.
 
-        ``jitter_buffer`` [s]: delay with which poses of peers are shown (:mod:`vinesim.net.replication.jitter_buffer`).
-        ``hand_force`` [N]: limit of each hand of a peer that pushes this robot. ``link_centre(link)``: centre of mass
-        [3] m of a link of this robot, None for a link that it has not; without it people of other clients push nothing.
+        ``interest_radius``: distance from an object within which peers receive its states [m], at most 5 m.
+        ``jitter_buffer``: delay with which poses of peers are shown [s] (:mod:`vinesim.net.replication.jitter_buffer`).
+        ``hand_force``: largest force of each hand of a person that pushes this robot [N]. ``link_centre(link)``: centre
+        of mass [3] m of a link of this robot, None if the link does not exist. Without this function people of other
+        clients cannot push the robot.
+
         Raises ValueError if the hello has another name than the bus.
         """
         if hello.name != bus.name:
@@ -77,117 +80,123 @@ class Replicator:
         self._receiver = Receiver(self._state)
         self._sender = Sender(self._state)
         self.step_time: Callable[[], float] | None = None
-        """Returns the world's time at the present step [s], for a client whose steps follow the world's clock. All
-        states that are sent and shown in a step have this time, however late the step is. None: they have the time of
-        the call."""
+        """Function that returns the world's time of the present step [s], for a client whose steps follow that time.
+
+        All states that are sent and shown in a step have this time, however late the step is. None: they have the time
+        of the call."""
         self.received_at = 0.0
-        """Own time of the last :meth:`receive` [s], to which the states in its inbox belong."""
+        """Own time of the last :meth:`receive` [s], which is the time of the states in the inbox."""
         self._last_sent = -1e9
         self._offset = self.offset
 
     @property
     def counters(self) -> Counters:
-        """Traffic and rejected messages since the start."""
+        """Counters of traffic and of rejected messages since the start."""
         return self._state.counters
 
     @property
     def voices(self) -> VoiceSync:
-        """The sender and receiver of voices of this actor."""
+        """Sender and receiver of voices for this actor."""
         return self._state.voices
 
     @property
     def interest_radius(self) -> float:
-        """Interest radius [m]."""
+        """Distance from an object within which peers receive its states [m]."""
         return self._state.cells.interest_radius
 
     def share_client(self, siblings: Iterable[Replicator]) -> None:
-        """Set the other actors of the same client. They share its simulation, so no messages are exchanged with them,
-        and none of the objects that they own is taken over."""
+        """Set the replicators of the other actors of the same client.
+
+        Actors of one client share its simulation. So they exchange no messages with each other.
+        """
         states = tuple(sibling._state for sibling in siblings)
         self._state.siblings = states
         self._state.ownership.siblings = tuple(state.ownership for state in states)
         self._state.peers.local_actors = {state.hello.name for state in states}
 
     def owner(self, object_id: int) -> str | None:
-        """Name of the live actor that owns an object now (perhaps this one), or None."""
+        """Returns the name of the live actor that owns an object now, which may be this actor, or None."""
         return self._state.ownership.owner(object_id)
 
     def is_present(self, name: str) -> bool:
-        """Whether an actor is in this world now, as a peer or before its hello has arrived."""
+        """Whether an actor is live in this world, even if its hello has not arrived, and was not rejected."""
         return self._state.peers.may_join(name)
 
     def claim(self, object_id: int) -> Claim:
-        """The greatest claim on an object that was made or received."""
+        """Returns the greatest claim on an object that this actor has made or received."""
         return self._state.ownership.claim(object_id)
 
     def record(self, object_id: int) -> RetainedRecord | None:
-        """The retained record of an object, if any."""
+        """Returns the retained record of an object, or None."""
         return self._state.retained.state.get(object_id)
 
     @property
     def owned(self) -> frozenset[int]:
-        """Objects that this actor owns."""
+        """Ids of the objects that this actor owns."""
         return frozenset(self._state.ownership.owned)
 
     @property
     def known(self) -> frozenset[int]:
-        """Objects on which any claim was made or received."""
+        """Ids of the objects on which this actor has made or received a claim."""
         return frozenset(self._state.ownership.known)
 
     @property
     def peers(self) -> dict[str, Hello]:
-        """The hello of each peer that is in this world now."""
+        """Hellos of all peers that are in this world now, by name."""
         return {name: peer.hello for name, peer in self._state.peers.known.items()}
 
     def peer_positions(self) -> list[np.ndarray]:
-        """Positions [3] m of the peers whose pose is known, including spectators. They may receive object states."""
+        """Returns the positions [3] m of all peers whose pose is known, including spectators."""
         return list(self._state.peers.positions().values())
 
     @property
     def offset(self) -> float:
-        """Network time minus the client's own time [s]."""
+        """Network time minus own time [s]."""
         return self._state.peers.clock.offset
 
     @property
     def real_time_factor(self) -> float:
-        """Real-time factor of the world; 1 unless a server reports another."""
+        """Real-time factor of the world, as reported by the server; 1 without a server."""
         return self._state.peers.clock.factor
 
     @property
     def pace_cause(self) -> str:
-        """Client that limits the world's real-time factor, and the cause: "picker: sensors". Empty if none does."""
+        """Client that limits the world's real-time factor, and the cause, like "picker: sensors"; empty if none
+        does."""
         return self._state.peers.clock.cause
 
     def report_pace(self, report: Callable[[], PaceReport | None]) -> None:
-        """Send the value of ``report()``, how fast this client can follow, to the server with every ping."""
+        """Send the value of ``report()``, which is how fast this client can follow, to the server with every ping."""
         self._state.peers.clock.report = report
 
     def keep_clock(self, now: float) -> None:
-        """Ping the server's clock when due, and take its replies, while no step is made. So network time advances, and
-        the server knows that this client lives."""
+        """Send due pings to the server's clock, and take the replies, between steps that are far apart.
+
+        So network time advances, and the server knows that this client is still running.
+        """
         self._state.peers.keep_clock(now)
         self._follow_clock()
 
     def network_time(self, now: float) -> float:
-        """Network time [s] at the time ``now`` [s] of the client's clock."""
+        """Returns network time [s] at the time ``now`` [s] of the client's clock."""
         return self._state.peers.clock.own(now) + self.offset
 
     def is_clock_current(self, now: float) -> bool:
-        """Whether the server has told the world's time so recently that network time at ``now`` [s] is right."""
+        """Whether the server has answered a ping so recently that network time at ``now`` [s] is reliable."""
         return self._state.peers.clock.is_current(now)
 
     @property
     def has_clock(self) -> bool:
-        """Whether a server has reported its clock, so that network time is the server's time."""
+        """Whether a server has answered a ping, so that network time is the server's time."""
         return bool(self._state.peers.clock.estimate.pings)
 
     @property
     def round_trip(self) -> float | None:
-        """Shortest of the last pings to the server and back [s]; None without a reply."""
+        """Shortest round trip of the last pings to the server [s]; None before the first reply."""
         return self._state.peers.clock.round_trip
 
     def receive(self, now: float) -> Inbox:
-        """Everything that arrived since the last call.
+        """Apply everything that arrived since the last call, and return the inbox for the step at ``now`` [s].
 
         Raises :class:`vinesim.net.replication.peers.WorldMismatch` if this actor does not belong to the world.
         """
@@ -213,22 +222,26 @@ class Replicator:
         messages: Mapping[int, Any] = MappingProxyType({}),
         carried_on: Iterable[int] = (),
     ) -> list[TreeUpdate]:
-        """Publish one step. Returns the states of trees at rest that were sent, quantised as all copies hold them.
+        """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
+        them.
 
-        ``pose``: of this actor; its ``time`` is replaced. A spectator passes its viewpoint, without joints.
-        ``read(object_id)``: joints ([n, 4], [n, 3] rad/s) of a tree, pose [7] and velocity [6] of another object;
-        called only for objects that a peer may need.
-        ``touched``: objects in contact with this actor; boxes and bunches only while they move in their parent's frame.
-        ``moving``: objects that move by themselves; trees and boxes of other owners are ignored.
-        ``grabbed``: objects that this actor grabbed, picked or cut in this step. ``detached``: the objects among them
-        that left their plant. ``detached_roots(tree)``: bodies that were cut off a tree.
-        ``pose_on_support(object_id)``: parent frame and pose [7] in it of an object at rest.
-        ``is_changed(tree)``: picks or cuts have changed the tree, so that its state at rest is retained.
-        ``has_body(object_id)``: whether the own simulation moves a box or a bunch; others are not read.
-        ``messages``: values that this actor sends to others in this step, by kind of message:
-        :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`.
-        ``carried_on``: objects at rest on this actor that it has carried so far that their records are published again,
-        with their present place.
+        * ``pose``: pose of this actor. Its ``time`` is replaced. For a spectator, the viewpoint without joints.
+        * ``read(object_id)``: function that returns the joints ([n, 4], [n, 3] rad/s) of a tree, or pose [7] and
+          velocity [6] of another object. It is called only for objects that a peer may need.
+        * ``touched``: objects in contact with this actor. Boxes and bunches only while they move in their parent's
+          frame.
+        * ``moving``: objects that move without contact. Trees and boxes of other owners are ignored.
+        * ``grabbed``: objects that this actor has grabbed, picked or cut in this step.
+        * ``detached``: objects of ``grabbed`` that have left their plant.
+        * ``detached_roots(tree)``: function that returns the bodies that were cut off a tree.
+        * ``pose_on_support(object_id)``: function that returns the parent frame of an object at rest, and the pose [7]
+          in this frame.
+        * ``is_changed(tree)``: whether picks or cuts have changed a tree, so that its state at rest is retained.
+        * ``has_body(object_id)``: whether the own simulation moves a box or a bunch. Others are not read.
+        * ``messages``: values of direct messages in this step, by kind of message
+          (:meth:`vinesim.net.replication.direct_messages.MessageSync.publish`).
+        * ``carried_on``: objects at rest on this actor that it has carried so far that their records shall be published
+          again, with the present place.
         """
         state = self._state
         self._follow_clock()
@@ -260,15 +273,15 @@ class Replicator:
         )
 
     def _own_time(self, now: float) -> float:
-        """Own time [s] of the present step, which is made at the time ``now`` [s] of the client's clock."""
+        """Returns own time [s] of the present step, which is called at the time ``now`` [s] of the client's clock."""
         if self.step_time is None or not self.has_clock:
             return self._state.peers.clock.own(now)
         return self.step_time() - self.offset
 
     def _follow_clock(self) -> None:
-        """Shift all times of peers and objects when the network clock was set, as by a server that was restarted.
+        """Shift all stored times of peers and objects if network time was set, as after a restart of the server.
 
-        Otherwise everything that arrives after a step back would count as older than what is known.
+        Otherwise, if it was set back, everything that arrives would count as older than the stored states.
         """
         step = self.offset - self._offset
         self._offset = self.offset

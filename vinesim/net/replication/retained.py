@@ -1,10 +1,10 @@
-"""Retained state: the record with the greatest claim of each object, and the cell it belongs to; a CRDT; pure.
+"""Retained state: for each object the record with the greatest claim, and its cell. A CRDT, without I/O.
 
-A last-writer-wins map: merging is a join of a semilattice, so that equal sets of records give equal maps, in whatever
-order and however often they arrive. Of two records of one object the one with the greater claim holds
-(:func:`authority.wins`); an author therefore never publishes two different records under one claim. Cuts accumulate:
-the winner takes over the cuts of the loser. The server keeps one such map for a world, and every client keeps a map of
-the records that it has received.
+A last-writer-wins map. Merging is a join of a semilattice: equal sets of records result in equal maps, in whatever
+order and however often the records arrive. Of two records of one object the one with the greater claim is kept
+(:func:`authority.wins`). An author therefore never publishes two different records with the same claim. Cuts
+accumulate: the record that is kept also takes over the cuts of the other one. The server keeps one map for each world,
+and every client keeps a map of the records that it has received.
 Source: M. Shapiro et al., Conflict-free Replicated Data Types, 2011.
 """
 
@@ -20,14 +20,14 @@ from vinesim.net.replication.interest import Cell
 
 
 class RetainedState:
-    """The winning record of every object. An object is in one cell: the cell of the record with its greatest claim."""
+    """The map of retained records: for each object the record with the greatest claim, and the cell of that record."""
 
     def __init__(self) -> None:
         self._cell_of: dict[int, Cell] = {}
         self._records: dict[Cell, dict[int, RetainedRecord]] = {}
 
     def merge(self, cell: Cell, record: RetainedRecord) -> bool:
-        """Merge a record that was published under ``cell``. Returns whether that changed anything."""
+        """Merge a record that was published under ``cell``. Returns whether the map has changed."""
         held = self.get(record.object)
         if held is None:
             self._put(cell, record)
@@ -44,17 +44,17 @@ class RetainedState:
         return True
 
     def get(self, object_id: int) -> RetainedRecord | None:
-        """The record of an object, or None."""
+        """Returns the record of an object, or None."""
         cell = self._cell_of.get(object_id)
         return None if cell is None else self._records[cell][object_id]
 
     def in_cell(self, cell: Cell) -> list[RetainedRecord]:
-        """Records of all objects in a cell, in the order of their ids."""
+        """Returns the records of all objects in a cell, in the order of object ids."""
         here = self._records.get(cell, {})
         return [here[object_id] for object_id in sorted(here)]
 
     def __iter__(self) -> Iterator[tuple[Cell, RetainedRecord]]:
-        """All cells and records, in the order of object ids."""
+        """Yield the cell and the record of each object, in the order of object ids."""
         for object_id in sorted(self._cell_of):
             cell = self._cell_of[object_id]
             yield cell, self._records[cell][object_id]

@@ -1,7 +1,8 @@
-"""Retained records between a client and the server: published until received, received from peers, queried by cell.
+"""Exchange of retained records between one actor, its peers and the server.
 
-A record is published once, wherever the peers are, because the server keeps it. After the server was lost, the client
-publishes all of its own records again, because a new server may have none.
+A record is published once, wherever the peers are, because the server keeps it for others. Records of peers arrive by
+subscription, and earlier records of a cell by a query to the server. When the connection to the server was lost and is
+back, the actor publishes all its own records again, because the server may be a new one without records.
 """
 
 from __future__ import annotations
@@ -17,17 +18,17 @@ from vinesim.net.replication.retained import RetainedState
 from vinesim.net.transport.bus import KEEP_ALL, Bus, Publisher, Subscription
 
 QUERY_TIMEOUT = 0.5
-"""Time after which the server is first queried again if it has not replied [s]. The time is doubled for each query."""
+"""Time after which a query without a reply is first repeated [s]. Each repetition doubles the time."""
 
 MAX_QUERY_PERIOD = 8.0
-"""Longest time between two queries to a server that has not replied [s]."""
+"""Longest time between two repetitions of a query without a reply [s]."""
 
 TYPICAL_RECORD_SIZE = 110
-"""Upper estimate of an encoded record without the state of a tree [B]."""
+"""Upper estimate of the size of an encoded record without the state of a tree [B]."""
 
 
 class RetainedSync:
-    """The retained state as one client knows it, and the records that it still has to publish."""
+    """The retained records that one actor knows, and its own records that are not published yet."""
 
     def __init__(self, bus: Bus, counters: Counters) -> None:
         self.bus = bus
@@ -41,10 +42,10 @@ class RetainedSync:
         self._is_disconnected = False
         self._window_changes = -1
         self._next_query = math.inf
-        """Time of the next query to the server [s]."""
+        """Time at which the next query to the server is due [s]."""
 
     def publish(self, cell: Cell, record: RetainedRecord) -> None:
-        """Queue an own record about an object in ``cell``."""
+        """Queue a record of this actor about an object in ``cell``. :meth:`flush` sends it."""
         self.state.merge(cell, record)
         if record.object in self._authored:
             before = self._authored[record.object][0]
@@ -53,7 +54,7 @@ class RetainedSync:
         self._pending.setdefault(cell, {})[record.object] = record
 
     def merge(self, cell: Cell, record: RetainedRecord) -> bool:
-        """Merge a record of a peer or the server. Returns whether that changed anything."""
+        """Merge a record from a peer or the server. Returns whether the retained state has changed."""
         is_new = self.state.merge(cell, record)
         if is_new and record.author != self.bus.name:
             held = self.state.get(record.object)
@@ -63,9 +64,10 @@ class RetainedSync:
         return is_new
 
     def update_window(self, window: Collection[Cell], changes: int, now: float) -> None:
-        """Subscribe to the records of the cells in ``window``, and query the server for cells that are new.
+        """Subscribe to the records of the cells in ``window``, and query the server for the records of new cells.
 
-        ``changes``: number of changes of the window so far. While it and all else stays the same, nothing is done.
+        ``changes``: number of changes of the window so far. ``now``: own time [s]. Returns at once if neither the
+        window nor the connection to the server has changed and no query is due.
         """
         is_disconnected = bool(self.bus.status_message)
         if (
@@ -100,11 +102,11 @@ class RetainedSync:
         self._next_query = min((due for due, _ in self._asked.values()), default=math.inf)
 
     def mark_answered(self, cell: Cell) -> None:
-        """Note that the server has replied for a cell."""
+        """Note that the server has replied to the query for a cell."""
         self._asked.pop(cell, None)
 
     def flush(self) -> None:
-        """Send queued records, one message for each cell; without a subscriber they wait."""
+        """Send queued records, one message for each cell. Records in cells without a subscriber wait."""
         for cell in sorted(self._pending):
             waiting = self._pending[cell]
             publisher = self._publishers.get(cell)

@@ -1,8 +1,8 @@
-"""Outgoing half of replication: claims, states of moving objects, states at rest and retained records.
+"""Outgoing half of replication: sends claims, states of moving objects, states at rest and retained records.
 
-A state is sent only if a peer is near the object and subscribes to its cell, and only if the copies of the peers would
+A state is sent only if a peer is near the object and subscribes to its cell, and only if the copies of peers would
 otherwise be wrong (:mod:`vinesim.net.replication.dead_reckoning`). A retained record is sent once, wherever the peers
-are: the server keeps it.
+are, because the server keeps it.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from vinesim.scene.ids import is_tree, parse_object_name
 from vinesim.scene.values import TreeUpdate
 
 ADOPTION_DELAY = 0.5
-"""If an object moves without an owner for this long [s], the nearest actor takes it over, and later publishes where it
-comes to rest. GUESSED."""
+"""Time for which an object moves without an owner until the nearest actor takes it over [s]. That actor later publishes
+where the object comes to rest. GUESSED."""
 
 _IDENTITY_POSE = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @dataclasses.dataclass(slots=True)
 class LocalStep:
-    """What the own simulation reports about one step; see
+    """Results of one step of the own simulation: the arguments of
     :meth:`vinesim.net.replication.replicator.Replicator.send`."""
 
     now: float
-    """Own clock [s]."""
+    """Own time [s]."""
     time: float
     """Network time [s]."""
     touched: set[int]
@@ -60,15 +60,16 @@ class LocalStep:
 
 
 class Sender:
-    """Publishes what the own actor does to objects."""
+    """Publishes states, claims and records of the objects that the own actor owns."""
 
     def __init__(self, state: ReplicationState) -> None:
         self._state = state
         self._orphans: dict[int, float] = {}
-        """Own time since which each moving object has had no owner [s], by object id."""
+        """Own time at which a moving object lost its owner [s], by object id."""
 
     def send(self, step: LocalStep) -> list[TreeUpdate]:
-        """Publish one step. Returns the states of trees at rest that were sent, quantised as all copies hold them."""
+        """Publish the results of one step. Returns the states of trees at rest that were sent, as all receivers decode
+        them."""
         state = self._state
         touched = set(step.touched)
         for object_id in sorted(step.grabbed):
@@ -96,7 +97,8 @@ class Sender:
         return settled
 
     def _adopt_orphans(self, moving: set[int], step: LocalStep) -> None:
-        """Take over objects that have moved without an owner for a while, if no candidate is nearer."""
+        """Take over objects that have moved without an owner for :data:`ADOPTION_DELAY`, if no other actor is
+        nearer."""
         state = self._state
         orphans = {
             object_id for object_id in moving if not is_tree(object_id) and state.ownership.owner(object_id) is None
@@ -109,7 +111,7 @@ class Sender:
                 state.ownership.take_over(object_id)
 
     def _update_interest(self, now: float) -> None:
-        """Open and close channels for the present position and the objects that are owned."""
+        """Open and close channels for the present position of the actor and for the objects that it owns."""
         state = self._state
         owned = {cell for object_id in state.ownership.owned if (cell := state.cell_of(object_id)) is not None}
         state.cells.update(owned)
@@ -146,7 +148,7 @@ class Sender:
                 if publisher is None or not publisher.matching:
                     continue
                 here = [(active[row], entries[row]) for row in rows]
-                # a cell of events consists of whole cells of trees
+                # a cell for events consists of whole cells for trees
                 self._announce(state.cells.event_publisher(stream.cell[here[0][0]]), here)
                 for payload in stream.encode(rows, _columns(here), step.time, layer):
                     put_counted(publisher, payload, state.counters.environment)
@@ -162,8 +164,12 @@ class Sender:
     def _find_due_trees(
         self, entries: list[ObjectRecord], listeners: list[np.ndarray], contact: list[bool], step: LocalStep
     ) -> tuple[np.ndarray, np.ndarray]:
-        """For each of the two layers, [k] bool: whether to publish each of the trees that were last read. A tree is
-        published if the copies of the layer's receivers are wrong, or a listener, claim or contact is new."""
+        """Decide which of the ``k`` trees that were last read to publish: [k] bool for each of the two layers.
+
+        A tree is published if the copies of the layer's receivers are wrong, if a peer has come near, if this actor has
+        just claimed the tree, or if its contact with the tree has begun or ended.
+        ``listeners``: number of receivers of each layer [k]. ``contact`` [k]: whether this actor touches the tree.
+        """
         stream = self._state.tree_stream
         (all_, near) = listeners
         silence = step.time - np.array([(entry.published_to_all_at, entry.published_at) for entry in entries]).T
@@ -172,8 +178,8 @@ class Sender:
             dead_reckoning.needs_update(*error, since, layer.tolerance)
             for error, since, layer in zip(errors, silence, TREE_LAYERS, strict=True)
         ]
-        # Some peers farther away receive the second layer, too. It ends when all near peers have left, but these copies
-        # remain.
+        # Some peers farther away receive the second layer, too. When all near peers have left, nothing is sent on this
+        # layer any more, but those peers keep the copies that it has updated.
         wrong[0] |= (near == 0) & dead_reckoning.needs_update(*errors[1], silence[1], TREE_LAYERS[0].tolerance)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
             wrong[0][row] |= all_[row] > entry.listener_count or entry.touching != touching
@@ -225,7 +231,11 @@ class Sender:
         contact: list[bool],
         step: LocalStep,
     ) -> np.ndarray:
-        """[k] bool Whether to publish each object: its prediction is wrong, or a listener, claim or contact is new."""
+        """Decide which of the ``k`` boxes and bunches ``active`` to publish: [k] bool.
+
+        An object is published if its copies are wrong, if a peer has come near, if this actor has just claimed the
+        object, or if its contact with the object has begun or ended.
+        """
         silence = step.time - np.array([entry.published_at for entry in entries])
         due = dead_reckoning.needs_update(*self._state.object_stream.prediction_error(active, silence), silence)
         for row, (entry, touching) in enumerate(zip(entries, contact, strict=True)):
@@ -235,7 +245,7 @@ class Sender:
         return due & (listeners > 0)
 
     def _announce(self, events: Publisher | None, objects: list[tuple[int, ObjectRecord]]) -> None:
-        """Publish the claims on ``objects`` that no peer can know yet."""
+        """Publish those claims on ``objects`` that no peer can know yet, reliably through ``events``."""
         new = [(object_id, entry.claim, entry.touching) for object_id, entry in objects if not entry.announced]
         if new and events is not None:
             put_counted(events, encode_claims(new), self._state.counters.event)
@@ -243,7 +253,7 @@ class Sender:
     # ------------------------------------------------------------ rest and retained records
 
     def _publish_at_rest(self, object_ids: list[int], step: LocalStep) -> list[TreeUpdate]:
-        """Release owned objects that have come to rest. Returns the states of trees that were sent."""
+        """Publish and release owned objects that have come to rest. Returns the states of trees that were sent."""
         settled = []
         for object_id in object_ids:
             if not is_tree(object_id):
@@ -253,9 +263,10 @@ class Sender:
         return settled
 
     def _publish_tree_at_rest(self, tree: int, step: LocalStep) -> TreeUpdate | None:
-        """Publish one reliable state of a tree to subscribers nearby, then nothing more.
+        """Publish the state of a tree at rest reliably to subscribers nearby, and release the tree.
 
-        If picks or cuts have changed the tree, the state is a retained record, too.
+        If picks or cuts have changed the tree, its state is also published as a retained record. Returns the state as
+        receivers decode it, or None if nothing was sent.
         """
         state = self._state
         is_changed = step.is_changed(tree)
@@ -284,10 +295,10 @@ class Sender:
         return update
 
     def _publish_object_at_rest(self, object_id: int, step: LocalStep) -> None:
-        """Publish where an object rests in the frame of its support, as a retained record.
+        """Publish the pose of an object at rest in the frame of its support, as a retained record, and release it.
 
-        An object without a body in this simulation was taken over from an actor that left. The claim is undone, because
-        this client knows nothing new about the object.
+        An object without a body in this simulation was taken over from an actor that left. For such an object only the
+        claim is undone, because this client knows nothing new about the object.
         """
         state = self._state
         if not step.has_body(object_id):
@@ -308,7 +319,7 @@ class Sender:
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_detachment(self, object_id: int, step: LocalStep) -> None:
-        """Publish, to everyone, that an object has left its plant and moves."""
+        """Publish, as a retained record, that an object has left its plant and moves."""
         state = self._state
         claim = state.ownership.claim(object_id)
         record = RetainedRecord(object_id, claim.ownership, claim.authority, state.hello.name, moving=True)
@@ -324,13 +335,16 @@ class Sender:
         state.retained.publish(state.object_stream.cells((object_id,))[0], record)
 
     def _publish_tree_record(self, cell: Cell, record: RetainedRecord, step: LocalStep) -> None:
-        """Publish a retained record of a tree, with all bodies that were cut off it."""
+        """Add all bodies that were cut off a tree to its retained record, and publish the record."""
         first = int(self._state.model.tree_first[record.object])
         cut = tuple((first + step.detached_roots(record.object)[0]).tolist())
         self._state.retained.publish(cell, msgspec.structs.replace(record, cut=cut))
 
     def _encode_tree(self, tree: int, claim: Claim, step: LocalStep, flags: int) -> tuple[bytes, TreeUpdate]:
-        """State of a tree as a message, and as receivers decode it. If the tree is at rest, its rates are zero."""
+        """Encode the state of a tree. Returns the message, and the state as receivers decode it.
+
+        If ``flags`` contains :data:`RESTING`, all rates are zero.
+        """
         q, qd = step.read(tree)
         numbers, x, xd = step.detached_roots(tree)
         rate_factor = 0.0 if flags & RESTING else 1.0
@@ -349,13 +363,13 @@ class Sender:
 
 
 def _columns(objects: list[tuple[int, ObjectRecord]]) -> ClaimColumns:
-    """Claims and flags of some objects."""
+    """Returns the claims and flags of objects for a message."""
     entries = [entry for _, entry in objects]
     return ClaimColumns([entry.claim for entry in entries], [TOUCHED * entry.touching for entry in entries])
 
 
 def _within_range(pose: np.ndarray) -> tuple[float, float, float, float, float, float, float]:
-    """A pose [7] in the format of a record."""
+    """Returns a pose [7] in the format of a retained record, with a clipped position."""
     x, y, z = np.clip(pose[:3], -LARGEST_COORDINATE, LARGEST_COORDINATE).tolist()
     qx, qy, qz, qw = pose[3:].tolist()
     return x, y, z, qx, qy, qz, qw

@@ -1,7 +1,8 @@
-"""The last published state of each moving object, the present error of its copies, and the messages that correct them.
+"""Streams of states of moving objects: last published states, errors of the copies, and messages that correct the
+copies.
 
-:class:`TreeStream` is for trees, which stay in their cells. :class:`ObjectStream` is for boxes and free bunches, which
-do not. Sender and receiver keep the same quantised values and extrapolate them in the same way
+:class:`TreeStream` is for trees, which stay in one cell. :class:`ObjectStream` is for boxes and free bunches, which
+move between cells. Sender and receiver store the same quantised states and extrapolate them in the same way
 (:mod:`vinesim.net.replication.dead_reckoning`).
 """
 
@@ -21,24 +22,25 @@ from vinesim.scene.model import Model
 from vinesim.scene.values import ObjectUpdate, TreeUpdate
 
 StateReader = Callable[[int], tuple[np.ndarray, np.ndarray]]
-"""Function that returns state and rate of one object: joints of a tree ([n, 4], [n, 3] rad/s), or pose [7] and velocity
-[6] of a box or bunch."""
+"""Function that returns the present state and rate of an object, by its id.
+
+For a tree: joint rotations [n, 4] and rates [n, 3] rad/s. For a box or bunch: pose [7] and velocity [6]."""
 
 DetachedRoots = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""Bodies that were cut off a tree: indices [k] in the tree, positions [k, 3] m, velocities [k, 3] m/s."""
+"""Bodies that were cut off a tree: indices [k] within the tree, positions [k, 3] m, velocities [k, 3] m/s."""
 
 NO_ROOTS: DetachedRoots = (np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ClaimColumns:
-    """Claims and flags of the objects of one message."""
+    """Claims and flags of the objects in one message."""
 
     claims: list[Claim]
     flags: list[int]
 
     def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Ownership, authority and flags, [k] each."""
+        """Returns the ownership sequences, authority sequences and flags of ``k`` objects, each as an array [k]."""
         return (
             np.array([claim.ownership for claim in self.claims]),
             np.array([claim.authority for claim in self.claims]),
@@ -47,21 +49,20 @@ class ClaimColumns:
 
 
 class TreeStream:
-    """Published and received states of trees."""
+    """The last published and received states of all trees."""
 
     def __init__(self, model: Model) -> None:
         self.model = model
         self.middle = _tree_centres(model)
         self.cell = [tuple(cell) for cell in interest.cells_of(self.middle).tolist()]
         self.layer_cell = [tuple(cell) for cell in interest.cells_of(self.middle, interest.TREE_CELL_SIZE).tolist()]
-        """Cell under which the states of each tree are published."""
+        """Cell of :data:`interest.TREE_CELL_SIZE` under which the states of each tree are published."""
         body_count = len(model.body_mass)
         layers = len(interest.TREE_LAYERS)
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
         self._lever_arm = _lever_arms(model)
         self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (layers, body_count, 1))
-        """[layer, body, 4] Last published quaternions, as copies of peers hold them that receive all layers up to this
-        one."""
+        """Last published joint rotations [layer, body, 4], at peers that receive all layers up to ``layer``."""
         self._published_rate = np.zeros((layers, body_count, 4))
         self._published_roots: tuple[dict[int, DetachedRoots], ...] = tuple({} for _ in range(layers))
         self._active: tuple[int, ...] | None = None
@@ -70,7 +71,10 @@ class TreeStream:
         self._roots: list[DetachedRoots] = []
 
     def read(self, active: tuple[int, ...], read: StateReader, cut: Callable[[int], DetachedRoots]) -> None:
-        """Read the states of the trees ``active``, for :meth:`prediction_error` and :meth:`encode`."""
+        """Read the present states of the trees ``active`` for :meth:`prediction_error` and :meth:`encode`.
+
+        ``cut(tree)``: function that returns the bodies that were cut off a tree.
+        """
         if self._active != active:
             self._active = active
             self._sizes = self.model.tree_size[list(active)].astype(np.int64)
@@ -82,8 +86,11 @@ class TreeStream:
         self._roots = [cut(tree) for tree in active]
 
     def prediction_error(self, layer: int, silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Errors [k] m and [k] rad of the copies of the trees that were last read, at peers that receive no layer after
-        ``layer``. ``silence`` [k]: time since the last state that these peers received [s]."""
+        """Returns the errors of the copies of the ``k`` trees that were last read: positions [k] m, angles [k] rad.
+
+        The copies are those of peers that receive no layer after ``layer``. ``silence`` [k]: time since the last state
+        that these peers received [s].
+        """
         assert self._active is not None
         bodies = self._order
         horizon = dead_reckoning.clamp_age(silence)
@@ -104,8 +111,11 @@ class TreeStream:
         return position, np.maximum.reduceat(angle, self._starts)
 
     def encode(self, rows: list[int], published: ClaimColumns, time: float, layer: int) -> list[bytes]:
-        """Messages about some rows of the trees that were last read. Their states become the last published ones of
-        ``layer`` and of all layers after it."""
+        """Encode the states of some of the trees that were last read, and return the messages.
+
+        The states become the last published ones on ``layer`` and all layers after it. ``rows``: indices into the trees
+        that were last read. ``published``: claims and flags of these trees. ``time``: network time [s].
+        """
         assert self._active is not None
         here = [self._active[row] for row in rows]
         part: slice | np.ndarray = slice(None)
@@ -122,7 +132,12 @@ class TreeStream:
         return payloads
 
     def extrapolated(self, news: dict[int, tuple[TreeStates, str]], now: float, time: float) -> list[TreeUpdate]:
-        """The last state of each tree in ``news``, extrapolated to now; it becomes the last known state."""
+        """Returns received states of trees, extrapolated to network ``time`` [s], with own time ``now`` [s] as their
+        time.
+
+        ``news``: the newest batch that contains a tree, and its owner, by tree. The states in ``news`` become the last
+        published ones.
+        """
         found: dict[int, TreeUpdate] = {}
         for trees, sender in {id(batch[0]): batch for batch in news.values()}.values():
             rate = dead_reckoning.quaternion_rate(trees.joint_q, trees.joint_qd)
@@ -149,7 +164,7 @@ class TreeStream:
 
 
 class ObjectStream:
-    """Published and received states of boxes and free bunches."""
+    """The last published and received states of all boxes and free bunches."""
 
     def __init__(self) -> None:
         self._published: dict[int, tuple[np.ndarray, np.ndarray]] = {}
@@ -159,15 +174,15 @@ class ObjectStream:
         self._active: tuple[int, ...] = ()
 
     def cell(self, object_id: int) -> Cell | None:
-        """Cell under which an object was last published, or None."""
+        """Returns the cell under which an object was last published, or None."""
         return self._cell.get(object_id)
 
     def position(self, object_id: int) -> np.ndarray:
-        """Last known position of an object [3] m."""
+        """Returns the last known position of an object [3] m; zero if it is unknown."""
         return self._published[object_id][0][:3] if object_id in self._published else np.zeros(3)
 
     def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
-        """Read and return the positions of these objects [k, 3] m."""
+        """Read the present states of the objects ``active``, and return their positions [k, 3] m."""
         self._active = active
         state = [read(object_id) for object_id in active]
         self._pose = np.array([pose for pose, _ in state], float)
@@ -177,11 +192,14 @@ class ObjectStream:
         return self._pose[:, :3]
 
     def cells(self, active: tuple[int, ...]) -> list[Cell]:
-        """Cells under which the objects ``active`` are published [k]."""
+        """Returns the cells under which the objects ``active`` are published."""
         return [self._cell[object_id] for object_id in active]
 
     def prediction_error(self, active: tuple[int, ...], silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Present errors of the peers' copies [k] m and [k] rad. ``silence`` [k]: time since the last state [s]."""
+        """Returns the errors of the copies of the ``k`` objects that were last read: positions [k] m, angles [k] rad.
+
+        ``silence`` [k]: time since the last published state [s].
+        """
         unknown: tuple[np.ndarray, np.ndarray] = np.full(7, np.inf), np.zeros(6)
         published = [self._published.get(object_id, unknown) for object_id in active]
         pose = np.array([pose for pose, _ in published])
@@ -193,8 +211,11 @@ class ObjectStream:
         )
 
     def encode(self, rows: list[int], published: ClaimColumns, time: float, cell: Cell) -> list[bytes]:
-        """Messages about some rows of the objects of the last :meth:`positions`. Their states become the last published
-        ones."""
+        """Encode the states of some of the objects that were last read, and return the messages.
+
+        The states become the last published ones. ``rows``: indices into the objects that were last read.
+        ``published``: claims and flags of these objects. ``time``: network time [s].
+        """
         ids = np.array([self._active[row] for row in rows])
         batch = ObjectStates(time, ids, *published.columns(), self._pose[rows], self._velocity[rows])
         payloads, received = encode_objects(batch, cell)
@@ -203,7 +224,7 @@ class ObjectStream:
         return payloads
 
     def receive(self, update: ObjectUpdate, cell: Cell) -> None:
-        """Take an accepted state; its time is network time."""
+        """Store a state of a peer's object that was accepted. The time of ``update`` is network time."""
         self._received[update.object] = update
         self._published[update.object] = update.pose, update.velocity
         self._cell[update.object] = cell
@@ -218,7 +239,11 @@ class ObjectStream:
             self._received[object_id] = dataclasses.replace(update, time=update.time + step)
 
     def extrapolated(self, remote: set[int], now: float, time: float) -> list[ObjectUpdate]:
-        """All objects that peers move, extrapolated to now; after 150 ms without a message they stand still."""
+        """Returns the states of the objects ``remote``, extrapolated to network ``time`` [s], with own time ``now``
+        [s].
+
+        ``remote``: objects that peers own. After 150 ms without a message an object stands still.
+        """
         received = [self._received[object_id] for object_id in sorted(self._received.keys() & remote)]
         if not received:
             return []
@@ -235,7 +260,7 @@ class ObjectStream:
 
 
 def with_roots(trees: TreeStates, roots: list[DetachedRoots]) -> TreeStates:
-    """A batch of trees with their detached bodies."""
+    """Returns a batch of trees with the detached bodies of each tree added."""
     if not any(len(numbers) for numbers, _, _ in roots):
         return trees
     counts = np.array([len(numbers) for numbers, _, _ in roots])
@@ -244,12 +269,12 @@ def with_roots(trees: TreeStates, roots: list[DetachedRoots]) -> TreeStates:
 
 
 def object_counts(model: Model) -> tuple[int, ...]:
-    """Number of objects of each kind in a scene: trees, bunches, boxes."""
+    """Returns the number of objects of each kind in a scene: trees, bunches, boxes."""
     return len(model.tree_first), len(model.bunch_body), len(model.box_mass)
 
 
 def _extrapolate_pose(pose: np.ndarray, velocity: np.ndarray, dt: float | np.ndarray) -> np.ndarray:
-    """Poses [..., 7] after ``dt`` [s] at velocities [..., 6]."""
+    """Returns poses [..., 7] after ``dt`` [s] at constant velocities [..., 6] m/s, rad/s."""
     turned = dead_reckoning.extrapolate(
         pose[..., 3:], dead_reckoning.quaternion_rate(pose[..., 3:], velocity[..., 3:]), dt
     )
@@ -257,7 +282,7 @@ def _extrapolate_pose(pose: np.ndarray, velocity: np.ndarray, dt: float | np.nda
 
 
 def _tree_centres(model: Model) -> np.ndarray:
-    """Centre of each tree [tree, 3] m: the mean of its settled bodies."""
+    """Returns the centre of each tree [tree, 3] m: the mean position of its bodies at rest."""
     origins = model.forward_kinematics(model.joint_settled)[:, :3]
     middles = np.zeros((len(model.tree_first), 3))
     np.add.at(middles, model.body_tree, origins)
@@ -265,7 +290,7 @@ def _tree_centres(model: Model) -> np.ndarray:
 
 
 def _lever_arms(model: Model) -> np.ndarray:
-    """Longest distance from each body's joint to the end of the wood that it carries [body] m."""
+    """Returns the largest distance from the joint of each body to the end of a body that it carries [body] m."""
     reach = model.body_length.astype(float).copy()
     for body in range(len(reach) - 1, -1, -1):
         parent = model.body_parent[body]

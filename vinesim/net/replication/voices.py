@@ -1,9 +1,9 @@
-"""Voices: speech of this actor and, if this client listens, of the actors within hearing reach.
+"""Voices: sends the voice of one actor, and receives the voices of the actors within hearing reach.
 
-Keys: ``voice/<actor>`` has a frame of 20 ms in each message, as the speaker coded it. ``voice/<actor>/pcm`` has the
-frame as PCM16, for hearers that cannot decode Opus; it is made only while one of them listens. Both are best effort. A
-hearer subscribes to the actors within reach, except spectators that it may not hear. A key without a subscriber costs
-nothing.
+Keys: a message under ``voice/<actor>`` contains a frame of 20 ms as the speaker has encoded it. A message under
+``voice/<actor>/pcm`` contains the frame as PCM16, for listeners that cannot decode Opus. It is made only while such an
+actor listens. All messages are best effort. An actor subscribes to the actors within reach, except spectators that it
+may not hear. A key without a subscriber costs nothing.
 """
 
 from __future__ import annotations
@@ -27,47 +27,50 @@ from vinesim.net.transport.bus import KEEP_LAST_64, Bus, Publisher, Subscription
 from vinesim.scene.values import HumanUpdate, RobotUpdate
 
 MAX_WAITING = 1024
-"""Largest number of frames that wait to be taken. Older frames are dropped."""
+"""Largest number of received frames that wait for :meth:`VoiceSync.take`. The oldest frames are dropped."""
 
 MAX_AGE = 2.0
-"""[s] Frames that began earlier before the present, or later after it, are refused."""
+"""Largest difference between the time of a frame and the present; other frames are refused [s]."""
 
 BURST = 25.0
-"""Number of frames that a speaker may send at once in addition to the frames of the passing time: half a second, for
-which a link may have held frames back."""
+"""Number of frames of one speaker that may arrive at once in addition to those of the elapsed time: half a second of
+sound, which a slow link may have delayed."""
 
 
 ROBOT_MOUTH = np.array([0.0, 0.0, 1.2])
-"""[m] From a robot's base to its microphone and its loudspeaker. GUESSED."""
+"""Position of a robot's microphone and loudspeaker relative to its base [3] m. GUESSED."""
 
 
 def mouth(kind: str, pose: RobotUpdate | HumanUpdate) -> np.ndarray:
-    """Position from which an actor of a ``kind`` speaks [3] m: a person's head, a spectator's eyes, or a point above a
-    robot's base."""
+    """Returns the position from which an actor speaks [3] m: a person's head, a spectator's eyes, or a point above a
+    robot's base. ``kind``: kind of the actor."""
     if isinstance(pose, HumanUpdate):
         return pose.pose.head[:3]
     return pose.base_q[:3] + (ROBOT_MOUTH if kind == "robot" else 0.0)
 
 
 class Heard(NamedTuple):
-    """A frame of another actor."""
+    """A received frame of the voice of another actor."""
 
     speaker: Hello
     frame: VoiceFrame
     place: np.ndarray
-    """[3] m Position of the speaker when the frame arrived."""
+    """Position of the speaker when the frame arrived [3] m."""
 
 
 class _Source:
-    """Another actor that may be heard."""
+    """Another actor to whose voice this actor subscribes."""
 
     def __init__(self, subscription: Subscription, now: float) -> None:
         self.subscription = subscription
         self.credit, self.credited = BURST, now
-        """Number of frames that the speaker may send now, and the time at which it was computed [s]."""
+        """Number of frames that may arrive at once, and the own time at which this number was computed [s]."""
 
     def admit(self, now: float) -> bool:
-        """Whether to accept a frame: frames may arrive at most a quarter faster than real time."""
+        """Whether to accept a frame that arrives at own time ``now`` [s].
+
+        Frames may arrive at most a quarter faster than real time, besides a burst of :data:`BURST` frames.
+        """
         self.credit = min(BURST, self.credit + 1.25 / FRAME * max(now - self.credited, 0.0))
         self.credited = now
         if self.credit < 1.0:
@@ -77,7 +80,7 @@ class _Source:
 
 
 class VoiceSync(MessageSync):
-    """Voices to and from one actor."""
+    """Sends and receives voices for one actor."""
 
     kind = VOICE
 
@@ -86,11 +89,11 @@ class VoiceSync(MessageSync):
         self._hello = hello
         self._counters = counters
         self.listens = False
-        """Whether this actor wants to hear."""
+        """Whether this actor listens to other actors."""
         self.decodes_opus = True
-        """Whether all listeners of this client can decode Opus."""
+        """Whether everything that plays received voices here can decode Opus."""
         self._made: list[Publisher] = []
-        """Publishers of this actor's voice. Empty until it speaks."""
+        """Publishers of this actor's voice, as encoded and as PCM16. Empty until the voice is first needed."""
         self._numbers = [0, 0]
         self._sources: dict[str, _Source] = {}
         self._is_plain = False
@@ -99,28 +102,32 @@ class VoiceSync(MessageSync):
 
     @property
     def _publishers(self) -> list[Publisher]:
+        """Publishers of this actor's voice, declared at the first use: as encoded, and as PCM16."""
         if not self._made:
             self._made = [self._bus.publisher(f"voice/{self._hello.name}{suffix}") for suffix in ("", "/pcm")]
         return self._made
 
     @property
     def is_heard(self) -> bool:
-        """Whether anyone listens to this actor."""
+        """Whether another actor listens to this one and can decode Opus."""
         return self._publishers[0].matching
 
     @property
     def is_heard_plain(self) -> bool:
-        """Whether anyone who cannot decode Opus listens to this actor."""
+        """Whether another actor listens to this one and cannot decode Opus."""
         return self._publishers[1].matching
 
     @property
     def may_speak(self) -> bool:
-        """Whether anyone may hear this actor, by the server's setting for spectators."""
+        """Whether people may hear this actor, by the server's setting for spectators."""
         return may_hear(self._hello.kind, "human", self._bus.spectators_speak_to)
 
     def say(self, time: float, codec: Codec, data: bytes, *, is_main: bool = True) -> None:
-        """Send a frame that began at network ``time`` [s]. PCM16 goes to the hearers without Opus and, if ``is_main``,
-        to the others, too."""
+        """Send a frame of this actor's voice that began at network ``time`` [s].
+
+        A frame in PCM16 is sent to listeners that cannot decode Opus. If ``is_main``, a frame in any codec is sent to
+        all other listeners.
+        """
         if not self.may_speak:
             return
         for which, applies in enumerate((is_main, codec is Codec.PCM16)):
@@ -131,7 +138,10 @@ class VoiceSync(MessageSync):
                     self._counters.voice.count_out(payload)
 
     def update_interest(self, peers: Mapping[str, RemotePose], here: np.ndarray, now: float) -> None:
-        """Listen to exactly the ``peers`` that are within reach of ``here`` [3] m and may be heard."""
+        """Subscribe to exactly those ``peers`` that are within hearing reach of ``here`` [3] m and may be heard.
+
+        ``now``: own time [s].
+        """
         if self._is_plain == self.decodes_opus:
             self._is_plain = not self.decodes_opus
             self._drop(self._sources.keys())
@@ -152,8 +162,10 @@ class VoiceSync(MessageSync):
             self._sources[name] = _Source(self._bus.subscribe(key, KEEP_LAST_64), now)
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a frame at own time ``now`` and network ``time`` [s]. Raises :class:`MessageError` if the payload is no
-        frame, or its time is too far from the present."""
+        """Take a frame of another actor at own time ``now`` and network ``time`` [s].
+
+        Raises :class:`MessageError` if the frame is invalid, or its time is too far from the present.
+        """
         source = self._sources.get(sender.hello.name)
         pose = sender.update
         if source is None or pose is None or not source.admit(now):
@@ -165,15 +177,16 @@ class VoiceSync(MessageSync):
         self._heard.append(Heard(sender.hello, frame, mouth(sender.hello.kind, pose)))
 
     def take(self) -> list[Heard]:
-        """Frames that arrived since the last call."""
+        """Returns the frames that arrived since the last call."""
         heard = list(self._heard)
         self._heard.clear()
         return heard
 
     def remove_peer(self, name: str) -> None:
-        """An actor has left."""
+        """Unsubscribe from an actor that has left."""
         self._drop({name} & self._sources.keys())
 
     def _drop(self, names: Iterable[str]) -> None:
+        """Unsubscribe from the voices of these actors."""
         for name in list(names):
             self._sources.pop(name).subscription.close()

@@ -1,1 +1,1 @@
-"""The server: admission, retained state on disk, clock. It simulates nothing."""
+"""The server of worlds: it admits actors, keeps retained state on disk and has the clock. It simulates nothing."""

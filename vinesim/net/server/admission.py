@@ -1,8 +1,8 @@
-"""Admission control: one scene, one protocol version, unique names, and a limit of actors in a world; pure.
+"""Admission control: actors of a world have the same scene and protocol version, and unique names. No I/O.
 
-A world takes the scene of the first actor that is admitted. It keeps it while an actor is there, and for good once
-records about its objects are retained (:meth:`AdmissionControl.pin_scene`): a vineyard with cut trees cannot become
-another one.
+The scene of a world is that of the first actor that is admitted. A world keeps its scene while it has actors. Once
+records about its objects are retained, it keeps the scene for good (:meth:`AdmissionControl.pin_scene`), because the
+cuts of a vineyard mean nothing in another one.
 """
 
 from __future__ import annotations
@@ -14,20 +14,23 @@ from vinesim.net.codec.control import Hello, Welcome, decode_hello
 from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion
 
 PROVISIONAL_TIMEOUT = 5.0
-"""Time for which the place of an admitted actor is reserved until its liveliness token is seen [s]."""
+"""Time for which the name of an admitted actor is reserved until its liveliness token arrives [s]."""
 
 
 class SceneId(NamedTuple):
-    """Identity of a scene."""
+    """Identity of a scene: its name and the digest of its vineyard."""
 
     scene: str = ""
     """Name of the scene."""
     digest: str = ""
-    """``Model.digest()`` of its vineyard; empty: unknown."""
+    """``Model.digest()`` of the scene's vineyard; empty: unknown."""
 
 
 class AdmissionControl:
-    """Decides about hellos. ``session`` distinguishes two programs with the same name."""
+    """Decides which actors may join which worlds, and knows which actors are live.
+
+    The Zenoh session id ``session`` distinguishes programs that use the same name.
+    """
 
     def __init__(
         self,
@@ -35,8 +38,8 @@ class AdmissionControl:
         max_actors: int | None = None,
         spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE,
     ) -> None:
-        """``scene``: the only scene allowed in every world. ``max_actors``: largest number of actors of all worlds
-        together. None: no such limit."""
+        """``scene``: the only scene that is allowed; None: any. ``max_actors``: largest number of actors in all worlds
+        together; None: no limit. ``spectators_speak_to``: who hears spectators."""
         self._required_scene = scene
         self._max_actors = max_actors
         self._spectators_speak_to = spectators_speak_to
@@ -45,51 +48,51 @@ class AdmissionControl:
         self._alive: dict[tuple[str, str], set[str]] = {}
         self._admitted: dict[tuple[str, str], tuple[str, float]] = {}
         self._spectators: set[tuple[str, str]] = set()
-        """World and name of the admitted spectators, who publish no records."""
+        """World and name of each admitted spectator. Spectators may not publish records."""
         self.joined = 0
-        """Number of joins since the start."""
+        """Number of times that an actor has become live since the start."""
         self.refused = 0
         """Number of hellos that were rejected."""
 
     @property
     def actors(self) -> list[str]:
-        """Actors that are live now, as ``world/name``, sorted."""
+        """Returns the actors that are live now, as ``world/name``, sorted."""
         return sorted(f"{world}/{name}" for (world, name), sessions in self._alive.items() if sessions)
 
     def is_admitted(self, world: str, name: str) -> bool:
-        """Whether an actor has been admitted and has not left."""
+        """Whether an actor was admitted and has not left."""
         return (world, name) in self._admitted
 
     def may_slow(self, world: str, name: str) -> bool:
-        """Whether the world waits for an actor: one that was admitted, is live, and simulates with a body."""
+        """Whether an actor may slow the time of its world: it was admitted, is live, and is no spectator."""
         actor = (world, name)
         return actor in self._admitted and actor not in self._spectators and self.is_live(world, name)
 
     def has_actors(self, world: str) -> bool:
-        """Whether any session is live in a world."""
+        """Whether any actor is live in a world."""
         return any(there == world for there, _ in self._alive)
 
     def is_live(self, world: str, name: str) -> bool:
-        """Whether a session with this name is live."""
+        """Whether any session holds a liveliness token of this name."""
         return bool(self._alive.get((world, name)))
 
     def scene_of(self, world: str) -> SceneId:
-        """The scene of a world now."""
+        """Returns the present scene of a world; with empty fields if any scene may join."""
         return self._required_scene or self._scenes.get(world, SceneId())
 
     def pin_scene(self, world: str, scene: SceneId) -> None:
-        """Fix the scene of a world that has retained records, even while it has no actor."""
+        """Fix the scene of a world for good, because records about its objects are retained."""
         self._scenes[world] = scene
         self._pinned.add(world)
 
     def on_join(self, world: str, name: str, session: str) -> None:
-        """Note that a session with this name is live."""
+        """Note that a session has declared the liveliness token of a name."""
         sessions = self._alive.setdefault((world, name), set())
         self.joined += not sessions
         sessions.add(session)
 
     def on_leave(self, world: str, name: str, session: str) -> None:
-        """Note that a session is no longer live."""
+        """Note that the liveliness token of a name and session is gone."""
         actor = (world, name)
         sessions = self._alive.get(actor, set())
         sessions.discard(session)
@@ -100,7 +103,7 @@ class AdmissionControl:
         self._forget(world)
 
     def forget_actors(self) -> None:
-        """Forget all actors, because no session is connected any more."""
+        """Forget all actors, because the router was closed. They join again when it is open."""
         self._alive.clear()
         self._admitted.clear()
         self._spectators.clear()
@@ -108,9 +111,10 @@ class AdmissionControl:
             self._forget(world)
 
     def may_publish(self, world: str, name: str, session: str) -> bool:
-        """Whether records under this name come from the session that was admitted with it, and not as a spectator.
+        """Whether a session may publish records under a name: it was admitted with this name, and not as a spectator.
 
-        Until an actor is admitted again by a server that was restarted: from the only session with this name.
+        A server that was restarted has not admitted the actor yet. Until then the only live session with the name may
+        publish.
         """
         actor = (world, name)
         if actor in self._admitted:
@@ -118,7 +122,10 @@ class AdmissionControl:
         return self._alive.get(actor) == {session}
 
     def decide(self, world: str, name: str, session: str, greeting: bytes, now: float) -> Welcome:
-        """Decide about an encoded hello under this name at ``now`` [s]; repeated queries are allowed."""
+        """Admit or reject an actor that sends the encoded hello ``greeting``, and return the reply to it.
+
+        ``name``: name in the key of the query. ``now`` [s]: time of a monotonic clock. A session may ask repeatedly.
+        """
         for actor, (admitted_session, since) in list(self._admitted.items()):
             if now - since > PROVISIONAL_TIMEOUT and admitted_session not in self._alive.get(actor, ()):
                 del self._admitted[actor]
@@ -142,7 +149,7 @@ class AdmissionControl:
         return Welcome(reason, *self.scene_of(world), self._spectators_speak_to)
 
     def _find_objection(self, world: str, name: str, session: str, hello: Hello) -> str:
-        """Returns why an actor cannot be admitted, or "" if it can."""
+        """Returns why an actor cannot be admitted and what to do about it; empty if it can."""
         if hello.name != name:
             return f"{name!r} introduces itself as {hello.name!r}"
         admitted = self._admitted.get((world, name), (session, 0.0))[0]
@@ -169,5 +176,6 @@ class AdmissionControl:
         return ""
 
     def _forget(self, world: str) -> None:
+        """Forget the scene of a world that has no actors and no retained records."""
         if world not in self._pinned and not any(there == world for there, _ in self._admitted):
             self._scenes.pop(world, None)

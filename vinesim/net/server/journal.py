@@ -1,9 +1,9 @@
-"""Write-ahead log of retained records: one journal file for a world, to which every record is appended on arrival.
+"""Write-ahead log of retained records: one journal file for each world, to which every record is appended on arrival.
 
-A journal starts with ``vsfacts`` and a version; then come frames: length, CRC-32, bytes. The first frame is the header
-(msgpack: world, scene), every other one a cell and a RETAINED message. A journal is compacted by writing it anew beside
-the old one, which is then replaced atomically. So a process may die at any byte: what was appended before is there, and
-at most the last frame is torn.
+A journal starts with ``vsfacts`` and a version. Frames follow: length, CRC-32, bytes. The first frame is the header
+(msgpack: world, scene). Every other frame has a cell and a RETAINED message with one record. To compact a journal, a
+new file is written next to it and then replaces it atomically. So a process may die at any moment: all complete frames
+remain, and at most the last frame is torn.
 """
 
 from __future__ import annotations
@@ -32,17 +32,19 @@ VERSION = 1
 SUFFIX = ".facts"
 
 MAX_OBSOLETE_RECORDS = 1000
-"""A journal is compacted when it has more obsolete frames than this plus three for each record that holds."""
+"""Number of obsolete frames above which a journal is compacted, in addition to three for each current record."""
 
 _RECORD = struct.Struct("<II")  # length, CRC-32
 _CELL = struct.Struct("<ii")
 
 
 class JournalError(BusError):
-    """A journal cannot be used or written; the text names the file and the remedy."""
+    """A journal cannot be used or written. The text names the file and what to do."""
 
 
 class _Header(msgspec.Struct, frozen=True):
+    """Content of the first frame of a journal."""
+
     world: str
     scene: str
     digest: str
@@ -50,7 +52,8 @@ class _Header(msgspec.Struct, frozen=True):
 
 
 class Journal:
-    """The retained state of one world, in memory and on disk. A context manager; used by one thread."""
+    """The journal of one world: its retained state in memory, and the file. A context manager. Only one thread uses
+    it."""
 
     def __init__(self, path: pathlib.Path, world: str, scene_id: SceneId, state: RetainedState) -> None:
         self.path = path
@@ -63,15 +66,15 @@ class Journal:
 
     @classmethod
     def load(cls, path: pathlib.Path) -> Self:
-        """Read a journal. A torn one is repaired and its original kept under another name.
+        """Read a journal file. If it is torn, repair it and keep the original under another name.
 
-        Raises :class:`JournalError` if it is no journal or one of another version; then the file stays untouched.
+        Raises :class:`JournalError`, and leaves the file as it is, if it is no journal or one of another version.
         """
         try:
             content = path.read_bytes()
         except OSError as error:
             raise JournalError(
-                f"{path}: cannot be read ({error.strerror}): mend that, or give another --state-dir"
+                f"{path}: cannot be read ({error.strerror}): repair that, or give another --state-dir"
             ) from error
         start = MAGIC + bytes((VERSION,))
         if not content.startswith(MAGIC):
@@ -106,7 +109,7 @@ class Journal:
             backup = _free_name(path)
             _write(backup, content)
             log.warning(
-                "%s: torn after %d of %d bytes; %d facts before that hold, the file as it was is kept as %s",
+                "%s: torn after %d of %d bytes; the %d facts before that are used, the original file is kept as %s",
                 path,
                 valid_end,
                 len(content),
@@ -116,7 +119,8 @@ class Journal:
         return cls(path, head.world, SceneId(head.scene, head.digest), state)
 
     def append(self, cell: Cell, retained: RetainedRecord) -> None:
-        """Append a record that :attr:`state` has merged. Survives the end of this process at once."""
+        """Append a record that is already in :attr:`state` to the file. The record then survives the end of this
+        process."""
         assert self._file is not None
         try:
             self._file.write(_packed(_CELL.pack(*cell) + encode_records([retained])))
@@ -126,7 +130,8 @@ class Journal:
         self._records += 1
 
     def sync(self) -> None:
-        """Force what was appended to the disk; compact the file if that is worth it."""
+        """Force appended records to the disk, so that they survive a crash of the machine. Compact the file if it has
+        many obsolete frames."""
         try:
             if self._records > MAX_OBSOLETE_RECORDS + 4 * len(self.state):
                 self.rewrite()
@@ -136,7 +141,7 @@ class Journal:
             raise _cannot_write(self.path, error) from error
 
     def rewrite(self) -> None:
-        """Write the state to a new file and replace the old one."""
+        """Compact the journal: write :attr:`state` to a new file and replace the old file with it."""
         head = _encoder.encode(_Header(self.world, *self.scene_id))
         records = [_CELL.pack(*cell) + encode_records([retained]) for cell, retained in self.state]
         try:
@@ -165,11 +170,14 @@ class Journal:
 
 
 def load_all(folder: pathlib.Path) -> dict[str, Journal]:
-    """The journals of a folder by their worlds; the folder is created if necessary. Raises :class:`JournalError`."""
+    """Read all journals of a folder, and return them by world. Creates the folder if it is missing.
+
+    Raises :class:`JournalError` if a journal cannot be used.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for rest in folder.glob(f"*{SUFFIX}.part"):
-            rest.unlink()  # half of a journal written anew: the old one is still there
+            rest.unlink()  # unfinished new journal: the old file is still there
     except OSError as error:
         raise _cannot_write(folder, error) from error
     journals: dict[str, Journal] = {}
@@ -184,7 +192,10 @@ def load_all(folder: pathlib.Path) -> dict[str, Journal]:
 
 
 def _records(content: bytes, at: int) -> Iterator[tuple[bytes, int]]:
-    """Intact frames and where each ends, up to the first that is not intact."""
+    """Yield the bytes of each intact frame of a journal from offset ``at`` on, and the offset of the frame's end.
+
+    Stops at the first frame that is not intact.
+    """
     while at + _RECORD.size <= len(content):
         length, crc = _RECORD.unpack_from(content, at)
         record = content[at + _RECORD.size : at + _RECORD.size + length]
@@ -199,7 +210,7 @@ def _packed(record: bytes) -> bytes:
 
 
 def _write(path: pathlib.Path, content: bytes) -> None:
-    """Write a file atomically."""
+    """Write a file atomically: it has the old content or the new one at any moment."""
     part = path.with_name(path.name + ".part")
     with part.open("wb") as file:
         file.write(content)

@@ -1,9 +1,9 @@
-"""Meshes of robots that the server keeps for clients without their files: by digest, in memory, within bounds.
+"""Store of robots' meshes on the server, in memory, for clients that do not have the files.
 
-An actor offers a mesh part by part (:class:`vinesim.net.codec.meshes.MeshPart`); each reply says which part is missing
-next, so that a lost message costs one repetition. What is complete is kept if its digest is right and it decodes. A
-mesh that several actors offer is sent and kept once. It stays while one of them is there, and then until its room is
-needed.
+An actor offers a mesh part by part (:class:`vinesim.net.codec.meshes.MeshPart`). Each reply names the next missing
+part, so a lost message costs one repetition. A complete mesh is kept if it has the stated digest and can be decoded. A
+mesh that several actors offer is sent and kept once. It is kept while one of these actors is live, and afterwards until
+the store needs the memory.
 """
 
 from __future__ import annotations
@@ -28,44 +28,46 @@ class MeshLimits:
     count: int = 4096
     """Number of meshes."""
     total: int = 256 << 20
-    """Size of all meshes, including parts of incomplete ones [B]."""
+    """Size of all meshes [B], including incomplete ones."""
     per_actor: int = 64 << 20
-    """Size of the meshes that one actor offers, including shared ones [B]."""
+    """Size of the meshes that one actor offers [B], including those that other actors offer, too."""
     count_per_actor: int = 256
     """Number of meshes that one actor offers."""
 
 
 @dataclasses.dataclass(slots=True)
 class MeshCounters:
-    """Counts of offered and requested meshes, by their fate."""
+    """Counters of offered and requested meshes."""
 
     kept: int = 0
-    """Meshes that were complete and right."""
+    """Number of meshes that arrived completely and were kept."""
     corrupt: int = 0
-    """Meshes that were complete, but had another digest or were no triangles."""
+    """Number of meshes that arrived completely, but had another digest or could not be decoded."""
     refused: int = 0
-    """Offers beyond a limit."""
+    """Number of offers that were refused because of a limit."""
     served: int = 0
-    """Parts sent."""
+    """Number of parts that were sent to clients."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Kept:
+    """A complete mesh in the store."""
+
     payload: bytes
     holders: set[Actor]
-    """Present actors that have offered the mesh."""
+    """Live actors that have offered the mesh."""
 
 
 class MeshStore:
-    """Meshes by digest. All methods may be called from any thread."""
+    """The meshes that the server keeps, by digest. All methods may be called from any thread."""
 
     def __init__(self, limits: MeshLimits = MeshLimits()) -> None:
         self.limits = limits
         self.counters = MeshCounters()
         self._kept: dict[str, _Kept] = {}
-        """Complete meshes by digest. The mesh that was last requested or offered is the last one."""
+        """Complete meshes by digest, in the order of their last request or offer."""
         self._incomplete: dict[Actor, tuple[MeshPart, bytearray]] = {}
-        """Mesh that each actor is sending: its first part without data, and the bytes that have arrived."""
+        """Incomplete mesh that each actor is sending: its first part without data, and all bytes that have arrived."""
         self._bytes = 0
         """Size of all meshes in :attr:`_kept` [B]."""
         self._lock = threading.Lock()
@@ -75,12 +77,13 @@ class MeshStore:
 
     @property
     def bytes(self) -> int:
-        """Size of all meshes and incomplete meshes [B]."""
+        """Size of all complete and incomplete meshes [B]."""
         with self._lock:
             return self._used()
 
     def part(self, digest: str, offset: int) -> MeshPart:
-        """The part of a mesh that begins at ``offset`` [B]; one of size 0 if there is no such mesh."""
+        """Returns the part of a mesh that begins at ``offset`` [B]; if the mesh is not in the store, one whose ``size``
+        is 0."""
         with self._lock:
             kept = self._kept.pop(digest, None)
             if kept is None:
@@ -92,7 +95,8 @@ class MeshStore:
         return MeshPart(digest, size, offset, kept.payload[offset : offset + MAX_PART])
 
     def offer(self, actor: Actor, part: MeshPart) -> MeshWanted:
-        """Take a part that an actor offers. Returns the part that the actor shall send next."""
+        """Take a part of a mesh that an actor offers. Returns the reply, which names the part that the actor shall send
+        next."""
         with self._lock:
             kept = self._kept.get(part.digest)
             if kept is not None:
@@ -115,15 +119,16 @@ class MeshStore:
         return self._complete(actor, part, bytes(arrived))
 
     def release(self, actor: Actor) -> None:
-        """Note that an actor has left. Meshes that only it offered may be removed to make room for others."""
+        """Note that an actor has left. Meshes that no other live actor offered may then be removed to make room."""
         with self._lock:
             self._incomplete.pop(actor, None)
             for kept in self._kept.values():
                 kept.holders.discard(actor)
 
     def _complete(self, actor: Actor, part: MeshPart, payload: bytes) -> MeshWanted:
-        """Keep a mesh that has arrived completely, if its content has its digest."""
-        try:  # without the lock: of a large mesh this takes milliseconds
+        """Keep a mesh that has arrived completely, if it has the stated digest and can be decoded. Returns the
+        reply."""
+        try:  # without the lock: decoding a large mesh takes milliseconds
             if digest_of(payload) != part.digest:
                 raise TrianglesError("its digest is another")
             decode_triangles(payload)
@@ -144,7 +149,10 @@ class MeshStore:
         return self._bytes + sum(begun.size for begun, _ in self._incomplete.values())
 
     def _objection(self, actor: Actor, size: int, room: int) -> str:
-        """Why an actor may not offer a mesh of this ``size`` [B]; empty if it may. Makes ``room`` [B] if need be."""
+        """Returns why an actor may not offer a mesh of ``size`` [B]; empty if it may.
+
+        Removes meshes of actors that have left if fewer than ``room`` [B] are free.
+        """
         limits = self.limits
         own = [len(kept.payload) for kept in self._kept.values() if actor in kept.holders]
         if not 1 <= size <= MAX_BYTES:
@@ -159,7 +167,7 @@ class MeshStore:
         return ""
 
     def _refuse(self, actor: Actor, reason: str, *, is_limit: bool = True) -> MeshWanted:
-        """Refuse an offer, and log the first refusal."""
+        """Count a refused offer, log the first one, and return the reply that refuses it."""
         if is_limit:
             self.counters.refused += 1
         if self.counters.refused + self.counters.corrupt == 1:

@@ -1,6 +1,6 @@
-"""Store of the server: the retained state of every world, in memory and, if wanted, in journals on disk.
+"""The server's store of retained records of all worlds: in memory and, if a folder is given, in journals on disk.
 
-Network threads only queue records; a thread of the store decodes, counts, merges and writes them.
+Threads of the network only queue records. A thread of the store decodes, counts, merges and writes them.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from vinesim.net.server.journal import SUFFIX, Journal, JournalError, load_all
 log = logging.getLogger(__name__)
 
 MAX_REPLY = 64_000
-"""Largest reply of a snapshot [B], unless a single record is larger."""
+"""Largest size of one message of a snapshot [B]. A single record may exceed this."""
 
 MAX_OBJECTS = 100_000
-"""Largest number of objects of one world with a retained record."""
+"""Largest number of objects with a retained record in one world."""
 
 SYNC_PERIOD = 0.5
 """Time after which appended records are forced to the disk [s]."""
@@ -37,34 +37,36 @@ RETRY_PERIOD = 5.0
 """Time between two attempts to write after a disk error [s]."""
 
 MAX_QUEUED = 10_000
-"""Largest number of messages in the queue. Further ones are dropped."""
+"""Largest number of messages in the store's queue. Further messages are dropped."""
 
 MAX_QUEUED_BYTES = 64 << 20
-"""Largest size of the messages in the queue [B]."""
+"""Largest size of all messages in the store's queue [B]."""
 
 
 class Quota(NamedTuple):
-    """Sustained rate at which one actor may publish records; :data:`BURST_TIME` worth of it may arrive at once."""
+    """Sustained rate at which one actor may publish records. The records of :data:`BURST_TIME` may arrive at once."""
 
     messages: float = 200.0
-    """[1/s] An actor publishes all its records again to a restarted server, one message for each step and cell."""
+    """Number of messages a second. After a restart of the server an actor publishes all its records again, with one
+    message for each step and cell."""
     payload: float = 200_000.0
-    """[B/s]"""
+    """Size of messages a second [B/s]."""
 
 
 MAX_EARLY = 1000
-"""Largest number of messages that wait for the admission of their author, who may publish before it is admitted
-again."""
+"""Largest number of messages that wait for the admission of their author.
+
+An actor may publish records before a restarted server has admitted it again."""
 
 MAX_EARLY_BYTES = 16 << 20
-"""Largest size of the messages that wait for the admission of their author [B]."""
+"""Largest size of all messages that wait for the admission of their author [B]."""
 
 BURST_TIME = 5.0
-"""Time [s] of its quota that an actor may use at once."""
+"""Time for which an actor may save up its :class:`Quota`, to use it at once [s]."""
 
 
 class _Sum:
-    """A number that several threads add to."""
+    """A sum to which several threads add."""
 
     def __init__(self) -> None:
         self.value = 0
@@ -77,7 +79,7 @@ class _Sum:
 
 
 class _TokenBucket:
-    """Token bucket of one actor: messages and bytes."""
+    """Token bucket that limits the messages and bytes of one actor to its :class:`Quota`."""
 
     def __init__(self, quota: Quota, now: float) -> None:
         self._quota = quota
@@ -85,7 +87,7 @@ class _TokenBucket:
         self._tokens = [BURST_TIME * rate for rate in quota]
 
     def spend(self, size: int, now: float) -> bool:
-        """Take the tokens of a message of ``size`` [B]; False, and nothing is taken, if there are too few."""
+        """Take the tokens for a message of ``size`` [B]. Returns False, and takes none, if there are too few."""
         elapsed = now - self._updated_at
         self._updated_at = now
         self._tokens = [
@@ -100,27 +102,31 @@ class _TokenBucket:
 
 @dataclasses.dataclass(slots=True)
 class StoreCounters:
-    """Counts of messages with published records, by their fate."""
+    """Counters of messages with records that arrived at the store."""
 
     received: int = 0
-    """Messages with records."""
+    """Number of messages with records that arrived."""
     malformed: int = 0
-    """Messages that could not be decoded."""
+    """Number of messages that could not be decoded."""
     over_quota: int = 0
-    """Messages of actors beyond their quota."""
+    """Number of messages that were dropped because their author had exceeded its quota."""
     rejected: int = 0
-    """Messages of worlds without an admitted actor, about too many objects, or beyond the queue."""
+    """Number of messages and records that were dropped: the world has no admitted actor, or the limit of objects, of
+    queued messages or of early messages is reached."""
     errors: int = 0
-    """Messages that caused an unexpected error."""
+    """Number of messages that caused an unexpected error."""
     snapshots: int = 0
-    """Queries for the records of a cell."""
+    """Number of queries for the records of cells."""
 
 
 class RetainedStore:
-    """Retained state of all worlds. :meth:`submit`, :meth:`open` and :meth:`snapshot` may be called from any thread."""
+    """The retained records of all worlds. Any thread may call :meth:`submit`, :meth:`open` and :meth:`snapshot`."""
 
     def __init__(self, folder: pathlib.Path | None = None, quota: Quota = Quota()) -> None:
-        """Journals in ``folder``, or in memory only. Raises :class:`vinesim.net.server.journal.JournalError`."""
+        """``folder``: folder of the journals; None: keep records in memory only. ``quota``: limit of each actor.
+
+        Raises :class:`vinesim.net.server.journal.JournalError` if a journal in the folder cannot be used.
+        """
         self.counters = StoreCounters()
         self._folder = folder
         self._quota = quota
@@ -138,22 +144,23 @@ class RetainedStore:
         self._wakeup = threading.Event()
         self._closing = False
         self.status_message = ""
-        """Reason why nothing can be written now, or "". Records stay in memory until they can be written."""
+        """Why the journals cannot be written now; empty if they can. Records stay in memory until they can be
+        written."""
         self._thread = threading.Thread(target=self._run, name="retained store", daemon=True)
         self._thread.start()
 
     def scene_of(self, world: str) -> SceneId | None:
-        """The scene of a world with retained records; None for any other."""
+        """Returns the scene of a world that has retained records; None for any other world."""
         with self._lock:
-            return self._scenes[world] if self._states.get(world) else None  # without records the scene is free
+            return self._scenes[world] if self._states.get(world) else None  # without records any scene may join
 
     def count(self) -> int:
-        """Number of objects of all worlds with a retained record."""
+        """Number of objects with a retained record, in all worlds together."""
         with self._lock:
             return sum(len(records) for records in self._states.values())
 
     def open(self, world: str, scene: SceneId) -> None:
-        """An actor was admitted to a world with this scene: from now on its records are retained."""
+        """Retain the records of a world, because an actor was admitted to it. ``scene``: the scene of the world."""
         with self._lock:
             if not self._states.get(world):
                 self._scenes[world] = scene
@@ -164,10 +171,10 @@ class RetainedStore:
         self._wakeup.set()
 
     def submit(self, key: str, payload: bytes) -> None:
-        """Queue records that arrived under ``<world>/fact/<cx>/<cy>/<actor>``; returns at once."""
+        """Queue a message with records that arrived under ``<world>/fact/<cx>/<cy>/<actor>``. Returns at once."""
         self.counters.received += 1
         if len(payload) > MAX_MESSAGE:
-            payload = b""  # counted as malformed by the thread
+            payload = b""  # the thread counts an empty message as malformed
         if len(self._queue) >= MAX_QUEUED or self._queued_bytes.value + len(payload) > MAX_QUEUED_BYTES:
             self.counters.rejected += 1
             return
@@ -176,7 +183,7 @@ class RetainedStore:
         self._wakeup.set()
 
     def snapshot(self, world: str, cells: Iterable[Cell]) -> list[tuple[Cell, bytes]]:
-        """Messages with all records of these cells, at least one for each."""
+        """Returns messages with all records of these cells, each with its cell; at least one message for each cell."""
         self.counters.snapshots += 1
         found: list[tuple[Cell, bytes]] = []
         with self._lock:
@@ -187,12 +194,12 @@ class RetainedStore:
         return found
 
     def cells(self, world: str) -> list[Cell]:
-        """Cells with retained records."""
+        """Returns the cells of a world that have retained records."""
         with self._lock:
             return sorted({cell for cell, _ in self._states.get(world, RetainedState())})
 
     def close(self) -> None:
-        """Process the queue, write everything and end the thread. Idempotent."""
+        """Process all queued messages, write all records and end the thread. Idempotent."""
         self._closing = True
         self._wakeup.set()
         self._thread.join()
@@ -200,7 +207,7 @@ class RetainedStore:
     # ------------------------------------------------------------ the store's own thread
 
     def _run(self) -> None:
-        """Body of the thread; if it ends by an error, :attr:`status_message` says so from then on."""
+        """Body of the store's thread. If an error ends the thread, :attr:`status_message` contains the error."""
         try:
             self._keep_records()
         except Exception as error:
@@ -208,6 +215,7 @@ class RetainedStore:
             self.status_message = f"the thread that keeps records has ended, restart the server: {error!r}"
 
     def _keep_records(self) -> None:
+        """Process the queue and force records to the disk until the store is closed."""
         synced_at = time.monotonic()
         unsynced: set[str] = set()
         while True:
@@ -235,7 +243,7 @@ class RetainedStore:
             self._try_write(journal.close)
 
     def _recover(self) -> None:
-        """After a disk error: try to write everything again."""
+        """Try to write all journals again after a disk error."""
         error = self.status_message
         for world, records in list(self._states.items()):
             if (journal := self._journals.get(world)) is not None:
@@ -251,7 +259,8 @@ class RetainedStore:
             log.warning("records are written again")
 
     def _ingest_guarded(self, key: str, payload: bytes) -> str:
-        """As :meth:`_ingest`; a message that ends in an unexpected error is dropped, and only that."""
+        """Call :meth:`_ingest` with a message. If this raises an unexpected error, drop the message and count the
+        error."""
         self._queued_bytes.add(-len(payload))
         try:
             return self._ingest(key, payload)
@@ -262,7 +271,10 @@ class RetainedStore:
             return ""
 
     def _ingest(self, key: str, payload: bytes) -> str:
-        """Merge the records of one message. Returns the name of the world if its journal must be synced, else ""."""
+        """Merge the records of one message. Returns the name of the world if its journal has changed, else "".
+
+        ``key``: key of the message, which begins with the world.
+        """
         chunks = key.split("/")
         world = chunks[0]
         where = chunks[2:-1]
@@ -285,7 +297,7 @@ class RetainedStore:
                 return ""
         now = time.monotonic()
         if len(self._buckets) >= MAX_QUEUED:
-            self._buckets.clear()  # a flood of names: all start again
+            self._buckets.clear()  # somebody floods the server with names: start all quotas again
         bucket = self._buckets.setdefault((world, actor), _TokenBucket(self._quota, now))
         if not bucket.spend(len(payload), now):
             self.counters.over_quota += 1
@@ -308,17 +320,17 @@ class RetainedStore:
         return world if is_changed else ""
 
     def _merge(self, world: str, cell: Cell, record: RetainedRecord) -> bool:
-        """Merge a record and append it to the journal. Returns whether that changed a world with a journal."""
+        """Merge a record and append it to the journal of its world. Returns whether a journal has changed."""
         records = self._states[world]
         with self._lock:
             if not records.merge(cell, record):
                 return False
         if self._folder is None:
             return False
-        # without the lock: snapshots do not wait for the disk
+        # without the lock, so that snapshots do not wait for the disk
         journal = self._journals.get(world)
         if self.status_message:
-            pass  # written with everything else once the disk can be written
+            pass  # _recover writes it with everything else
         elif journal is not None:
             self._try_write(lambda: journal.append(cell, record))
         else:
@@ -326,35 +338,35 @@ class RetainedStore:
         return world in self._journals
 
     def _open_journal(self, world: str) -> None:
-        """Create a journal with the present state of a world."""
+        """Create the journal of a world, with all its present records."""
         assert self._folder is not None
         path = self._folder / f"{world}{SUFFIX}"
         self._journals[world] = Journal(path, world, self._scenes[world], self._states[world])
 
     def _try_write(self, write: Callable[[], object]) -> bool:
-        """Call ``write``. After an error, records stay in memory until writing succeeds. Returns whether it did."""
+        """Call ``write``, which writes a journal. Returns whether it succeeded; if not, set :attr:`status_message`."""
         try:
             write()
             return True
         except JournalError as error:
             if not self.status_message:
-                log.error("records are kept in memory only until this is mended: %s", error)
+                log.error("records are kept in memory only until this is repaired: %s", error)
             self.status_message = str(error)
             return False
 
     def _count_malformed(self, world: str, actor: str, reason: str) -> None:
         self.counters.malformed += 1
-        self._warn_once(world, actor, f"sent what cannot be believed: {reason}")
+        self._warn_once(world, actor, f"sent an invalid message: {reason}")
 
     def _warn_once(self, world: str, actor: str, what: str) -> None:
-        """Log the first problem of each actor; the rest is only counted."""
+        """Log a problem with the messages of an actor, but only the first one of each actor."""
         if (world, actor) not in self._warned and len(self._warned) < MAX_QUEUED:
             self._warned.add((world, actor))
             log.warning("%s/%s %s (logged once)", world, actor, what)
 
 
 def _split_messages(records: list[RetainedRecord]) -> list[bytes]:
-    """Encode records into messages of at most :data:`MAX_REPLY`."""
+    """Encode records as messages of at most :data:`MAX_REPLY` bytes each."""
     message = encode_records(records)
     if len(records) <= 1 or (len(message) <= MAX_REPLY and len(records) <= MAX_RECORDS):
         return [message]

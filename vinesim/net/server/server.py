@@ -1,8 +1,7 @@
-"""The server: a Zenoh router that admits actors, has the clock, and keeps the retained state for actors that join
-later.
+"""The server: a Zenoh router that admits actors, has the clock, and keeps retained state for actors that join later.
 
-CANOPIES D6.4 section 2.3: "The network server has only the task to manage the synchronization between the clients." It
-simulates nothing, and it receives retained records, no states and no poses.
+CANOPIES D6.4 section 2.3: "The network server has only the task to manage the synchronization between the clients." The
+server simulates nothing. Of the state of the world it subscribes to retained records only, not to poses and states.
 """
 
 from __future__ import annotations
@@ -37,27 +36,29 @@ from vinesim.scene.triangles import is_digest
 log = logging.getLogger(__name__)
 
 LISTEN = "tcp/127.0.0.1:7447"
-"""Default endpoint: this machine alone, Zenoh's port."""
+"""Default endpoint of a server: Zenoh's port, reachable from this machine only."""
 
 LEASE = 1000
-"""A server that is silent for this long is taken to be gone [ms]: half of the time that actors are granted."""
+"""Time after which a silent server is considered lost [ms]: half of the time for an actor."""
 
 
 RELEASE_TIMEOUT = 5.0
-"""Time limit for the release of the ports of a session that was closed [s]."""
+"""Longest time for which a closed session may keep its ports [s]."""
 
 REOPEN_DELAY = 0.25
-"""Least time between closing a router and opening its successor [s]. Linked routers compute their routes 100 ms after a
-link went (Zenoh 1.10). If the next router is there sooner, they do not tell it which of their clients are live: seen in
-5 to 15 % of restarts, in none of 180 after 0.15 s or more. A process that is started again takes longer."""
+"""Shortest time between closing a router and opening it again [s].
+
+Linked routers compute their routes 100 ms after a link was lost (Zenoh 1.10). If a new router connects sooner, they do
+not report to it which of their clients are live: observed in 5 to 15 % of restarts, and in none of 180 restarts after
+0.15 s or more. A process that is started again takes longer than that."""
 
 
 MAX_EMPTY_WORLDS = 64
-"""Largest number of worlds without actors whose clocks continue."""
+"""Largest number of worlds without actors whose clocks are kept."""
 
 
 class PortTaken(BusError):
-    """The server cannot listen on the endpoint."""
+    """The server cannot listen on an endpoint."""
 
     def __init__(self, endpoint: str, reason: str) -> None:
         protocol = endpoint.partition("/")[0]
@@ -68,7 +69,7 @@ class PortTaken(BusError):
 
 
 class Server:
-    """An embedded router, from construction to :meth:`close`. A context manager."""
+    """A running server: a Zenoh router in this process, from construction to :meth:`close`. A context manager."""
 
     def __init__(
         self,
@@ -84,15 +85,18 @@ class Server:
         world: str = WORLD,
         real_time_factor: float | None = None,
     ) -> None:
-        """Listen on endpoints like ``tcp/0.0.0.0:7447``; port 0 chooses a free one, see :attr:`endpoint`.
+        """Listen on endpoints like ``tcp/0.0.0.0:7447``. Port 0 chooses a free port, see :attr:`endpoint`.
 
-        ``connect``: routers or servers to link to. A linked server only routes. Among linked servers, the one that
-        connects to none admits actors and retains records. ``state_folder``: folder of the journals; without one the
-        state lives as long as the server. ``scene``: the only scene allowed. ``max_actors``: largest number of actors
-        at a time. ``spectators_speak_to``: who hears spectators. ``certificates``: folder of a server, see
-        :mod:`vinesim.net.transport.certificates`; then only ``world`` exists, for actors with a certificate. It is read
-        again when its files change. ``real_time_factor``: how many times as fast as real time its worlds run; None:
-        each as fast as its clients can follow, at most 1.
+        ``connect``: endpoints of routers or servers to link to. A server that is linked to another one only routes. The
+        server that connects to no other one admits actors and retains records. ``state_folder``: folder of the
+        journals; None: retained records are lost when the server ends. ``scene``: the only scene that is allowed.
+        ``max_actors``: largest number of actors at a time. ``spectators_speak_to``: who hears spectators. ``quota``:
+        rate at which one actor may publish records.
+
+        ``certificates``: folder of the server's certificates (:mod:`vinesim.net.transport.certificates`), which is read
+        again when its files change. With it, ``world`` is the only world, and every actor needs a certificate.
+        ``real_time_factor``: fixed real-time factor of all worlds; None: each world is as fast as its clients can
+        follow, at most 1.
 
         Raises :class:`PortTaken`, :class:`vinesim.core.errors.UsageError` for an invalid endpoint or combination,
         :class:`vinesim.net.server.journal.JournalError` and
@@ -105,14 +109,15 @@ class Server:
             raise UsageError(f"the real-time factor is {real_time_factor:g}: give auto, or {MIN_FACTOR:g} to 1")
         if linked and (state_folder, scene, max_actors, real_time_factor) != (None, None, None, None):
             raise UsageError(
-                f"a server linked to {linked[0]} only carries: give --state-dir, --scene, --max-clients and "
+                f"a server linked to {linked[0]} only routes: give --state-dir, --scene, --max-clients and "
                 "--real-time-factor to the one server that connects to no other"
             )
         self._certificates = certificates
         self._linked = linked
         self._root = f"{ROOT}/{'*' if certificates is None else world}"
-        """Key of all worlds; with certificates access control denies declarations beyond the one world."""
-        self._watcher = self._new_watcher()  # before the files are read: a change meanwhile is noticed
+        """Key expression of all worlds. With certificates it names only one world, because access control denies
+        others."""
+        self._watcher = self._new_watcher()  # before the files are read, to notice changes meanwhile
         settings = self._access_settings()
         try:
             self.endpoints = endpoints.resolve_ports(listen, secured=is_secured)
@@ -120,14 +125,14 @@ class Server:
             raise PortTaken(listen[0], str(error.strerror)) from error
         self._fixed_factor = real_time_factor
         self._start = time.monotonic(), time.time()
-        """Real time at the start, and the time at which all worlds begin [s]: the time of day. A later step of the time
-        of day does not change the time of any world."""
+        """Monotonic time at the start, and the time at which all worlds begin [s], which is the time of day. If the
+        time of day is set later, the time of the worlds does not change."""
         self._clocks: dict[str, WorldClock] = {}
-        """The clock of each world."""
+        """Clocks by world."""
         self.pings = 0
-        """Number of queries of the clock."""
+        """Number of clock queries since the start."""
         self.foreign = 0
-        """Number of messages with records that came under the name of another session."""
+        """Number of messages with records that a session sent under the name of another session."""
         self._malformed = 0
         self._admission = AdmissionControl(scene, max_actors, spectators_speak_to)
         self._lock = threading.Lock()
@@ -136,9 +141,9 @@ class Server:
         self._stop = threading.Event()
         self._warned: set[str] = set()
         self.store = None if linked else RetainedStore(state_folder, quota)
-        """The retained state; None if another server keeps it."""
+        """Store of retained records; None if another server keeps them."""
         self.meshes = MeshStore()
-        """Meshes of robots, for clients that have no files of them."""
+        """Meshes of robots, for clients that do not have the files."""
         try:
             self._session = _open_router(self.endpoints, linked, settings)
         except PortTaken:
@@ -152,7 +157,8 @@ class Server:
         log.info("listening on %s", ", ".join(map(str, self.endpoints)))
 
     def _access_settings(self) -> dict[str, Any]:
-        """Zenoh's settings for access control. Raises :class:`CertificateError` if a certificate is unusable."""
+        """Returns Zenoh's settings for TLS and access control. Raises :class:`CertificateError` if a certificate is
+        unusable."""
         if self._certificates is None:
             return {} if self._linked else server_answers_config(ROOT)
         from vinesim.net.transport import certificates
@@ -162,13 +168,17 @@ class Server:
         return settings | acl_config(self._root, certificates.roles(self._certificates))
 
     def _declare(self, root: str) -> list[object]:
-        """Subscribe to liveliness; where this server decides, declare queryables and subscribe to retained records."""
+        """Subscribe to liveliness tokens. Unless this server only routes, also declare the queryables and subscribe to
+        records.
+
+        Returns the declared entities.
+        """
         session = self._session
         declared: list[object] = [
             session.liveliness().declare_subscriber(f"{root}/live/*/*", self._on_liveliness, history=True)
         ]
         if self.store is not None:
-            declared += [  # join first: an actor that reconnects joins before it publishes
+            declared += [  # join first, because actors that reconnect join before they publish
                 session.declare_queryable(f"{root}/join/*/*", self._on_join_query),
                 session.declare_queryable(f"{root}/clock/*", self._on_clock_query),
                 session.declare_queryable(f"{root}/snap/*/*", self._on_snapshot_query),
@@ -180,27 +190,30 @@ class Server:
 
     @property
     def endpoint(self) -> str:
-        """The first endpoint, with its actual port."""
+        """Text of the first endpoint on which the server listens, with its actual port."""
         return str(self.endpoints[0])
 
     @property
     def actors(self) -> list[str]:
-        """Actors that are live now, as ``world/name``, sorted."""
+        """Returns the actors that are live now, as ``world/name``, sorted."""
         with self._lock:
             return self._admission.actors
 
     @property
     def joined(self) -> int:
-        """Number of joins since the start."""
+        """Number of times that an actor has become live since the start."""
         return self._admission.joined
 
     @property
     def malformed(self) -> int:
-        """Number of messages and queries that could not be decoded."""
+        """Number of messages and queries that could not be decoded, since the start."""
         return self._malformed + (self.store.counters.malformed if self.store is not None else 0)
 
     def _clock(self, world: str) -> WorldClock:
-        """The clock of a world, kept from the first question of an actor that is live there; call it under the lock."""
+        """Returns the clock of a world. Hold :attr:`_lock` during the call.
+
+        A new clock is kept only if an actor is live in the world.
+        """
         if (clock := self._clocks.get(world)) is not None:
             return clock
         now = time.monotonic()
@@ -214,12 +227,12 @@ class Server:
 
     @property
     def time(self) -> float:
-        """The time of the default world now [s]."""
+        """Present time of the default world [s]."""
         with self._lock:
             return self._clock(WORLD).time(time.monotonic())
 
     def _run_clocks(self) -> None:
-        """Body of the thread that adapts the factors of all worlds."""
+        """Body of the thread that advances the clocks of all worlds and so adapts their real-time factors."""
         while not self._stop.wait(pace.STEP):
             now = time.monotonic()
             with self._lock:
@@ -227,7 +240,7 @@ class Server:
                     clock.advance(now)
 
     def figures(self) -> dict[str, Any]:
-        """Content of a status line: live actors, links, and counters since the start."""
+        """Returns the content of a status line: live actors, number of links, clocks, and counters since the start."""
         figures: dict[str, Any] = {
             "endpoints": [str(endpoint) for endpoint in self.endpoints],
             "actors": self.actors,
@@ -257,7 +270,8 @@ class Server:
         return figures
 
     def _clock_figures(self) -> dict[str, dict[str, Any]]:
-        """Factor of each world, what limits it, and who is left behind."""
+        """Returns, by world, the real-time factor, what limits it, and the clients for which the world does not
+        wait."""
         with self._lock:
             return {
                 world: {"real_time_factor": one.factor, "cause": one.cause, "left_behind": one.left_behind}
@@ -269,11 +283,11 @@ class Server:
             return 0 if self._session.is_closed() else len(self._session.info.links())
 
     def run(self, duration: float | None = None) -> None:
-        """Block until :meth:`stop` (from a signal handler or another thread), at most ``duration`` [s]."""
+        """Wait until a signal handler or another thread calls :meth:`stop`, but not longer than ``duration`` [s]."""
         self._stop.wait(duration)
 
     def stop(self) -> None:
-        """Let :meth:`run` return."""
+        """Make :meth:`run` return."""
         self._stop.set()
 
     def close(self) -> None:
@@ -293,10 +307,11 @@ class Server:
     # ------------------------------------------------------------ certificates that change
 
     def _new_watcher(self) -> threading.Thread | None:
-        """A thread that opens the router again with the certificates of a folder that changed.
+        """Returns a thread that opens the router again when the files of certificates change; None without
+        certificates.
 
-        Zenoh 1.10 reads certificates and access control only when a session is opened. Actors come back by themselves,
-        as after a restart; the store, the clock and the counters stay.
+        Zenoh 1.10 reads certificates and access control only when a session is opened. Actors reconnect by themselves,
+        as after a restart of the server. The store, the clocks and the counters are kept.
         """
         if self._certificates is None:
             return None
@@ -314,7 +329,7 @@ class Server:
         return threading.Thread(target=run, name="certificates of the server", daemon=True)
 
     def _open_again(self) -> None:
-        """Open the router with the certificates that the folder holds now, unless they are unusable."""
+        """Close the router and open it with the present certificates, unless they are unusable."""
         try:
             settings = self._access_settings()
         except (BusError, OSError) as error:
@@ -326,7 +341,7 @@ class Server:
             close_session(self._session)
             with self._lock:
                 self._admission.forget_actors()
-            # a session that fails to open may keep some of its sockets: so only when all are free
+            # a session that fails to open may keep some sockets, so wait until all of them are free
             until = time.monotonic() + RELEASE_TIMEOUT
             self._stop.wait(REOPEN_DELAY)
             while time.monotonic() < until and not all(map(endpoints.can_listen, self.endpoints)):
@@ -335,9 +350,9 @@ class Server:
                 self._session = _open_router(self.endpoints, self._linked, settings)
                 self._declared = self._declare(self._root)
             except BusError as error:
-                log.error("no client can connect until the server listens again, which is tried on: %s", error)
+                log.error("no client can connect until the server listens again; it goes on trying: %s", error)
                 return
-        log.warning("the certificates changed: opened the server again with them; actors come back by themselves")
+        log.warning("the certificates changed: opened the server again with them; actors reconnect by themselves")
 
     # ------------------------------------------------------------ called by Zenoh's threads
 
@@ -365,7 +380,7 @@ class Server:
             )
         if not is_own:
             self.foreign += 1
-            self._warn_once(key, "records of a session that did not join with this name, or as a spectator: dropped")
+            self._warn_once(key, "dropped records of a session that did not join with this name, or of a spectator")
             return
         payload = sample.payload.to_bytes() if len(sample.payload) <= MAX_MESSAGE else b""
         self.store.submit(key, payload)
@@ -376,7 +391,7 @@ class Server:
             world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
             try:
                 if "*" in key or not is_valid_name(name):
-                    raise MessageError("the question names no world, or not the actor that asks")
+                    raise MessageError("the query names no world, or no valid actor")
                 question = decode_time(_query_payload(query))
             except MessageError as error:
                 self._count_malformed(key, error)
@@ -396,7 +411,7 @@ class Server:
         with query:
             key = _strip_root(query.key_expr)
             if "*" in key or key.count("/") != 3 or self.store is None:
-                self._count_malformed(key, MessageError("an actor asks for itself alone"))
+                self._count_malformed(key, MessageError("an actor can only ask for itself"))
                 return
             world, _, name, session = key.split("/")
             with self._lock:
@@ -414,7 +429,7 @@ class Server:
             key = _strip_root(query.key_expr)
             world, *_, x, y = key.split("/") if key.count("/") == 3 else ("*", "", "")
             if "*" in world or self.store is None:
-                self._count_malformed(key, MessageError("the question names no world and no cell"))
+                self._count_malformed(key, MessageError("the query names no world or no cell"))
                 return
             cells: list[Cell]
             try:
@@ -428,7 +443,7 @@ class Server:
                 else:
                     cells = [(int(x), int(y))]
             except ValueError:
-                self._count_malformed(_strip_root(query.key_expr), MessageError("the question names no cell"))
+                self._count_malformed(_strip_root(query.key_expr), MessageError("the query names no cell"))
                 return
             for cell, payload in self.store.snapshot(world, cells):
                 query.reply(f"{ROOT}/{world}/snap/{cell[0]}/{cell[1]}", payload)
@@ -439,10 +454,10 @@ class Server:
             world, _, name = key.split("/") if key.count("/") == 2 else ("*", "", "")
             try:
                 if "*" in key:
-                    raise MessageError("an actor offers its own meshes")
+                    raise MessageError("an actor can only offer its own meshes")
                 with self._lock:
                     if not self._admission.is_admitted(world, name):
-                        raise MessageError("only an actor that has joined offers meshes")
+                        raise MessageError("only an actor that has joined can offer meshes")
                 wanted = self.meshes.offer((world, name), decode_part(_query_payload(query)))
             except MessageError as error:
                 self._count_malformed(key, error)
@@ -455,7 +470,7 @@ class Server:
             digest = key.rpartition("/")[2]
             try:
                 if not is_digest(digest) or "*" in key:
-                    raise MessageError("the question names no mesh")
+                    raise MessageError("the query names no mesh")
                 part = self.meshes.part(digest, decode_request(_query_payload(query)))
             except MessageError as error:
                 self._count_malformed(key, error)
@@ -463,11 +478,12 @@ class Server:
             query.reply(str(query.key_expr), encode_part(part))
 
     def _count_malformed(self, key: str, error: MessageError) -> None:
-        """Count an invalid query; log the first of each key."""
+        """Count an invalid query, and log the first one for each key."""
         self._malformed += 1
-        self._warn_once(key, f"this question cannot be answered: {error}")
+        self._warn_once(key, f"this query cannot be answered: {error}")
 
     def _warn_once(self, key: str, reason: str) -> None:
+        """Log a problem with what arrived under a key, but only the first one for each key."""
         if key not in self._warned and len(self._warned) < 1000:
             self._warned.add(key)
             log.warning("%s: %s (logged once)", key, reason)
@@ -476,7 +492,7 @@ class Server:
 def _open_router(
     listen: Sequence[endpoints.Endpoint], connect: Sequence[endpoints.Endpoint], settings: dict[str, Any]
 ) -> zenoh.Session:
-    """Open a router; :class:`PortTaken` if it cannot listen."""
+    """Open a Zenoh router. Raises :class:`PortTaken` if it cannot listen on all endpoints."""
     try:
         return open_session(
             config(
@@ -497,10 +513,11 @@ def _open_router(
 
 
 def _strip_root(key: zenoh.KeyExpr) -> str:
-    """A key without the root: its first chunk is the world."""
+    """Returns a key without :data:`ROOT`, so that its first chunk is the world."""
     return str(key)[len(ROOT) + 1 :]
 
 
 def _query_payload(query: zenoh.Query) -> bytes:
+    """Returns the payload of a query; empty if the query has none or it is too large."""
     payload = query.payload
     return payload.to_bytes() if payload is not None and len(payload) <= MAX_MESSAGE else b""

@@ -1,9 +1,10 @@
-"""TLS and access control of Zenoh: keys that each certificate may publish, subscribe to and query. All else is denied.
+"""Settings of Zenoh's TLS and access control: which keys the holder of a certificate may publish, subscribe to and
+query.
 
-Every actor has a certificate with its name as common name. It may subscribe to its whole world, query, and publish only
-under keys that end with its own name. A robot also offers its meshes to the server, under its own name. A spectator
-publishes only its presence, its hello, its viewpoint and its voice. The router applies the rules, so a message under a
-foreign key ends there.
+The common name of an actor's certificate is the name of the actor. An actor may subscribe to its whole world, send
+queries, and publish only under keys that contain its own name. A robot may also offer its meshes to the server. A
+spectator may only publish its presence, its hello, its viewpoint and its voice. Everything else is denied. The router
+applies the rules, so it drops a message under the key of another actor.
 """
 
 from __future__ import annotations
@@ -17,14 +18,14 @@ from vinesim.net.codec.messages import FAMILIES
 from vinesim.net.transport.bus import BusError
 
 SERVER = "server"
-"""Common name of all servers: nothing is denied between them."""
+"""Common name in the certificates of all servers. The router denies servers nothing."""
 
 CA_NAME = "ca"
-"""Common name of the certificate authority, and stem of its files."""
+"""Name of the certificate authority, after which its files ``ca.pem`` and ``ca.key`` are named."""
 
 
 class Role(enum.StrEnum):
-    """Role of the holder of a certificate."""
+    """Role of the holder of a certificate, which determines what the holder may publish."""
 
     ROBOT = "robot"
     HUMAN = "human"
@@ -33,7 +34,7 @@ class Role(enum.StrEnum):
 
 
 class CertificateError(BusError):
-    """A certificate or key is missing or unusable; the text names it."""
+    """A certificate or key is missing or unusable. The text names the file and what to do."""
 
 
 _EVERYTHING = [
@@ -50,23 +51,24 @@ _EVERYTHING = [
 
 
 def authority_folder(folder: pathlib.Path) -> pathlib.Path:
-    """Default folder of the authority's key for a folder of certificates."""
+    """Returns the default folder of the authority's key, for a ``folder`` of certificates."""
     folder = folder.absolute() if not folder.name else folder
     return folder.with_name(f"{folder.name}-authority")
 
 
 def refuse_authority_key(folder: pathlib.Path) -> None:
-    """Raise :class:`CertificateError` if the key of the authority lies in a folder of certificates."""
+    """Raise :class:`CertificateError` if a folder of certificates contains the key of the authority."""
     if (folder / f"{CA_NAME}.key").exists():
         place = authority_folder(folder)
         raise CertificateError(
-            f"{folder / CA_NAME}.key: who has it can make certificates for every name, so no server or client may hold "
-            f"it: mkdir -m 700 {place} && cp {folder}/{CA_NAME}.pem {place}/ && mv {folder}/{CA_NAME}.key {place}/"
+            f"{folder / CA_NAME}.key: whoever has it can make certificates for every name, so no server or client may "
+            f"have it: mkdir -m 700 {place} && cp {folder}/{CA_NAME}.pem {place}/ && mv {folder}/{CA_NAME}.key {place}/"
         )
 
 
 def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
-    """Settings of a session with the certificate of ``name`` that trusts only what ``folder/ca.pem`` signed."""
+    """Returns Zenoh's TLS settings for the certificate of ``name`` in ``folder``. Only certificates of the authority
+    ``folder/ca.pem`` are trusted. Raises :class:`CertificateError` if a file is missing."""
     refuse_authority_key(folder)
     authority, certificate, key = (folder / file for file in (f"{CA_NAME}.pem", f"{name}.pem", f"{name}.key"))
     for file in (authority, certificate, key):
@@ -89,8 +91,11 @@ def tls_config(folder: pathlib.Path, name: str) -> dict[str, Any]:
 
 
 def server_answers_config(root: str) -> dict[str, Any]:
-    """Access control of a server without certificates under ``root`` (like ``vs/1``): no other program that connects to
-    the server can answer queries that actors send to the server."""
+    """Returns Zenoh's settings of access control for a server without certificates.
+
+    The settings keep other programs that connect to the server from answering queries that actors send to the server.
+    ``root``: first chunks of all keys, like ``vs/1``.
+    """
     questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**")]
     rule = {
         "id": "answers of the server",
@@ -111,7 +116,11 @@ def server_answers_config(root: str) -> dict[str, Any]:
 
 
 def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
-    """Access control of a router for the one world under ``root`` (like ``vs/1/vineyard``)."""
+    """Returns Zenoh's settings of access control for a server with certificates.
+
+    ``root``: first chunks of the keys of its only world, like ``vs/1/vineyard``. ``actors``: roles of all certificates
+    by name.
+    """
     rules: list[dict[str, Any]] = []
     policies: list[dict[str, Any]] = []
 
@@ -129,7 +138,7 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         ),
         rule("query", "ingress", ["query"], f"{root}/hello/*", f"{root}/snap/*/*", f"{root}/mesh/*"),
         rule("be queried", "egress", ["query"], f"{root}/hello/*"),
-        # without the declarations of subscribers a publisher would never match and never send
+        # without declarations of subscribers publishers would never match, and never send
         rule("see queryables", "egress", ["declare_queryable"], world),
         rule("see subscribers", "egress", ["declare_subscriber"], world),
     ]

@@ -1,9 +1,10 @@
-"""Publish, subscribe and query on one world: the :class:`Bus` protocol that Zenoh, memory and recordings implement.
+"""The :class:`Bus` protocol: publish, subscribe and query in one world. Implemented over Zenoh, in memory and by
+replays.
 
-Keys are relative to the world, chunks joined by ``/``. In a key expression ``*`` matches one chunk and ``**`` any
-number (Zenoh's grammar without ``$*``). A bus never calls back into the real-time loop: samples are stored on arrival
-and :meth:`Bus.poll` returns them. Every member has a name, whose liveliness token holds from construction to
-:meth:`Bus.close`.
+Keys are relative to the world. Their chunks are separated by ``/``. In a key expression ``*`` matches one chunk and
+``**`` any number of chunks (Zenoh's grammar without ``$*``). A bus never calls back into the real-time loop: samples
+are stored on arrival, and :meth:`Bus.poll` returns them. Every member of the world has a name. The liveliness token of
+the name exists from construction of the bus to :meth:`Bus.close`.
 """
 
 from __future__ import annotations
@@ -17,26 +18,26 @@ from typing import NamedTuple, Protocol
 from vinesim.audio.hearing import SpectatorsSpeakTo
 
 KEEP_LAST_1 = 1
-"""History depth that keeps the newest sample of each key: poses."""
+"""History depth that keeps only the newest sample of each key. For poses."""
 
 KEEP_LAST_64 = 64
-"""History depth that keeps the last samples of each key, in order: records that complete each other."""
+"""History depth that keeps the last 64 samples of each key, in order. For messages that complete each other."""
 
 KEEP_ALL = 10_000
-"""History depth that keeps all samples, in order: events. The number only bounds memory in a flood."""
+"""History depth that keeps all samples of each key, in order. For events. The number only bounds the memory."""
 
 MAX_STORED_BYTES = 64 << 20
-"""Largest size of the payloads that wait to be polled [B]."""
+"""Largest size of all payloads that wait for :meth:`Bus.poll` [B]."""
 
 
 class BusError(RuntimeError):
-    """The network cannot be used as requested; the text gives the cause, the place and the remedy."""
+    """The network cannot be used as requested. The text gives the cause, the place and what to do."""
 
     exit_code = 4
 
 
 class NameTaken(BusError):
-    """Another live actor has this name."""
+    """An actor cannot join because another live actor has its name."""
 
     def __init__(self, name: str, world: str) -> None:
         super().__init__(
@@ -45,7 +46,7 @@ class NameTaken(BusError):
 
 
 class JoinRejected(BusError):
-    """The server rejects this actor. The text is the server's reason."""
+    """The server does not admit an actor. The text is the server's reason."""
 
 
 class Reply(NamedTuple):
@@ -54,19 +55,19 @@ class Reply(NamedTuple):
     key: str
     payload: bytes
     age: float
-    """Time since it arrived [s]."""
+    """Time since the reply arrived [s]."""
 
 
 class Publisher(Protocol):
-    """Sends samples under one exact key."""
+    """Sends samples under one key, which has no wildcards."""
 
     @property
     def matching(self) -> bool:
-        """Whether another member subscribes to this key now."""
+        """Whether another member of the world subscribes to the key now."""
         ...
 
     def put(self, payload: bytes) -> bool:
-        """Send without blocking. Without a subscriber, nothing is sent or counted, and the result is False."""
+        """Send a sample without blocking. Returns False, and sends and counts nothing, if there is no subscriber."""
         ...
 
     def close(self) -> None:
@@ -74,20 +75,20 @@ class Publisher(Protocol):
 
 
 class Subscription(Protocol):
-    """Receives samples under a key expression; :meth:`Bus.poll` returns them."""
+    """Receives samples under a key expression. :meth:`Bus.poll` returns the samples."""
 
     def close(self) -> None:
-        """Undeclare the subscription; samples that have arrived stay until polled."""
+        """Undeclare the subscription. :meth:`Bus.poll` still returns samples that arrived before."""
 
 
 class Bus(Protocol):
-    """Membership of one actor in one world on the network."""
+    """Connection of one actor to one world on the network."""
 
     name: str
     bytes_in: int
-    """Payload bytes received."""
+    """Number of payload bytes that were received."""
     bytes_out: int
-    """Payload bytes sent; without a subscriber nothing is sent."""
+    """Number of payload bytes that were sent. Without a subscriber nothing is sent."""
 
     @property
     def dropped(self) -> int:
@@ -95,66 +96,76 @@ class Bus(Protocol):
         ...
 
     foreign: int
-    """Number of samples and replies that were dropped because their session does not hold the name in their key."""
+    """Number of samples and replies that were dropped because another session holds the name in their key."""
     failures: int
-    """Number of puts, declarations and queries that the network refused. None of them raises."""
+    """Number of puts, declarations and queries that failed on the network. They are counted and raise nothing."""
 
     @property
     def status_message(self) -> str:
-        """Returns why the network is unreachable now, or "" if it is reachable."""
+        """Why the network is unreachable now; empty if it is reachable."""
         ...
 
     def join(self, greeting: bytes) -> None:
-        """Ask the server for admission with an encoded :class:`~vinesim.net.codec.control.Hello`, once, before anything
-        else is sent.
+        """Ask the server to admit this actor. Call it once, before anything else is sent.
 
-        Raises :class:`JoinRejected`. Without a server the actors check each other
-        (:mod:`vinesim.net.replication.peers`).
+        ``greeting``: encoded :class:`~vinesim.net.codec.control.Hello`. Raises :class:`JoinRejected` if the server does
+        not admit the actor. Without a server the actors check each other (:mod:`vinesim.net.replication.peers`).
         """
 
     def publisher(self, key: str, reliable: bool = False) -> Publisher:
-        """Declare a publisher of one exact key. Reliable: in order and without loss while the connection lives."""
+        """Declare a publisher of one key without wildcards.
+
+        ``reliable``: samples arrive in order and without loss while the connection exists; else they are best effort.
+        """
         ...
 
     def subscribe(self, pattern: str, depth: int = KEEP_LAST_1) -> Subscription:
-        """Receive samples of other members: the last ``depth`` of each key until polled. A sample under the name of an
-        actor comes from the session that holds this name (:mod:`vinesim.net.transport.name_holders`).
+        """Receive samples of other members under the key expression ``pattern``.
 
-        Reliable samples need ``KEEP_ALL``: they use another session than poses.
+        The last ``depth`` samples of each key are kept until :meth:`poll`. Samples under the name of an actor that do
+        not come from the session that holds this name are dropped (:mod:`vinesim.net.transport.name_holders`). Reliable
+        samples need the depth ``KEEP_ALL``, because they use another session than poses.
         """
         ...
 
     def poll(self) -> list[tuple[str, bytes]]:
-        """All (key, payload) that arrived since the last call, in order of arrival."""
+        """Returns all samples (key, payload) that arrived since the last call, in order of arrival."""
         ...
 
     def query(self, key: str, payload: bytes = b"") -> None:
-        """Send a query to all queryables that match ``key``. :meth:`replies` returns the replies, if any arrive."""
+        """Send a query to all queryables that match ``key``. :meth:`replies` returns the replies that arrive."""
 
     def replies(self) -> list[Reply]:
-        """Replies that arrived since the last call."""
+        """Returns the replies to queries that arrived since the last call."""
         ...
 
     def fetch(self, key: str, payload: bytes = b"") -> list[bytes]:
-        """Ask all queryables that match ``key`` and wait for their replies, some seconds at most: not for the real-time
-        loop. Any thread may call it; it delays no other message, and returns nothing if the network fails."""
+        """Send a query to all queryables that match ``key``, wait for their replies, and return them.
+
+        Waits some seconds at most, so the real-time loop must not call it. Any other thread may. Delays no other
+        message. Returns an empty list if the network fails.
+        """
         ...
 
     @property
     def spectators_speak_to(self) -> SpectatorsSpeakTo:
-        """Who hears spectators in this world, as the server has set it. People, if the server has not set it."""
+        """Who hears spectators in this world, as set by the server; people if there is no server."""
         ...
 
     @property
     def admissions(self) -> int:
-        """How often a server has admitted this actor: 0 without a server, one more whenever a server starts again."""
+        """Number of times that a server has admitted this actor: 0 without a server, one more after each restart of
+        it."""
         ...
 
     def declare_queryable(self, key: str, respond: Callable[[bytes], bytes]) -> None:
-        """Reply to queries for ``key``; ``respond`` is called from any thread and must return quickly."""
+        """Reply to queries for ``key``.
+
+        ``respond(payload)`` returns the payload of the reply. Any thread may call it, so it must return quickly.
+        """
 
     def alive(self) -> frozenset[str]:
-        """Names of all live actors, including this one."""
+        """Returns the names of all live actors, including this one."""
         ...
 
     def close(self) -> None:
@@ -176,7 +187,7 @@ def _covers(pattern: tuple[str, ...], key: tuple[str, ...]) -> bool:
 
 
 class SampleStore:
-    """Queue of received samples between a network thread, which puts, and the real-time loop, which takes."""
+    """Queue of received samples: a thread of the network puts them, the real-time loop takes them."""
 
     def __init__(self) -> None:
         self._samples: collections.deque[tuple[int, str, bytes]] = collections.deque()
@@ -185,7 +196,8 @@ class SampleStore:
         self.overflowed = 0
 
     def put(self, depth: int, key: str, payload: bytes) -> None:
-        """Append a sample that was received with this history depth; the oldest ones make room for it."""
+        """Append a sample of a subscription with this history ``depth``. If there is no room, drop the oldest
+        samples."""
         with self._lock:
             self._samples.append((depth, key, payload))
             self._bytes += len(payload)
@@ -194,7 +206,7 @@ class SampleStore:
                 self.overflowed += 1
 
     def take(self) -> list[tuple[str, bytes]]:
-        """Remove and return all samples in order of arrival. Samples beyond the depth of their key are dropped."""
+        """Remove and return all samples in order of arrival, without those beyond the history depth of their key."""
         with self._lock:
             taken = self._samples
             self._samples = collections.deque()

@@ -1,4 +1,4 @@
-"""Notices that files of a folder of certificates changed, and warns of certificates that are about to expire."""
+"""Watches a folder of certificates: detects changed files, and warns of certificates that are about to expire."""
 
 from __future__ import annotations
 
@@ -19,7 +19,8 @@ WARNING_PERIOD = 86400.0
 
 
 class CertificateWatch:
-    """Watches the folder of a server or client. A thread that may read files checks it once a :data:`WATCH_PERIOD`."""
+    """Watches a folder of certificates. Call its methods once a :data:`WATCH_PERIOD`, from a thread that may read
+    files."""
 
     def __init__(self, folder: pathlib.Path) -> None:
         self._folder = folder
@@ -27,9 +28,10 @@ class CertificateWatch:
         self._next_warning = 0.0
 
     def has_changed(self) -> bool:
-        """Whether files were added, replaced or removed and then left alone for a period; True once for each change.
+        """Whether files were added, replaced or removed, and not changed again until this call. True once for each
+        change.
 
-        Certificate and key are two files, so a file that was just written may be only half of a change.
+        A certificate and its key are two files, so just after one was written the other may still be missing.
         """
         seen = self._seen
         self._seen = self._state()
@@ -40,7 +42,7 @@ class CertificateWatch:
         return True
 
     def warn(self) -> None:
-        """Log the certificates that are about to expire: at the first call, after a change, and once a day."""
+        """Log which certificates are about to expire, at the first call, after a change, and once a day."""
         if time.monotonic() < self._next_warning:
             return
         self._next_warning = time.monotonic() + WARNING_PERIOD
@@ -51,12 +53,12 @@ class CertificateWatch:
             log.warning("%s", error)
 
     def _state(self) -> tuple[tuple[str, int, int, int], ...]:
-        """Name, time of change, size and inode of each file of certificates."""
+        """Returns name, time of change, size and inode of each file, to detect changes."""
         found = []
         for file in sorted([*self._folder.glob("*.pem"), *self._folder.glob("*.key")]):
             try:
                 status = file.stat()
-            except OSError:  # removed meanwhile
+            except OSError:  # the file was removed meanwhile
                 continue
             found.append((file.name, status.st_mtime_ns, status.st_size, status.st_ino))
         return tuple(found)

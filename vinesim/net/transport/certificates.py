@@ -1,9 +1,10 @@
 """Certificates for secured links: one authority, one certificate for each actor.
 
-``server.pem`` and ``server.key`` belong to the server; ``NAME.pem`` and ``NAME.key`` to an actor, who needs only those
-two and ``ca.pem``. The key of the authority, ``ca.key``, lies in a folder of its own. Whoever has it can make
-certificates for every name, so servers and clients refuse a folder that holds it. The role of an actor is the
-organisational unit of its certificate. Keys are elliptic (P-256), readable only by their owner.
+``server.pem`` and ``server.key`` are the files of the server, ``NAME.pem`` and ``NAME.key`` those of an actor. An actor
+needs only its two files and ``ca.pem``. The key of the authority, ``ca.key``, is in a folder of its own. Whoever has
+this key can make certificates for every name, so servers and clients refuse a folder that contains it. The
+organisational unit of a certificate is the role of its holder. Keys are elliptic (P-256), and only their owner can read
+the files.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ AUTHORITY_YEARS = 10
 CERTIFICATE_DAYS = 825
 """Validity of the certificate of an actor or a server [d]."""
 WARNING_DAYS = 30
-"""A certificate that expires within this time causes a warning [d]."""
+"""Time before the expiry of a certificate at which warnings begin [d]."""
 
 
 class CryptographyMissing(RuntimeError):
-    """The library that makes certificates is not installed."""
+    """The library that makes and checks certificates is not installed."""
 
     exit_code = 3
 
@@ -66,10 +67,12 @@ def create(
 
     Returns the paths of the files that were written.
 
-    ``hosts``: for ``server``, names and addresses under which clients reach it, besides those of this machine; its
-    certificate is replaced. ``authority``: folder of ``ca.key``, by default ``folder`` with ``-authority`` appended.
-    Raises :class:`CertificateError` if an actor has one already, and
-    :class:`vinesim.core.errors.UsageError` for an impossible name or role.
+    ``hosts``: if ``name`` is ``server``, names and addresses under which clients reach the server, besides those of
+    this machine. The server's certificate is then replaced. ``days``: validity [d]. ``authority``: folder of
+    ``ca.key``, by default ``folder`` with ``-authority`` appended.
+
+    Raises :class:`CertificateError` if the actor already has a certificate, and
+    :class:`vinesim.core.errors.UsageError` for an invalid name or role.
     """
     if _missing is not None:
         raise CryptographyMissing from _missing
@@ -95,12 +98,15 @@ def create(
             written += _signed(folder, authority, SERVER, Role.SERVER, (), days)
         return written + _signed(folder, authority, name, role, hosts, days)
     except OSError as error:
-        place = error.filename or folder  # a full disk names no file
+        place = error.filename or folder  # the error of a full disk names no file
         raise CertificateError(f"{place}: {error.strerror}: the certificate cannot be made there") from error
 
 
 def roles(folder: pathlib.Path) -> dict[str, Role]:
-    """Roles of all certificates of this folder, by name; :class:`CertificateError` for one of another authority."""
+    """Returns the roles of all certificates in a folder, by name.
+
+    Raises :class:`CertificateError` if another authority has signed one of them.
+    """
     if _missing is not None:
         raise CryptographyMissing from _missing
     authority = _read(folder / f"{CA_NAME}.pem")
@@ -125,8 +131,10 @@ def roles(folder: pathlib.Path) -> dict[str, Role]:
 
 
 def check(folder: pathlib.Path, name: str) -> None:
-    """Raise :class:`CertificateError` if the certificate of ``name`` or the authority's is not valid now, or if the
-    certificate does not belong to its key."""
+    """Check the certificate of ``name`` and that of the authority.
+
+    Raises :class:`CertificateError` if one of them is not valid now, or if the certificate does not belong to its key.
+    """
     if _missing is not None:
         raise CryptographyMissing from _missing
     now = datetime.datetime.now(datetime.UTC)
@@ -146,7 +154,8 @@ def check(folder: pathlib.Path, name: str) -> None:
 
 
 def expiring(folder: pathlib.Path) -> list[str]:
-    """One line, with the date, for each certificate of this folder that expires within :data:`WARNING_DAYS`."""
+    """Returns a line of text with the date for each certificate of a folder that expires within
+    :data:`WARNING_DAYS`."""
     if _missing is not None:
         return []
     soon = datetime.datetime.now(datetime.UTC) + datetime.timedelta(days=WARNING_DAYS)
@@ -155,14 +164,16 @@ def expiring(folder: pathlib.Path) -> list[str]:
         last = _read(file).not_valid_after_utc
         if last < soon:
             lines.append(
-                f"{file} is valid until {last:%Y-%m-%d %H:%M} UTC, and refused afterwards: make it anew in time"
+                f"{file} is valid until {last:%Y-%m-%d %H:%M} UTC, and refused afterwards: make a new one in time"
             )
     return lines
 
 
 def _authority_of(folder: pathlib.Path, authority: pathlib.Path) -> list[pathlib.Path]:
-    """Create the authority if there is none, and copy its certificate to ``folder``. Returns the paths that were
-    written."""
+    """Create the authority in the folder ``authority`` if there is none, and copy its certificate to ``folder``.
+
+    Returns the paths of the files that were written.
+    """
     own = authority / f"{CA_NAME}.pem"
     public = folder / f"{CA_NAME}.pem"
     has_key = (authority / f"{CA_NAME}.key").exists()
@@ -204,7 +215,8 @@ def _create_authority(folder: pathlib.Path) -> list[pathlib.Path]:
 def _signed(
     folder: pathlib.Path, authority_at: pathlib.Path, name: str, role: Role, hosts: Sequence[str], days: float
 ) -> list[pathlib.Path]:
-    """Create a key and its certificate, signed by the authority in ``authority_at``."""
+    """Create a key and a certificate, signed by the authority in the folder ``authority_at``. Returns the written
+    paths."""
     authority = _read(authority_at / f"{CA_NAME}.pem")
     signer = _load_key(authority_at / f"{CA_NAME}.key")
     key = ec.generate_private_key(ec.SECP256R1())
@@ -221,7 +233,7 @@ def _signed(
         _builder(subject, authority.subject, key.public_key(), days)
         .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
         .add_extension(x509.SubjectAlternativeName([_host(one) for one in names]), critical=False)
-        # a server is also a client: of the router it is linked to
+        # a server is also a client of the router to which it is linked
         .add_extension(
             x509.ExtendedKeyUsage(
                 [ExtendedKeyUsageOID.CLIENT_AUTH] + [ExtendedKeyUsageOID.SERVER_AUTH] * (role == Role.SERVER)
@@ -244,7 +256,7 @@ def _builder(
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_before(now - datetime.timedelta(days=2))  # clocks of machines differ
+        .not_valid_before(now - datetime.timedelta(days=2))  # because clocks of machines differ
         .not_valid_after(now + datetime.timedelta(days=days))
     )
 
@@ -271,7 +283,7 @@ def _save(
 
 
 def _write(path: pathlib.Path, content: bytes, mode: int) -> None:
-    """Write a file atomically: after an error, ``path`` is unchanged."""
+    """Write a file atomically: if an error occurs, ``path`` is unchanged. ``mode``: permissions of the file."""
     part = path.with_name(f"{path.name}.part")
     part.unlink(missing_ok=True)
     with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as file:

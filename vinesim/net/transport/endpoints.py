@@ -1,8 +1,8 @@
-"""Endpoints of servers and clients as text, and the two links between a client and a server: a stream and datagrams.
-All functions but those that look for free ports are pure.
+"""Endpoints of servers and clients, and the two links between a client and a server: a stream and datagrams.
 
-``tcp`` and ``tls`` carry everything. ``udp`` and ``quic`` use the same port number and carry best-effort messages
-(poses) without head-of-line blocking. ``tls`` and ``quic`` need certificates on both sides.
+A stream (``tcp``, ``tls``) can carry all messages. Datagrams (``udp``, ``quic``) use the same port number and carry
+best-effort messages like poses without head-of-line blocking. ``tls`` and ``quic`` need certificates on both sides.
+Only the functions that search for free ports do I/O.
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ PORT = 7447
 
 _COUNTERPART = {"tcp": "udp", "udp": "tcp", "tls": "quic", "quic": "tls"}
 _MIXED = {"udp": "?rel=1;mixed_rel=auto", "quic": "?mixed_rel=auto"}
-"""Options for one session over two links: a reliable one, and datagrams. Without ``rel=1`` udp would be lossy only."""
+"""Zenoh's options for one session over two links, a reliable one and datagrams. Without ``rel=1`` a udp session would
+have no reliable link."""
 
 
 class Endpoint(NamedTuple):
-    """An address to listen on or to connect to."""
+    """An address on which a server listens or to which a client connects."""
 
     protocol: str
     host: str
@@ -39,17 +40,17 @@ class Endpoint(NamedTuple):
 
     @property
     def datagrams(self) -> bool:
-        """Whether it carries best-effort messages as datagrams."""
+        """Whether best-effort messages are sent as datagrams."""
         return self.protocol in _MIXED
 
     @property
     def secured(self) -> bool:
-        """Whether both sides show certificates."""
+        """Whether server and client need certificates."""
         return self.protocol in ("tls", "quic")
 
     @property
     def loopback(self) -> bool:
-        """Whether it stays on this machine."""
+        """Whether only programs on this machine can use the endpoint."""
         try:
             return ipaddress.ip_address(self.host.strip("[]")).is_loopback
         except ValueError:
@@ -57,13 +58,16 @@ class Endpoint(NamedTuple):
 
     @property
     def counterpart(self) -> Endpoint:
-        """The other link to the same server: datagrams for a stream and vice versa."""
+        """Endpoint of the other link to the same server: datagrams for a stream, a stream for datagrams."""
         return self._replace(protocol=_COUNTERPART[self.protocol])
 
 
 def parse(text: str, *, secured: bool = False) -> Endpoint:
-    """Parse the text ``PROTOCOL/HOST:PORT``. Raises :class:`vinesim.core.errors.UsageError` for anything else and, if
-    ``secured``, for a protocol without TLS."""
+    """Parse the text ``PROTOCOL/HOST:PORT``. ``secured``: whether certificates are given.
+
+    Raises :class:`vinesim.core.errors.UsageError` for any other text, for protocols without TLS if ``secured``, and for
+    protocols with TLS if not.
+    """
     allowed = ("tls", "quic") if secured else ("tcp", "udp")
     protocol, _, address = text.partition("/")
     host, colon, port = address.rpartition(":")
@@ -79,14 +83,20 @@ def parse(text: str, *, secured: bool = False) -> Endpoint:
 
 
 def default_listen(*, secured: bool = False, insecure: bool = False) -> tuple[str, ...]:
-    """Default endpoints of a server, a stream and datagrams. They listen on this machine only, or on all interfaces if
-    the server is ``secured`` by certificates or allowed to be ``insecure``."""
+    """Returns the default endpoints of a server, for a stream and for datagrams.
+
+    They are reachable from this machine only, unless the server is ``secured`` by certificates or the user allows it to
+    be ``insecure``.
+    """
     host = "0.0.0.0" if secured or insecure else "127.0.0.1"
     return tuple(f"{protocol}/{host}:{PORT}" for protocol in (("tls", "quic") if secured else ("tcp", "udp")))
 
 
 def check_exposure(listen: Sequence[str], *, secured: bool = False, insecure: bool = False) -> None:
-    """Raise :class:`vinesim.core.errors.UsageError` if anyone on the network could join without a check."""
+    """Raise :class:`vinesim.core.errors.UsageError` if any program on the network could join without a certificate.
+
+    ``listen``: endpoints of the server. ``insecure``: whether the user allows this.
+    """
     for text in listen:
         endpoint = parse(text, secured=secured)
         if not (endpoint.secured or endpoint.loopback or insecure):
@@ -97,17 +107,20 @@ def check_exposure(listen: Sequence[str], *, secured: bool = False, insecure: bo
 
 
 class Links(NamedTuple):
-    """How one client reaches its server."""
+    """The endpoints to which a client connects to reach its server."""
 
     bulk: Endpoint
-    """A stream: events, queries, snapshots, everything large."""
+    """Stream for events, queries, snapshots and everything large."""
     live: Endpoint | None
-    """Datagrams: poses and states. None: poses and states use the stream, too."""
+    """Datagrams for poses and states. None: the stream carries poses and states, too."""
 
 
 def client_links(connect: str, *, secured: bool = False) -> Links:
-    """Both links to a remote server. To a server on this machine only the stream, which is the cheapest, unless the
-    protocol ``udp/`` or ``quic/`` asks for both."""
+    """Returns the links to the server at the endpoint ``connect``.
+
+    To a server on this machine, a client uses only the stream, which is cheapest, unless the protocol is ``udp`` or
+    ``quic``. To any other server it uses both links.
+    """
     endpoint = parse(connect, secured=secured)
     if endpoint.datagrams:
         return Links(endpoint.counterpart, endpoint)
@@ -115,7 +128,7 @@ def client_links(connect: str, *, secured: bool = False) -> Links:
 
 
 def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endpoint, ...]:
-    """Endpoints to listen on. Port 0 is replaced by one number that is free for both streams and datagrams."""
+    """Parse the endpoints of a server. Replaces port 0 by one number that is free for both streams and datagrams."""
     wanted = [parse(text, secured=secured) for text in listen]
     if not wanted:
         raise UsageError("a server that listens nowhere: give --listen at least once")
@@ -130,8 +143,10 @@ def resolve_ports(listen: Sequence[str], *, secured: bool = False) -> tuple[Endp
 
 
 def can_listen(endpoint: Endpoint) -> bool:
-    """Whether no socket listens at an endpoint. Zenoh 1.10 may release the socket of datagrams 0.1 s after its
-    session."""
+    """Whether a server could listen at an endpoint now.
+
+    Zenoh 1.10 may keep the socket of datagrams for 0.1 s after its session was closed.
+    """
     family = socket.AF_INET6 if endpoint.host.startswith("[") else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM if endpoint.datagrams else socket.SOCK_STREAM) as probe:
         if not endpoint.datagrams:

@@ -1,5 +1,4 @@
-"""A network in memory with a clock of its own: deterministic delay, jitter, loss and partition for tests and
-benchmarks."""
+"""A network in memory with its own clock: deterministic delay, jitter, loss and partition, for tests and benchmarks."""
 
 from __future__ import annotations
 
@@ -14,15 +13,15 @@ from vinesim.net.transport.bus import KEEP_LAST_1, JoinRejected, NameTaken, Repl
 from vinesim.net.transport.name_holders import bound_name
 
 MAX_KNOWN_KEYS = 10_000
-"""Largest number of keys for which a bus remembers whether it subscribes to them."""
+"""Largest number of keys for which a bus stores whether it subscribes to them."""
 
 
 class MemoryHub:
-    """Carries samples between buses in memory; :meth:`advance` moves its clock. All randomness comes from ``seed``.
+    """An emulated network that carries samples between its buses. :meth:`advance` moves its clock.
 
-    ``delay`` and ``jitter`` [s] are one way: uniform from delay - jitter to delay + jitter, so that samples overtake
-    each other. ``loss`` and ``duplicated`` are the probabilities that an unreliable sample is lost or arrives twice.
-    Reliable samples arrive once and in order.
+    The one-way delay of a sample is uniform from ``delay - jitter`` to ``delay + jitter`` [s], so samples can overtake
+    each other. ``loss`` and ``duplicated`` are the probabilities that a best-effort sample is lost or arrives twice.
+    Reliable samples arrive once and in order. All random numbers follow from ``seed``.
     """
 
     def __init__(
@@ -36,13 +35,13 @@ class MemoryHub:
         self.loss = loss
         self.duplicated = duplicated
         self.down = False
-        """Whether the network is partitioned: no message passes, and every member sees only itself."""
+        """Whether the network is down: no message arrives, and for each member only the member itself is live."""
         self.binds_names = True
-        """Whether the bus checks names. False: members may send and answer under the names of others."""
+        """Whether messages under the name of another member are dropped, as by a real bus."""
         self.rejection_reason: Callable[[bytes], str] = lambda greeting: ""
-        """Returns why the emulated server rejects a hello, or "" if it admits the actor."""
+        """Function that returns why the emulated server rejects a hello; empty if it admits the actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
-        """Who hears spectators, as the emulated server sets it."""
+        """Who hears spectators, as set by the emulated server."""
         self._random = random.Random(seed)
         self._order = 0
         self._pending: list[tuple[float, int, Callable[[], None]]] = []
@@ -51,10 +50,13 @@ class MemoryHub:
         self._hidden: set[str] = set()
         self._last_arrival: dict[tuple[str, str], float] = {}
         self._subscribers: dict[str, list[str]] = {}
-        """Sorted names of the members that subscribe to a key, until subscriptions or members change."""
+        """Sorted names of the members that subscribe to a key. Cleared when subscriptions or members change."""
 
     def bus(self, name: str, *, live: bool = True) -> MemoryBus:
-        """Add a member. Raises :class:`NameTaken` if the name is live. If not ``live``, it has no liveliness token."""
+        """Add a member, and return its bus. Raises :class:`NameTaken` if there is a member with this name.
+
+        ``live``: whether the member has a liveliness token, so that others know that it is there.
+        """
         if name in self._members:
             raise NameTaken(name, "memory")
         bus = MemoryBus(self, name)
@@ -70,7 +72,7 @@ class MemoryHub:
         return bus
 
     def advance(self, dt: float) -> None:
-        """Advance the clock by ``dt`` [s] and deliver the samples that arrive until then, in order."""
+        """Advance the clock by ``dt`` [s], and deliver in order all samples that arrive in this time."""
         end = self.time + dt
         while self._pending and self._pending[0][0] <= end + 1e-12:
             self.time, _, action = heapq.heappop(self._pending)
@@ -78,7 +80,7 @@ class MemoryHub:
         self.time = end
 
     def _schedule(self, action: Callable[[], None], order_key: tuple[str, str] | None = None) -> None:
-        """Call ``action`` after one random delay; actions with the same ``order_key`` stay in order."""
+        """Call ``action`` after a random one-way delay. Actions with the same ``order_key`` are called in order."""
         at = self.time + max(0.0, self.delay + self._random.uniform(-self.jitter, self.jitter))
         if order_key is not None:
             at = self._last_arrival[order_key] = max(at, self._last_arrival.get(order_key, 0.0))
@@ -86,20 +88,24 @@ class MemoryHub:
         heapq.heappush(self._pending, (at, self._order, action))
 
     def has_subscriber(self, sender: str, key: str) -> bool:
-        """Whether another member subscribes to this key."""
+        """Whether a member other than ``sender`` subscribes to a key."""
         return not self.down and any(name != sender for name in self._subscribers_of(key))
 
     def _subscribers_of(self, key: str) -> list[str]:
+        """Returns the sorted names of all members that subscribe to a key."""
         if key not in self._subscribers:
             self._subscribers[key] = sorted(name for name, bus in self._members.items() if bus.is_subscribed(key))
         return self._subscribers[key]
 
     def forget_subscribers(self) -> None:
-        """Clear the stored subscribers, because subscriptions or members have changed."""
+        """Clear the stored subscribers. Called when subscriptions or members have changed."""
         self._subscribers.clear()
 
     def send(self, sender: str, key: str, payload: bytes, reliable: bool) -> None:
-        """Send a sample to every other member that is subscribed now; a closed subscription ignores it on arrival."""
+        """Send a sample to every other member that subscribes to the key now.
+
+        A member that has closed its subscription when the sample arrives ignores it.
+        """
         for name in self._subscribers_of(key):
             bus = self._members[name]
             if name == sender:
@@ -111,7 +117,7 @@ class MemoryHub:
                     self._schedule(functools.partial(self._deliver, bus, sender, key, payload))
 
     def query(self, sender: MemoryBus, key: str, payload: bytes) -> None:
-        """Send a query to every other member with a matching queryable, and its reply back."""
+        """Send a query to every other member with a matching queryable, and the replies back to ``sender``."""
 
         def respond(bus: MemoryBus, served_key: str) -> None:
             if not self.down and served_key in bus.queryables:
@@ -129,8 +135,10 @@ class MemoryHub:
                     self._schedule(functools.partial(respond, self._members[name], served_key))
 
     def fetch(self, sender: str, key: str, payload: bytes) -> list[bytes]:
-        """Ask every other member with a matching queryable. Replies come at once, without the delay, because callers
-        cannot wait for the clock."""
+        """Send a query to every other member with a matching queryable, and return the replies at once.
+
+        There is no delay here, because the caller cannot wait while the clock stands.
+        """
         if self.down:
             return []
         return [
@@ -141,11 +149,11 @@ class MemoryHub:
         ]
 
     def visible_names(self, name: str) -> frozenset[str]:
-        """Names that a member sees as live."""
+        """Returns the names that are live for the member ``name``."""
         return frozenset((name,)) if self.down else frozenset(self._visible_names.get(name, ()))
 
     def remove(self, name: str) -> None:
-        """Remove a member; the others notice after one delay."""
+        """Remove a member. The other members are notified after a random one-way delay."""
         self._members.pop(name, None)
         self.forget_subscribers()
         self._visible_names.pop(name, None)
@@ -158,7 +166,7 @@ class MemoryHub:
             (self._visible_names[observer].add if there else self._visible_names[observer].discard)(name)
 
     def _is_foreign(self, bus: MemoryBus, source: str, key: str) -> bool:
-        """Whether a member sends under another's name. Such messages are counted."""
+        """Whether ``source`` sends under the name of another member. Counts such messages for the receiver ``bus``."""
         is_foreign = self.binds_names and bound_name(key) not in ("", source)
         bus.foreign += is_foreign
         return is_foreign
@@ -169,7 +177,7 @@ class MemoryHub:
 
 
 class MemoryPublisher:
-    """See :class:`vinesim.net.transport.bus.Publisher`."""
+    """A publisher of a :class:`MemoryBus`. Implements :class:`vinesim.net.transport.bus.Publisher`."""
 
     def __init__(self, bus: MemoryBus, key: str, reliable: bool) -> None:
         self._bus = bus
@@ -192,7 +200,7 @@ class MemoryPublisher:
 
 
 class MemorySubscription:
-    """See :class:`vinesim.net.transport.bus.Subscription`."""
+    """A subscription of a :class:`MemoryBus`. Implements :class:`vinesim.net.transport.bus.Subscription`."""
 
     def __init__(self, bus: MemoryBus, pattern: str, depth: int) -> None:
         self._bus = bus
@@ -204,7 +212,8 @@ class MemorySubscription:
 
 
 class MemoryBus:
-    """See :class:`vinesim.net.transport.bus.Bus`; created by :meth:`MemoryHub.bus`."""
+    """A bus on a :class:`MemoryHub`, made by :meth:`MemoryHub.bus`. Implements
+    :class:`vinesim.net.transport.bus.Bus`."""
 
     def __init__(self, hub: MemoryHub, name: str) -> None:
         self.hub = hub
@@ -215,8 +224,8 @@ class MemoryBus:
         self._store = SampleStore()
         self._subscriptions: list[MemorySubscription] = []
         self._depths: dict[str, int] = {}
-        """Depth of the deepest subscription to each key that was looked up, 0 without a subscription. Cleared when
-        subscriptions change."""
+        """Largest history depth of the subscriptions that match a key; 0 if none matches. Cleared when subscriptions
+        change."""
 
     @property
     def dropped(self) -> int:

@@ -1,12 +1,13 @@
-"""Names of actors and the sessions that hold them: a message under a name counts only from the session that holds it.
+"""Which Zenoh session holds the name of an actor. A message under a name is accepted only from the session that holds
+it.
 
-A session holds a name from its liveliness token ``live/<name>/<session>`` on. If a second session declares a token of
-the same name, members that saw the first token keep to it. Members that see both tokens at first believe neither until
-one is left. Messages of a session that arrive after it has left still count, because the last records of an actor may
-be under way.
+A session holds a name once it has declared the liveliness token ``live/<name>/<session>``. If a second session declares
+a token of the same name, members that know the first token still accept the first session. A member that joins while
+both tokens exist accepts neither session until one token is gone. Messages that arrive after their session has left are
+accepted, because the last records of an actor may still be on their way.
 
-Without TLS a session states its own identity. This keeps programs apart that use vinesim or Zenoh as they are, but not
-a program that was written to deceive (``docs/network.md``).
+Without TLS a session states its own identity. This separates programs that use vinesim or Zenoh as intended, but does
+not stop a program that was written to deceive (``docs/network.md``).
 """
 
 from __future__ import annotations
@@ -16,34 +17,37 @@ import threading
 from vinesim.net.codec.messages import FAMILIES, sender_of
 
 MAX_FORMER_SESSIONS = 8
-"""Largest number of sessions of one name that have left and are still remembered."""
+"""Largest number of sessions that have left and are still stored, for one name."""
 
 BOUND_FAMILIES = frozenset(name for name, family in FAMILIES.items() if family.is_published) | {"hello"}
-"""First chunks of the keys that belong to one actor."""
+"""Families of keys that contain the name of the actor that may send under them, by their first chunk."""
 
 
 def bound_name(key: str) -> str:
-    """Name of the actor that a key, without its world, belongs to; empty for a key of no actor."""
+    """Returns the name of the only actor that may send under a key; empty if the key belongs to no actor.
+
+    ``key``: relative to the world.
+    """
     return sender_of(key) if key.partition("/")[0] in BOUND_FAMILIES else ""
 
 
 class NameHolders:
-    """Sessions of each name, in the order in which they declared it. May be used from several threads."""
+    """All names of a world and the sessions that declared them. May be used from several threads."""
 
     def __init__(self, own: frozenset[str] = frozenset()) -> None:
-        """``own``: names that are live whatever tokens arrive."""
+        """``own``: names that are always live."""
         self._own = own
         self._sessions: dict[str, dict[str, bool]] = {}
-        """Whether a session is live, by name and session."""
+        """Whether a session is live, by name and session, in the order in which the sessions declared the name."""
         self._holder: dict[str, str] = {}
         self._disputed: set[str] = set()
-        """Names that several sessions held before this session joined."""
+        """Names with several live sessions that all declared the name before this member joined."""
         self._lock = threading.Lock()
         self.live = own
-        """Names that have a live session."""
+        """Names that have a live session, and the own names."""
 
     def start(self, tokens: list[tuple[str, str]]) -> None:
-        """Take the name and session of all tokens that existed before this session joined."""
+        """Store all tokens, as (name, session), that existed before this member joined."""
         for name, session in tokens:
             self.update(name, session, True)
         with self._lock:
@@ -53,13 +57,13 @@ class NameHolders:
                     self._choose(name)
 
     def update(self, name: str, session: str, is_live: bool) -> None:
-        """Note that a session has declared (``is_live``) or withdrawn the token of a name."""
+        """Note that a session has declared the token of a name, or withdrawn it if not ``is_live``."""
         with self._lock:
             sessions = self._sessions.setdefault(name, {})
             if not is_live and session not in sessions:
                 return
             if is_live and not sessions.get(session, True):
-                del sessions[session]  # one that comes back is the last again
+                del sessions[session]  # a session that comes back counts as the latest
             sessions[session] = is_live
             former = [one for one, live in sessions.items() if not live]
             for one in former[: len(former) - MAX_FORMER_SESSIONS]:
@@ -69,10 +73,11 @@ class NameHolders:
             self.live = self._own.union(there)
 
     def holder(self, name: str) -> str:
-        """The session that holds a name, or held it last. Empty if there is none."""
+        """Returns the session that holds a name or held it last; empty if there is none."""
         return self._holder.get(name, "")
 
     def _choose(self, name: str) -> None:
+        """Set the session that holds a name, by the sessions that are live now."""
         live = [session for session, is_live in self._sessions[name].items() if is_live]
         if len(live) < 2:
             self._disputed.discard(name)

@@ -1,7 +1,7 @@
-"""Admission of an actor by the vinesim server of a world, and again by every server that starts later.
+"""Admission of an actor by the server of a world, and again by each server that is started later.
 
-A server that was restarted does not know which actors are present. A querier with a matching listener notices the new
-server, and the hello is sent again.
+A server that was restarted does not know which actors are present. A Zenoh querier with a matching listener detects the
+new server, and the hello is sent again.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, has_match
 log = logging.getLogger(__name__)
 
 RETRY_PERIOD = 0.05
-"""Time between two attempts to be admitted again [s]."""
+"""Time between two attempts to be admitted by a restarted server [s]."""
 
 
 class ServerAdmission:
-    """Asks the server of a world to admit one actor, and watches whether that server is there."""
+    """Asks the server of a world to admit one actor, and watches whether the server is present."""
 
     def __init__(
         self,
@@ -38,7 +38,9 @@ class ServerAdmission:
         is_secured: bool,
         submit: Callable[[Callable[[], object]], None],
     ) -> None:
-        """``prefix``: key of the world with a trailing slash. ``submit`` runs a function in the bus's own thread."""
+        """``prefix``: first chunks of the world's keys, with a trailing slash. ``name``: name of the actor.
+        ``endpoint``: text of the server's endpoint. ``is_secured``: whether certificates are used. ``submit(task)``
+        runs a function in the bus's own thread."""
         self._session = session
         self._key = f"{prefix}join/{name}/{session.zid()}"
         self._name = name
@@ -47,31 +49,36 @@ class ServerAdmission:
         self._is_secured = is_secured
         self._submit = submit
         self.is_served = True
-        """Whether the server of this world is present, or there never was a server."""
+        """Whether the server of this world is present. Also true if there never was a server."""
         self.rejection = ""
-        """Reason why a server that was restarted rejects this actor, or "" if none does."""
+        """Why a server that was restarted does not admit this actor; empty if none has rejected it."""
         self.count = 0
-        """How often a server has admitted this actor."""
+        """Number of times that a server has admitted this actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
-        """Who hears spectators, as the server that admitted this actor has set it."""
+        """Who hears spectators, as set by the server that admitted this actor."""
         self._servers: frozenset[str] | None = None
-        """The session that admitted this actor, if any did; None: it has not joined."""
+        """Session of the server that admitted this actor; empty: no server has; None: the actor has not asked."""
         self._declared: list[object] = []
         self._querier: zenoh.Querier | None = None
-        """Querier that knows whether a server is announced; None before the first hello."""
+        """Querier whose matching status tells whether a server is present; None before the first hello."""
         self._was_announced = False
-        """Whether a server was ever announced, even if none of its replies arrived."""
+        """Whether the querier has ever matched a server, even if no reply arrived."""
         self._hello = b""
         self._is_join_submitted = False
 
     def is_server(self, replier: zenoh.EntityGlobalId | None) -> bool:
-        """Whether to accept answers for all actors (clock, retained records) from ``replier``: it must be the server
-        that admitted this actor. A program that never joins accepts any."""
+        """Whether to accept replies about the clock and retained records from the session ``replier``.
+
+        It must be the server that admitted this actor. A program that never joins accepts all replies.
+        """
         return self._servers is None or (replier is not None and str(replier.zid) in self._servers)
 
     def join(self, hello: bytes) -> None:
-        """Send an encoded hello. Raises :class:`JoinRejected` if a server rejects it. Without a server nothing
-        happens."""
+        """Send an encoded hello to the server, and wait for the reply.
+
+        Raises :class:`JoinRejected` if the server rejects the actor, or if a secured server does not reply. Without a
+        server the hello is sent when one appears.
+        """
         welcomes = self._query(hello)
         if welcomes and welcomes[0].refused:
             raise JoinRejected(welcomes[0].refused)
@@ -105,10 +112,11 @@ class ServerAdmission:
             self._submit_join()
 
     def watch(self) -> None:
-        """Correct the state if Zenoh's threads reported events late or in another order. Called from time to time.
+        """Correct :attr:`is_served` by the present matching status of the querier. The bus's thread calls this
+        regularly.
 
-        A server may be reported as gone before the reply in which it admitted this actor is read, or after its
-        successor was reported, or before it is reported itself: then the present state of the querier counts.
+        Zenoh's threads may report events late or in another order: that a server left before the reply of that server
+        is read, after its successor was reported, or before the server itself was reported.
         """
         if self._querier is None:
             return
@@ -118,16 +126,16 @@ class ServerAdmission:
             self.is_served = False
 
     def _submit_join(self) -> None:
-        """Have the hello sent again by the bus's own thread, unless that is submitted already."""
+        """Submit to the bus's own thread to send the hello again, unless that is already submitted."""
         if not self._is_join_submitted:
             self._is_join_submitted = True
             self._submit(self._join_again)
 
     def _join_again(self) -> None:
-        """Send the hello to a server that has appeared, and note whether it rejects this actor.
+        """Send the hello to a server that has appeared, and note whether the server rejects this actor.
 
-        Between linked routers a server is announced before queries are routed to it: without a reply this is submitted
-        again, behind what else the thread has to do, as long as the server is announced.
+        Between linked routers the querier may match a server before queries are routed to it. If no reply arrives, this
+        method is therefore submitted again, after other tasks of the thread, while the querier matches.
         """
         self._is_join_submitted = False
         if self._querier is None or not has_match(self._querier):
@@ -138,14 +146,17 @@ class ServerAdmission:
             time.sleep(RETRY_PERIOD)
             self._submit_join()
             return
-        self.is_served = True  # whatever order Zenoh's threads report in that one server went and another came
+        self.is_served = True  # whatever Zenoh's threads reported before
         self.rejection = welcomes[0].refused
         self.count += not self.rejection
         if self.rejection:
             log.error("%s: the server that came back rejects this actor: %s", self._name, self.rejection)
 
     def _query(self, hello: bytes) -> list[Welcome]:
-        """Replies of all servers. The first is the one that counts. An unreadable reply counts as a rejection."""
+        """Send the hello and return the replies of all servers. The first reply counts.
+
+        A reply that cannot be decoded is returned as a rejection.
+        """
         replies = self._session.get(
             self._key, payload=hello, timeout=CONNECT_TIMEOUT, consolidation=zenoh.ConsolidationMode.NONE
         )
@@ -164,6 +175,7 @@ class ServerAdmission:
         return welcomes
 
     def _decode(self, answer: bytes) -> Welcome:
+        """Decode a reply of a server. If that is impossible, return a rejection with the reason."""
         try:
             return decode_welcome(answer)
         except WrongVersion as error:

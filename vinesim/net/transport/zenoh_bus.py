@@ -1,12 +1,12 @@
 """The bus over Zenoh (eclipse-zenoh 1.10): client sessions to one router, without scouting and without listening.
 
-Publishers have exact keys, so that without a subscriber not one byte is sent. Callbacks only store samples, and the
-threads that read the network call them. Otherwise Zenoh would keep a Python thread for every subscription, a hundred in
-a client. Poses are best effort and may be dropped. Events are reliable, and a thread of the bus sends them, because
-sending them may block.
+Publishers have keys without wildcards, so that not one byte is sent without a subscriber. The threads of Zenoh that
+read the network call the callbacks, which only store samples. Otherwise Zenoh would keep a Python thread for every
+subscription, about a hundred in a client. Poses are best effort and may be dropped. Events are reliable. A thread of
+the bus sends them, because sending may block.
 
-If the server is on another machine, poses and states have a session of their own, over datagrams, so that neither a
-lost packet nor a large snapshot delays them. If no datagrams pass, they share the stream with everything else.
+If the server is on another machine, poses and states use a second session over datagrams, so that neither a lost packet
+nor a large snapshot delays them. If no datagrams arrive, poses and states use the stream of the first session.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from vinesim.net.transport.zenoh_session import (
 log = logging.getLogger(__name__)
 
 ROOT = "vs/1"
-"""First chunks of every key: the version of the key layout. The name of the world follows."""
+"""First chunks of every key, with the version of the key layout. The next chunk is the name of the world."""
 
 WORLD = "vineyard"
 """Default name of a world."""
@@ -53,30 +53,33 @@ CONNECT = "tcp/127.0.0.1:7447"
 """Default endpoint: a server on this machine."""
 
 WATCH_PERIOD = 0.5
-"""Time between two checks whether datagrams pass [s]."""
+"""Time between two checks of the links, like whether datagrams still arrive [s]."""
 
 SILENCE_TIMEOUT = 3.0
-"""If no datagram arrives for this long while the stream works, datagrams are given up [s]."""
+"""Time without datagrams, while the stream works, after which poses move to the stream [s]."""
 
 DATAGRAM_RETRY_PERIOD = 10.0
-"""Time between two attempts to send poses over datagrams again [s]."""
+"""Time between two attempts to open the session over datagrams again [s]."""
 
 FETCH_TIMEOUT = 10.0
-"""Time limit of :meth:`ZenohBus.fetch` [s]: large replies over slow links."""
+"""Time limit of :meth:`ZenohBus.fetch` [s], long enough for large replies over slow links."""
 
 MAX_PENDING_PUTS = 10_000
-"""Largest number of reliable messages that wait to be sent. Further ones are refused."""
+"""Largest number of reliable messages that wait to be sent. Further messages are refused."""
 
 MAX_PENDING_BYTES = 32 << 20
-"""Largest size of the reliable messages that wait to be sent [B]."""
+"""Largest size of all reliable messages that wait to be sent [B]."""
 
 MAX_PENDING_REPLIES = 1000
-"""Largest number of replies to queries that wait for :meth:`ZenohBus.replies`. Further ones are discarded and
+"""Largest number of replies to queries that wait for :meth:`ZenohBus.replies`. Further replies are discarded and
 counted."""
 
 
 class ZenohBus:
-    """See :class:`vinesim.net.transport.bus.Bus`. A context manager: an open session delays the exit of the program."""
+    """The bus over Zenoh. Implements :class:`vinesim.net.transport.bus.Bus`.
+
+    A context manager. An open session delays the exit of the program.
+    """
 
     def __init__(
         self,
@@ -87,14 +90,14 @@ class ZenohBus:
         certificates: pathlib.Path | None = None,
         live: bool = True,
     ) -> None:
-        """Enter ``world`` as ``name`` through the server at ``connect`` (:func:`endpoints.client_links`).
+        """Connect the actor ``name`` to ``world`` through the server at the endpoint ``connect``.
 
-        If not ``live``, it has no liveliness token and is invisible to others. ``certificates``: folder with ``ca.pem``
-        and this actor's ``NAME.pem`` and ``NAME.key``; the endpoint is then ``tls/`` or ``quic/``.
+        ``certificates``: folder with ``ca.pem`` and this actor's ``NAME.pem`` and ``NAME.key``. The endpoint is then
+        ``tls/HOST:PORT`` or ``quic/HOST:PORT``. ``live``: whether to declare a liveliness token, without which others
+        do not know of this actor. Which sessions are opened: :func:`endpoints.client_links`.
 
-        Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if the name is live,
-        and :class:`vinesim.core.errors.UsageError` if the name or the world cannot be part of a key or the endpoint is
-        invalid.
+        Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if another session
+        holds the name, and :class:`vinesim.core.errors.UsageError` if the name, the world or the endpoint is invalid.
         """
         for what, text in (("actor name", name), ("world", world)):
             if not is_valid_name(text):
@@ -112,19 +115,20 @@ class ZenohBus:
         self._replies: collections.deque[tuple[str, bytes, float]] = collections.deque()
         self._names = NameHolders(frozenset((name,) if live else ()))
         self._lost_endpoints: set[str] = set()
-        """Endpoints that are not connected now."""
+        """Endpoints whose connection is lost now."""
         self._datagram_endpoint = links.live
         self._silent_since: float | None = None
         self._pose_watch: object = None
         self._probe: threading.Thread | None = None
         self._probed: zenoh.Session | None = None
-        """Session whose datagrams pass again, until poses are moved to it."""
+        """Session over datagrams that was opened again, until poses are moved to it."""
         self._next_probe = time.monotonic() + DATAGRAM_RETRY_PERIOD
         self.unreliable: set[BusPublisher | BusSubscription] = set()
-        """Publishers and subscriptions of the pose session."""
+        """Best-effort publishers and subscriptions, which use the session of poses."""
         self._session = self._pose_session = open_client(links.bulk, self._credentials)
         self.source = zenoh.SourceInfo(self._session.id, 0)
-        """Id of the session that holds the name. It is sent with every sample, including those of the pose session."""
+        """Id of the session that holds the actor's name. All samples have this id, also those of the session of
+        poses."""
         self._admission = ServerAdmission(
             self._session,
             self._prefix,
@@ -157,12 +161,13 @@ class ZenohBus:
         self._worker.start()
 
     def _open_datagrams(self, endpoint: Endpoint) -> zenoh.Session:
-        """Open the session for poses; the one there is if no datagrams pass."""
+        """Open and return the session for poses, over datagrams. If no router answers there, return
+        the session over the stream."""
         try:
             session = open_client(endpoint, self._credentials)
         except ServerUnreachable:
             log.warning(
-                "%s: no datagrams pass to %s: poses go over %s as well, where one lost packet delays all that follow",
+                "%s: no datagrams pass to %s: poses use %s as well, where one lost packet delays all messages after it",
                 self.name,
                 endpoint,
                 self.endpoint,
@@ -171,28 +176,28 @@ class ZenohBus:
         self._pose_watch = self._watch_connection(session, str(endpoint))
         if zenoh.Reliability.BEST_EFFORT not in [link.reliability for link in session.info.links()]:
             log.warning(
-                "%s: the router at %s offers no datagrams on that link: poses go in line there; "
-                "it is older than Zenoh 1.10, or listens without mixed_rel",
+                "%s: the router at %s offers no datagrams on that link, so lost packets delay poses; "
+                "the router is older than Zenoh 1.10, or listens without mixed_rel",
                 self.name,
                 endpoint,
             )
         return session
 
     def session_for(self, reliable: bool) -> zenoh.Session:
-        """The session of events (reliable) or of poses."""
+        """Returns the session for ``reliable`` messages, or the session for best-effort ones."""
         return self._session if reliable else self._pose_session
 
     def _watch_links(self) -> None:
-        """What the bus's own thread does once a :data:`WATCH_PERIOD`."""
+        """Check datagrams, the server and certificates. The bus's own thread calls this once a :data:`WATCH_PERIOD`."""
         self._watch_datagrams()
         self._admission.watch()
         if (watch := self._certificate_watch) is not None:
-            if watch.has_changed():  # Zenoh reads the files whenever it connects
-                log.warning("%s: its certificates changed: they are used from the next connection on", self.name)
+            if watch.has_changed():  # Zenoh reads the files at each connection
+                log.warning("%s: its certificates changed: the next connection uses the new ones", self.name)
             watch.warn()
 
     def _watch_datagrams(self) -> None:
-        """Move poses to the stream when datagrams stop passing while the stream works, and back."""
+        """Move poses to the stream if datagrams stop arriving while the stream works, and back if they arrive again."""
         endpoint = str(self._datagram_endpoint)
         if self._pose_session is self._session:
             if self._datagram_endpoint is not None and self.endpoint not in self._lost_endpoints:
@@ -205,7 +210,7 @@ class ZenohBus:
         self._silent_since = self._silent_since or now
         if now - self._silent_since < SILENCE_TIMEOUT:
             return
-        log.warning("%s: no datagrams pass to %s any more: poses go over %s", self.name, endpoint, self.endpoint)
+        log.warning("%s: no datagrams pass to %s any more: poses use %s", self.name, endpoint, self.endpoint)
         abandoned = self._pose_session
         self._move_poses(self._session)
         self._lost_endpoints.discard(endpoint)
@@ -213,12 +218,16 @@ class ZenohBus:
         close_session(abandoned)
 
     def _return_to_datagrams(self, endpoint: Endpoint) -> None:
-        """Move poses back if datagrams pass again, which another thread tries from time to time: that may take long."""
+        """Move poses back to datagrams if another thread could open a session over them; else start such a thread if
+        due.
+
+        Opening a session may take long, so the bus's own thread does not do it.
+        """
         if (session := self._probed) is not None:
             self._probed = None
             self._pose_watch = self._watch_connection(session, str(endpoint))
             self._silent_since = None
-            log.info("%s: datagrams pass to %s: poses go over them", self.name, endpoint)
+            log.info("%s: datagrams pass to %s: poses use them", self.name, endpoint)
             self._move_poses(session)
         elif time.monotonic() >= self._next_probe and (self._probe is None or not self._probe.is_alive()):
             self._next_probe = time.monotonic() + DATAGRAM_RETRY_PERIOD
@@ -228,19 +237,19 @@ class ZenohBus:
             self._probe.start()
 
     def _try_datagrams(self, endpoint: Endpoint) -> None:
-        """Body of the thread that opens a session over datagrams."""
+        """Body of the thread that tries to open a session over datagrams."""
         with contextlib.suppress(ServerUnreachable):
             self._probed = open_client(endpoint, self._credentials)
 
     def _move_poses(self, session: zenoh.Session) -> None:
-        """Publish and receive poses over another session from now on."""
+        """Move all best-effort publishers and subscriptions to another session."""
         self._pose_session = session
         for entity in list(self.unreliable):
             entity.move_to(session)
 
     @property
     def links(self) -> list[str]:
-        """One line for each connection now: its endpoint and its reliability."""
+        """One line of text for each present connection, with its endpoint and reliability."""
         sessions = dict.fromkeys((self._session, self._pose_session))
         links = [link for session in sessions for link in session.info.links()]
         return sorted(
@@ -250,10 +259,10 @@ class ZenohBus:
         )
 
     def _claim_name(self) -> zenoh.LivelinessToken:
-        """Declare the liveliness token of this name unless another session has it.
+        """Declare the liveliness token of this actor's name. Raises :class:`NameTaken` if another session has one.
 
-        If two sessions claim it at once, the one whose token the router took second sees the first: never both stay. If
-        both look after both have declared, neither stays.
+        After the declaration the tokens of the name are read again. If two sessions declare the name at once, the later
+        one finds the token of the earlier one and leaves. If both read the tokens after both declarations, both leave.
         """
         liveliness = self._session.liveliness()
         mine = str(self._session.zid())
@@ -265,40 +274,45 @@ class ZenohBus:
         return token
 
     def _name_holders(self) -> set[str]:
-        """Ids of the sessions that hold this name."""
+        """Returns the ids of all sessions with a liveliness token of this actor's name."""
         replies = self._session.liveliness().get(f"{self._prefix}live/{self.name}/*", timeout=CONNECT_TIMEOUT)
         return {str(reply.ok.key_expr).rpartition("/")[2] for reply in replies if reply.ok is not None}
 
     # ------------------------------------------------------------ called by Zenoh's threads
 
     def _watch_connection(self, session: zenoh.Session, endpoint: str) -> object:
-        """Note and log when the connection of a session is lost or restored."""
+        """Declare a listener that notes and logs when the connection of a session is lost or restored, and return
+        it."""
 
         def on_event(event: zenoh.TransportEvent) -> None:
             if session.is_closed() or session not in (self._session, self._pose_session):
-                return  # left, or given up: that is no loss
+                return  # the bus itself closed this session: no loss
             if event.kind == zenoh.SampleKind.PUT:
                 self._lost_endpoints.discard(endpoint)
                 log.info("%s: connected to %s again", self.name, endpoint)
             else:
                 self._lost_endpoints.add(endpoint)
-                log.warning("%s: lost the server at %s; goes on alone and tries to come back", self.name, endpoint)
+                log.warning("%s: lost the server at %s; simulates alone and tries to reconnect", self.name, endpoint)
 
         return session.info.declare_transport_events_listener(on_event)
 
     def _on_liveliness(self, sample: zenoh.Sample) -> None:
+        """Note that a liveliness token was declared or withdrawn."""
         self._names.update(*_token(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
     def _is_foreign(self, key: str, source: zenoh.EntityGlobalId | None) -> bool:
-        """Whether what arrived under a key is of another session than the one that holds its name; then it is
-        counted."""
+        """Whether a message comes from another session than the one that holds the name in its key. Counts such
+        messages.
+
+        ``source``: session that sent the message; None: unknown, which counts as foreign.
+        """
         name = bound_name(key)
         if not name or (source is not None and str(source.zid) == self._names.holder(name)):
             return False
         self.foreign += 1
         if self.foreign == 1:
             log.warning(
-                "%s: dropped %s, of a session that does not hold the name %r, further ones only counted",
+                "%s: dropped %s from a session that does not hold the name %r; further messages are only counted",
                 self.name,
                 key[:100],
                 name[:50],
@@ -383,7 +397,7 @@ class ZenohBus:
                 elif not is_foreign:
                     self._replies.append((reply_key, reply.ok.payload.to_bytes(), arrived))
 
-        # Zenoh's own choice would keep one reply of a key: a snapshot comes in several
+        # by default Zenoh keeps one reply for each key, but a snapshot has several
         no_consolidation = zenoh.ConsolidationMode.NONE
         self.submit(
             lambda: self._session.get(
@@ -441,13 +455,14 @@ class ZenohBus:
         return self._names.live
 
     def submit(self, task: Callable[[], object]) -> None:
-        """Run a function that may block, in order, in the bus's own thread."""
+        """Have the bus's own thread call a function that may block. Functions are called in order of submission."""
         self._work.put(task)
 
     def submit_put(self, put: Callable[[], object], size: int) -> bool:
-        """Run a reliable put of ``size`` [B] in the bus's own thread; False, and counted, if too many wait already.
+        """Have the bus's own thread call ``put``, which sends a reliable message of ``size`` [B].
 
-        Only the thread of the real-time loop calls this, so that the counts need no lock.
+        Returns False, and counts a failure, if too many messages wait already. Only the thread of the real-time loop
+        may call this, so that the counters need no lock.
         """
         if (
             self._put_count - self._sent_count >= MAX_PENDING_PUTS
@@ -469,10 +484,10 @@ class ZenohBus:
         return True
 
     def count_failure(self, error: Exception) -> None:
-        """Count what the network refused; log the first."""
+        """Count a failed operation of the network, and log the first one."""
         self.failures += 1
         if self.failures == 1:
-            log.warning("%s: the network refused, further times are only counted: %s", self.name, error)
+            log.warning("%s: an operation failed on the network, further ones are only counted: %s", self.name, error)
 
     def _run(self) -> None:
         """Body of the bus's own thread."""
@@ -490,7 +505,7 @@ class ZenohBus:
                 task()
             except zenoh.ZError as error:
                 self.count_failure(error)
-            except Exception as error:  # this thread sends everything that is reliable
+            except Exception as error:  # go on: this thread sends all reliable messages
                 log.exception("%s: an error in the thread of the bus", self.name)
                 self.count_failure(error)
 
@@ -513,19 +528,22 @@ class ZenohBus:
 
 
 def _token(key: zenoh.KeyExpr) -> tuple[str, str]:
-    """Name and session of a liveliness token."""
+    """Returns the name and the session of a liveliness token."""
     name, session = str(key).split("/")[-2:]
     return name, session
 
 
-# Publishers and subscriptions of a bus, which move between its sessions.
+# Publishers and subscriptions of a bus, which can move between its sessions.
 #
-# The real-time loop publishes, and the bus's thread moves entities to another session at any time: what fails in
-# between is counted and declared again.
+# While the real-time loop publishes, the bus's own thread may move a publisher to another session. If an operation
+# fails because of that, it is counted, and the publisher is declared again.
 
 
 class BusPublisher:
-    """See :class:`vinesim.net.transport.bus.Publisher`. What the network refuses is counted, never raised."""
+    """A publisher of a :class:`ZenohBus`. Implements :class:`vinesim.net.transport.bus.Publisher`.
+
+    Failures of the network are counted and never raised.
+    """
 
     def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Publisher], reliable: bool) -> None:
         self._bus = bus
@@ -540,7 +558,7 @@ class BusPublisher:
             self._publisher = declare(session)
         except zenoh.ZError as error:
             self._fail(error)
-        if bus.session_for(reliable) is not session:  # poses have moved meanwhile
+        if bus.session_for(reliable) is not session:  # poses were moved meanwhile
             self._renew_soon()
 
     @property
@@ -569,7 +587,7 @@ class BusPublisher:
         return True
 
     def move_to(self, session: zenoh.Session) -> None:
-        """Publish over another session from now on."""
+        """Declare the publisher on another session instead of the present one."""
         before = self._publisher
         self._publisher = self._declare(session)
         _undeclare(before)
@@ -580,11 +598,13 @@ class BusPublisher:
         self._bus.submit(lambda: _undeclare(self._publisher))
 
     def _fail(self, error: zenoh.ZError) -> None:
+        """Count a failure, and have the publisher declared again."""
         self._bus.count_failure(error)
         self._renew_soon()
 
     def _renew_soon(self) -> None:
-        """Let the bus's thread declare the publisher again, over the session of now."""
+        """Have the bus's own thread declare the publisher again on the present session, unless that is already
+        submitted."""
         if not self._is_renewing:
             self._is_renewing = True
             self._bus.submit(self._renew)
@@ -596,7 +616,7 @@ class BusPublisher:
 
 
 class BusSubscription:
-    """See :class:`vinesim.net.transport.bus.Subscription`."""
+    """A subscription of a :class:`ZenohBus`. Implements :class:`vinesim.net.transport.bus.Subscription`."""
 
     def __init__(self, bus: ZenohBus, declare: Callable[[zenoh.Session], zenoh.Subscriber], reliable: bool) -> None:
         self._bus = bus
@@ -607,7 +627,7 @@ class BusSubscription:
         bus.submit(lambda: self.move_to(bus.session_for(reliable)))
 
     def move_to(self, session: zenoh.Session) -> None:
-        """Subscribe over another session from now on."""
+        """Declare the subscription on another session instead of the present one."""
         before = self._declared
         self._declared = self._declare(session)
         _undeclare(before)
@@ -618,7 +638,7 @@ class BusSubscription:
 
 
 def _undeclare(entity: zenoh.Publisher | zenoh.Subscriber | None) -> None:
-    """Undeclare; that of a closed session is gone already."""
+    """Undeclare a publisher or a subscriber. Does nothing if its session is closed."""
     if entity is not None:
         with contextlib.suppress(zenoh.ZError):
             entity.undeclare()

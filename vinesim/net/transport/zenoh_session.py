@@ -1,4 +1,4 @@
-"""Zenoh sessions as vinesim opens them (eclipse-zenoh 1.10): configuration, connection errors, closing at exit."""
+"""Opens and closes Zenoh sessions (eclipse-zenoh 1.10): configuration, errors of the connection, closing at exit."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LEASE = 2000
-"""A peer that is silent for this long is taken to have left [ms]."""
+"""Lease of Zenoh's links: time after which a silent session is considered lost [ms]."""
 
 MAX_RECEIVE = 4 * MAX_MESSAGE
-"""Fragmented messages beyond this size are not even reassembled, here or in the router [B]."""
+"""Largest size of a fragmented message that Zenoh reassembles, in clients and in the router [B]."""
 
 CONNECT_TIMEOUT = 2.0
-"""Time limit of connecting and of every query [s]."""
+"""Time limit for connecting, and for each query [s]."""
 
 EXIT_TIMEOUT = 10.0
-"""Longest time that a program waits at its exit for running callbacks to end [s]."""
+"""Longest time that a program waits at its exit until Zenoh has released all callbacks [s]."""
 
 
 class ServerUnreachable(BusError):
-    """No server answers at the endpoint."""
+    """No server answers at an endpoint."""
 
     def __init__(self, endpoint: str, reason: str) -> None:
         super().__init__(
@@ -47,10 +47,10 @@ class ServerUnreachable(BusError):
 
 
 def config(mode: str, **settings: Any) -> zenoh.Config:
-    """Configuration of a session: no scouting of any kind, no shared memory, a short lease, then ``settings``.
+    """Returns the configuration of a session: no scouting, no shared memory, a short lease, and further ``settings``.
 
-    Keys of ``settings`` are those of Zenoh's configuration file, with ``__`` for ``/``. Shared memory is off so that
-    counted bytes are those that cross the network.
+    ``mode``: Zenoh's mode, like ``client``. Keys of ``settings`` are those of Zenoh's configuration file, with ``__``
+    for ``/``. Shared memory is off, so that the counted bytes are those that cross the network.
     """
     common = {
         "mode": mode,
@@ -70,18 +70,18 @@ def config(mode: str, **settings: Any) -> zenoh.Config:
 
 
 _open_sessions: set[zenoh.Session] = set()
-"""Sessions to close when the main thread ends."""
+"""Open sessions, which are closed when the main thread ends."""
 
 _closer: list[threading.Thread] = []
 
 _direct: set[object] = set()
-"""One for each callback that a thread of Zenoh may still call."""
+"""A mark for each callback of :func:`called_directly` that Zenoh has not released yet."""
 
 
 def open_session(settings: zenoh.Config) -> zenoh.Session:
-    """Open a session and close it when the main thread ends, unless it was closed before.
+    """Open a session. It is closed when the main thread ends, unless it was closed before.
 
-    Zenoh runs Python callbacks in threads that the interpreter joins at exit, so an open session would block the exit.
+    Zenoh calls Python callbacks in threads that the interpreter joins at exit, so an open session would block the exit.
     """
     session = zenoh.open(settings)
     _open_sessions.add(session)
@@ -99,17 +99,19 @@ def close_session(session: zenoh.Session) -> None:
 
 
 def _close_all() -> None:
+    """Body of a thread: wait for the end of the main thread, close all sessions, and wait for running callbacks."""
     threading.main_thread().join()
     for session in list(_open_sessions):
         close_session(session)
     deadline = time.monotonic() + EXIT_TIMEOUT
-    while _direct and time.monotonic() < deadline:  # a thread that enters Python while that ends aborts the program
+    # a thread of Zenoh that calls Python while the interpreter ends would abort the program
+    while _direct and time.monotonic() < deadline:
         time.sleep(0.005)
 
 
 @contextlib.contextmanager
 def _user_facing(endpoint: str) -> Iterator[None]:
-    """Turn a Zenoh error into :class:`ServerUnreachable`."""
+    """Raise :class:`ServerUnreachable` instead of an error of Zenoh."""
     try:
         yield
     except zenoh.ZError as error:
@@ -117,7 +119,10 @@ def _user_facing(endpoint: str) -> Iterator[None]:
 
 
 def open_client(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Session:
-    """Open a client session over one endpoint; :class:`ServerUnreachable` if no router answers."""
+    """Open a client session to a router at an endpoint. Raises :class:`ServerUnreachable` if no router answers.
+
+    ``credentials``: Zenoh's TLS settings; empty without certificates.
+    """
     with _user_facing(str(endpoint)):
         return open_session(
             config(
@@ -132,7 +137,10 @@ def open_client(endpoint: Endpoint, credentials: dict[str, Any]) -> zenoh.Sessio
 
 
 def watch_certificates(folder: pathlib.Path, name: str) -> CertificateWatch | None:
-    """Check the certificate of ``name``, and watch it from now on; None without the library that reads certificates."""
+    """Check the certificate of ``name``, and return a watch of its folder.
+
+    Returns None, without a check, if the library that reads certificates is not installed.
+    """
     from vinesim.net.transport import certificates
     from vinesim.net.transport.certificate_watch import CertificateWatch
 
@@ -147,10 +155,11 @@ def watch_certificates(folder: pathlib.Path, name: str) -> CertificateWatch | No
 
 
 def called_directly(callback: Callable[[Any], object]) -> zenoh.handlers.Callback:
-    """A callback that the threads of Zenoh call which read the network. It must not wait for anything.
+    """Make a callback that those threads of Zenoh call which read the network. ``callback`` must not wait for anything.
 
-    No Python code runs after its mark is gone: between two instructions the thread may give the interpreter away, which
-    ends then, and aborts the program when the thread wants it back.
+    The program exits only when the marks of all callbacks are gone (:data:`EXIT_TIMEOUT`). Removing the mark is the
+    last Python code that a thread runs for a callback. A thread that still ran Python code later could lose the
+    interpreter lock, and would abort the program when it requests the lock after the interpreter has ended.
     """
     mark = object()
     _direct.add(mark)
@@ -159,5 +168,5 @@ def called_directly(callback: Callable[[Any], object]) -> zenoh.handlers.Callbac
 
 def has_match(entity: zenoh.Publisher | zenoh.Querier) -> bool:
     """Whether a publisher has a subscriber, or a querier a queryable."""
-    status: Any = entity.matching_status  # zenoh's type stubs call it a bool
+    status: Any = entity.matching_status  # a bool by the type stubs of zenoh
     return status.matching

@@ -1,1 +1,1 @@
-"""Controllers: joint trajectories, Cartesian motion, waypoints, admittance."""
+"""Controllers of a robot: joint trajectories, Cartesian motion, grippers, waypoints, admittance."""

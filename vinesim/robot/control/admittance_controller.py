@@ -1,10 +1,12 @@
-"""Admittance control of a hand: it moves as the force at its wrist asks; an example of force feedback.
+"""Admittance control of a robot's hand, which moves in the direction of the force at its wrist; an example of force
+feedback.
 
     controller = AdmittanceController(robot, "arm_left", "wrist_left_ft")
     ...
     controller(robot.sample(time, contacts))    # each step, before robot.control(time)
 
-It uses only the robot's samples, so a ROS node can do the same from topics (CANOPIES D6.4, section 3.1; Hogan 1985).
+The controller uses only the robot's samples, so a ROS node can do the same with topics (CANOPIES D6.4, section 3.1;
+Hogan 1985).
 """
 
 from __future__ import annotations
@@ -17,11 +19,12 @@ from vinesim.robot.drives.joint_servos import CommandError
 from vinesim.scene.values import RobotSample
 
 JACOBIAN_DAMPING = 0.05
-"""[m/rad] Damping of the inverse Jacobian, which bounds joint rates of a stretched arm. GUESSED"""
+"""[m/rad] Damping of the inverse Jacobian, which limits joint rates when the arm is stretched. GUESSED"""
 
 
 class AdmittanceController:
-    """The hand moves as a damped mass: mass dv/dt + damping v = force. It keeps its orientation."""
+    """Moves a robot's hand like a damped mass, with mass dv/dt + damping v = force at the wrist. The hand keeps its
+    orientation."""
 
     def __init__(
         self,
@@ -33,11 +36,12 @@ class AdmittanceController:
         damping: float = 60.0,
         force_deadband: float = 0.5,
     ) -> None:
-        """``mass`` [kg] and ``damping`` [N s/m] of the virtual mass; forces below ``force_deadband`` [N] count as 0.
+        """``group``: joint group of the arm. ``sensor``: name of the wrist's force-torque sensor. ``mass`` [kg],
+        ``damping`` [N s/m]: of the virtual mass. ``force_deadband`` [N]: smaller forces count as 0.
 
-        ``group``: joints of the arm; ``sensor``: name of the wrist sensor. The mass must exceed that of the links
-        beyond the sensor, which measures their inertia too. The force in the first sample, or in the first after
-        :meth:`tare`, is taken for their weight. Raises :class:`CommandError` for an unknown sensor.
+        The virtual mass must exceed the mass of the links beyond the sensor, because the sensor also measures their
+        inertia. The force in the first sample, and in the first after :meth:`tare`, is assumed to be their weight.
+        Raises :class:`CommandError` for an unknown sensor.
         """
         known = [mount.name for mount in robot.description.wrenches]
         if sensor not in known:
@@ -50,16 +54,16 @@ class AdmittanceController:
         self.damping = damping
         self.force_deadband = force_deadband
         self.velocity = np.zeros(3)
-        """[3] m/s, commanded velocity of the hand, world axes"""
+        """[3] m/s, commanded velocity of the hand, world axes."""
         self._joints = robot.description.joint_indices(group)
         self._weight: np.ndarray | None = None
 
     def tare(self) -> None:
-        """Take the force in the next sample for the weight."""
+        """Take the force in the next sample as the weight of the links beyond the sensor."""
         self._weight = None
 
     def __call__(self, sample: RobotSample) -> None:
-        """Command the arm for one step, given the robot's last ``sample``."""
+        """Command the arm for one step. ``sample``: the robot's last sample."""
         wrench = next(wrench for wrench in sample.wrenches if wrench.name == self.sensor)
         pose = self.robot.frame_pose(wrench.frame)
         force = frames.rotate(pose[3:], wrench.force)

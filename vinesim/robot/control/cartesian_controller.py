@@ -1,4 +1,4 @@
-"""Cartesian control of one arm: the tip follows straight lines, the tool turns to an orientation.
+"""Cartesian control of one arm: the tip of its tool follows straight lines, and the tool turns to an orientation.
 
     arm = CartesianController(robot, "left")
     arm.reset()
@@ -7,9 +7,9 @@
         robot.control(time)
         physics.step()
 
-Differential inverse kinematics: the damped pseudo-inverse of the Jacobian (Nakamura and Hanafusa 1986) at the measured
-state moves the tip, so moving bases and obstacles need no special case. The remaining degrees of freedom of an arm
-with seven joints on a lift first turn the tool, then approach a posture (Siciliano and Slotine 1991).
+The method is differential inverse kinematics with the damped pseudo-inverse of the Jacobian (Nakamura and Hanafusa
+1986) at the measured state. So a moving base and obstacles need no special case. The remaining degrees of freedom of an
+arm with seven joints on a lift first turn the tool, then approach a posture (Siciliano and Slotine 1991).
 """
 
 from __future__ import annotations
@@ -28,32 +28,33 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import CommandError, clip
 
 POSITION_GAIN = 5.0
-"""[1/s] Feedback gain of position and orientation; well below the servos' bandwidth. GUESSED"""
+"""[1/s] Feedback gain of position and orientation. It is well below the bandwidth of the servos. GUESSED"""
 POSTURE_GAIN = 1.0
-"""[1/s] Gain towards the posture. GUESSED"""
+"""[1/s] Feedback gain of the posture. GUESSED"""
 MAX_TOOL_RATE = 1.0
 """[rad/s] Largest rate at which the tool turns. GUESSED"""
 SHOULDER_DROP = 0.10
-"""[m] The lift brings the shoulder this far below the working height. GUESSED"""
+"""[m] Distance below the working height at which the lift holds the shoulder. GUESSED"""
 MIN_SINGULAR_VALUE = 0.06
-"""[m/rad] Smaller singular values are damped, which bounds joint rates near singular postures. GUESSED"""
+"""[m/rad] Singular value of the Jacobian below which damping begins. It limits joint rates near singular postures.
+GUESSED"""
 LIMIT_MARGIN = 0.005
-"""[rad or m] Joints stop this far before their limits, where each would press on an end stop, a constraint for the
-physics to solve. GUESSED"""
+"""[rad or m] Distance from its limits at which a joint stops. At a limit, the joint would press on its end stop,
+which is a constraint that the physics must solve. GUESSED"""
 RATE_RAMP_TIME = 0.15
 """[s] Shortest time in which a joint reaches its largest velocity. GUESSED"""
 
 
 class CartesianController:
-    """Moves the tip of one arm's tool, and with it the lift that carries the arm."""
+    """Moves the tip of one arm's tool, by the joints of the arm and of the lift that carries the arm."""
 
     def __init__(
         self, robot: Robot, side: str, *, tip_offset: float = 0.0, acceleration: float = 0.8, use_lift: bool = True
     ) -> None:
-        """Control the group ``arm_{side}`` of ``robot``, and its torso if ``use_lift``.
+        """``robot``: its group ``arm_{side}`` is controlled, and its torso if ``use_lift``. ``tip_offset`` [m]:
+        distance of the tip ahead of the tool's frame, along the x axis. ``acceleration`` [m/s2]: of the tip.
 
-        ``tip_offset`` [m]: distance of the tip ahead of the tool's frame, along its x axis. ``acceleration`` [m/s2] of
-        the tip. Raises :class:`CommandError` if the robot has no such arm with a tool.
+        Raises :class:`CommandError` if the robot has no such arm with a tool.
         """
         description = robot.description
         arm = description.groups.get(f"arm_{side}")
@@ -64,7 +65,7 @@ class CartesianController:
         self.tool = arm.tool
         self.acceleration = acceleration
         self.gripper = f"gripper_{side}" if f"gripper_{side}" in description.groups else ""
-        """The group of its fingers; empty if it has none."""
+        """Joint group of the arm's fingers; empty if there is none."""
         self._tip_offset = tip_offset
         self._joints = robot.joint_indices([*lifts, *arm.joints])
         self._lifts = len(lifts)
@@ -75,12 +76,12 @@ class CartesianController:
         self._upper = upper - margin
         self._fastest = robot.max_velocity[self._joints]
         self._largest_change = self._fastest * robot.rigid.dt / RATE_RAMP_TIME
-        """[joint] Largest change of a rate in one step [rad/s or m/s]."""
-        weights = self._fastest / self._fastest.max()  # the slow lift moves less than the arm
+        """[joint] Largest change of the joint rate in one step [rad/s or m/s]."""
+        weights = self._fastest / self._fastest.max()  # the lift is slow, so it moves less than the arm
         self._pointing = InverseKinematics(weights, (3, 2))
-        """Inverse kinematics of a tip on a line, and of the tool's x axis."""
+        """Inverse kinematics for a tip on a line and the direction of the tool's x axis."""
         self._orienting = InverseKinematics(weights, (3, 3))
-        """Inverse kinematics of a tip on a line, and of the tool's whole orientation."""
+        """Inverse kinematics for a tip on a line and the tool's whole orientation."""
         self._home = description.home[self._joints]
         moving = description.moving_joints
         self._shoulder = moving.frames[moving.names.index(arm.joints[0])][1]
@@ -88,12 +89,12 @@ class CartesianController:
         self.reset()
 
     def reset(self) -> None:
-        """Restart the reference at the present tip position, at rest."""
+        """Set the reference to the present position of the tip, with velocity 0."""
         self._reference, self._reference_speed = self.tip_position, 0.0
 
     @property
     def reference(self) -> np.ndarray:
-        """Reference position [3] m in the world, which :attr:`tip_position` follows."""
+        """Reference position of the tip [3] m in the world, which :attr:`tip_position` follows."""
         return self._reference
 
     @property
@@ -104,11 +105,11 @@ class CartesianController:
 
     @property
     def shoulder_position(self) -> np.ndarray:
-        """Origin of the arm's first link [3] m in the world."""
+        """Position of the origin of the arm's first link [3] m in the world."""
         return self.robot.frame_pose(self._shoulder)[:3]
 
     def distance_to(self, goal: np.ndarray) -> float:
-        """Distance [m] of the tip from ``goal`` [3] m in the world."""
+        """Returns the distance [m] between the tip and ``goal`` [3] m in the world."""
         return _length(goal - self.tip_position)
 
     def move_towards(
@@ -120,10 +121,11 @@ class CartesianController:
         speed: float,
         working_height: float,
     ) -> None:
-        """Command the arm for one step: the tip moves towards ``goal`` [3] m at no more than ``speed`` [m/s].
+        """Command the arm for one step, in which the tip moves towards ``goal`` [3] m in the world with at most
+        ``speed`` [m/s].
 
-        The tool's x axis turns to ``x_axis`` [3], and its z axis to ``z_axis`` [3] if given: unit vectors in the
-        world, perpendicular to each other. The lift brings the shoulder to :data:`SHOULDER_DROP` below
+        The tool's x axis turns to ``x_axis`` [3], and its z axis to ``z_axis`` [3] if given. These are unit vectors in
+        the world, perpendicular to each other. The lift moves the shoulder to :data:`SHOULDER_DROP` below
         ``working_height`` [m].
         """
         robot = self.robot
@@ -155,25 +157,26 @@ class CartesianController:
         ik.min_rates[:] = (self._lower - now) / dt
         ik.max_rates[:] = (self._upper - now) / dt
         rates = ik.solve()
-        # all joints are slowed down by the same factor: the tip stays on its line
+        # all joints are slowed down by the same factor, so that the tip stays on its line
         rates = rates / max(1.0, float((np.abs(rates) / fastest).max()))
         change = rates - self._rates
         self._rates = self._rates + change / max(1.0, float((np.abs(change) / self._largest_change).max()))
         robot.command_position(now + dt * self._rates, self._joints)
 
     def hold_position(self) -> None:
-        """Command the joints to their present set-points, for one step in which the arm does not move."""
+        """Command the joints to keep their present set-points, in a step in which the arm is not to move."""
         self._rates[:] = 0.0
         self.robot.command_position(self.robot.setpoint[self._joints], self._joints)
 
     def _advance_reference(self, goal: np.ndarray, speed: float, dt: float) -> np.ndarray:
-        """Advance the reference by a step of a trapezoidal velocity profile; its velocity [3] m/s."""
+        """Advance the reference position by one step of a trapezoidal velocity profile. Returns the velocity [3]
+        m/s."""
         offset = goal - self._reference
         left = _length(offset)
         if left < 1e-9:
             self._reference_speed = 0.0
             return np.zeros(3)
-        # the largest speed from which it can stop at the goal
+        # the largest speed from which the reference can stop at the goal
         braking = math.sqrt(2.0 * self.acceleration * left)
         self._reference_speed = min(self._reference_speed + self.acceleration * dt, speed, braking)
         step = min(self._reference_speed * dt, left)
@@ -182,7 +185,8 @@ class CartesianController:
 
 
 def _pointing_error(axis: np.ndarray) -> np.ndarray:
-    """Rotation [2] rad about a tool's y and z axes that turns its x axis to ``axis`` [3], given in the tool's frame."""
+    """Returns the rotation [2] rad about a tool's y and z axes that turns its x axis to ``axis`` [3], which is given
+    in the tool's frame."""
     ahead, left, up = axis
     turn = np.array([-up, left])
     if ahead < 0.0:
@@ -191,17 +195,18 @@ def _pointing_error(axis: np.ndarray) -> np.ndarray:
 
 
 def _clip_norm(vector: np.ndarray, length: float) -> np.ndarray:
-    """The vector, scaled down to ``length`` if it is longer."""
+    """Returns the vector, scaled to ``length`` if it is longer."""
     return vector * min(1.0, length / max(_length(vector), 1e-12))
 
 
 def _length(vector: np.ndarray) -> float:
-    """Length of a vector; takes a quarter of the time of ``np.linalg.norm``."""
+    """Returns the length of a vector, in a quarter of the time of ``np.linalg.norm``."""
     return math.sqrt(vector.dot(vector))
 
 
 def axes_of_pose(pose: np.ndarray) -> np.ndarray:
-    """The axes of a pose [7] as rows [3, 3], in its parent: frames.to_matrix in Python floats, ten times as fast."""
+    """Returns the axes of a pose [7] as rows [3, 3], in the pose's parent frame. This is frames.to_matrix in Python
+    floats, which is ten times as fast."""
     x, y, z, w = pose[3:].tolist()
     return np.array(
         [
@@ -213,26 +218,27 @@ def axes_of_pose(pose: np.ndarray) -> np.ndarray:
 
 
 class InverseKinematics:
-    """Joint rates of one arm that fulfil tasks in order of priority, within bounds; one compiled call.
+    """Computes, in one compiled call, bounded joint rates of one arm that fulfil several tasks in order of priority.
 
-    A task uses only the null space of those before it (Siciliano and Slotine 1991). See
+    A task uses only the null space of the tasks before it (Siciliano and Slotine 1991). See
     :mod:`vinesim.kernels.robot.inverse_kinematics`.
     """
 
     def __init__(self, joint_weights: np.ndarray, task_rows: Sequence[int]) -> None:
-        """``joint_weights`` [joint]: relative use of the joints; ``task_rows``: number of rows of each task."""
+        """``joint_weights`` [joint]: relative use of the joints. ``task_rows``: number of rows of each task."""
         joints = len(joint_weights)
         rows = sum(task_rows)
         self.jacobian = np.zeros((rows, joints))
         self.velocity = np.zeros(rows)
-        """[row, joint] and [row]: rows of all tasks, in order; velocities along them that are asked for."""
+        """[row] Input: requested velocity along each row of :attr:`jacobian`, whose rows [row, joint] are those of
+        all tasks in order."""
         self.posture_rates = np.zeros(joints)
+        """[joint] Input: rates towards a posture, applied in the null space of the tasks [rad/s or m/s]."""
         self.rates = np.zeros(joints)
-        """[joint] Input: rates towards a posture, used in the null space of the tasks. Output: the result [rad/s or
-        m/s]."""
+        """[joint] Output: the result [rad/s or m/s]."""
         self.min_rates = np.zeros(joints)
         self.max_rates = np.zeros(joints)
-        """[joint] bounds of the rates [rad/s or m/s]."""
+        """[joint] Input: upper bounds of the rates [rad/s or m/s]. :attr:`min_rates` has the lower bounds."""
         scratch = SharedArrays(
             inverse_kinematics.IkScratch,
             weights=np.zeros(joints),
@@ -256,9 +262,10 @@ class InverseKinematics:
         self._solve = KernelGraph(solve)
 
     def solve(self) -> np.ndarray:
-        """Joint rates [joint] for the present inputs; the array is used again by the next call.
+        """Returns the joint rates [joint] for the present inputs. The next call overwrites the returned array.
 
-        Joints that would exceed their bounds are fixed there, one at a time, and the others do the tasks.
+        Joints that would exceed their bounds are fixed at the bounds, one at a time, and the other joints fulfil the
+        tasks.
         """
         self._solve()
         return self.rates

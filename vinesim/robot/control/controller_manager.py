@@ -1,7 +1,7 @@
-"""Runs the controllers of one robot: each joint obeys the controller that was commanded last, and no other.
+"""Runs the controllers of one robot. Each joint obeys only the controller that was commanded last.
 
-A command to one controller ends the goals of all others that move any of its joints. The sender of a goal gives it an
-id. :meth:`ControllerManager.take_results` returns the results of goals that have ended.
+A command to one controller ends the goals of all other controllers that move any of its joints. The sender of a goal
+gives the goal an id. :meth:`ControllerManager.take_results` returns the results of goals that have ended.
 """
 
 from __future__ import annotations
@@ -26,27 +26,27 @@ from vinesim.scene.values import ControllerKind, ControllerSpec, GripperState
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GoalResult:
-    """How a goal ended."""
+    """Result of a goal that has ended."""
 
     goal: bytes
     outcome: Outcome
     text: str = ""
-    """Why it failed; empty if it did not."""
+    """Reason of a failure; empty if the goal succeeded."""
     gripper: GripperState | None = None
     """State of the gripper, for a goal of a gripper; otherwise None."""
 
 
 @dataclasses.dataclass(slots=True)
 class _ActiveGoal:
-    """A goal that is executed."""
+    """A goal that is being executed."""
 
     id: bytes
     trajectory: GoalHandle | None
-    """Handle of the trajectory; None for grippers."""
+    """Handle of the trajectory; None for a goal of a gripper."""
 
 
 class ControllerManager:
-    """The controllers of a local robot; all its methods belong to the thread of the physics."""
+    """The controllers of a local robot. Only the physics thread may call its methods."""
 
     def __init__(self, robot: Robot) -> None:
         self.robot = robot
@@ -54,26 +54,27 @@ class ControllerManager:
         joints = robot.description.joints
         self.desired = robot.setpoint.copy()
         self.desired_velocity = np.zeros(len(joints))
-        """[joint] Desired velocity of the controllers in this step [rad/s or m/s]; :attr:`desired` is the position [rad
-        or m]."""
+        """[joint] Velocity that the controllers request in this step [rad/s or m/s]. :attr:`desired` is the
+        requested position [rad or m]."""
         self._indices = {spec.name: robot.joint_indices(spec.joints) for spec in self.specs.values()}
         self._owner: list[str | None] = [None] * len(joints)
-        """[joint] Name of the controller that moves the joint, or None."""
+        """[joint] Name of the controller that moves the joint; None if there is none."""
         self._follows = np.zeros(len(joints), bool)
         """[joint] Whether a trajectory controller moves the joint."""
         self._trajectories: dict[str, TrajectoryController] = {}
         self._grippers: dict[str, GripperController] = {}
         self._goals: dict[str, _ActiveGoal] = {}
-        """Active goals by name of the controller."""
+        """Active goal of each controller, by name of the controller."""
         self._results: list[GoalResult] = []
         self._gains: dict[str, dict[str, np.ndarray]] = {}
 
     # ------------------------------------------------------------------ goals
 
     def start_trajectory(self, name: str, trajectory: Trajectory, time: float, goal: bytes | None = None) -> None:
-        """Follow a trajectory from ``time`` [s]; :class:`CommandError` if there is no such controller.
+        """Follow a trajectory from ``time`` [s]. ``goal``: id of the goal; None if nobody waits for its result. Raises
+        :class:`CommandError` for an unknown controller.
 
-        A goal that cannot be followed ends at once; without one :class:`TrajectoryError` is raised.
+        If the trajectory is invalid, its goal ends at once; without a goal, :class:`TrajectoryError` is raised.
         """
         spec = self._spec(name, ControllerKind.JOINT_TRAJECTORY)
         if name not in self._trajectories:
@@ -94,7 +95,7 @@ class ControllerManager:
             self._goals[name] = _ActiveGoal(goal, handle)
 
     def stop_trajectory(self, name: str) -> None:
-        """End the motion of a trajectory controller and hold its joints."""
+        """Stop the motion of a trajectory controller, end its goal, and hold its joints."""
         self._spec(name, ControllerKind.JOINT_TRAJECTORY)
         if name in self._trajectories:
             self._trajectories[name].cancel()
@@ -102,7 +103,8 @@ class ControllerManager:
             self._end(name, Outcome.CANCELED, "an empty trajectory stopped it")
 
     def start_gripper(self, name: str, position: float, effort: float | None, time: float, goal: bytes) -> None:
-        """Give a gripper a goal. Its :class:`GripperController` defines the meaning of ``position`` and ``effort``."""
+        """Start a goal of a gripper. The meaning of ``position`` and ``effort`` depends on its
+        :class:`GripperController`."""
         spec = self._spec(name, ControllerKind.GRIPPER)
         try:
             if name not in self._grippers:
@@ -116,7 +118,7 @@ class ControllerManager:
         self._goals[name] = _ActiveGoal(goal, None)
 
     def cancel(self, goal: bytes, time: float) -> None:
-        """Cancel a goal and hold its joints; nothing happens if it has ended."""
+        """Cancel a goal and hold its joints. Nothing happens if the goal has ended already."""
         for name, active in list(self._goals.items()):
             if active.id == goal:
                 if name in self._trajectories:
@@ -127,17 +129,17 @@ class ControllerManager:
                 self._end(name, Outcome.CANCELED, "it was cancelled", time)
 
     def cancel_all(self, time: float) -> None:
-        """Cancel all goals."""
+        """Cancel all goals and hold their joints."""
         for active in list(self._goals.values()):
             self.cancel(active.id, time)
 
     def abort_all(self, text: str) -> None:
-        """Abort all goals; ``text`` says why."""
+        """Abort all goals. ``text``: the reason."""
         for name in list(self._goals):
             self._end(name, Outcome.PREEMPTED, text)
 
     def take_results(self) -> list[GoalResult]:
-        """The goals that have ended since the last call."""
+        """Returns the results of the goals that ended since the last call."""
         results = self._results
         self._results = []
         return results
@@ -145,7 +147,8 @@ class ControllerManager:
     # ------------------------------------------------------------------ commands without a goal
 
     def forward(self, name: str, values: np.ndarray) -> None:
-        """Pass positions, velocities or efforts on to the joints of a forward controller; NaN leaves a joint alone."""
+        """Command the joints of a forward controller by ``values`` [joint]: positions, velocities or efforts. NaN
+        leaves a joint as it is."""
         spec = self.specs.get(name)
         commands = {
             ControllerKind.FORWARD_POSITION: self.robot.command_position,
@@ -157,7 +160,8 @@ class ControllerManager:
         self._pass_on(spec, values, commands[spec.kind])
 
     def command_impedance(self, name: str, what: str, values: np.ndarray) -> None:
-        """Set ``what``, "stiffness" or "damping" [joint] of an impedance controller, or move its "equilibrium"."""
+        """Set the stiffness or damping of an impedance controller's joints, or move its equilibrium. ``what``:
+        "stiffness", "damping" or "equilibrium". ``values`` [joint]."""
         spec = self._spec(name, ControllerKind.IMPEDANCE)
         if what == "equilibrium":
             self._pass_on(spec, values, self.robot.command_position)
@@ -174,7 +178,7 @@ class ControllerManager:
         self._gains[name] = gains
 
     def command_motor(self, name: str, joint: str, position: float) -> None:
-        """Hold the motor of a series elastic joint at ``position`` [rad or m]."""
+        """Hold the motor of a series elastic joint at ``position`` [rad or m], converted to the joint side."""
         spec = self._spec(name, ControllerKind.SERIES_ELASTIC)
         if joint not in spec.joints:
             raise CommandError(
@@ -186,7 +190,7 @@ class ControllerManager:
     # ------------------------------------------------------------------ each step
 
     def __call__(self, time: float) -> None:
-        """Command the set-points of the step that starts at ``time`` [s]; call it before :meth:`Robot.control`."""
+        """Command the set-points of the step that starts at ``time`` [s]. Call this before :meth:`Robot.control`."""
         for name, controller in self._trajectories.items():
             active = self._goals.get(name)
             if controller.is_moving:
@@ -202,17 +206,20 @@ class ControllerManager:
         self.desired_velocity[~self._follows] = 0.0
 
     def _take_desired(self, name: str) -> None:
-        """Let :attr:`desired` be what a trajectory controller asks of its joints now."""
+        """Copy the desired state of a trajectory controller's joints into :attr:`desired` and
+        :attr:`desired_velocity`."""
         joints = self._indices[name]
         controller = self._trajectories[name]
         self.desired[joints], self.desired_velocity[joints] = controller.desired, controller.desired_velocity
 
     def _gripper_state(self, name: str, time: float) -> GripperState | None:
+        """Returns the state of a gripper's goal; None if ``name`` is not the controller of a gripper."""
         return self._grippers[name].state(time) if name in self._grippers else None
 
     # ------------------------------------------------------------------ claims
 
     def _pass_on(self, spec: ControllerSpec, values: np.ndarray, command: Callable[..., None]) -> None:
+        """Command the joints of a controller that have a value other than NaN, and make the controller their owner."""
         if len(values) != len(spec.joints):
             raise CommandError(
                 f"{self.robot.name}: {len(values)} values for {spec.name}; give one each for {', '.join(spec.joints)}"
@@ -223,7 +230,8 @@ class ControllerManager:
         self._claim(spec.name, joints)
 
     def _claim(self, name: str, joints: np.ndarray | None = None) -> None:
-        """Give joints (all of the controller unless given) to a controller; goals of others on any of them end."""
+        """Make a controller the owner of ``joints`` (indices; all its joints unless given). Goals of other
+        controllers on these joints are aborted."""
         joints = self._indices[name] if joints is None else joints
         others = {self._owner[j] for j in joints} - {None, name}
         for other in sorted(o for o in others if o is not None):
@@ -235,11 +243,13 @@ class ControllerManager:
         self._follows[joints] = name in self._trajectories
 
     def _end(self, name: str, outcome: Outcome, text: str, time: float = 0.0) -> None:
+        """End the active goal of a controller, if there is one, and keep its result."""
         active = self._goals.pop(name, None)
         if active is not None:
             self._results.append(GoalResult(active.id, outcome, text, self._gripper_state(name, time)))
 
     def _spec(self, name: str, kind: ControllerKind) -> ControllerSpec:
+        """Returns a controller by name. Raises :class:`CommandError` if it does not exist or is of another kind."""
         spec = self.specs.get(name)
         if spec is None or spec.kind is not kind:
             known = ", ".join(one.name for one in self.specs.values() if one.kind is kind) or "none"

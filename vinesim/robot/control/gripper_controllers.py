@@ -1,6 +1,7 @@
-"""Controllers for each kind of gripper: they execute goals of ``control_msgs/GripperCommand`` and report their results.
+"""Controllers for the kinds of grippers: they execute goals of ``control_msgs/GripperCommand`` and report the results.
 
-The kinds are declared in :mod:`vinesim.robot.description.grippers`; :data:`CONTROLLERS` has one controller for each.
+The kinds are declared in :mod:`vinesim.robot.description.grippers`; :data:`CONTROLLERS` has one controller class for
+each.
 """
 
 from __future__ import annotations
@@ -13,41 +14,42 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import GripperState
 
 GOAL_TOLERANCE = 2e-3
-"""[m or rad] A gripper this near to its goal has reached it."""
+"""[m or rad] Distance from its goal within which a gripper has reached the goal."""
 STALL_SPEED = 1e-3
-"""[m/s or rad/s] A gripper that moves slower is stalled; the default of ``gripper_action_controller``."""
+"""[m/s or rad/s] Speed below which a gripper counts as stalled: the default of ``gripper_action_controller``."""
 STALL_DURATION = 0.3
 """[s] Time for which a gripper must be slower than :data:`STALL_SPEED` to be stalled. GUESSED: a tenth of the time that
 it takes to close."""
 
 
 class GripperController(abc.ABC):
-    """The grippers of one kind at one group of a robot; they have one goal at a time."""
+    """Base class for the controller of all grippers of one kind in one joint group. It executes one goal at a time."""
 
     def __init__(self, robot: Robot, group: str) -> None:
-        """Raises :class:`CommandError` if the robot has no gripper of this kind at ``group``."""
+        """Raises :class:`CommandError` if the robot has no gripper of this kind in ``group``."""
         self.robot = robot
         self.group = group
 
     @abc.abstractmethod
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """Take a goal at ``time`` [s]. ``effort`` None: the gripper's own limit. Raises :class:`CommandError` if the
-        goal is unfit."""
+        """Start a goal at ``time`` [s]. ``effort``: largest effort; None: the gripper's own limit. Raises
+        :class:`CommandError` if the goal is invalid."""
 
     @abc.abstractmethod
     def state(self, time: float) -> GripperState:
-        """State of the present goal at ``time`` [s]. Called in every step while there is a goal."""
+        """Returns the state of the present goal at ``time`` [s]. It is called in every step until the goal ends."""
 
     @abc.abstractmethod
     def cancel(self, time: float) -> None:
-        """Stop in a goal that is not done, at ``time`` [s]."""
+        """Stop the gripper at ``time`` [s], when a goal is cancelled."""
 
 
 class FingersController(GripperController):
-    """Moves fingers to an opening. They keep pressing after the goal has ended, so that they hold their object.
+    """Moves fingers to an opening. They keep pressing after the goal has ended, so that they hold an object.
 
     Goal: the opening [m or rad], and the largest effort of each finger [N or N m]; see :meth:`Robot.command_gripper`.
-    Result: the opening, and the largest effort of a finger; stalled if something is between the fingers.
+    Result: the opening, and the largest effort of a finger. The result is ``stalled`` if an object is between the
+    fingers.
     """
 
     def __init__(self, robot: Robot, group: str) -> None:
@@ -57,13 +59,15 @@ class FingersController(GripperController):
         self._slow_since: float | None = None
 
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """See :class:`GripperController`."""
+        """Start to move the fingers to the opening ``position`` at ``time`` [s], with at most ``effort`` [N or N m]
+        each; None: the drives' own limit."""
         self.robot.command_gripper(self.group, position, effort)
         self._goal = position
         self._slow_since = None
 
     def state(self, time: float) -> GripperState:
-        """See :class:`GripperController`."""
+        """Returns opening and largest effort of the fingers at ``time`` [s], and whether they have reached their
+        goal or are stalled."""
         robot = self.robot
         _, velocity, effort, _ = robot.rigid.joint_measurements(robot.name)
         opening = robot.gripper_opening(self.group)
@@ -78,16 +82,16 @@ class FingersController(GripperController):
         return GripperState(opening, strongest, stalled=stalled)
 
     def cancel(self, time: float) -> None:
-        """Hold the fingers where they are."""
+        """Hold the fingers at their present positions."""
         self.start(self.robot.gripper_opening(self.group), None, time)
 
 
 class CutterController(GripperController):
     """Closes a cutter once, whatever position the goal has.
 
-    Goal: the largest force of the blades [N]; see :meth:`Robot.command_cutter`.
-    Result: position 0 once closed, and the force [N] that the blades had to overcome, 0 if nothing was between them;
-    stalled if that was more than they had, and nothing was cut.
+    Goal: the largest force of the blades [N]; see :meth:`Robot.command_cutter`. Result: position 0 once closed, and the
+    force [N] that the blades had to overcome, 0 if nothing was between them. The result is ``stalled`` if this force
+    exceeds the largest force, so that nothing was cut.
     """
 
     def __init__(self, robot: Robot, group: str) -> None:
@@ -95,12 +99,13 @@ class CutterController(GripperController):
         self._closures = tuple(blade.closures for blade in robot.cutter_blades(group))
 
     def start(self, position: float, effort: float | None, time: float) -> None:
-        """See :class:`GripperController`."""
+        """Close the cutter at ``time`` [s] with at most ``effort`` [N]; None: the cutter's own limit. ``position``
+        is ignored."""
         self.robot.command_cutter(self.group, effort)
         self._closures = tuple(blade.closures for blade in self.robot.cutter_blades(self.group))
 
     def state(self, time: float) -> GripperState:
-        """See :class:`GripperController`."""
+        """Returns whether the blades have closed, and the force [N] that they had to overcome."""
         blades = self.robot.cutter_blades(self.group)
         if any(blade.closures == before for blade, before in zip(blades, self._closures, strict=True)):
             return GripperState(1.0, 0.0)
@@ -109,8 +114,8 @@ class CutterController(GripperController):
         return GripperState(0.0, effort, stalled=too_weak, reached_goal=not too_weak)
 
     def cancel(self, time: float) -> None:
-        """Nothing: the blades close within one step."""
+        """Do nothing, because the blades close within one step."""
 
 
 CONTROLLERS: dict[str, type[GripperController]] = {"fingers": FingersController, "cutter": CutterController}
-"""Classes of controllers: kind of gripper -> class."""
+"""Classes of controllers, by kind of gripper."""

@@ -6,10 +6,11 @@
     controller(time)              # each step, before robot.control(time)
     if goal.outcome is Outcome.PATH_TOLERANCE_VIOLATED: ...
 
-Between waypoints the splines are cubic if velocities are given, else linear. Where the drives cannot follow, the limits
-of the URDF hold, and the tolerances detect the error. A newer trajectory replaces the older one from its start time on,
-which may lie ahead, and begins with the position and velocity that the older one has then; joints that it does not name
-follow the older one to its end (``allow_trajectory_replacement`` of joint_trajectory_controller 6.8).
+Between waypoints, interpolation is cubic if velocities are given, else linear. If the drives cannot follow, they move
+within the limits of the URDF, and the tolerances detect the error. A newer trajectory replaces the older one from the
+start time of the newer one, which may be in the future. It begins with the position and velocity that the older
+trajectory has then. Joints that are not in the newer trajectory follow the older one to its end
+(``allow_trajectory_replacement`` of joint_trajectory_controller 6.8).
 """
 
 from __future__ import annotations
@@ -25,8 +26,8 @@ from vinesim.robot.drives.joint_servos import CommandError, CommandInterface
 
 
 class Outcome(enum.IntEnum):
-    """How a goal ended: error codes of control_msgs/action/FollowJointTrajectory, and two for which ROS has goal
-    states."""
+    """Result of a goal: error codes of control_msgs/action/FollowJointTrajectory, and two values for which ROS uses
+    goal states."""
 
     SUCCESSFUL = 0
     INVALID_GOAL = -1
@@ -39,7 +40,7 @@ class Outcome(enum.IntEnum):
 
 
 class TrajectoryError(CommandError):
-    """A trajectory that cannot be followed; ``code`` is its :class:`Outcome`."""
+    """A trajectory that cannot be executed. ``code`` is the :class:`Outcome` that describes why."""
 
     def __init__(self, code: Outcome, text: str) -> None:
         super().__init__(text)
@@ -48,79 +49,81 @@ class TrajectoryError(CommandError):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Tolerance:
-    """Largest permitted errors, each [joint] in the trajectory's order; infinite where there is no limit."""
+    """Largest permitted errors, in the order of the trajectory's joints; infinite where there is no limit."""
 
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] Largest permitted position errors, rad or m."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] Largest permitted velocity errors, rad/s or m/s."""
 
     @classmethod
     def uniform(cls, count: int, position: float = np.inf, velocity: float = np.inf) -> Tolerance:
-        """The same for ``count`` joints."""
+        """Returns a tolerance with the same limits for ``count`` joints."""
         return cls(np.full(count, float(position)), np.full(count, float(velocity)))
 
     def violated(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Indices [k] of the joints whose errors in ``position`` or ``velocity`` [joint] are too large."""
+        """Returns the indices [k] of joints whose errors in ``position`` or ``velocity`` [joint] exceed the
+        tolerance."""
         return np.flatnonzero((np.abs(position) > self.position) | (np.abs(velocity) > self.velocity))
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Waypoints of some joints (trajectory_msgs/JointTrajectory), and tolerances of the goal."""
+    """Waypoints of some joints (trajectory_msgs/JointTrajectory), with the tolerances of a goal."""
 
     joints: tuple[str, ...]
     times: np.ndarray
-    """[point] s after the start, increasing; if the first is not 0, the spline begins at the present positions"""
+    """[point] s after the start, increasing. If the first is not 0, the path begins at the present positions."""
     positions: np.ndarray
-    """[point, joint] rad or m"""
+    """[point, joint] Positions at the waypoints, rad or m."""
     velocities: np.ndarray | None = None
-    """[point, joint] rad/s or m/s; None: linear interpolation"""
+    """[point, joint] Velocities at the waypoints, rad/s or m/s; None: linear interpolation."""
     start_time: float = 0.0
-    """Simulation time [s] at which it starts; 0: when it is accepted."""
+    """Simulation time [s] of the start; 0: the time at which the trajectory is accepted."""
     path_tolerance: Tolerance | None = None
-    """Permitted errors on the path; None: the controller's."""
+    """Permitted errors on the path; None: the controller's tolerance."""
     goal_tolerance: Tolerance | None = None
-    """Permitted errors at the end; None: the controller's."""
+    """Permitted errors at the end; None: the controller's tolerance."""
     goal_time_tolerance: float | None = None
-    """[s] Permitted delay of the arrival; 0: unlimited, as in ROS; None: the controller's."""
+    """[s] Permitted delay of the arrival; 0: unlimited, as in ROS; None: the controller's permitted delay."""
 
 
 @dataclasses.dataclass(slots=True, eq=False)
 class GoalHandle:
-    """One accepted trajectory and its result."""
+    """A trajectory that was accepted, and its result."""
 
     trajectory: Trajectory
     start_time: float
-    """Simulation time [s] of its start."""
+    """Simulation time [s] at which the trajectory starts."""
     outcome: Outcome | None = None
-    """None while it is executed."""
+    """Result; None while the trajectory is being executed."""
     text: str = ""
-    """Why it failed; empty if it did not."""
+    """Reason of a failure; empty if the trajectory succeeded."""
 
     @property
     def is_done(self) -> bool:
-        """Whether it has ended, successfully or not."""
+        """Whether the trajectory has ended, successfully or not."""
         return self.outcome is not None
 
 
 @dataclasses.dataclass(slots=True, eq=False)
 class _Spline:
-    """The path of some joints of a controller."""
+    """The path of some of a controller's joints: waypoints with interpolation between them."""
 
     start: float
-    """Simulation time [s]"""
+    """Simulation time [s] at which the path starts."""
     order: np.ndarray
-    """[k] its joints among those of the controller"""
+    """[k] Indices of the joints among those of the controller."""
     times: np.ndarray
-    """[knot] s after the start"""
+    """[knot] Times of the waypoints, s after the start."""
     positions: np.ndarray
-    """[knot, k]"""
+    """[knot, k] Positions at the waypoints, rad or m."""
     velocities: np.ndarray | None
-    """[knot, k]; None: linear interpolation"""
+    """[knot, k] Velocities at the waypoints, rad/s or m/s; None: linear interpolation."""
 
     def sample(self, elapsed: float) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and velocities [k] at ``elapsed`` [s]; at rest beyond its end."""
+        """Returns positions and velocities [k] at ``elapsed`` [s] after the start. After the end, the joints rest at
+        the last waypoint."""
         knots = self.times
         points = self.positions
         if elapsed >= knots[-1]:
@@ -140,11 +143,12 @@ class _Spline:
 
 
 MAX_SPLINES = 32
-"""Trajectories of one controller that are executed or wait for their start; further ones are refused."""
+"""Largest number of trajectories of one controller that are being executed or wait for their start. Further ones are
+refused."""
 
 
 class TrajectoryController:
-    """Moves some joints of a robot along trajectories; a newer one preempts the goal of the older."""
+    """Moves some joints of a robot along trajectories. A newer trajectory preempts the goal of an older one."""
 
     def __init__(
         self,
@@ -155,7 +159,8 @@ class TrajectoryController:
         goal_tolerance: Tolerance | None = None,
         goal_time_tolerance: float = 0.0,
     ) -> None:
-        """The tolerances are those of trajectories that have none of their own; None: no limit."""
+        """``path_tolerance``, ``goal_tolerance``, ``goal_time_tolerance`` [s]: defaults for trajectories without
+        their own tolerances. None: no limit."""
         self.robot = robot
         self.joints = tuple(joints)
         self.indices = robot.joint_indices(self.joints)
@@ -163,25 +168,27 @@ class TrajectoryController:
         self.goal_tolerance = goal_tolerance or Tolerance.uniform(len(self.joints))
         self.goal_time_tolerance = goal_time_tolerance
         self.active_goal: GoalHandle | None = None
-        """The goal that is executed, None if there is none."""
+        """The goal that is being executed; None if there is none."""
         self._splines: list[_Spline] = []
-        """Oldest first; each joint follows the newest that has begun. The last is that of the active goal."""
+        """Paths, oldest first. Each joint follows the newest path that has started. The last path is that of the
+        active goal."""
         self.desired = robot.setpoint[self.indices].copy()
         self.desired_velocity = np.zeros(len(self.joints))
-        """[joint] with :attr:`desired`, what it asks for at the end of the step [rad or m, rad/s or m/s]."""
+        """[joint] Velocity at the end of the present step [rad/s or m/s]. :attr:`desired` is the position at that
+        time [rad or m]."""
 
     @property
     def is_moving(self) -> bool:
-        """Whether joints follow a trajectory, or one waits for its start."""
+        """Whether a trajectory is being executed or waits for its start."""
         return bool(self._splines)
 
     # ------------------------------------------------------------------ commands
 
     def start(self, trajectory: Trajectory, time: float) -> GoalHandle:
-        """Follow a trajectory from ``time`` [s], or from its own start; the goal before it is preempted.
+        """Follow a trajectory from its start time, or from ``time`` [s] if it has none. The active goal is preempted.
 
-        Joints that it does not name go on as before. Raises :class:`TrajectoryError` and changes nothing if the
-        trajectory is invalid.
+        Joints that are not in the trajectory continue as before. Raises :class:`TrajectoryError` and changes nothing if
+        the trajectory is invalid.
         """
         order = self._validate(trajectory, time)
         began = max(trajectory.start_time, time) if trajectory.start_time > 0.0 else time
@@ -215,10 +222,10 @@ class TrajectoryController:
         return self.active_goal
 
     def _splines_before(self, order: np.ndarray, began: float, time: float) -> list[_Spline]:
-        """The splines that some joints follow after ``time`` [s] yet, when joints ``order`` [k] have a new one from
-        ``began`` [s] on."""
+        """Returns the paths that some joints still follow after ``time`` [s], if the joints ``order`` [k] (indices)
+        get a new path that starts at ``began`` [s]."""
         kept: list[_Spline] = []
-        taken = np.full(len(self.joints), np.inf)  # [joint] when a newer spline takes over [s]
+        taken = np.full(len(self.joints), np.inf)  # [joint] time at which a newer spline takes over [s]
         taken[order] = began
         for spline in reversed(self._splines):
             if (taken[spline.order] > max(time, spline.start)).any():
@@ -230,27 +237,29 @@ class TrajectoryController:
         return kept
 
     def cancel(self) -> None:
-        """Cancel the goal, and what joints follow yet of earlier ones, and hold the present positions."""
+        """Cancel the active goal and all paths, also those of earlier trajectories, and hold the present positions."""
         if self._splines:
             self._end(Outcome.CANCELED, "it was cancelled")
             self._hold()
 
     def release(self, text: str) -> None:
-        """End the goal, as another controller moves its joints from now on; ``text`` says which."""
+        """End the active goal because another controller takes over its joints. ``text``: the reason, with the name
+        of that controller."""
         self._end(Outcome.PREEMPTED, text)
         self.active_goal = None
         self._splines = []
 
     def _validate(self, trajectory: Trajectory, time: float) -> np.ndarray:
-        """Indices [joint] of the trajectory's joints among the controller's; :class:`TrajectoryError` if invalid."""
+        """Returns the indices [joint] of the trajectory's joints among those of the controller. Raises
+        :class:`TrajectoryError` if the trajectory is invalid."""
         name = self.robot.name
         t = trajectory
         unknown = [joint for joint in t.joints if joint not in self.joints]
         if unknown or len(set(t.joints)) < len(t.joints) or not t.joints:
             raise TrajectoryError(
                 Outcome.INVALID_JOINTS,
-                f"{name}: trajectory for {', '.join(t.joints) or 'no joints'}; this controller moves each of "
-                f"{', '.join(self.joints)} once",
+                f"{name}: trajectory for {', '.join(t.joints) or 'no joints'}; name joints among "
+                f"{', '.join(self.joints)}, each at most once",
             )
         shape = (len(t.times), len(t.joints))
         for what, values in (("positions", t.positions), ("velocities", t.velocities)):
@@ -280,9 +289,9 @@ class TrajectoryController:
     # ------------------------------------------------------------------ each step
 
     def __call__(self, time: float) -> None:
-        """Command the set-points of the step that starts at ``time`` [s], and check the errors after the last one.
+        """Command the set-points of the step that starts at ``time`` [s], and check the errors after the previous step.
 
-        The desired state is that of the end of the step, where the joints will be measured.
+        The desired state is the one at the end of the step, because the joints are measured then.
         """
         if not self._splines:
             return
@@ -295,14 +304,15 @@ class TrajectoryController:
         if goal is not None and time >= goal.start_time and not self._judge(goal, time, wanted, rate):
             return
         self.robot.command_position(ahead[moved], self.indices[moved])
-        # From the oldest on: one that a newer has replaced must not come back when that has ended.
+        # Oldest first, so that a spline that a newer one has replaced does not take over again when the newer one ends.
         while self._splines and time + dt >= self._splines[0].start + self._splines[0].times[-1]:
             if len(self._splines) == 1 and self.active_goal is not None:
                 break
             self._splines.pop(0)
 
     def _judge(self, goal: GoalHandle, time: float, wanted: np.ndarray, rate: np.ndarray) -> bool:
-        """Check the errors of a goal against the ``wanted`` positions and velocities [joint]; False if it failed."""
+        """Check the errors of a goal against its tolerances. ``wanted``, ``rate`` [joint]: desired positions and
+        velocities. Returns False if the goal has failed."""
         position, velocity, _, _ = self.robot.rigid.joint_measurements(self.robot.name)
         spline = self._splines[-1]
         elapsed = time - goal.start_time
@@ -329,7 +339,8 @@ class TrajectoryController:
         return True
 
     def _sample(self, time: float, ahead: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Positions, velocities [joint] so far ``ahead`` of ``time`` [s], and whether each joint follows a spline."""
+        """Returns, for ``time`` + ``ahead`` [s], the desired positions and velocities [joint], and whether each
+        joint follows a path [joint]."""
         position = self.desired.copy()
         velocity = np.zeros(len(self.joints))
         moved = np.zeros(len(self.joints), bool)
@@ -342,11 +353,13 @@ class TrajectoryController:
     def _fail(
         self, goal: GoalHandle, outcome: Outcome, joint: int, error: np.ndarray, slip: np.ndarray, when: str
     ) -> None:
+        """End a goal with an error of one joint, and hold the present positions."""
         name = goal.trajectory.joints[joint]
         self._end(outcome, f"{name} is off by {error[joint]:.4f} and {slip[joint]:.4f} a second, {when}")
         self._hold()
 
     def _hold(self) -> None:
+        """Drop all paths and hold their joints at the present positions."""
         order = np.unique(np.concatenate([spline.order for spline in self._splines]))
         active = self.indices[order]
         position = self.robot.rigid.joint_measurements(self.robot.name)[0][active]
@@ -356,10 +369,12 @@ class TrajectoryController:
         self._splines = []
 
     def _end(self, outcome: Outcome, text: str) -> None:
+        """Set the result of the active goal, if there is one."""
         if self.active_goal is not None:
             self.active_goal.outcome = outcome
             self.active_goal.text = text
 
 
 def _reordered(tolerance: Tolerance, order: np.ndarray) -> Tolerance:
+    """Returns the tolerance of the joints ``order`` [k]."""
     return Tolerance(tolerance.position[order], tolerance.velocity[order])

@@ -1,4 +1,5 @@
-"""Drives the base along waypoints: it turns towards each, drives there straight, and turns to the final heading."""
+"""Drives the base along waypoints: it turns towards each waypoint, drives straight to it, and finally turns to a
+heading."""
 
 from __future__ import annotations
 
@@ -9,20 +10,20 @@ import numpy as np
 from vinesim.robot.drives.controlled_robot import Robot
 
 POSITION_TOLERANCE = 0.01
-"""[m] A waypoint this near is reached. GUESSED"""
+"""[m] Distance within which a waypoint is reached. GUESSED"""
 HEADING_TOLERANCE = 0.01
-"""[rad] A heading with a smaller error is reached. GUESSED"""
+"""[rad] Error below which a heading is reached. GUESSED"""
 DECELERATION = 0.5
-"""Deceleration of the base before a waypoint [m/s2] and before a heading [rad/s2]: half of the largest one of vinebot's
-tracks."""
+"""Deceleration of the base before a waypoint [m/s2] and before a heading [rad/s2]: half of the largest deceleration
+of vinebot's tracks."""
 LOOKAHEAD_DISTANCE = 0.4
-"""[m] A base beside its line steers for the point this far ahead on the line. GUESSED"""
+"""[m] Distance along the line between waypoints to the point for which the base steers. GUESSED"""
 STUCK_TIMEOUT = 4.0
-"""[s] A base that should move and has not moved for this time is stuck. GUESSED"""
+"""[s] Time without motion after which a base that should move counts as stuck. GUESSED"""
 
 
 class WaypointFollower:
-    """Drives a robot's base along points, one straight leg after the other, forwards or in reverse."""
+    """Drives a robot's base along waypoints, one straight leg after the other, forwards or in reverse."""
 
     def __init__(
         self,
@@ -34,9 +35,9 @@ class WaypointFollower:
         turn_rate: float = 0.4,
         reverse: bool = False,
     ) -> None:
-        """``points`` [n, 2] m in the world, ``heading`` [rad] at the end (that of the last leg unless
-        given); ``speed`` [m/s] and ``turn_rate`` [rad/s]: the largest; ``reverse``: the base drives backwards.
-        """
+        """``points`` [n, 2] m: waypoints in the world. ``heading`` [rad]: heading at the end (the heading of the
+        last leg unless given). ``speed`` [m/s], ``turn_rate`` [rad/s]: largest values. ``reverse``: whether the base
+        drives backwards."""
         self.robot = robot
         self.points = np.asarray(points, float).reshape(-1, 2)
         self.heading = heading
@@ -71,7 +72,8 @@ class WaypointFollower:
         self.robot.command_base(linear, angular, time)
 
     def _follow_leg(self, here: np.ndarray, yaw: float) -> tuple[float, float]:
-        """Velocity [m/s] and yaw rate [rad/s] on the present leg; ``here`` [2] m and ``yaw`` [rad] of the base."""
+        """Returns velocity [m/s] and yaw rate [rad/s] to follow the present leg. ``here`` [2] m, ``yaw`` [rad]:
+        position and heading of the base."""
         goal = self.points[self._leg]
         leg = goal - self._leg_start
         length = float(np.hypot(*leg))
@@ -93,7 +95,8 @@ class WaypointFollower:
         return 0.0, 0.0
 
     def _turn_towards(self, course: float, yaw: float) -> float:
-        """Yaw rate [rad/s] towards the heading ``course`` [rad]; ends the turn when it is reached."""
+        """Returns the yaw rate [rad/s] towards the heading ``course`` [rad]. Ends the turn when the heading is
+        reached."""
         error = _wrap_angle(course - yaw)
         rate = float(self.robot.rigid.base_state(self.robot.name)[1][5])
         if abs(error) < HEADING_TOLERANCE and abs(rate) < 0.02:
@@ -113,5 +116,5 @@ class WaypointFollower:
 
 
 def _wrap_angle(angle: float) -> float:
-    """The angle between -pi and pi [rad]."""
+    """Returns the equivalent angle between -pi and pi [rad]."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi

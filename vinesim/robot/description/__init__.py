@@ -1,1 +1,1 @@
-"""Robot descriptions: URDF, and a TOML file beside it with what a URDF cannot express."""
+"""Robot descriptions: a URDF, and a TOML file of the same name with data that a URDF cannot contain."""

@@ -1,6 +1,7 @@
-"""Controllers of a robot: those of its TOML file, or derived from its joint groups as ros2_control robots name them.
+"""Controllers of a robot: those in its TOML file, or controllers derived from its joint groups and named as in
+ros2_control.
 
-Where the URDF has ``ros2_control`` tags, a controller commands a joint only by an interface that the tags offer.
+If the URDF has ``ros2_control`` tags, a controller commands only joints that have the command interface it needs.
 """
 
 from __future__ import annotations
@@ -24,15 +25,17 @@ INTERFACE_OF_KIND = {
     ControllerKind.FORWARD_EFFORT: "effort",
     ControllerKind.IMPEDANCE: "effort",
 }
-"""The command interface of ros2_control that each kind of controller needs of its joints."""
+"""Command interface of ros2_control that a joint must have for each kind of controller."""
 FINGERS_CONTROLLER = "gripper"
-"""Second name for the kind of a controller of fingers in a TOML file, besides ``fingers``."""
+"""Alternative to ``fingers`` as the ``kind`` of a controller in a TOML file."""
 MIN_ARM_JOINTS = 4
-"""A group with a tool, or with at least this number of joints, is an arm. It gets an impedance controller."""
+"""Number of joints from which on a joint group counts as an arm, which gets an impedance controller. A group with a
+tool always counts as an arm."""
 
 
 def command_interfaces(urdf: str) -> dict[str, set[str]]:
-    """Command interfaces of each joint in the ``ros2_control`` tags of a URDF; empty if it has none."""
+    """Returns the command interfaces of each joint in the ``ros2_control`` tags of a URDF, by joint; empty without
+    such tags."""
     found: dict[str, set[str]] = {}
     for joint in etree.fromstring(urdf.encode()).iterfind("ros2_control/joint"):
         names = {interface.get("name", "") for interface in joint.iterfind("command_interface")}
@@ -43,10 +46,10 @@ def command_interfaces(urdf: str) -> dict[str, set[str]]:
 def make_controllers(
     sidecar: Sidecar, driven: Sequence[str], interfaces: Mapping[str, set[str]], file: pathlib.Path
 ) -> tuple[ControllerSpec, ...]:
-    """The controllers of a robot with these ``driven`` joints, sorted by name.
+    """Returns the controllers of a robot, sorted by name. ``driven``: names of its driven joints.
 
     ``interfaces``: command interfaces of each joint; if empty, all joints have all interfaces. Raises
-    :class:`DescriptionError` if a controller of the ``sidecar`` names a joint, group or gripper that does not exist.
+    :class:`DescriptionError` if a controller in the ``sidecar`` names a joint, group or gripper that does not exist.
     """
     if sidecar.controllers is not None:
         specs = [_checked(name, one, sidecar, driven, file) for name, one in sidecar.controllers.items()]
@@ -57,6 +60,7 @@ def make_controllers(
 
 
 def _derived(sidecar: Sidecar, driven: Sequence[str]) -> list[ControllerSpec]:
+    """Returns controllers for the joint groups and grippers of a robot whose TOML file lists no controllers."""
     of_name = {gripper.controller: gripper for gripper in sidecar.all_grippers}
     specs = [_of_gripper(name, gripper.kind, gripper.group, sidecar) for name, gripper in of_name.items()]
     moved_by_grippers = {gripper.group for gripper in sidecar.all_grippers if gripper.moves_joints}
@@ -77,6 +81,7 @@ def _derived(sidecar: Sidecar, driven: Sequence[str]) -> list[ControllerSpec]:
 def _checked(
     name: str, given: Controller, sidecar: Sidecar, driven: Container[str], file: pathlib.Path
 ) -> ControllerSpec:
+    """Returns a controller that is listed in the TOML file. Raises :class:`DescriptionError` if it is invalid."""
     if given.group and given.group not in {*sidecar.groups, *(gripper.group for gripper in sidecar.all_grippers)}:
         raise description_error(file, f"controller {name!r} belongs to {given.group!r}", "name a group")
     gripper = {FINGERS_CONTROLLER: "fingers"}.get(given.kind, given.kind)
@@ -101,13 +106,13 @@ def _checked(
 
 
 def _of_gripper(name: str, kind: str, group: str, sidecar: Sidecar) -> ControllerSpec:
-    """The controller ``name`` for the grippers of a ``kind`` at a ``group``."""
+    """Returns the controller ``name`` for the grippers of a ``kind`` that belong to the joint group ``group``."""
     joints = sidecar.groups[group].joints if GRIPPER_KINDS[kind].moves_joints else ()
     return ControllerSpec(name, ControllerKind.GRIPPER, joints, group, kind)
 
 
 def _limited(spec: ControllerSpec, interfaces: Mapping[str, set[str]]) -> ControllerSpec | None:
-    """The controller with the joints that offer its interface; None if there are none."""
+    """Returns the controller restricted to joints that have the command interface it needs; None if there are none."""
     needed = INTERFACE_OF_KIND.get(spec.kind)
     if not interfaces or needed is None or not spec.joints:
         return spec

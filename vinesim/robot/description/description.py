@@ -1,4 +1,4 @@
-"""A robot as all layers need it: joints, drives, frames, sensors, limits."""
+"""The description of a robot: joints, drives, frames, sensors, limits."""
 
 from __future__ import annotations
 
@@ -17,69 +17,72 @@ from vinesim.scene.values import ControllerSpec, Drive, RenderedMount, RobotSpec
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class RobotDescription:
-    """A robot as loaded from its URDF and TOML file; constant."""
+    """A robot as loaded from its URDF and TOML file. It never changes."""
 
     name: str
     """The robot's name in the URDF."""
     file: pathlib.Path
     urdf: str
-    """Text for physics and ``/robot_description``, meshes by absolute path."""
+    """Text of the URDF for physics and ``/robot_description``, with absolute paths of meshes."""
     base: str
-    """Root link: base_footprint, if the URDF has it."""
+    """Name of the root link: base_footprint, if the URDF has this link."""
     drives: tuple[Drive, ...]
-    """In the URDF's order; mimicking joints have none."""
+    """Drives in the order of the URDF. Joints that mimic another joint have none."""
     home: np.ndarray
     """[joint] Home positions [rad or m]."""
     groups: dict[str, JointGroup]
     moving_joints: MovingJoints
     fixed_frames: tuple[tuple[str, str], ...]
-    """(parent frame, child frame) of every fixed joint: ``/tf_static``."""
+    """(parent frame, child frame) of every fixed joint, for ``/tf_static``."""
     fixed_poses: np.ndarray
     """[fixed, 7] Pose of the child in the parent, for each of :attr:`fixed_frames`."""
     link_anchors: dict[str, tuple[str, np.ndarray]]
-    """For every link, by name: the moving link (or the root) to which it is fixed, and its pose [7] there."""
+    """For every link, by name: the moving link (or the root link) to which it is fixed, and its pose [7] in the
+    frame of that link."""
     sensors: tuple[RenderedMount, ...]
-    """All rendered sensors, in the order of :data:`vinesim.scene.values.SENSOR_KINDS`."""
+    """Cameras, lidars and other rendered sensors, in the order of :data:`vinesim.scene.values.SENSOR_KINDS`."""
     imus: tuple[SensorMount, ...]
     wrenches: tuple[SensorMount, ...]
     sensor_pacing: SensorPacing
     grippers: tuple[AnyGripper, ...]
     controllers: tuple[ControllerSpec, ...]
-    """Controllers by which ROS may command the robot, sorted by name."""
+    """Controllers through which ROS may command the robot, sorted by name."""
     base_limits: BaseLimits
     mass: float
     """Total mass [kg]."""
     notes: tuple[str, ...]
-    """Changes and derived values of the loading, one line each."""
+    """Changes and derived values that were made during loading, one line each."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Corners [face, 3, 3] m of meshes that came over the network, by the file name that ``urdf`` gives them."""
+    """Corners [face, 3, 3] m of meshes that were received over the network, by the file name in ``urdf``."""
     is_remote: bool = False
-    """Whether its text came over the network: another client simulates the robot."""
+    """Whether the description was received over the network, because another client simulates the robot."""
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Names of the driven joints, in the order of joint arrays everywhere."""
+        """Names of the driven joints, in the order of all joint arrays."""
         return tuple(drive.joint for drive in self.drives)
 
     @property
     def cutters(self) -> tuple[Cutter, ...]:
-        """The grippers that cut."""
+        """The robot's grippers that cut."""
         return tuple(gripper for gripper in self.grippers if isinstance(gripper, Cutter))
 
     def sensors_of(self, kind: str) -> tuple[RenderedMount, ...]:
-        """Its sensors of one of :data:`vinesim.scene.values.SENSOR_KINDS`, in the order of its file."""
+        """Returns the robot's sensors of ``kind``, one of :data:`vinesim.scene.values.SENSOR_KINDS`, in the order of
+        its TOML file."""
         return tuple(mount for mount in self.sensors if mount.kind == kind)
 
     def joint_indices(self, group: str) -> np.ndarray:
-        """Indices of a group's joints in joint arrays; KeyError if there is no such group."""
+        """Returns the indices of a group's joints in joint arrays. Raises KeyError for an unknown group."""
         order = {name: i for i, name in enumerate(self.joints)}
         return np.array([order[name] for name in self.groups[group].joints], int)
 
     def finger_travel(self, fingers: np.ndarray) -> tuple[float, float]:
-        """Opening of a gripper as a linear function of the common position of its driven fingers.
+        """Returns the opening of a gripper as a linear function of the common position of its driven fingers: the
+        slope, and the opening at position 0 [m or rad].
 
-        Returns the slope, and the opening at position 0 [m or rad]. ``fingers`` [k]: indices of the driven fingers.
-        Sliding fingers that mimic a driven one count, too. Turning ones do not: they are its linkage.
+        ``fingers`` [k]: indices of the driven fingers. Prismatic joints that mimic a driven finger count as fingers,
+        too. Revolute joints that mimic one do not, because they are part of its linkage.
         """
         moving = self.moving_joints
         is_driven = np.isin(moving.names, self.joints)
@@ -88,7 +91,8 @@ class RobotDescription:
         return float(np.abs(moving.multiplier[counts]).sum()), float((sign * moving.offset[counts]).sum())
 
     def link_poses(self, position: np.ndarray) -> dict[str, np.ndarray]:
-        """Pose [7] of every link in the root for drive positions; walks the tree: not for the real-time loop."""
+        """Returns the pose [7] of every link in the root link's frame, by name. ``position`` [joint]: positions of
+        the drives. This walks the tree and is too slow for the real-time loop."""
         parents = dict(
             zip([child for _, child in self.moving_joints.frames], range(len(self.moving_joints.frames)), strict=True)
         )
@@ -110,7 +114,8 @@ class RobotDescription:
         return found
 
     def to_spec(self, name: str, index: int = 0, pose: np.ndarray | None = None) -> RobotSpec:
-        """The robot as physics needs it, under ``name``, with its base at ``pose`` [7] (the origin unless given)."""
+        """Returns the specification with which physics adds the robot. ``name``: its name in the world. ``index``:
+        number of its instance label. ``pose`` [7]: pose of its base (the origin unless given)."""
         pose = frames.pose([0.0, 0.0, 0.0]) if pose is None else np.asarray(pose, float)
         return RobotSpec(
             name,

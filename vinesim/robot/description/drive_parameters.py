@@ -1,4 +1,4 @@
-"""Parameters of the drives: home positions, carried inertia, and gains where the TOML file gives none."""
+"""Parameters of the drives: home positions, carried inertia, and gains for joints without gains in the TOML file."""
 
 from __future__ import annotations
 
@@ -15,19 +15,23 @@ from vinesim.robot.description.urdf import Joint, Robot, joint_limits
 from vinesim.scene.values import Drive
 
 ACCELERATION_TIME = 0.02
-"""[s] Time in which full effort brings a drive to full speed, if its armature is not given. GUESSED"""
+"""[s] Time in which full effort accelerates a drive to full speed, by which an armature that is not given is
+derived. GUESSED"""
 FULL_EFFORT_ANGLE = 0.05
-"""[rad] Position error at which a servo gives full effort if its gains are not given. GUESSED"""
+"""[rad] Position error at which the servo of a revolute joint reaches full effort, by which gains that are not given
+are derived. GUESSED"""
 FULL_EFFORT_DISTANCE = 0.005
-"""[m] Position error at which a prismatic joint's servo gives full effort if its gains are not given. GUESSED"""
+"""[m] Position error at which the servo of a prismatic joint reaches full effort, by which gains that are not given
+are derived. GUESSED"""
 STANDARD_GRAVITY = 9.80665
-"""[m/s2]"""
+"""[m/s2] Standard acceleration of gravity, from which the weight on a drive is computed."""
 CENTRED_SHARE = 0.1
-"""A range whose middle is nearer to 0 than this share of the range counts as centred about 0."""
+"""Share of a joint's range. If the middle of the range is nearer to 0 than this share, the home position is 0."""
 
 
 def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.ndarray:
-    """Home positions [joint] rad or m of the driven joints: those of their groups, else the middle of the range."""
+    """Returns the home positions [joint] rad or m of the driven joints: those given by their groups, else the middle
+    of the range (see :func:`_default_home`)."""
     home = np.array([_default_home(joint) for joint in driven])
     order = [joint.name for joint in driven]
     for group in groups.values():
@@ -37,8 +41,8 @@ def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.nda
 
 
 def _default_home(joint: Joint) -> float:
-    """Middle of the range [rad or m], so that elbows are bent in their direction. It is 0 if the middle is near 0 or
-    the joint is continuous."""
+    """Returns the middle of a joint's range [rad or m], so that an elbow is bent in its only direction. Returns 0 if
+    the middle is near 0 or the joint is continuous."""
     if joint.type == "continuous":
         return 0.0
     limits = joint_limits(joint)
@@ -49,10 +53,11 @@ def _default_home(joint: Joint) -> float:
 def make_drives(
     robot: Robot, driven: list[Joint], description: RobotDescription, notes: list[str], assumed: list[str]
 ) -> tuple[Drive, ...]:
-    """The drives of the driven joints: gains of their groups, else derived ones, which is added to ``notes``.
+    """Returns the drives of the driven joints, with the gains of their groups. Missing gains are derived, which is
+    added to ``notes``.
 
-    A drive too weak for the weight that it carries at home is taken to have a counterbalance: that weight is added to
-    its effort, and the joints to ``assumed``.
+    If a drive is too weak for the weight that it carries at home, the joint is assumed to have a counterbalance: the
+    weight is added to the drive's effort, and the joint is added to ``assumed``.
     """
     gains: dict[str, tuple[float, float]] = {}
     armatures: dict[str, float] = {}
@@ -90,7 +95,8 @@ def _make_drive(
     spring: tuple[float, float] | None,
     inertia: float,
 ) -> Drive:
-    """One drive; ``inertia`` [kg m2 or kg] that it carries gives a derived servo its critical damping."""
+    """Returns one drive. ``inertia`` [kg m2 or kg]: inertia that the drive carries, from which missing gains are
+    derived with critical damping."""
     limits = joint_limits(joint)
     if armature is None:
         armature = ACCELERATION_TIME * limits.effort / limits.velocity
@@ -112,10 +118,10 @@ def _make_drive(
 
 
 def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[str, float], dict[str, float]]:
-    """The load of each moving joint with the robot at home. Returns the mass [kg] or the inertia about the joint's
-    origin [kg m2], and the magnitude of the effort that the weight takes [N or N m].
+    """Returns the load of each moving joint with the robot at home, as two dictionaries: mass [kg] or inertia about the
+    joint's origin [kg m2], and magnitude of the effort that the weight requires [N or N m].
 
-    The inertia is the one about the worst axis through the joint, since arms bend: gains must suit any posture.
+    The inertia is about the worst axis through the joint, since the gains must suit any posture of an arm.
     """
     poses = description.link_poses(description.home)
     above = {child: description.link_anchors[parent][0] for parent, child in description.moving_joints.frames}
@@ -145,7 +151,8 @@ def _carried_loads(robot: Robot, description: RobotDescription) -> tuple[dict[st
 
 
 def _is_distal(link: str, joint_child: str, above: dict[str, str]) -> bool:
-    """Whether ``joint_child`` carries ``link``; ``above``: the moving link that carries each moving link."""
+    """Returns whether ``link`` is ``joint_child`` or is carried by it. ``above``: parent among the moving links, by
+    moving link."""
     while link != joint_child and link in above:
         link = above[link]
     return link == joint_child

@@ -1,8 +1,8 @@
-"""Kinds of grippers: how the TOML file of a robot names one, and which controller serves it.
+"""Kinds of grippers: how a robot's TOML file names a gripper, and which controller serves it.
 
 A kind is a subclass of :class:`Gripper`, a member of :data:`AnyGripper`, and a controller in
-:data:`vinesim.robot.control.gripper_controllers.CONTROLLERS`. ROS sees all kinds alike: each is an action
-control_msgs/GripperCommand, whose goal and result the controller explains.
+:data:`vinesim.robot.control.gripper_controllers.CONTROLLERS`. In ROS all kinds look the same: each is an action
+control_msgs/GripperCommand. The controller defines the meaning of goal and result.
 """
 
 from __future__ import annotations
@@ -17,79 +17,83 @@ from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, descripti
 
 
 class Gripper(msgspec.Struct, frozen=True, forbid_unknown_fields=True, tag_field="kind"):
-    """A gripper, which holds or cuts at one place of a robot: an entry of ``grippers`` with its ``kind``."""
+    """A gripper of a robot, which holds or cuts: an entry of ``grippers`` in the TOML file."""
 
     group: str
-    """The joint group that the gripper is or belongs to. Commands name the gripper by its group."""
+    """Name of the joint group that the gripper consists of or belongs to. Commands refer to the gripper by this
+    name."""
 
     moves_joints: ClassVar[bool] = False
-    """Whether its controller moves the joints of the group, so that no trajectory controller gets them."""
+    """Whether the gripper's controller moves the joints of the group, so that they get no trajectory controller."""
 
     @property
     def kind(self) -> str:
-        """Name of the kind in TOML files and in :class:`vinesim.scene.values.ControllerSpec`."""
+        """Name of the kind of gripper in TOML files and in :class:`vinesim.scene.values.ControllerSpec`."""
         return str(self.__struct_config__.tag)
 
     @property
     def controller(self) -> str:
-        """Name of its controller, unless the TOML file names the controllers itself."""
+        """Name of the gripper's controller, unless the TOML file lists controllers."""
         return f"{self.group}_controller"
 
     def check(self, groups: Container[str], links: Container[str], file: pathlib.Path) -> None:
-        """Raise :class:`DescriptionError` unless the names are ``groups`` or ``links`` and all values are fit."""
+        """Raise :class:`DescriptionError` unless the gripper refers only to existing ``groups`` and ``links`` and
+        all its values are valid."""
         if self.group not in groups:
             raise description_error(file, f"a {self.kind} belongs to {self.group!r}", "name a group")
 
 
 class Fingers(Gripper, frozen=True, tag="fingers"):
-    """The joints of a group as fingers, which close on an object between them and hold it by friction."""
+    """A gripper whose fingers are the joints of a group. They close on an object and hold it by friction."""
 
     moves_joints: ClassVar[bool] = True
 
 
 class Cutter(Gripper, frozen=True, tag="cutter"):
-    """The space between two blades: x along the blades, y from one to the other, z across their plane."""
+    """A gripper with two blades: the box-shaped space between them in which wood is cut. x is along the blades, y
+    from one blade to the other, z across the plane of the blades."""
 
     frame: str
-    """The link that carries it."""
+    """Link that carries the cutter."""
     half: tuple[float, float, float]
-    """Half edges of the space [m]. The second one is the distance to either side within which wood is caught."""
+    """Half edges of the space [m]. The second one is the distance to either side within which wood is cut."""
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Its centre in ``frame`` [m]."""
+    """Centre of the space in ``frame`` [m]."""
     force: float | None = None
-    """Largest force with which it cuts [N]. None: it cuts whatever is in its mouth."""
+    """Largest cutting force [N]. None: everything between the blades is cut."""
 
     @property
     def controller(self) -> str:
-        """Name of the cutter's controller. It differs from the name for fingers of the same group."""
+        """Name of the cutter's controller. It differs from the controller of fingers in the same group."""
         stem = self.group.replace("gripper", "cutter") if "gripper" in self.group else f"{self.group}_cutter"
         return f"{stem}_controller"
 
     def check(self, groups: Container[str], links: Container[str], file: pathlib.Path) -> None:
-        """See :class:`Gripper`."""
+        """Raise :class:`DescriptionError` unless the cutter refers only to existing ``groups`` and ``links`` and all
+        its values are valid."""
         super().check(groups, links, file)
         if self.frame not in links:
             raise description_error(
-                file, f"the cutter of {self.group!r} sits in {self.frame!r}", "name a link of the URDF"
+                file, f"the cutter of {self.group!r} is mounted on {self.frame!r}", "name a link of the URDF"
             )
         if self.force is not None and not self.force > 0.0:
             raise description_error(file, f"the cutter of {self.group!r} has {self.force} N", "give more than 0")
         if min(self.half) <= 0.0:
             raise description_error(
-                file, f"the cutter of {self.group!r} has a mouth of {self.half}", "give half edges above 0"
+                file, f"the cutter of {self.group!r} has the half edges {self.half}", "give lengths above 0"
             )
 
 
 AnyGripper = Fingers | Cutter
-"""Union of all kinds of grippers."""
+"""Union of the classes of all kinds of grippers."""
 
 GRIPPER_KINDS: dict[str, type[Gripper]] = {str(kind.__struct_config__.tag): kind for kind in get_args(AnyGripper)}
-"""Classes of grippers: name of the kind -> class."""
+"""Classes of grippers, by name of the kind."""
 
 
 def guess_fingers(groups: Iterable[str], cutters: Collection[Cutter]) -> tuple[Fingers, ...]:
-    """Fingers of a robot whose file does not list its grippers: groups with gripper or hand in their name, or with a
-    cutter."""
+    """Returns the fingers of a robot whose TOML file does not list its grippers: each group with ``gripper`` or
+    ``hand`` in its name, and each group with a cutter."""
     cut = {cutter.group for cutter in cutters}
     return tuple(Fingers(name) for name in groups if "gripper" in name or "hand" in name or name in cut)
 
@@ -97,10 +101,10 @@ def guess_fingers(groups: Iterable[str], cutters: Collection[Cutter]) -> tuple[F
 def warn_of_unlisted_fingers(
     groups: Mapping[str, Collection[str]], fingers: Collection[Fingers], joints: Collection[Joint], assumed: list[str]
 ) -> None:
-    """Add to ``assumed`` the groups whose joints look like fingers, but whose names do not.
+    """Add a warning to ``assumed`` for each group whose joints look like fingers but that is not among ``fingers``.
 
-    Fingers are joints of a group that start at the same link, including joints that mimic one. ``groups``: names of the
-    driven joints of each group.
+    Joints look like fingers if several of them, including joints that mimic them, start at the same link. ``groups``:
+    names of the driven joints of each group.
     """
     named = {gripper.group for gripper in fingers}
     moving = [joint for joint in joints if joint.type in MOVABLE_JOINT_TYPES]
@@ -112,6 +116,6 @@ def warn_of_unlisted_fingers(
         ]
         if group not in named and len(set(parents)) < len(parents):
             assumed.append(
-                f"group {group!r} is no gripper, though joints of it start at one link, as fingers do (say in the TOML "
+                f"group {group!r} is no gripper, though several of its joints start at one link (write in the TOML "
                 f'file: [[grippers]] kind = "fingers", group = "{group}"; or grippers = [], for none)'
             )

@@ -1,4 +1,4 @@
-"""Joint groups, cameras and lidars guessed from the names in a URDF that has no TOML file."""
+"""Joint groups, cameras and lidars, guessed from the names in a URDF without a TOML file."""
 
 from __future__ import annotations
 
@@ -13,9 +13,10 @@ from vinesim.scene.values import CameraMount, LidarMount, RenderedMount
 
 
 def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGroup]:
-    """Groups from joint names in the style of PAL Robotics: ``arm_left_3_joint`` belongs to ``arm_left``.
+    """Returns joint groups guessed from joint names in the style of PAL Robotics: ``arm_left_3_joint`` belongs to
+    ``arm_left``.
 
-    ``links``: names of all links, among which the tool of an arm is looked for.
+    ``links``: names of all links, in which the tool of an arm is searched.
     """
 
     def tool(group: str) -> str:
@@ -31,10 +32,10 @@ def guess_groups(joints: list[str], links: Container[str]) -> dict[str, JointGro
 
 
 def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[CameraMount, ...]:
-    """A D435 in the first optical frame (colour before others), else in the first link named a camera; adds to
-    ``notes``.
+    """Returns a D435 camera in the first optical frame (a colour frame is preferred), or else in the first link whose
+    name has ``camera`` in it. Adds the guess to ``notes``.
 
-    If there is no optical frame, one is added to ``root``.
+    In the second case an optical frame is added to ``root``.
     """
     links = [link.get("name", "") for link in root.iterfind("link")]
     optical = [link for link in links if link.endswith("optical_frame")]
@@ -46,7 +47,7 @@ def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[CameraMount, 
         notes.append("no camera: no link is called camera or optical")
         return ()
     name = re.sub(r"(_(rgb|color|colour|depth))?(_optical_frame|_link|_frame)$", "", found)
-    notes.append(f"a d435 is taken to sit in {found!r}")
+    notes.append(f"a d435 is assumed to be mounted on {found!r}")
     if not optical:
         found, link = f"{name}_optical_frame", found
         etree.SubElement(root, "link", name=found)
@@ -58,12 +59,13 @@ def guess_cameras(root: etree._Element, notes: list[str]) -> tuple[CameraMount, 
 
 
 def guess_lidars(root: etree._Element, notes: list[str]) -> tuple[LidarMount, ...]:
-    """A VLP-16 in the first link named a lidar or laser, one in front before others; adds to ``notes``."""
+    """Returns a VLP-16 lidar in the first link whose name has ``lidar`` or ``laser`` in it (a front one is
+    preferred). Adds the guess to ``notes``."""
     links = [link.get("name", "") for link in root.iterfind("link")]
     found = sorted((link for link in links if re.search(r"lidar|laser|velodyne", link)), key=lambda n: "front" not in n)
     if not found:
         return ()
-    notes.append(f"a vlp16 is taken to sit in {found[0]!r}")
+    notes.append(f"a vlp16 is assumed to be mounted on {found[0]!r}")
     return (LidarMount("lidar", found[0], "vlp16"),)
 
 
@@ -71,4 +73,4 @@ SENSOR_GUESSES: dict[str, Callable[[etree._Element, list[str]], tuple[RenderedMo
     CameraMount.kind: guess_cameras,
     LidarMount.kind: guess_lidars,
 }
-"""Functions that guess the sensors of a robot: kind of sensor -> function. Other kinds of sensors are not guessed."""
+"""Functions that guess the sensors of a robot, by kind of sensor. Sensors of other kinds are not guessed."""

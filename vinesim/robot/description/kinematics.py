@@ -1,4 +1,4 @@
-"""Kinematics of a description: moving joints as arrays, and the moving link that carries each link."""
+"""Kinematics of a robot description: moving joints as arrays, and the moving link to which each link is fixed."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class MovingJoints:
-    """Every joint that moves, driven or mimicking, as arrays: a few array operations give all poses."""
+    """All joints that move, driven or mimicking, as arrays, so that a few array operations compute all poses."""
 
     names: tuple[str, ...]
     frames: tuple[tuple[str, str], ...]
     """[joint] (parent frame, child frame)."""
     drive_index: np.ndarray
-    """[joint] index of the drive that moves it, its own or the one that it mimics."""
+    """[joint] Index of the drive that moves the joint: the joint's own drive, or that of the joint it mimics."""
     multiplier: np.ndarray
     """[joint] Joint position per drive position [1]."""
     offset: np.ndarray
@@ -26,14 +26,14 @@ class MovingJoints:
     origin: np.ndarray
     """[joint, 7] Pose of the child in its parent at joint position 0."""
     translation: np.ndarray
-    """[joint, 3] translation of the child in its parent per metre; zero for a joint that turns."""
+    """[joint, 3] Translation of the child in its parent per metre of a prismatic joint; 0 for other joints."""
     rotation: np.ndarray
-    """[joint, 4] quaternion of the origin times (axis, 0); zero for a joint that slides."""
+    """[joint, 4] Quaternion of the origin times (axis, 0); 0 for a prismatic joint."""
     half_angle: np.ndarray
-    """[joint, 1] half of the angle per position: 1/2, or 0 for a joint that slides."""
+    """[joint, 1] Half of the rotation angle per joint position: 1/2, or 0 for a prismatic joint."""
 
     def poses(self, position: np.ndarray) -> np.ndarray:
-        """Poses of the child in its parent [joint, 7] for drive positions [drive] rad or m."""
+        """Returns the pose of each child in its parent [joint, 7] m, 1 for drive positions [drive] rad or m."""
         q = self.multiplier * position[self.drive_index] + self.offset
         half = self.half_angle * q[:, None]
         poses = np.empty((len(q), 7))
@@ -43,7 +43,8 @@ class MovingJoints:
 
 
 def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:
-    """The joints of ``robot`` that move, as arrays; ``driven``: names of the drives, in the order of joint arrays."""
+    """Returns the moving joints of ``robot`` as arrays. ``driven``: names of the driven joints, in the order of
+    joint arrays."""
     joints = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES]
     origin = np.array([joint_origin(joint) for joint in joints]).reshape(-1, 7)
     axis = np.array([joint.axis / np.linalg.norm(joint.axis) for joint in joints]).reshape(-1, 3)
@@ -63,7 +64,8 @@ def moving_joints(robot: Robot, driven: list[str]) -> MovingJoints:
 
 
 def link_anchors(base: str, order: list[Joint]) -> dict[str, tuple[str, np.ndarray]]:
-    """For every link, by name: the moving link (or the root ``base``) to which it is fixed, and its pose [7] there.
+    """For every link, by name, returns the moving link (or the root link ``base``) to which it is fixed, and its pose
+    [7] in the frame of that link.
 
     ``order``: all joints from the root outwards.
     """
@@ -78,7 +80,7 @@ def link_anchors(base: str, order: list[Joint]) -> dict[str, tuple[str, np.ndarr
 
 
 def joint_origin(joint: Joint) -> np.ndarray:
-    """Pose [7] of the child in the parent at joint position 0."""
+    """Returns the pose [7] of a joint's child in its parent at joint position 0."""
     if joint.origin is None:
         return frames.pose([0.0, 0.0, 0.0])
     return frames.pose(joint.origin[:3, 3], frames.from_matrix(joint.origin[:3, :3]))

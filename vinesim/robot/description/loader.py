@@ -1,12 +1,12 @@
-"""Loads a robot description: a URDF, and beside it a TOML file with what a URDF cannot express.
+"""Loads a robot description: a URDF, and a TOML file of the same name with data that a URDF cannot contain.
 
     robot = load_description("vinebot")
     rigid.add_robot(robot.to_spec("robot_1", index=0, pose=frames.pose([2.0, 0.0, 0.0])))
 
-The text that physics and ROS receive differs from the file: meshes are named by absolute path, wheels and casters are
-fixed (the base is driven as a whole), a root link ``world`` is renamed and bolts the robot down, shapes whose mesh
-format physics cannot read are replaced, and what is missing or unfit is repaired. :attr:`RobotDescription.notes` lists
-each change; one warning a robot says what was assumed.
+Physics and ROS receive a changed text of the URDF. Meshes have absolute paths. Wheels and casters are fixed, because
+the base is driven as one body. A root link ``world`` is renamed and bolts the robot down. Shapes whose mesh format
+physics cannot read are replaced, and missing or invalid values are repaired. :attr:`RobotDescription.notes` lists each
+change. One warning for each robot lists what was assumed.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorPacing
 log = logging.getLogger(__name__)
 
 BOLTED_EFFORT = (1e6, 1e6)
-"""[N], [N m] Largest force and moment that hold the base of a robot that is bolted down. A robot's pushes move it by
-micrometres."""
+"""Largest force [N] and moment [N m] that hold the base of a robot that is bolted down. Forces of the robot move the
+base by micrometres."""
 
 
 def load_description(
@@ -69,12 +69,12 @@ def load_description(
     sidecar: Sidecar | None = None,
     received: Mapping[str, np.ndarray] | None = None,
 ) -> RobotDescription:
-    """Read a robot: a path to a URDF, the name of one in ``data/robots``, or ``tiago_pro`` (extra ``tiago``).
+    """Load a robot description. ``name``: path of a URDF, name of a URDF in ``data/robots``, or ``tiago_pro`` (needs
+    the extra ``tiago``).
 
-    ``is_remote``: its text came over the network, so no file that it names is opened. Its meshes are taken from
-    ``received`` (digest -> corners [face, 3, 3] m); meshes that are not there become boxes. ``sidecar`` replaces the
-    TOML file beside the URDF.
-    Raises :class:`DescriptionError`, with one line of text, if the robot cannot be simulated.
+    ``is_remote``: whether the URDF was received over the network. Then no file that it names is opened, and its meshes
+    are taken from ``received`` (digest -> corners [face, 3, 3] m); other meshes become boxes. ``sidecar``: replaces the
+    TOML file. Raises :class:`DescriptionError`, with one line of text, if the robot cannot be simulated.
     """
     file = _locate(str(name))
     root = read_xml(file)
@@ -101,7 +101,7 @@ def load_description(
         parsed = parse_robot(root)
     except ValueError as error:
         raise description_error(
-            file, f"not a URDF: {error}", "give every link, joint and shape what URDF requires"
+            file, f"not a URDF: {error}", "add what URDF requires to every link, joint and shape"
         ) from error
     base, order = check_tree(parsed, file)
     check_joints(parsed, file)
@@ -120,7 +120,7 @@ def load_description(
 
 
 def _locate(name: str) -> pathlib.Path:
-    """The URDF of that name; :class:`DescriptionError` if there is none."""
+    """Returns the path of the URDF called ``name``. Raises :class:`DescriptionError` if there is none."""
     if name == "tiago_pro":
         found = find_installed("example-robot-data/robots/tiago_pro_description/robots/tiago_pro.urdf")
         if found is None:
@@ -133,8 +133,8 @@ def _locate(name: str) -> pathlib.Path:
 
 
 def _sensors(sidecar: Sidecar, root: etree._Element, notes: list[str]) -> tuple[RenderedMount, ...]:
-    """The sensors of the TOML file. For kinds that it does not name, sensors are guessed from the URDF and added to
-    ``notes``."""
+    """Returns the sensors listed in the TOML file. Sensors of kinds that it does not have are guessed from the URDF,
+    which is added to ``notes``."""
     found: list[RenderedMount] = []
     for kind in SENSOR_KINDS:
         given = sidecar.mounts(kind)
@@ -157,7 +157,8 @@ def _assemble(
     *,
     is_remote: bool,
 ) -> RobotDescription:
-    """The description of a checked ``robot``. ``base``: its root link. ``order``: its joints from the root outwards."""
+    """Returns the description of a checked ``robot``. ``base``: its root link. ``order``: its joints from the root
+    outwards."""
     driven = [joint for joint in robot.joints if joint.type in MOVABLE_JOINT_TYPES and joint.mimic is None]
     names = [joint.name for joint in driven]
     anchors = link_anchors(base, order)
@@ -165,7 +166,7 @@ def _assemble(
         sidecar = msgspec.structs.replace(sidecar, groups=guess_groups(names, anchors))
     if sidecar.grippers is None:
         fingers = guess_fingers(sidecar.groups, sidecar.cutters)
-        if not is_remote:  # the list is not sent to other clients
+        if not is_remote:  # the list of controllers is not sent to other clients
             driven_by_group = {name: group.joints for name, group in sidecar.groups.items()}
             warn_of_unlisted_fingers(driven_by_group, fingers, robot.joints, assumed)
         sidecar = msgspec.structs.replace(sidecar, grippers=fingers)

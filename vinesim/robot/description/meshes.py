@@ -1,8 +1,8 @@
-"""Meshes of a URDF: found, named by absolute path, and replaced where physics cannot read their format.
+"""Meshes of a URDF: finds their files, sets their absolute paths, and replaces meshes whose format physics cannot read.
 
-Each mesh gets the attributes ``bounds``, its bounding box, and ``digest`` and ``faces``, by which others ask for its
-triangles (:mod:`vinesim.scene.triangles`). A client that receives the URDF over the network opens no file that it
-names: it makes boxes of these bounds where it has no triangles of that digest.
+Each mesh gets three attributes: ``bounds``, its bounding box, and ``digest`` and ``faces``, with which other clients
+request its triangles (:mod:`vinesim.scene.triangles`). A client that receives the URDF over the network opens no file
+that the URDF names. It replaces a mesh by the box of its ``bounds`` if it has no triangles with this digest.
 """
 
 from __future__ import annotations
@@ -21,31 +21,33 @@ from vinesim.robot.description.urdf import description_error, parse_origin
 from vinesim.scene import triangles
 
 MESH_FORMATS = (".stl", ".obj", ".msh")
-"""File formats that MuJoCo reads; meshes of others, such as Collada, are replaced."""
+"""File formats of meshes that MuJoCo reads. Meshes in other formats, such as Collada, are replaced."""
 MAX_STL_FACES = 200_000
-"""Largest number of faces of an STL file that MuJoCo reads."""
+"""Largest number of faces in an STL file that MuJoCo reads."""
 MIN_BOX_EDGE = 1e-4
-"""[m] Smallest edge of a box in place of a mesh, which may be flat."""
+"""[m] Smallest edge of a box that replaces a mesh, since a mesh may be flat."""
 
 
 MAX_MESHES = 256
-"""Largest number of meshes of one robot that are requested from its client. Further meshes are shown as boxes."""
+"""Largest number of meshes of one robot that a client requests from another client. Further meshes are shown as
+boxes."""
 
 MAX_ROBOT_BYTES = 64 << 20
-"""Largest total size of the meshes of one robot that are requested from its client [B]."""
+"""Largest total size of the meshes of one robot that a client requests from another client [B]."""
 
 
 class MeshOffer(NamedTuple):
-    """A mesh that a URDF names, by its digest."""
+    """A mesh that a URDF names and whose triangles other clients may request."""
 
     file: str
     """File name in the URDF. It is a path on the machine that wrote the URDF, and is never opened on another."""
     size: int
-    """Size of its encoded triangles [B]."""
+    """Size of the mesh's encoded triangles [B]."""
 
 
 def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
-    """The file of a mesh URI: beside the URDF, in its package above it, or installed with a wheel; None if missing."""
+    """Returns the file of a mesh URI: relative to the folder of the URDF, in a package folder above it, or installed
+    with a wheel. Returns None if it is missing."""
     path = uri.removeprefix("file://")
     if not path.startswith("package://"):
         found = file.parent / path
@@ -60,22 +62,23 @@ def find_mesh(uri: str, file: pathlib.Path) -> pathlib.Path | None:
 
 
 def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
-    """Name meshes by absolute path, and replace those of unreadable formats.
+    """Set the absolute paths of all meshes, and replace meshes whose format cannot be read.
 
-    Collision meshes become their bounding boxes, visual meshes the collision shapes of their link, which is added to
-    ``notes``. Raises :class:`DescriptionError` for a missing or broken file.
+    A collision mesh is replaced by its bounding box, a visual mesh by the collision shapes of its link. Replacements
+    are added to ``notes``. Raises :class:`DescriptionError` for a missing or broken file.
     """
     for mesh in root.iterfind("link//geometry/mesh"):
         uri = mesh.get("filename", "")
         found = find_mesh(uri, file)
         if found is None:
             raise description_error(
-                file, f"mesh {uri!r} is missing", "put it there, beside the URDF, or install its package"
+                file, f"mesh {uri!r} is missing", "put it into the folder of the URDF, or install its package"
             )
         mesh.set("filename", str(found))
     unread: set[str] = set()
 
     def readable(shape: etree._Element) -> bool:
+        """Returns whether MuJoCo can read the mesh of a shape."""
         mesh = shape.find("geometry/mesh")
         suffix = pathlib.Path(mesh.get("filename")).suffix.lower() if mesh is not None else ".stl"
         readable = suffix in MESH_FORMATS and (mesh is None or suffix != ".stl" or _is_binary_stl(mesh.get("filename")))
@@ -97,7 +100,7 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
             link.remove(shape)
     if unread:
         formats = ", ".join(sorted(unread))
-        notes.append(f"meshes of format {formats} cannot be read: seen as collision shapes, touched as boxes")
+        notes.append(f"meshes of format {formats} cannot be read: shown as collision shapes, boxes in contacts")
     for mesh in root.iterfind("link//geometry/mesh"):
         facts = _facts(mesh, file)
         mesh.set("bounds", " ".join(f"{value:.6g}" for value in facts.bounds.ravel()))
@@ -106,9 +109,10 @@ def resolve_meshes(root: etree._Element, file: pathlib.Path, notes: list[str]) -
 
 
 def list_meshes(urdf: str) -> dict[str, MeshOffer]:
-    """The meshes that a URDF offers, by digest, in its order. Meshes beyond the limits of one robot are left out.
+    """Returns the meshes that a URDF offers to other clients, by digest, in the order of the URDF. Meshes beyond the
+    limits for one robot are left out.
 
-    ``urdf`` may come over the network. A text that is no URDF offers no meshes.
+    ``urdf`` may come from the network. A text that is no URDF offers no meshes.
     """
     found: dict[str, MeshOffer] = {}
     try:
@@ -130,7 +134,8 @@ def list_meshes(urdf: str) -> dict[str, MeshOffer]:
 
 
 def read_triangles(file: str) -> np.ndarray:
-    """Corners [face, 3, 3] m of a mesh file, binary32. Raises the errors of its format if the file is unreadable."""
+    """Returns the corners [face, 3, 3] m, float32, of a mesh file. Raises the errors of the file's format if it is
+    unreadable."""
     if file.lower().endswith(".stl") and _is_binary_stl(file):
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         with open(file, "rb") as opened:
@@ -144,11 +149,11 @@ def read_triangles(file: str) -> np.ndarray:
 def replace_unopened_meshes(
     root: etree._Element, assumed: list[str], received: Mapping[str, np.ndarray] | None = None
 ) -> dict[str, np.ndarray]:
-    """Replace all file names of meshes, without opening a file: by the name of ``received`` triangles (by digest), or
-    the mesh by the box of its ``bounds``; a mesh without bounds is removed.
+    """Replace all meshes of a URDF from the network, whose numbers were checked, without opening a file. Returns the
+    corners [face, 3, 3] m of the remaining meshes, by their file name in ``root``.
 
-    For a URDF from the network, whose numbers were checked. Adds to ``assumed``. Returns the corners [face, 3, 3] of
-    the meshes, by the names that they have in ``root`` now.
+    A mesh whose digest is in ``received`` (digest -> corners) gets the file name of these triangles. Another mesh is
+    replaced by the box of its ``bounds``, or removed if it has no bounds; this is added to ``assumed``.
     """
     links = list(root.iterfind("link"))
     count = 0
@@ -170,12 +175,13 @@ def replace_unopened_meshes(
             else:
                 _replace_by_box(shape, mesh, np.array(mesh.get("bounds").split(), float).reshape(2, 3))
     if count:
-        assumed.append(f"{count} meshes of another client are not opened: boxes of their size stand in")
+        assumed.append(f"{count} meshes of another client are not opened: replaced by boxes of the same size")
     return meshes
 
 
 def _is_binary_stl(filename: str) -> bool:
-    """Whether physics can read an STL file: it is binary, by its size, and has at most :data:`MAX_STL_FACES` faces."""
+    """Returns whether MuJoCo can read an STL file: its size is that of a binary STL, and it has at most
+    :data:`MAX_STL_FACES` faces."""
     with open(filename, "rb") as file:
         header = file.read(84)
     faces = int.from_bytes(header[80:84], "little")
@@ -183,27 +189,28 @@ def _is_binary_stl(filename: str) -> bool:
 
 
 class _Facts(NamedTuple):
-    """Properties of a mesh file that other clients need."""
+    """Properties of a mesh file that other clients need to show the mesh."""
 
     bounds: np.ndarray
     """Lower and upper corner of the mesh [2, 3] m before scaling."""
     digest: str
-    """Digest of its triangles. Empty if it has none, or too many to be sent."""
+    """Digest of the mesh's triangles. It is empty if there are none, or too many to be sent."""
     faces: int
 
 
 def _facts(mesh: etree._Element, file: pathlib.Path) -> _Facts:
-    """Properties of a mesh that other clients need. Raises :class:`DescriptionError` if its file is unreadable."""
+    """Returns the properties of a mesh. Raises :class:`DescriptionError` if its file is unreadable."""
     name = mesh.get("filename")
     try:
         return _file_facts(name, pathlib.Path(name).stat().st_mtime_ns)
-    except Exception as error:  # each format has errors of its own
+    except Exception as error:  # each format raises different errors
         raise description_error(file, f"mesh {name!r} cannot be read ({error})", "convert it to STL or OBJ") from error
 
 
-@functools.lru_cache(1024)  # a mesh is often there as visual and collision shape, and for several robots
+@functools.lru_cache(1024)  # a mesh is often used as visual and collision shape, and by several robots
 def _file_facts(name: str, modified: int) -> _Facts:
-    """Properties of a mesh file that was last modified at ``modified`` [ns]."""
+    """Returns the properties of a mesh file. ``modified`` [ns]: time of its last change, so that a changed file is
+    read again."""
     corners = read_triangles(name)
     points = corners.reshape(-1, 3)
     bounds = np.array([points.min(axis=0), points.max(axis=0)], float)
@@ -233,7 +240,8 @@ def _replace_by_box(shape: etree._Element, mesh: etree._Element, bounds: np.ndar
 
 
 def find_installed(path: str) -> pathlib.Path | None:
-    """A file that a wheel of cmeel (example-robot-data and others) installed below ``share``; None if missing."""
+    """Returns the path of a file that a cmeel wheel (such as example-robot-data) installed in ``share``; None if it
+    is missing."""
     roots = [pathlib.Path(sys.prefix) / "share"]
     cmeel = importlib.util.find_spec("cmeel")
     if cmeel is not None and cmeel.origin:

@@ -1,7 +1,7 @@
-"""Repairs of URDFs as they are found in practice: what is missing or unfit is replaced, and each replacement is named.
+"""Repairs of common faults in URDFs: missing or invalid values are replaced, and each replacement is reported.
 
-All functions change the XML of a URDF whose numbers were checked, and add what they assumed to ``assumed``, a line per
-kind. A repaired URDF needs no repair.
+All functions change the XML of a URDF whose numbers were checked. They add what they assumed to ``assumed``, one line
+per kind of repair. A repaired URDF needs no further repair.
 """
 
 from __future__ import annotations
@@ -16,27 +16,30 @@ from vinesim.robot.description.kinematics import link_anchors
 from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, parse_inertial
 
 MOUNT = "world_mount"
-"""Name that the root link ``world`` gets: a robot with a root of this name is bolted down."""
+"""New name of a root link ``world``. A robot whose root link has this name is bolted down."""
 RANGE = ("lower", "upper")
-"""Attributes of a ``<limit>``. If a joint turns and both are 0 or missing, its range is taken to be unknown."""
+"""Attributes of a ``<limit>`` with the range of a joint. If both are 0 or missing for a revolute joint, its range is
+assumed to be unknown."""
 DEFAULT_EFFORT = {"revolute": 10.0, "continuous": 10.0, "prismatic": 100.0}
-"""[N m or N] Effort of a joint whose effort is 0 or missing, in addition to the weight that it carries. GUESSED"""
+"""[N m or N] Effort limit of a joint whose limit is 0 or missing. The weight that the joint carries is added later.
+GUESSED"""
 DEFAULT_VELOCITY = {"revolute": 1.0, "continuous": 1.0, "prismatic": 0.1}
 """[rad/s or m/s] Velocity limit of a joint whose limit is 0 or missing. GUESSED"""
 DEFAULT_MASS = 1e-3
-"""[kg] Mass of a moving link without any. GUESSED"""
+"""[kg] Mass of a moving link whose mass is missing. GUESSED"""
 GYRATION_RADIUS = 0.05
-"""[m] Radius of gyration of a moving link without inertia. GUESSED"""
+"""[m] Radius of gyration of a moving link whose inertia is missing. GUESSED"""
 NEGLIGIBLE_MOMENT = 1e-6
-"""[kg m2] A principal moment below 0 by no more than this is a rounding error. GUESSED"""
+"""[kg m2] Magnitude up to which a negative principal moment counts as a rounding error. GUESSED"""
 LEAST_MOMENT = 1e-12
-"""[kg m2] Principal moments up to this count as 0."""
+"""[kg m2] Magnitude up to which a principal moment counts as 0."""
 LEAST_MOMENT_SHARE = 1e-3
-"""Share of the largest principal moment to which rounding errors are raised."""
+"""Share of the largest principal moment to which principal moments with a rounding error are raised."""
 
 
 def rename_world(root: etree._Element, notes: list[str]) -> None:
-    """Rename a root link ``world``, the name of the world frame, to :data:`MOUNT`; adds to ``notes``."""
+    """Rename a root link ``world``, which is also the name of the world frame, to :data:`MOUNT`. Adds this to
+    ``notes``."""
     links = [link for link in root.iterfind("link") if link.get("name") == "world"]
     if not links or root.find("joint/child[@link='world']") is not None:
         return
@@ -49,7 +52,8 @@ def rename_world(root: etree._Element, notes: list[str]) -> None:
 
 
 def repair_joints(root: etree._Element, assumed: list[str]) -> None:
-    """Give every joint that moves an effort and a velocity above 0 and a range, and mimics a source that is driven."""
+    """Give every moving joint a range, and limits of effort and velocity above 0. A joint that mimics a joint that
+    does not move becomes a driven joint."""
     joints = {joint.get("name"): joint for joint in root.iterfind("joint")}
     moving = {name: joint for name, joint in joints.items() if joint.get("type") in MOVABLE_JOINT_TYPES}
     freed = []
@@ -77,7 +81,7 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
             unbounded.append(name)
     filled = list(dict.fromkeys(filled))
     if freed:
-        assumed.append(f"{some_names(freed)} mimics no joint that moves: driven by itself")
+        assumed.append(f"{some_names(freed)} mimics a joint that does not move: it has its own drive")
     if filled:
         assumed.append(
             f"{some_names(filled)} has no effort or no velocity above 0: "
@@ -89,7 +93,8 @@ def repair_joints(root: etree._Element, assumed: list[str]) -> None:
 
 
 def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
-    """Let a joint that mimics a mimicking one mimic the driven joint at the end; cycles stay, and are refused later.
+    """Change joints that mimic a mimicking joint so that they mimic the driven joint at the end of the chain. Cycles
+    are kept here, and are rejected by a later check.
 
     With q1 = m1 q2 + o1 and q2 = m2 q3 + o2: q1 = m1 m2 q3 + (m1 o2 + o1).
     """
@@ -108,7 +113,7 @@ def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
 
 
 def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
-    """Raise principal moments that are not above 0 by a rounding error only."""
+    """Raise principal moments that are 0 or, by a rounding error, negative."""
     repaired = []
     for link in root.iterfind("link"):
         inertial = parse_inertial(link.find("inertial"))
@@ -125,9 +130,10 @@ def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
 
 
 def add_missing_masses(root: etree._Element, robot: Robot, base: str, order: list[Joint], assumed: list[str]) -> None:
-    """Give a mass and an inertia to each moving body of ``robot``, parsed from ``root``, that has none.
+    """Give a mass and an inertia to each moving body of ``robot`` without them. A body is a moving link with all links
+    that are fixed to it.
 
-    ``base``: its root link, ``order``: its joints outwards. A body is a moving link and all that is fixed to it.
+    ``root``: XML of the robot. ``base``: its root link. ``order``: its joints from the root outwards.
     """
     anchors = link_anchors(base, order)
     mass = dict.fromkeys((base, *(joint.child for joint in order if joint.type != "fixed")), 0.0)
@@ -152,12 +158,12 @@ def add_missing_masses(root: etree._Element, robot: Robot, base: str, order: lis
 
 
 def some_names(names: list[str]) -> str:
-    """The first name, and how many more there are."""
+    """Returns the first name as text, with the number of further names."""
     return repr(names[0]) + (f" (and {len(names) - 1} more)" if len(names) > 1 else "")
 
 
 def _set_inertial(link: etree._Element, mass: float, inertia: np.ndarray) -> None:
-    """Give a link this mass [kg] and inertia [3, 3] kg m2; the centre of mass stays."""
+    """Set the mass [kg] and inertia [3, 3] kg m2 of a link. Its centre of mass stays the same."""
     inertial = link.find("inertial")
     if inertial is None:
         inertial = etree.SubElement(link, "inertial")

@@ -1,7 +1,8 @@
-"""The TOML file beside a URDF: base limits, joint groups with gains, sensors, grippers, controllers.
+"""The TOML file of a robot, next to its URDF: limits of the base, joint groups with gains, sensors, grippers,
+controllers.
 
-The attributes are the keys of the file, except ``armature``, ``series_stiffness`` and ``series_damping`` of a group,
-which the file calls ``rotor``, ``elastic`` and ``elastic_damping``.
+The attributes have the names of the keys in the file. Exceptions are ``armature``, ``series_stiffness`` and
+``series_damping`` of a group: their keys are ``rotor``, ``elastic`` and ``elastic_damping``.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ from vinesim.scene.values import SENSOR_KINDS, RenderedMount, SensorMode, Sensor
 
 
 class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Limits for the motion of the base."""
+    """Limits of the motion of the base."""
 
     linear: float = 0.5
     """Largest speed [m/s]."""
     angular: float = 0.8
-    """Largest rate of turn [rad/s]."""
+    """Largest yaw rate [rad/s]."""
     linear_acceleration: float = 1.0
     """Largest linear acceleration [m/s2]."""
     angular_acceleration: float = 2.0
@@ -32,13 +33,14 @@ class BaseLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     effort: tuple[float, float] = (800.0, 400.0)
     """Largest force [N] and moment [N m]."""
     timeout: float = 0.5
-    """Time without a command after which the base stops [s]."""
+    """Time after the last command at which the base stops [s]."""
     slip: tuple[float, float] = (0.0, 0.0)
-    """Shares of the tracks' travel that are lost by slip, ahead and in turns. Odometry measures the whole travel."""
+    """Shares of the tracks' travel that are lost by slip: of travel ahead, and of turns. Odometry measures the
+    travel of the tracks."""
 
 
 class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Joints that one controller moves; arrays are in the order of ``joints``."""
+    """Joints that one controller moves. All arrays are in the order of ``joints``."""
 
     joints: tuple[str, ...]
     stiffness: tuple[float, ...] | None = None
@@ -46,18 +48,18 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     damping: tuple[float, ...] | None = None
     """Velocity gains [N m s/rad or N s/m]."""
     armature: tuple[float, ...] | None = msgspec.field(name="rotor", default=None)
-    """Inertias of motor and gear seen from the joint [kg m2 or kg]."""
+    """Inertias of motor and gear, converted to the joint side [kg m2 or kg]."""
     series_stiffness: tuple[float, ...] | None = msgspec.field(name="elastic", default=None)
-    """Stiffnesses of the springs between gear and joint [N m/rad or N/m]. None: the position gains are used."""
+    """Stiffnesses of the springs between gear and joint [N m/rad or N/m]. None: the position gains are used instead."""
     series_damping: tuple[float, ...] | None = msgspec.field(name="elastic_damping", default=None)
-    """Dampings of these springs [N m s/rad or N s/m]."""
+    """Dampings of the springs between gear and joint [N m s/rad or N s/m]."""
     home: tuple[float, ...] | None = None
     """Home positions [rad or m]."""
     tool: str = ""
-    """Frame whose x axis points out of the hand, if the group is an arm."""
+    """Frame of the tool, with the x axis pointing out of the hand, if the group is an arm; otherwise empty."""
 
     def arrays(self) -> dict[str, tuple[float, ...] | None]:
-        """The attributes that have one value for each joint, by their keys in the file."""
+        """Returns the attributes that have one value for each joint, by their key in the file."""
         return {
             "stiffness": self.stiffness,
             "damping": self.damping,
@@ -69,26 +71,28 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SensorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Whether simulated time waits for the robot's sensors: :class:`vinesim.scene.values.SensorPacing`."""
+    """Settings for whether simulated time waits for the robot's sensors; see
+    :class:`vinesim.scene.values.SensorPacing`."""
 
     mode: SensorMode = SensorMode.LIVE
     least_rate: float = SensorPacing().least_rate
-    """Lowest rate of the sensors, see :class:`vinesim.scene.values.SensorPacing` [Hz]."""
+    """Lowest acceptable rate of the sensors [Hz]; see :class:`vinesim.scene.values.SensorPacing`."""
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A controller, as ROS sees it."""
+    """A controller through which ROS commands the robot."""
 
     kind: str
-    """A :class:`~vinesim.scene.values.ControllerKind`, or a kind of gripper."""
+    """A :class:`~vinesim.scene.values.ControllerKind`, or the kind of a gripper."""
     joints: tuple[str, ...] = ()
-    """Its joints; the joints of ``group`` unless given."""
+    """Names of the controller's joints. If empty, the joints of ``group``."""
     group: str = ""
-    """A joint group; a gripper needs one."""
+    """Name of a joint group. It is required for a gripper."""
 
 
 class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The file without the tables of :data:`~vinesim.scene.values.SENSOR_KINDS`, which :data:`SidecarFile` adds."""
+    """Content of a robot's TOML file, without the tables for the kinds of rendered sensors, which
+    :data:`SidecarFile` adds."""
 
     base: BaseLimits = BaseLimits()
     groups: dict[str, JointGroup] = {}
@@ -96,24 +100,25 @@ class Sidecar(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     imus: tuple[SensorMount, ...] = ()
     wrenches: tuple[SensorMount, ...] = ()
     grippers: tuple[AnyGripper, ...] | None = None
-    """None: fingers are guessed from the names of groups, :func:`vinesim.robot.description.grippers.guess_fingers`."""
+    """Grippers of the robot. None: fingers are guessed by :func:`vinesim.robot.description.grippers.guess_fingers`."""
     cutters: tuple[Cutter, ...] = ()
-    """Further ``grippers``, all cutters, so that ``kind`` may be left out."""
+    """Further grippers, all of them cutters, so that ``kind`` is not needed."""
     friction: dict[str, float] = {}
-    """Coulomb friction coefficient [1] of contacts with a link, by link. It replaces the URDF's ``mu1``."""
+    """Coulomb friction coefficient [1] of a link in contacts, by link. It replaces ``mu1`` of the URDF."""
     controllers: dict[str, Controller] | None = None
     """Controllers by name. None: :mod:`vinesim.robot.description.controllers` derives them from the groups."""
     srdf: str = ""
-    """SRDF file whose pairs of ``disable_collisions`` never touch, by its path from the TOML file; unless given, the
-    file of the URDF's name that ends with ``.srdf``, if there is one."""
+    """Path of an SRDF file, relative to the TOML file. Pairs of links in its ``disable_collisions`` never collide.
+    If empty, the file with the URDF's name and the ending ``.srdf`` is used, if it exists."""
 
     @property
     def all_grippers(self) -> tuple[AnyGripper, ...]:
-        """The entries of ``grippers`` and ``cutters``."""
+        """All grippers: the entries of ``grippers`` and ``cutters``."""
         return (*(self.grippers or ()), *self.cutters)
 
     def mounts(self, kind: str) -> tuple[RenderedMount, ...] | None:
-        """The sensors of a kind. None: the file does not have this kind, and the sensors are guessed from the URDF."""
+        """Returns the sensors of a kind. None: the file has no table for this kind, so the sensors are guessed from
+        the URDF."""
         return getattr(self, SENSOR_KINDS[kind].table, None)
 
 
@@ -127,40 +132,42 @@ SidecarFile = cast(
         forbid_unknown_fields=True,
     ),
 )
-"""Type of the whole file: :class:`Sidecar` with one table for each kind of sensor."""
+"""Type of a robot's whole TOML file: :class:`Sidecar` with one table for each of
+:data:`~vinesim.scene.values.SENSOR_KINDS`."""
 
 
 def read_sidecar(file: pathlib.Path) -> Sidecar:
-    """Returns the file's content, or defaults if there is no file. Raises :class:`DescriptionError` if it has unknown
-    or unfit keys."""
+    """Returns the content of a robot's TOML file, or the default values if there is no file. Raises
+    :class:`DescriptionError` for unknown keys or invalid values."""
     if not file.is_file():
         return Sidecar()
     try:
         return msgspec.toml.decode(file.read_bytes(), type=SidecarFile)
     except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise description_error(file, str(error), "see data/robots/vinebot.toml for what may be said") from error
+        raise description_error(file, str(error), "see data/robots/vinebot.toml for all keys") from error
 
 
 MAX_REMOTE_SIDECAR = 1 << 16
-"""Longest sidecar that is accepted from another client [B]."""
+"""Largest size of a sidecar that is accepted from another client [B]."""
 
 MAX_REMOTE_NUMBER = 1e7
-"""Largest gain, limit or position in a sidecar from another client: ten times the values of a robot that is bolted
-down."""
+"""Largest gain, limit or position in a sidecar from another client: ten times that of a robot that is bolted down."""
 
 
 def encode_sidecar(base: BaseLimits, groups: dict[str, JointGroup]) -> str:
-    """Data for the copies of a robot on other clients, as JSON: limits of the base, joint groups with their gains.
+    """Returns, as JSON, the data that other clients need for their copies of a robot: limits of the base, and joint
+    groups with gains.
 
-    Sensors and grippers act where the robot is simulated, and are not part of it.
+    Sensors and grippers are left out, because they act only where the robot is simulated.
     """
     return msgspec.json.encode(Sidecar(base=base, groups=groups)).decode()
 
 
 def decode_sidecar(text: str) -> Sidecar:
-    """The sidecar of another client's robot, without sensors, so that no file is looked for.
+    """Returns the sidecar of another client's robot, without sensors and grippers. The copy of the robot needs no TOML
+    file.
 
-    :class:`DescriptionError` if it is too long or malformed; ``check_sidecar`` checks its names and values.
+    Raises :class:`DescriptionError` if it is too long or malformed. :func:`check_sidecar` checks names and values.
     """
     origin = pathlib.Path("sidecar of another client")
     if len(text) > MAX_REMOTE_SIDECAR:
@@ -185,7 +192,8 @@ def check_sidecar(
     links: Container[str],
     file: pathlib.Path,
 ) -> None:
-    """Raise :class:`DescriptionError` unless all names are ``driven`` joints or ``links`` and all values are fit."""
+    """Raise :class:`DescriptionError` unless the sidecar refers only to ``driven`` joints and existing ``links`` and
+    all its values are valid."""
     for name, group in sidecar.groups.items():
         _check_group(name, group, driven, links, file)
     for gripper in sidecar.all_grippers:
@@ -195,7 +203,7 @@ def check_sidecar(
     mounts: Iterable[SensorMount] = (*sensors, *sidecar.imus, *sidecar.wrenches)
     for mount in mounts:
         if mount.frame not in links:
-            raise description_error(file, f"{mount.name!r} sits in {mount.frame!r}", "name a link of the URDF")
+            raise description_error(file, f"{mount.name!r} is mounted on {mount.frame!r}", "name a link of the URDF")
     if not 0.01 <= sidecar.sensors.least_rate <= 1000.0:
         found = f"sensors have the least_rate {sidecar.sensors.least_rate}"
         raise description_error(file, found, "give 0.01 to 1000 Hz")
@@ -208,10 +216,12 @@ def check_sidecar(
 def _check_group(
     name: str, group: JointGroup, driven: Container[str], links: Container[str], file: pathlib.Path
 ) -> None:
+    """Raise :class:`DescriptionError` unless a joint group refers only to ``driven`` joints and existing ``links``
+    and all its values are valid."""
     for joint in group.joints:
         if joint not in driven:
             raise description_error(
-                file, f"group {name!r} names {joint!r}, which no drive moves", "name driven joints only"
+                file, f"group {name!r} names {joint!r}, which is no driven joint", "name driven joints only"
             )
     for key, values in group.arrays().items():
         if values is not None and len(values) != len(group.joints):
@@ -219,9 +229,7 @@ def _check_group(
                 file, f"group {name!r} has {len(values)} of {key} for {len(group.joints)} joints", "give one each"
             )
     if (group.series_stiffness is None) != (group.series_damping is None):
-        raise description_error(
-            file, f"group {name!r} gives only half of its springs", "give elastic and elastic_damping"
-        )
+        raise description_error(file, f"group {name!r} gives only one of elastic and elastic_damping", "give both")
     if min((*(group.series_stiffness or ()), *(group.series_damping or ()), 0.0)) < 0.0:
         raise description_error(file, f"group {name!r} has a spring below zero", "give 0 or more")
     if group.tool and group.tool not in links:

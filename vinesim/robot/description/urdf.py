@@ -1,7 +1,7 @@
-"""A URDF: its XML read, edited and checked, and its links and joints as Python objects.
+"""A URDF: reads, edits and checks its XML, and converts its links and joints to Python objects.
 
-Robot and joints are read here because the libraries for it load trimesh and scipy, most of a second, at every start.
-Meshes are left to :mod:`vinesim.robot.description.meshes`.
+The usual URDF libraries are not used because they import trimesh and scipy, which takes most of a second at every
+start. Meshes are handled in :mod:`vinesim.robot.description.meshes`.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ MOVABLE_JOINT_TYPES = ("revolute", "continuous", "prismatic")
 """Types of URDF joints that move about or along one axis."""
 
 SOLIDS = ("box", "sphere", "cylinder", "capsule", "mesh")
-"""Elements that a ``<geometry>`` may have."""
+"""Elements that may be in a ``<geometry>``."""
 NUMBER_COUNTS = {
     ("origin", "xyz"): 3,
     ("origin", "rpy"): 3,
@@ -36,13 +36,13 @@ NUMBER_COUNTS = {
     ("mesh", "bounds"): 6,
     ("mesh", "faces"): 1,
 }
-"""Count of numbers in each attribute, by element and attribute."""
+"""How many numbers each attribute has, by element and attribute."""
 
 MAX_NUMBER = 1e6
-"""Largest number in a URDF [m, kg, kg m2, rad]. Larger ones make the state of everything that touches the robot
-inexact."""
+"""Largest number in a URDF [m, kg, kg m2, rad]. Larger numbers would make the state of everything that touches the
+robot inexact."""
 MAX_LIMIT = 1e17
-"""Largest value of a joint limit. Some files give 1e16 for a joint without a limit."""
+"""Largest value of a joint limit. It is large because some files use 1e16 for a joint without a limit."""
 _SHAPE_ATTRIBUTES = {
     "box": ("size",),
     "sphere": ("radius",),
@@ -50,15 +50,16 @@ _SHAPE_ATTRIBUTES = {
     "capsule": ("radius", "length"),
     "mesh": ("filename",),
 }
-"""Attributes that a geometry must have."""
+"""Attributes that each geometry must have, by element."""
 
 
 class DescriptionError(ValueError):
-    """A robot description that cannot be simulated: one line with the file, what is wrong, and the remedy."""
+    """A robot description that cannot be simulated. The message is one line with the file, the problem, and the
+    remedy."""
 
 
 def description_error(file: pathlib.Path, problem: str, remedy: str) -> DescriptionError:
-    """The error with its text in one line, to be raised."""
+    """Returns an error to raise, with a message in one line."""
     return DescriptionError(" ".join(f"{file}: {problem}; {remedy}".split()))
 
 
@@ -66,12 +67,13 @@ def description_error(file: pathlib.Path, problem: str, remedy: str) -> Descript
 
 
 def read_xml(file: pathlib.Path) -> etree._Element:
-    """The root element; :class:`DescriptionError` if the file is not XML or its root is not ``<robot>``."""
+    """Returns the root element of a URDF. Raises :class:`DescriptionError` if the file is not XML or its root is not
+    ``<robot>``."""
     try:
         root = etree.fromstring(file.read_bytes(), etree.XMLParser(remove_comments=True, resolve_entities=False))
     except etree.XMLSyntaxError as error:
         raise description_error(
-            file, f"not well-formed XML: {error.msg}", "mend that line (is it a xacro? expand it)"
+            file, f"not well-formed XML: {error.msg}", "correct this line (is it a xacro? expand it)"
         ) from error
     if root.getroottree().docinfo.internalDTD is not None:
         raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: a URDF needs none")
@@ -83,7 +85,7 @@ def read_xml(file: pathlib.Path) -> etree._Element:
 
 
 def check_friction(root: etree._Element, file: pathlib.Path) -> None:
-    """Raise :class:`DescriptionError` unless the coefficients that links are given are finite numbers of 0 or more."""
+    """Raise :class:`DescriptionError` unless all friction coefficients of links are finite numbers of at least 0."""
     given = [
         (element, element.get("value") if element.get("value") is not None else element.text)
         for element in (*root.iterfind("gazebo/mu1"), *root.iterfind("link/contact/lateral_friction"))
@@ -100,7 +102,8 @@ def check_friction(root: etree._Element, file: pathlib.Path) -> None:
 
 
 def set_friction(root: etree._Element, friction: Mapping[str, float], file: pathlib.Path) -> None:
-    """Write the coefficients by link of a TOML ``file`` into the URDF as Gazebo's ``mu1``, instead of its own ones."""
+    """Write the friction coefficients of a TOML ``file`` (link -> coefficient) into the URDF as Gazebo's ``mu1``,
+    instead of the URDF's own coefficients."""
     links = {link.get("name") for link in root.iterfind("link")}
     for name, coefficient in friction.items():
         if name not in links:
@@ -112,12 +115,13 @@ def set_friction(root: etree._Element, friction: Mapping[str, float], file: path
 
 
 def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: list[str]) -> None:
-    """Copy the ``disable_collisions`` of an SRDF ``file`` between links of the URDF into its text; adds to ``notes``.
+    """Copy the ``disable_collisions`` of an SRDF ``file`` into the URDF, for links that exist in the URDF. Adds this to
+    ``notes``.
 
-    So all readers of that text know them. Raises :class:`DescriptionError` if the file is missing or no SRDF.
+    Then everything that reads the URDF knows them. Raises :class:`DescriptionError` if the file is missing or no SRDF.
     """
     if not file.is_file():
-        raise description_error(file, "this SRDF is missing", "mend its path in the robot's TOML file")
+        raise description_error(file, "this SRDF is missing", "correct its path in the robot's TOML file")
     pairs = read_xml(file).findall("disable_collisions")
     links = {link.get("name") for link in root.iterfind("link")}
     known = [pair for pair in pairs if links.issuperset((pair.get("link1"), pair.get("link2")))]
@@ -128,7 +132,7 @@ def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: l
 
 
 def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
-    """Raise :class:`DescriptionError` unless all numbers are complete and bounded, and all sizes above 0."""
+    """Raise :class:`DescriptionError` unless all numbers are complete and within bounds, and all sizes are above 0."""
     for element in root.iter(*{tag for tag, _ in NUMBER_COUNTS}):
         for (tag, key), count in NUMBER_COUNTS.items():
             text = element.get(key) if element.tag == tag else None
@@ -148,13 +152,13 @@ def check_numbers(root: etree._Element, file: pathlib.Path) -> None:
                 raise description_error(file, f"{where} is not finite", "give a number")
             largest = MAX_LIMIT if tag == "limit" else MAX_NUMBER
             if max(map(abs, numbers)) > largest:
-                raise description_error(file, f"{where} is beyond {largest:g}", "give what a robot can have")
+                raise description_error(file, f"{where} is beyond {largest:g}", "give a smaller number")
             if tag in SOLIDS and key != "bounds" and min(map(abs, numbers) if tag == "mesh" else numbers) <= 0.0:
-                raise description_error(file, f"{where} is no size", "give numbers above 0")
+                raise description_error(file, f"{where} is not a size", "give numbers above 0")
 
 
 def fix_wheels(root: etree._Element, notes: list[str]) -> None:
-    """Make the joints of wheels and casters fixed, because the base is driven as one body; adds to ``notes``."""
+    """Make the joints of wheels and casters fixed, because the base is driven as one body. Adds this to ``notes``."""
     wheels = [
         joint
         for joint in root.iterfind("joint")
@@ -174,7 +178,7 @@ def fix_wheels(root: etree._Element, notes: list[str]) -> None:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Inertial:
-    """Mass of a link and how it is distributed."""
+    """Mass of a link, with its centre and its inertia."""
 
     origin: np.ndarray | None
     """[4, 4] Frame of the inertia in the link, with the centre of mass as its origin [m]."""
@@ -194,7 +198,7 @@ class Link:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Limit:
-    """Limits as the file gives them [rad or m, N m or N, rad/s or m/s]."""
+    """Joint limits as given in the file [rad or m, N m or N, rad/s or m/s]."""
 
     effort: float | None
     velocity: float | None
@@ -204,7 +208,7 @@ class Limit:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Mimic:
-    """Rule of a mimicking joint: its position is multiplier x position of another joint + offset."""
+    """Coupling of a mimicking joint: position = multiplier x position of another joint + offset."""
 
     joint: str
     multiplier: float
@@ -229,7 +233,7 @@ class Joint:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Robot:
-    """Links and joints in the order of the file."""
+    """Links and joints of a URDF, in the order of the file."""
 
     name: str
     links: list[Link]
@@ -237,7 +241,7 @@ class Robot:
 
 
 def parse_robot(root: etree._Element) -> Robot:
-    """The robot of a ``<robot>`` element; :class:`ValueError` if something that URDF requires is missing."""
+    """Convert a ``<robot>`` element. Raises :class:`ValueError` if something that URDF requires is missing."""
     return Robot(
         _required(root, "name"),
         [_parse_link(element) for element in root.iterfind("link")],
@@ -246,7 +250,8 @@ def parse_robot(root: etree._Element) -> Robot:
 
 
 def parse_origin(element: etree._Element | None) -> np.ndarray | None:
-    """Homogeneous transform [4, 4] of an ``<origin>``: translation, and rotation about fixed x, then y, then z."""
+    """Returns the homogeneous transform [4, 4] of an ``<origin>``: a translation, and a rotation about fixed x, then
+    y, then z. None if there is no such element."""
     if element is None:
         return None
     place = np.identity(4)
@@ -285,7 +290,7 @@ def _parse_link(element: etree._Element) -> Link:
 
 
 def parse_inertial(element: etree._Element | None) -> Inertial | None:
-    """The content of an ``<inertial>``; None if there is none."""
+    """Convert an ``<inertial>`` element; None if there is none."""
     if element is None:
         return None
     mass = element.find("mass")
@@ -320,7 +325,7 @@ def _parse_joint(element: etree._Element) -> Joint:
 
 
 def _required(element: etree._Element, attribute: str) -> str:
-    """An attribute that URDF requires; :class:`ValueError` if it is not there."""
+    """Returns an attribute that URDF requires. Raises :class:`ValueError` if it is missing."""
     value = element.get(attribute)
     if value is None:
         raise ValueError(f"a <{element.tag}> has no {attribute}")
@@ -333,7 +338,7 @@ def _number(element: etree._Element, attribute: str, default: float | None = Non
 
 
 def _numbers(text: str) -> np.ndarray:
-    """Three numbers [3]."""
+    """Convert a text to three numbers [3]. Raises :class:`ValueError` if it is not three numbers."""
     values = np.array([float(word) for word in text.split()])
     if len(values) != 3:
         raise ValueError(f"{text!r} is not three numbers")
@@ -342,20 +347,20 @@ def _numbers(text: str) -> np.ndarray:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointLimits:
-    """Limits of one joint, infinite in position if it is continuous."""
+    """Limits of one driven joint. The position limits of a continuous joint are infinite."""
 
     lower: float
-    """[rad or m]"""
+    """Lower position limit [rad or m]."""
     upper: float
-    """[rad or m]"""
+    """Upper position limit [rad or m]."""
     effort: float
-    """[N m or N]"""
+    """Largest effort [N m or N]."""
     velocity: float
-    """[rad/s or m/s]"""
+    """Largest velocity [rad/s or m/s]."""
 
 
 def joint_limits(joint: Joint) -> JointLimits:
-    """Limits of a driven joint. Raises ValueError if a limit that the joint needs is missing."""
+    """Returns the limits of a driven joint. Raises ValueError if a limit that its type requires is missing."""
     limit = joint.limit
     if limit is None or limit.effort is None or limit.velocity is None:
         raise ValueError(f"joint {joint.name!r} has no limits of effort and velocity")
@@ -370,13 +375,14 @@ def joint_limits(joint: Joint) -> JointLimits:
 
 
 def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
-    """The root link, and the joints from it outwards; :class:`DescriptionError` if they are not one tree."""
+    """Returns the root link, and the joints from the root outwards. Raises :class:`DescriptionError` if links and
+    joints are not one tree."""
     links = {link.name for link in robot.links}
     for kind, elements in (("link", robot.links), ("joint", robot.joints)):
         names = [element.name for element in elements]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise description_error(file, f"{kind} {twice[0]!r} is there twice", "rename one")
+            raise description_error(file, f"{kind} {twice[0]!r} appears twice", "rename one")
     if "world" in links:
         raise description_error(
             file,
@@ -391,7 +397,7 @@ def check_tree(robot: Robot, file: pathlib.Path) -> tuple[str, list[Joint]]:
         for link in (joint.parent, joint.child):
             if link not in links:
                 raise description_error(
-                    file, f"joint {joint.name!r} names a link {link!r} that is not there", "add it or rename"
+                    file, f"joint {joint.name!r} names a link {link!r} that does not exist", "add it or rename"
                 )
         if joint.child in parent_of:
             other = parent_of[joint.child].name
@@ -438,9 +444,7 @@ def check_joints(robot: Robot, file: pathlib.Path) -> None:
         if joint.mimic is not None:
             source = names.get(joint.mimic.joint)
             if source is None or source.type not in MOVABLE_JOINT_TYPES or source.mimic is not None:
-                raise description_error(
-                    file, f"{where} mimics {joint.mimic.joint!r}", "let it mimic a joint that is driven itself"
-                )
+                raise description_error(file, f"{where} mimics {joint.mimic.joint!r}", "make it mimic a driven joint")
             continue
         limit = joint.limit
         needed = ("effort", "velocity") + (() if joint.type == "continuous" else ("lower", "upper"))
@@ -461,7 +465,7 @@ def check_joints(robot: Robot, file: pathlib.Path) -> None:
 def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
     """Raise :class:`DescriptionError` unless masses are not negative and every inertia is positive definite.
 
-    Inertias that violate the triangle inequality are added to ``notes``.
+    Inertias that violate the triangle inequality are reported in ``notes``.
     """
     lopsided = []
     for link in robot.links:
@@ -471,7 +475,7 @@ def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
         mass = inertial.mass
         inertia = inertial.inertia
         if mass < 0.0 or not math.isfinite(mass):
-            raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give it its mass")
+            raise description_error(file, f"link {link.name!r} has a mass of {mass:g} kg", "give 0 or more")
         if inertia is not None and mass > 0.0:
             moments = np.linalg.eigvalsh(inertia)
             if moments[0] <= 0.0 and moments[2] > 0.0:
@@ -483,4 +487,4 @@ def check_masses(robot: Robot, file: pathlib.Path, notes: list[str]) -> None:
             if moments[0] + moments[1] < moments[2] * (1.0 - 1e-6):
                 lopsided.append(link.name)
     if lopsided:
-        notes.append(f"{len(lopsided)} inertias no real body has (triangle inequality), first {lopsided[0]!r}")
+        notes.append(f"{len(lopsided)} inertias violate the triangle inequality, first {lopsided[0]!r}")

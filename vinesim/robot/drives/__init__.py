@@ -1,2 +1,2 @@
-"""Robots in the world: joint servos, base, gripper, cutters, odometry, body sensors; copies of other clients'
+"""Robots in the world: joint servos, base, grippers, cutters, odometry, body sensors; and copies of other clients'
 robots."""

@@ -29,7 +29,7 @@ from vinesim.world import Physics
 
 Values = Sequence[float] | np.ndarray
 Joints = Sequence[str] | np.ndarray | None
-"""Names of driven joints, their indices, or None for all."""
+"""Joints to command: names, indices, or None for all driven joints."""
 
 
 class Robot(RobotInstance):
@@ -43,7 +43,11 @@ class Robot(RobotInstance):
         index: int = 0,
         pose: np.ndarray | None = None,
     ) -> None:
-        """The arguments are those of :class:`RobotInstance`. The robot holds its joints at home until commanded."""
+        """Add the robot to ``rigid`` at ``pose`` [7] (the origin unless given), holding its joints at their home
+        positions.
+
+        ``name``: the name in the description unless given. ``index``: number of the robot's instance label.
+        """
         super().__init__(rigid, description, name, index, pose)
         self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
         self._cutters: dict[str, list[Blade]] = {}
@@ -52,12 +56,12 @@ class Robot(RobotInstance):
         self._servos = JointServos(rigid, self.name, description.drives)
         self.lower_limit = self._servos.lower_limit
         self.upper_limit = self._servos.upper_limit
-        """[joint] limits of position [rad or m]"""
+        """[joint] Upper position limits [rad or m]. :attr:`lower_limit` has the lower ones."""
         self.max_velocity = self._servos.max_velocity
         self.max_effort = self._servos.max_effort
-        """[joint] limits of velocity [rad/s or m/s] and effort [N m or N]"""
+        """[joint] Largest efforts [N m or N]. :attr:`max_velocity` has the largest velocities [rad/s or m/s]."""
         self.series_stiffness = self._servos.series_stiffness
-        """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
+        """[joint] Stiffnesses of the series elastic elements [N m/rad or N/m]."""
         self._stop_base()
 
     @property
@@ -67,18 +71,18 @@ class Robot(RobotInstance):
 
     @property
     def interface(self) -> np.ndarray:
-        """[joint] :class:`CommandInterface` by which each joint was commanded last."""
+        """[joint] :class:`CommandInterface` of the last command to each joint."""
         return self._servos.interface
 
     @property
     def physics(self) -> Physics:
-        """The world whose plants its grippers act on; :class:`CommandError` before :meth:`fit_cutters`."""
+        """The world whose plants the grippers act on. Raises :class:`CommandError` before :meth:`fit_cutters`."""
         if self._physics is None:
             raise CommandError(f"{self.name} has no grippers for plants; call fit_cutters(physics) first")
         return self._physics
 
     def fit_cutters(self, physics: Physics) -> None:
-        """Let grippers act on plants in ``physics``: give the robot the cutters of its description."""
+        """Add the cutters of the robot's description to ``physics``, so that grippers act on plants."""
         self._physics = physics
         for cutter in self.description.cutters:
             blade = physics.add_blade(self.name, cutter.frame, frames.pose(cutter.origin), np.array(cutter.half))
@@ -92,7 +96,7 @@ class Robot(RobotInstance):
             super().remove()
 
     def stop(self) -> None:
-        """Drop all commands; hold every joint and the base where they are."""
+        """Drop all commands, and hold all joints and the base at their present positions."""
         self._servos.hold()
         self._stop_base()
 
@@ -103,7 +107,7 @@ class Robot(RobotInstance):
     # ------------------------------------------------------------------ commands
 
     def joint_indices(self, joints: Joints) -> np.ndarray:
-        """Indices of joints in joint arrays; :class:`CommandError` for a name that has no drive."""
+        """Returns the indices of joints in joint arrays. Raises :class:`CommandError` for a joint without a drive."""
         if joints is None:
             return np.arange(len(self.setpoint))
         if isinstance(joints, np.ndarray):
@@ -115,46 +119,47 @@ class Robot(RobotInstance):
             raise CommandError(f"{self.name} has no drive for {error.args[0]!r}; it drives: {known}") from None
 
     def command_position(self, position: Values, joints: Joints = None) -> None:
-        """Move to positions [rad or m] as fast as the joints may. A position beyond a limit is clipped to the limit."""
+        """Move joints to positions [rad or m] as fast as their limits permit. Positions beyond the limits are
+        clipped."""
         self._servos.command(*self._validated(position, joints), CommandInterface.POSITION)
 
     def command_velocity(self, velocity: Values, joints: Joints = None) -> None:
-        """Move with velocities [rad/s or m/s] until the joints' limits."""
+        """Move joints with velocities [rad/s or m/s], until they reach their limits."""
         self._servos.command(*self._validated(velocity, joints), CommandInterface.VELOCITY)
 
     def command_effort(self, effort: Values, joints: Joints = None) -> None:
-        """Apply efforts [N m or N] in addition to the weight, which the drives carry. With effort 0 a joint can be
-        moved by hand."""
+        """Apply efforts [N m or N] in addition to gravity compensation. With effort 0, a joint can be moved by hand."""
         self._servos.command(*self._validated(effort, joints), CommandInterface.EFFORT)
 
     def command_motor_position(self, motor: Values, joints: Joints = None) -> None:
-        """Hold the motors at positions [rad or m]; each link deflects by its load over the series stiffness.
+        """Hold the motors of series elastic joints at positions [rad or m]. Each link deflects by its load divided by
+        the series stiffness.
 
-        The weight is not compensated, as only the spring connects motor and link (CANOPIES D6.4, section 3.1).
+        Gravity is not compensated, because only the spring connects motor and link (CANOPIES D6.4, section 3.1).
         """
         self._servos.command(*self._validated(motor, joints), CommandInterface.MOTOR_POSITION)
 
     def command_impedance(self, stiffness: Values, damping: Values, joints: Joints = None) -> None:
-        """Set the gains [N m/rad, N m s/rad or N/m, N s/m] of joints commanded by position or velocity.
+        """Set stiffness [N m/rad or N/m] and damping [N m s/rad or N s/m] of joints with position or velocity commands.
 
-        CANOPIES D6.4, section 3.1. Kept until :meth:`reset_gains`; :meth:`stop` leaves them.
+        See CANOPIES D6.4, section 3.1. The gains stay until :meth:`reset_gains`, also after :meth:`stop`.
         """
         i, stiffness = self._validated(stiffness, joints)
         _, damping = self._validated(damping, joints)
         if (stiffness < 0.0).any() or (damping < 0.0).any():
-            raise CommandError(f"{self.name}: gains below zero would feed energy in; give 0 or more")
+            raise CommandError(f"{self.name}: gains below zero would add energy; give 0 or more")
         self._servos.set_gains(i, stiffness, damping)
 
     def reset_gains(self, joints: Joints = None) -> None:
-        """Restore the gains of the description."""
+        """Restore the gains of the robot's description."""
         self._servos.reset_gains(self.joint_indices(joints))
 
     def command_gripper(self, group: str, opening: float, effort: float | None = None) -> None:
-        """Open a gripper's fingers to ``opening``, at most as far as they can.
+        """Move a gripper's fingers to ``opening``, limited to their range.
 
-        ``opening`` [m]: distance between the fingers (sum over prismatic fingers, including those that mimic a driven
-        one), or [rad]. ``effort`` [N or N m]: largest effort of each finger; the drive's own limit unless given.
-        Objects between the fingers are held by friction alone.
+        ``opening``: distance between the fingers [m] (sum over prismatic fingers, including those that mimic a driven
+        finger), or angle [rad]. ``effort`` [N or N m]: largest effort of each finger; the drive's own limit unless
+        given. Objects between the fingers are held by friction only.
         """
         if group not in self.description.groups:
             known = ", ".join(self.description.groups)
@@ -167,7 +172,8 @@ class Robot(RobotInstance):
         self._servos.group_fingers(group, fingers, effort)
 
     def gripper_opening(self, group: str) -> float:
-        """How far a gripper is open [m or rad], as :meth:`command_gripper` counts; KeyError for an unknown group."""
+        """Returns the opening of a gripper [m or rad], as defined in :meth:`command_gripper`. Raises KeyError for an
+        unknown group."""
         fingers = self.description.joint_indices(group)
         travel, offset = self.description.finger_travel(fingers)
         return travel * float(self.rigid.joint_measurements(self.name)[0][fingers].mean()) + offset
@@ -175,7 +181,7 @@ class Robot(RobotInstance):
     def command_cutter(self, group: str, force: float | None = None) -> None:
         """Close the cutter of a gripper and open it again. Wood between its blades in the next step is cut.
 
-        ``force`` [N]: largest force, the cutter's own limit unless given. Wood that resists more is not cut.
+        ``force`` [N]: largest force; the cutter's own limit unless given. Wood that needs more force is not cut.
         """
         if force is not None and not force > 0.0:
             raise CommandError(f"{self.name}: cutting force {force}; give more than 0, or none for all there is")
@@ -184,14 +190,16 @@ class Robot(RobotInstance):
             blade.close(min(np.inf if limit is None else limit, np.inf if force is None else force))
 
     def cutter_blades(self, group: str) -> tuple[Blade, ...]:
-        """The cutters of a gripper, which tell what they cut; :class:`CommandError` if it has none."""
+        """Returns the blades of a gripper's cutters, which report what they cut. Raises :class:`CommandError` if
+        there are none."""
         if group not in self._cutters:
             known = ", ".join(sorted(self._cutters)) or "none"
             raise CommandError(f"{self.name} has no cutter at {group!r}; cutters fitted: {known}")
         return tuple(self._cutters[group])
 
     def command_base(self, linear: float, angular: float, time: float) -> None:
-        """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left. A command lapses after the timeout."""
+        """Drive with ``linear`` [m/s] ahead and ``angular`` [rad/s] to the left. The base stops
+        :attr:`BaseLimits.timeout` after the last command."""
         if not np.isfinite([linear, angular]).all():
             raise CommandError(f"{self.name}: base velocity ({linear}, {angular}) is not finite")
         limits = self.description.base_limits
@@ -199,8 +207,8 @@ class Robot(RobotInstance):
         self._base_time = time
 
     def command_lights(self, pattern: LightPattern, color: Sequence[float] | None = None) -> None:
-        """Let the indicator lights show a pattern, in a ``color`` [3] of sRGB from 0 to 1, that of the pattern unless
-        given; whether it sounds stays as it was. See :class:`Lights`."""
+        """Show a pattern with the indicator lights, see :class:`Lights`. ``color`` [3]: sRGB from 0 to 1; the colour
+        of the pattern unless given. The tone stays on or off as before."""
         if color is None:
             self.lights = Lights(pattern, USUAL_COLOR[pattern], self.lights.has_sound)
             return
@@ -210,7 +218,8 @@ class Robot(RobotInstance):
         self.lights = Lights(pattern, (red, green, blue), self.lights.has_sound)
 
     def _validated(self, values: Values, joints: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Indices [k] and finite values [k], or :class:`CommandError`."""
+        """Returns indices [k] and values [k] of a command. Raises :class:`CommandError` if their numbers differ or a
+        value is not finite."""
         i = self.joint_indices(joints)
         values = np.asarray(values, float)
         if values.shape != i.shape:
@@ -223,14 +232,14 @@ class Robot(RobotInstance):
     # ------------------------------------------------------------------ each step
 
     def control(self, time: float) -> None:
-        """Pass the set-points of the step that starts at ``time`` [s] to the physics; call it before the step."""
+        """Pass the set-points of the step that starts at ``time`` [s] to the physics. Call this before the step."""
         self._servos.update()
         self._drive_base(time)
         if self._tracks_slip:
             self._odometry(self.rigid.base_state(self.name)[0])
 
     def _drive_base(self, time: float) -> None:
-        """Accelerate the base towards its commanded velocity, or towards standing once the command has lapsed."""
+        """Accelerate the base towards its commanded velocity, or to a stop if the last command is too old."""
         limits = self.description.base_limits
         linear_goal, angular_goal = self._base_goal if time - self._base_time <= limits.timeout else (0.0, 0.0)
         linear, angular = self._base_velocity
@@ -240,7 +249,8 @@ class Robot(RobotInstance):
         self.rigid.command_base(self.name, (linear, 0.0, angular))
 
     def sample(self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True) -> RobotSample:
-        """State of the robot at ``time`` [s], with wrenches, IMUs and series elastic elements if ``body_sensors``."""
+        """Returns the state of the robot at ``time`` [s]. ``body_sensors``: whether it includes wrenches, IMUs and
+        series elastic elements."""
         measured = self.measure(time, contacts, body_sensors=body_sensors)
         return dataclasses.replace(
             measured,
@@ -251,19 +261,20 @@ class Robot(RobotInstance):
     def measure(
         self, time: float, contacts: Sequence[Contact] = (), *, body_sensors: bool = True, **more: Any
     ) -> RobotSample:
-        """Like :meth:`RobotInstance.measure`. Series elastic elements are left out, too."""
+        """Like :meth:`RobotInstance.measure`. ``body_sensors``: whether the sample includes wrenches and IMUs;
+        series elastic elements are never included."""
         if body_sensors:
             own = self._own(contacts)
             more |= {"wrenches": self._body_sensors.wrenches(time, own), "imus": self._body_sensors.imus(time)}
         return super().measure(time, contacts, **more)
 
     def update(self, time: float) -> RobotUpdate:
-        """State of the robot that is sent to other clients: actual joint states, never commands."""
+        """Returns the state of the robot that is sent to other clients: measured joint states, never commands."""
         position, velocity = self.rigid.joint_state(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         return RobotUpdate(self.name, time, base_q, base_qd, position, velocity, self.lights)
 
 
 def _clamp(value: float, bound: float) -> float:
-    """The value within -``bound`` to ``bound``."""
+    """Returns the value, limited to the range from -``bound`` to ``bound``."""
     return float(min(max(value, -bound), bound))

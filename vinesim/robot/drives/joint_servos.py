@@ -1,11 +1,12 @@
-"""Joint servos: commands become set-points within the limits of the URDF, gains and efforts, once a step.
+"""Joint servos: convert commands to set-points, gains and efforts within the limits of the URDF, once per step.
 
-A step of a position command becomes a ramp at the joint's largest velocity, as joint_limits of ros2_control does it.
-The servos themselves, with their effort limits, act in the physics.
+A sudden change of a position command becomes a ramp with the joint's largest velocity, as in joint_limits of
+ros2_control. The servos themselves, with their effort limits, act in the physics.
 
-A series elastic drive is a motor behind a spring (CANOPIES D6.4, section 3.1). The motor's own control is taken to be
-fast: it turns to where the spring gives what position, velocity, effort or impedance control asks for. In
-:attr:`CommandInterface.MOTOR_POSITION` the motor itself holds a position, and the link deflects under its load.
+A series elastic drive is a motor behind a spring (CANOPIES D6.4, section 3.1). The motor's own control is assumed to be
+fast: the motor turns to the position at which the spring exerts the effort that position, velocity, effort or impedance
+control requests. In :attr:`CommandInterface.MOTOR_POSITION` the motor itself holds a position, and the link deflects
+under its load.
 """
 
 from __future__ import annotations
@@ -23,15 +24,16 @@ from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.scene.values import Drive
 
 ACCELERATION_EFFORT_SHARE = 0.7
-"""Share of its effort that a drive may spend on acceleration: the rest carries weight and resists loads. GUESSED"""
+"""Share of a drive's effort that may be used for acceleration. The rest carries weight and resists loads. GUESSED"""
 RIGID_DEFLECTION = 0.05
-"""[rad or m] Deflection at full effort of a drive for which neither spring nor servo stiffness is given. GUESSED"""
+"""[rad or m] Deflection at full effort of a drive for which neither a spring nor a servo stiffness is given. GUESSED"""
 MIN_DIVISOR = 1e-9
-"""Lower bound of a stiffness, inertia or velocity that is used as a divisor [SI units]."""
+"""Smallest stiffness, inertia or velocity that is used as a divisor [SI units]."""
 
 
 class CommandInterface(enum.IntEnum):
-    """Quantity by which a joint is commanded: an interface of ros2_control, or the motor of a series elastic drive.
+    """Quantity by which a joint is commanded: a command interface of ros2_control, or the motor position of a series
+    elastic drive.
 
     Source: CANOPIES D6.4, sections 5.2 (position, velocity, effort) and 3.1 (series elastic elements).
     """
@@ -47,16 +49,16 @@ class CommandInterface(enum.IntEnum):
 
 
 class CommandError(ValueError):
-    """A command that the robot cannot take; the message names the robot, the joint or group, and the remedy."""
+    """A command that the robot cannot execute. The message names the robot, the joint or group, and the remedy."""
 
 
 def series_stiffness(drives: Sequence[Drive]) -> np.ndarray:
-    """[joint] Stiffnesses of the series elastic elements of some drives [N m/rad or N/m]."""
+    """Returns the stiffness of the series elastic element of each drive [joint] N m/rad or N/m."""
     return np.array([drive.series_stiffness or drive.stiffness or drive.effort / RIGID_DEFLECTION for drive in drives])
 
 
 class JointServos:
-    """The servos of one robot's driven joints; all arrays are [joint], in the order of ``drives``."""
+    """The servos of one robot's driven joints. All arrays are [joint], in the order of ``drives``."""
 
     def __init__(self, rigid: RigidWorld, name: str, drives: Sequence[Drive]) -> None:
         """``name``: the robot's name in ``rigid``."""
@@ -65,29 +67,29 @@ class JointServos:
         self._drives = tuple(drives)
         self.lower_limit = np.array([drive.lower for drive in drives], float)
         self.upper_limit = np.array([drive.upper for drive in drives], float)
-        """[joint] limits of position [rad or m]"""
+        """[joint] Upper position limits [rad or m]."""
         self.max_velocity = np.array([drive.velocity for drive in drives], float)
-        """[joint] largest velocities [rad/s or m/s]"""
+        """[joint] Largest velocities [rad/s or m/s]."""
         self.max_effort = np.array([drive.effort for drive in drives], float)
-        """[joint] largest efforts [N m or N]"""
+        """[joint] Largest efforts [N m or N]."""
         self.series_stiffness = series_stiffness(drives)
-        """[joint] stiffnesses of the series elastic elements [N m/rad or N/m]"""
+        """[joint] Stiffnesses of the series elastic elements [N m/rad or N/m]."""
         self._series_damping = np.array(
             [drive.series_damping if drive.series_stiffness else drive.damping for drive in drives]
         )
         self._stiffness = np.array([drive.stiffness for drive in drives])
         self._damping = np.array([drive.damping for drive in drives])
         self._is_compliant = np.zeros(len(drives), bool)
-        """[joint] whether gains were commanded, so that the physics must not add damping of its own"""
+        """[joint] Whether gains were commanded, so that the physics must not add its own damping."""
         self._effort_limit = self.max_effort.copy()
         self._finger_groups: dict[str, np.ndarray] = {}
-        """Indices of the fingers that move together, by group. Fingers that moved independently would drift to one side
-        with the object that they hold."""
+        """Indices of the fingers of a gripper, which move together, by group. Fingers that moved independently would
+        drift to one side with the object that they hold."""
         joints = len(drives)
         self.setpoint = np.zeros(joints)
         self.interface = np.zeros(joints, np.int64)
-        """[joint] position that the servos are asked for [rad or m], and :class:`CommandInterface` by which each was
-        commanded last; both are written in place."""
+        """[joint] :class:`CommandInterface` of the last command to each joint. :attr:`setpoint` is the position that
+        the servo is to reach [rad or m]. Both arrays are changed in place."""
         self._command = np.zeros(joints)
         self._rate = np.zeros(joints)
         self._target_velocity = np.zeros(joints)
@@ -98,7 +100,7 @@ class JointServos:
         self.hold()
 
     def _advance_kernel(self) -> KernelGraph:
-        """The kernel of :meth:`_advance_setpoints` on the arrays of this robot."""
+        """Returns the kernel of :meth:`_advance_setpoints`, bound to the arrays of this robot."""
         limits = SharedArrays(
             joint_servos.ServoLimits,
             lower=self.lower_limit,
@@ -118,7 +120,7 @@ class JointServos:
         return KernelGraph(advance)
 
     def hold(self) -> None:
-        """Drop all commands: position control at the present positions. Gains and effort limits stay."""
+        """Drop all commands and hold the present positions by position control. Gains and effort limits stay."""
         self.setpoint[:] = self._command[:] = self._rigid.joint_measurements(self._name)[0]
         self.interface[:] = CommandInterface.POSITION
         self._velocity = np.zeros(len(self.setpoint))
@@ -129,7 +131,8 @@ class JointServos:
     # ------------------------------------------------------------------ commands
 
     def command(self, joints: np.ndarray, values: np.ndarray, interface: CommandInterface) -> None:
-        """Command ``joints`` [k] (indices) by ``values`` [k] in the units of ``interface``, clipped to the limits."""
+        """Command ``joints`` [k] (indices) to ``values`` [k], in the unit of ``interface``. Values are clipped to
+        the limits."""
         if interface == CommandInterface.POSITION:
             values = clip(values, self.lower_limit[joints], self.upper_limit[joints])
         elif interface == CommandInterface.VELOCITY:
@@ -140,21 +143,22 @@ class JointServos:
         self._switch_interface(joints, interface)
 
     def set_gains(self, joints: np.ndarray, stiffness: np.ndarray, damping: np.ndarray) -> None:
-        """Impedance of ``joints`` [k]: gains [k] N m/rad or N/m, and N m s/rad or N s/m."""
+        """Set stiffness [k] N m/rad or N/m and damping [k] N m s/rad or N s/m of ``joints`` [k] (indices)."""
         self._stiffness[joints] = stiffness
         self._damping[joints] = damping
         self._is_compliant[joints] = True
         self._gains_changed = True
 
     def reset_gains(self, joints: np.ndarray) -> None:
-        """Restore the gains that the description gives to ``joints`` [k]."""
+        """Restore the gains that the robot's description gives for ``joints`` [k] (indices)."""
         self._stiffness[joints] = [self._drives[j].stiffness for j in joints]
         self._damping[joints] = [self._drives[j].damping for j in joints]
         self._is_compliant[joints] = False
         self._gains_changed = True
 
     def group_fingers(self, group: str, fingers: np.ndarray, effort: float | None) -> None:
-        """Move ``fingers`` [k] about their common middle from now on, with at most ``effort`` [N m or N] each."""
+        """Move ``fingers`` [k] (indices) together, about their common middle, with at most ``effort`` [N m or N]
+        each. None: the drives' own limits."""
         self._finger_groups[group] = fingers
         self._effort_limit[fingers] = (
             self.max_effort[fingers] if effort is None else np.minimum(effort, self.max_effort[fingers])
@@ -162,7 +166,8 @@ class JointServos:
         self._gains_changed = True
 
     def _switch_interface(self, joints: np.ndarray, interface: CommandInterface) -> None:
-        """Convert the set-points from links to motors or back, so that no joint jumps."""
+        """Switch joints [k] to another interface. Set-points are converted from links to motors or back, so that no
+        joint jumps."""
         if (self.interface[joints] == interface).all():
             return
         before = self.interface[joints] == CommandInterface.MOTOR_POSITION
@@ -193,11 +198,11 @@ class JointServos:
         self._rigid.command(self._name, self.setpoint, rate)
 
     def _prepare_interfaces(self) -> None:
-        """Compute the values that change only with the interfaces, gains and limits."""
+        """Compute values that change only when interfaces, gains or limits change."""
         self._in_effort = self.interface == CommandInterface.EFFORT
         self._in_motor_position = self.interface == CommandInterface.MOTOR_POSITION
         self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
-        """Whether gains depend on the state, so that they must be set in every step."""
+        """Whether the gains depend on the state, so that they must be set in every step."""
         self._active_stiffness = np.where(self._in_motor_position, self.series_stiffness, self._stiffness)
         self._max_tracking_error[:] = (
             self._effort_limit / np.maximum(self._active_stiffness, MIN_DIVISOR) + self.max_velocity * self._rigid.dt
@@ -205,7 +210,7 @@ class JointServos:
         self._max_impulse[:] = ACCELERATION_EFFORT_SHARE * self._rigid.dt * self._effort_limit
 
     def _advance_setpoints(self, position: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-        """Advance the set-points by a step. Returns their rates [joint] rad/s or m/s."""
+        """Advance the set-points by one step. Returns their rates [joint] rad/s or m/s."""
         self._position[:] = self._middle[:] = position
         self._velocity_now[:], self._inertia[:] = velocity, self._rigid.joint_inertia(self._name)
         for fingers in self._finger_groups.values():
@@ -214,12 +219,13 @@ class JointServos:
         return self._target_velocity
 
     def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joints whose commanded effort would exceed their largest velocity [joint] bool, and the damping [joint]
-        N m s/rad or N s/m about that velocity which prevents it.
+        """Returns which joints would exceed their largest velocity under their commanded effort [joint] bool, and the
+        damping that prevents this [joint] N m s/rad or N s/m. The damping acts on the difference from the largest
+        velocity.
 
         Below 90 % of the largest velocity there is no damping. The velocity is extrapolated by one step. The damping
-        force never exceeds the commanded effort, because a saturated servo does not see that the velocity falls within
-        the step.
+        force never exceeds the commanded effort, because a saturated servo does not notice that the velocity decreases
+        within the step.
         """
         sign = np.copysign(1.0, velocity)
         brake = 10.0 * self.max_effort / self.max_velocity
@@ -234,7 +240,7 @@ class JointServos:
         return self._is_speed_limited, np.minimum(brake, most / np.maximum(np.abs(spare), MIN_DIVISOR))
 
     def _apply_gains(self, is_limited: np.ndarray, limiter_damping: np.ndarray) -> None:
-        """Give the servos in the physics the gains and efforts that the interfaces ask for."""
+        """Set the gains and efforts of the servos in the physics, according to the interface of each joint."""
         in_effort = self._in_effort
         in_motor_position = self._in_motor_position
         damping = np.where(in_motor_position, self._series_damping, self._damping)
@@ -251,5 +257,5 @@ class JointServos:
 
 
 def clip(values: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """``np.clip`` of finite numbers, in half its time."""
+    """Same as ``np.clip`` for finite numbers, in half the time."""
     return np.minimum(np.maximum(values, lower), upper)

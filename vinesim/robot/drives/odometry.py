@@ -1,8 +1,9 @@
-"""Odometry of tracks that slip: pose and velocity of the base as its track encoders measure them.
+"""Odometry of tracks that slip: pose and velocity of the base as measured by the track encoders.
 
-Tracks measure travel ahead and turns, never motion sideways. A constant share of both is lost on the ground. Odometry
-does not know this share, so the share is the standard deviation of its measurements. The covariance of the pose follows
-to first order, from the derivative of the measured pose with respect to the two shares.
+Tracks measure travel ahead and turns, but no sideways motion. A constant share of travel and of turns is lost by slip
+on the ground. Odometry does not know this share, so the share is used as the standard deviation of its measurements.
+The covariance of the pose is computed to first order, from the derivative of the measured pose with respect to the two
+shares.
 """
 
 from __future__ import annotations
@@ -12,30 +13,31 @@ import numpy as np
 from vinesim.core import frames
 
 LEAST_VARIANCE = 1e-6
-"""[m2, rad2, m2/s2, rad2/s2] Added to every variance, so that filters can invert covariances. GUESSED: the variance of
-encoders that resolve a millimetre."""
+"""[m2, rad2, m2/s2, rad2/s2] Variance that is added to every measurement, so that filters can invert covariances.
+GUESSED: the variance of encoders with a resolution of a millimetre."""
 
 _EXACT = np.tile(LEAST_VARIANCE * np.eye(3), (2, 1, 1))
-"""Covariances of tracks that do not slip."""
+"""Covariances [2, 3, 3] of pose and velocity for tracks that do not slip."""
 
 
 class TrackOdometry:
-    """Pose since the start, integrated from the travel of tracks. A constant share of the travel is lost by slip."""
+    """Pose of the base since the start, integrated from the travel of its tracks, of which a constant share is lost
+    by slip."""
 
     def __init__(self, linear_slip: float, angular_slip: float, pose: np.ndarray) -> None:
-        """``linear_slip``, ``angular_slip``: shares of the travel that are lost, 0 to below 1; ``pose`` [7] at
-        start."""
+        """``linear_slip``, ``angular_slip``: lost shares of travel ahead and of turns, from 0 to below 1. ``pose``
+        [7]: pose of the base at the start."""
         self._slip = linear_slip, angular_slip
         self._gain = 1.0 / (1.0 - linear_slip), 1.0 / (1.0 - angular_slip)
         self._actual = float(pose[0]), float(pose[1]), frames.to_yaw(pose[3:])
         self._measured = 0.0, 0.0, 0.0
         self._by_linear = 0.0, 0.0
-        """Derivative of the measured x and y with respect to the share of the travel that is lost."""
+        """Derivative of the measured x and y with respect to the lost share of travel ahead."""
         self._by_angular = 0.0, 0.0, 0.0
-        """Derivative of the measured x, y and yaw with respect to the share of turns that is lost."""
+        """Derivative of the measured x, y and yaw with respect to the lost share of turns."""
 
     def update(self, base_q: np.ndarray) -> np.ndarray:
-        """Add the motion to ``base_q`` [7], the actual pose, and return the measured pose [7] since the start."""
+        """Add the motion to the actual pose ``base_q`` [7]. Returns the measured pose [7] since the start."""
         x, y, yaw = self._actual
         self._actual = float(base_q[0]), float(base_q[1]), frames.to_yaw(base_q[3:])
         turn = (self._actual[2] - yaw + np.pi) % (2.0 * np.pi) - np.pi
@@ -55,7 +57,8 @@ class TrackOdometry:
         return frames.pose([*self._measured[:2], 0.0], frames.from_yaw(self._measured[2]))
 
     def velocity(self, base_q: np.ndarray, base_qd: np.ndarray) -> np.ndarray:
-        """Velocity [6] in the base's axes as the tracks measure it, at the pose [7] and velocity [6] in the world."""
+        """Returns the velocity [6] m/s, rad/s that the tracks measure, in the axes of the base. ``base_q`` [7],
+        ``base_qd`` [6]: pose and velocity of the base in the world."""
         x, y, z, w = base_q[3:].tolist()
         vx, vy, vz, wx, wy, wz = base_qd.tolist()
         # along the base's x axis and about its z axis, in Python floats: ten times as fast as frames.rotate
@@ -64,7 +67,8 @@ class TrackOdometry:
         return np.array([self._gain[0] * ahead, 0.0, 0.0, 0.0, 0.0, self._gain[1] * turn])
 
     def covariance(self, velocity: np.ndarray) -> np.ndarray:
-        """Covariances [2, 3, 3] in x, y and yaw: of the measured pose, and of the measured ``velocity`` [6]."""
+        """Returns the covariances [2, 3, 3] of x, y and yaw: of the measured pose, and of the measured ``velocity``
+        [6]."""
         if not any(self._slip):
             return _EXACT
         linear = self._slip[0] * np.array([*self._by_linear, 0.0])

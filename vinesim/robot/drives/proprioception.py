@@ -1,4 +1,4 @@
-"""A robot's measurements of its own state: wrist wrenches, inertial measurement units, series elastic elements."""
+"""Measurements of a robot's own state: wrist wrenches, inertial measurement units, series elastic elements."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vinesim.scene.values import Contact, ElasticSample, Imu, JointSample, Senso
 
 
 class BodySensors:
-    """Force-torque sensors and IMUs of one robot, at the frames that its description names."""
+    """Force-torque sensors and IMUs of one robot, at the frames that are given in its description."""
 
     def __init__(self, rigid: RigidWorld, name: str, description: RobotDescription) -> None:
         self._rigid = rigid
@@ -24,12 +24,12 @@ class BodySensors:
         self._distal_links = {mount.frame: _subtree_links(description, mount.frame) for mount in description.wrenches}
 
     def wrenches(self, time: float, contacts: Sequence[Contact]) -> tuple[Wrench, ...]:
-        """Wrenches at ``time`` [s]. The forces of this robot's ``contacts`` with plants, which MuJoCo does not know,
-        are added."""
+        """Returns the wrenches at ``time`` [s]. They include the forces of plants on the robot, ``contacts``, which
+        MuJoCo does not know."""
         return tuple(self._wrench(mount, time, contacts) for mount in self._description.wrenches)
 
     def imus(self, time: float) -> tuple[Imu, ...]:
-        """Samples of all IMUs at ``time`` [s]."""
+        """Returns the readings of all IMUs at ``time`` [s]."""
         return tuple(self._imu(mount, time) for mount in self._description.imus)
 
     def _wrench(self, mount: SensorMount, time: float, contacts: Sequence[Contact]) -> Wrench:
@@ -52,7 +52,7 @@ class BodySensors:
 
 
 def elastic_sample(joints: JointSample, stiffness: np.ndarray) -> ElasticSample:
-    """Motor positions and deflections of series elastic elements of ``stiffness`` [joint] N m/rad or N/m."""
+    """Returns motor positions and deflections of series elastic elements. ``stiffness`` [joint] N m/rad or N/m."""
     deflection = joints.effort / stiffness
     return ElasticSample(
         joints.time, joints.names, stiffness, joints.position + deflection, deflection, stiffness * deflection
@@ -60,7 +60,7 @@ def elastic_sample(joints: JointSample, stiffness: np.ndarray) -> ElasticSample:
 
 
 def _subtree_links(description: RobotDescription, frame: str) -> frozenset[str]:
-    """A link and all links that it carries."""
+    """Returns the link ``frame`` and all links that it carries."""
     subtree = {frame}
     joints = (*description.fixed_frames, *description.moving_joints.frames)
     while children := {child for parent, child in joints if parent in subtree} - subtree:

@@ -1,4 +1,5 @@
-"""A robot in the rigid world, whether this client controls it or another one does."""
+"""A robot in the rigid world: base class of robots that this client or another client controls, and the latter's
+copy."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ _NO_POSES = np.zeros((0, 7))
 
 
 class RobotInstance:
-    """A robot of one description under one name in the rigid world; base class of local and remote robots."""
+    """A robot in the rigid world; base class of local and remote robots."""
 
     def __init__(
         self,
@@ -34,8 +35,8 @@ class RobotInstance:
     ) -> None:
         """Add the robot to ``rigid`` at ``pose`` [7] (the origin unless given).
 
-        ``name``: the description's name unless given. ``index``: number of its instance label.
-        ``is_in_world``: whether it was added to ``rigid`` already.
+        ``name``: the name in the description unless given. ``index``: number of the robot's instance label.
+        ``is_in_world``: whether the robot was added to ``rigid`` before.
         """
         self.rigid = rigid
         self.description = description
@@ -46,23 +47,24 @@ class RobotInstance:
         if not is_in_world:
             rigid.add_robot(spec)
         self.lights = Lights()
-        """Indicator lights."""
+        """State of the indicator lights."""
         self._shown_color: Color | None = None
         back = frames.conjugate(spec.pose[3:])
         self._start = spec.pose[:3].copy()
         self._start_turn = frames.to_matrix(back)
         self._start_left = frames.multiply(back, np.eye(4)).T
-        """[4, 4] Matrix of the quaternion product with the inverse of the orientation at the start."""
+        """[4, 4] Matrix that multiplies a quaternion from the left by the inverse of the orientation at the start."""
         self._tracks_slip = any(description.base_limits.slip)
         self._track_odometry = TrackOdometry(*description.base_limits.slip, spec.pose)
 
     @property
     def shown_lights(self) -> Color | None:
-        """Colour that the indicator lights show now, :data:`UNLIT` between flashes. None: they are off."""
+        """Colour that the indicator lights show now: :data:`UNLIT` between flashes, None while they are off."""
         return self._shown_color
 
     def show_lights(self, time: float) -> None:
-        """Let the indicator lights flash as they are at a ``time`` of the world [s]; cheap while nothing changes."""
+        """Update the colour of the indicator lights to the ``time`` of the world [s]. This is cheap if the colour
+        does not change."""
         shown = self.lights.shown(time)
         if shown != self._shown_color:
             self._shown_color = shown
@@ -73,13 +75,14 @@ class RobotInstance:
         self.rigid.remove_robot(self.name)
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
-        """State of the robot at ``time`` [s], with the robot's own contacts among ``contacts``."""
+        """Returns the state of the robot at ``time`` [s]. ``contacts``: contacts in the world, of which the robot's
+        own are included."""
         measured = self.measure(time, contacts)
         return dataclasses.replace(measured, transform_q=self.description.moving_joints.poses(measured.joints.position))
 
     def measure(self, time: float, contacts: Sequence[Contact] = (), **more: Any) -> RobotSample:
-        """Like :meth:`sample`, without the transforms, which follow from the joints: :attr:`RobotSample.transform_q` is
-        empty. ``more``: further values of the sample."""
+        """Like :meth:`sample`, without the transforms, which follow from the joints: :attr:`RobotSample.transform_q`
+        is empty. ``more``: values of further fields of the sample."""
         position, velocity, effort, contact = self.rigid.joint_measurements(self.name)
         base_q, base_qd = self.rigid.base_state(self.name)
         odom_q = self._odometry(base_q)
@@ -99,35 +102,38 @@ class RobotInstance:
         )
 
     def _own(self, contacts: Sequence[Contact]) -> tuple[Contact, ...]:
-        """The contacts of this robot among ``contacts``."""
+        """Returns the contacts that involve this robot."""
         return tuple(c for c in contacts if c.actor == self.name)
 
     def frame_pose(self, frame: str) -> np.ndarray:
-        """World pose [7] of a link of the URDF, such as a sensor's frame."""
+        """Returns the pose [7] in the world of a link of the URDF, such as a sensor's frame."""
         return self.rigid.link_pose(self.name, frame)
 
     def _odometry(self, base_q: np.ndarray) -> np.ndarray:
-        """Pose [7] since the start as odometry measures it: exact, unless the tracks slip."""
+        """Returns the pose [7] of the base since the start as odometry measures it. It is exact, unless the tracks
+        slip."""
         if self._tracks_slip:
             return self._track_odometry.update(base_q)
         return np.concatenate([self._start_turn @ (base_q[:3] - self._start), self._start_left @ base_q[3:]])
 
 
 class RemoteRobot(RobotInstance):
-    """The copy of a robot that another client controls: pulled to its states, yet it can be held and pushed."""
+    """The copy of a robot that another client controls. The copy is pulled to the received states, yet it can be
+    held and pushed."""
 
     TELEPORT_DISTANCE = 1.0
-    """[m] If the copy is farther than this from its state, it is placed there instead of pulled. GUESSED"""
+    """[m] Distance of the copy from the received state above which the copy is placed at that state instead of
+    pulled. GUESSED"""
 
     def follow(self, update: RobotUpdate) -> None:
-        """Pull the copy to the state of ``update`` from now on.
+        """Pull the copy to the state of ``update``, until the next update.
 
-        Raises :class:`CommandError` if the update has another number of joints than the description.
+        Raises :class:`CommandError` if the update and the description have different numbers of joints.
         """
         count = len(self.description.drives)
         if update.position.shape != (count,) or update.velocity.shape != (count,):
             raise CommandError(
-                f"{self.name}: update has {update.position.size} joints, its description {count}; "
+                f"{self.name}: the update has {update.position.size} joints, the robot's description {count}; "
                 "load the same robot on both clients"
             )
         self.lights = update.lights
@@ -137,8 +143,8 @@ class RemoteRobot(RobotInstance):
         self.rigid.follow_remote(self.name, update.base_q, update.base_qd, update.position, update.velocity)
 
     def _teleport(self, update: RobotUpdate, here: np.ndarray) -> None:
-        """Place the copy at the update's state. ``here`` [7]: present pose of its base."""
-        if abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar: another height needs a new body
+        """Place the copy at the state of ``update``. ``here`` [7]: present pose of its base."""
+        if abs(update.base_q[2] - here[2]) > 1e-3:  # the base joint is planar, so another height needs a new body
             self.rigid.remove_robot(self.name)
             self._shown_color = None
             self.rigid.add_robot(self.description.to_spec(self.name, self._index, update.base_q))

@@ -1,1 +1,1 @@
-"""Scripted tasks: push a bunch, pick a bunch into a box, swap boxes."""
+"""Scripted tasks of a robot: push a bunch, pick a bunch into a box, swap boxes, bring a box to a person."""

@@ -1,6 +1,6 @@
-"""Base class for tasks of a carrier with a clamp at either end: take a box, carry it, list the bunches in it.
+"""Base class for tasks of a robot with a clamp at either end: take a box, carry it, list the bunches in it.
 
-The poses of base, clamps and boxes are read from the physics; boxes are held by friction alone.
+The poses of base, clamps and boxes are read from the physics. Boxes are held by friction only.
 """
 
 from __future__ import annotations
@@ -20,25 +20,26 @@ from vinesim.world import Physics
 LIFT_HEIGHT = 0.15
 """[m] Height above the ground at which boxes are carried. GUESSED"""
 MIN_CLAMP_FORCE = 100.0
-"""[N] Contact force of each paddle from which on it has clamped something. GUESSED"""
+"""[N] Contact force on each paddle from which on the paddles have clamped something. GUESSED"""
 CLAMP_TIME = 1.5
-"""[s] In which the paddles close or open. GUESSED"""
+"""[s] Time in which the paddles close or open. GUESSED"""
 LIFT_TIMEOUT = 6.0
-"""[s] In which a lift must reach its height. GUESSED"""
+"""[s] Time in which a lift must reach its height. GUESSED"""
 LIFT_TOLERANCE = 0.003
-"""[m] A lift this near to its height has reached it. GUESSED"""
+"""[m] Distance from its height within which a lift has reached the height. GUESSED"""
 APPROACH_SPEED = 0.2
-"""[m/s] Speed of the base close to a box. GUESSED"""
+"""[m/s] Speed of the base near a box. GUESSED"""
 
 
 class BoxHandling(Task):
-    """A task that moves boxes with clamps."""
+    """Base class of tasks in which a robot moves boxes with its clamps."""
 
     GROUPS: tuple[str, ...] = ("lift_front", "clamp_front")
-    """Joint groups that the task needs."""
+    """Joint groups that the robot must have."""
 
     def __init__(self, physics: Physics, robot: Robot, *, timeout: float) -> None:
-        """Raises :class:`CommandError` if the robot lacks one of :attr:`GROUPS`; ``timeout`` [s]."""
+        """``timeout`` [s]: time after which the task fails. Raises :class:`CommandError` if the robot lacks one of
+        :attr:`GROUPS`."""
         super().__init__(robot, timeout=timeout)
         self.physics = physics
         for group in self.GROUPS:
@@ -46,14 +47,14 @@ class BoxHandling(Task):
                 raise CommandError(f"{robot.name} has no group {group!r}; give a robot with a clamp at either end")
 
     def box_pose(self, box: int) -> np.ndarray:
-        """Pose [7] of a box: the middle of its underside."""
+        """Returns the pose [7] of a box, whose origin is the middle of its underside."""
         rigid = self.physics.rigid
         return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{box}")]
 
     # ------------------------------------------------------------------ motions
 
     def _take(self, phase: str, end: str, box: int) -> Iterator[str]:
-        """Approach a box with the clamp at ``end``, clamp it, lift it, and return to where the base can turn."""
+        """Approach a box with the clamp at ``end``, clamp and lift it, and return to where the base can turn."""
         group = f"clamp_{end}"
         here = self._base_pose()[:2].copy()
         fingers = self.robot.description.joint_indices(group)
@@ -73,54 +74,59 @@ class BoxHandling(Task):
         yield from self._drive_straight(phase, here, backwards=end == "front")
 
     def _follow_path(self, phase: str, points: np.ndarray, heading: float) -> Iterator[str]:
+        """Drive along ``points`` [n, 2] m in the world, and turn to ``heading`` [rad]."""
         yield from self._follow(phase, WaypointFollower(self.robot, points, heading, speed=0.5, turn_rate=0.3))
 
     def _drive_straight(self, phase: str, place: np.ndarray, *, backwards: bool) -> Iterator[str]:
+        """Drive slowly to ``place`` [2] m in the world, without turning."""
         yield from self._follow(
             phase, WaypointFollower(self.robot, place, None, speed=APPROACH_SPEED, reverse=backwards)
         )
 
     def _align_clamp(self, phase: str, end: str, box: np.ndarray) -> Iterator[str]:
-        """Drive straight until the clamp at ``end`` is at a box of pose ``box`` [7]."""
+        """Drive straight until the clamp at ``end`` is at a box. ``box`` [7]: pose of the box."""
         clamp = self.robot.frame_pose(f"clamp_{end}_link")[:2]
         base = self._base_pose()[:2]
         reach = float(np.linalg.norm(clamp - base))
         ahead = (clamp - base) / reach
-        # along the base only: the heading was aligned before
+        # Only along the base, because its heading was aligned before.
         place = base + ahead * (float((box[:2] - base) @ ahead) - reach)
         yield from self._drive_straight(phase, place, backwards=end == "rear")
 
     def _follow(self, phase: str, follower: WaypointFollower) -> Iterator[str]:
+        """Drive until ``follower`` has reached its last waypoint. Raises :class:`TaskFailed` if the base is stuck."""
         while not follower.is_done:
             follower.control(self.time)
             if follower.is_stuck:
-                raise TaskFailed("something keeps the base from going on")
+                raise TaskFailed("the base is stuck")
             yield phase
 
     def _move_lift(self, phase: str, end: str, height: float) -> Iterator[str]:
-        """Move the lift at ``end`` to ``height`` [m]."""
+        """Move the lift at ``end`` to ``height`` [m], a position of its joint."""
         index = self.robot.description.joint_indices(f"lift_{end}")
         self.robot.command_position([height], index)
         until = self.time + LIFT_TIMEOUT
         while abs(self.robot.rigid.joint_measurements(self.robot.name)[0][index[0]] - height) > LIFT_TOLERANCE:
             if self.time > until:
-                raise TaskFailed(f"the {end} lift does not come to {height:.2f} m")
+                raise TaskFailed(f"the {end} lift does not reach {height:.2f} m")
             yield phase
 
     def _lift_index(self, end: str) -> int:
+        """Returns the index of the lift at ``end`` in joint arrays."""
         return int(self.robot.description.joint_indices(f"lift_{end}")[0])
 
     def _base_pose(self) -> np.ndarray:
-        """Pose [7] of the base in the world."""
+        """Returns the pose [7] of the base in the world."""
         return self.robot.rigid.base_state(self.robot.name)[0]
 
     def _away_from(self, box: int, place: np.ndarray, pose: np.ndarray | None = None) -> float:
-        """Heading [rad] of a base at ``place`` [2] m with its back to a box, or to ``pose`` [7]."""
+        """Returns the heading [rad] of a base at ``place`` [2] m that points away from a box, or from ``pose`` [7]
+        if given."""
         pose = self.box_pose(box) if pose is None else pose
         return math.atan2(place[1] - pose[1], place[0] - pose[0])
 
     def _bunches_in(self, box: int) -> tuple[int, ...]:
-        """The free bunches in a box."""
+        """Returns the indices of the free bunches in a box."""
         rigid = self.physics.rigid
         size = self.physics.model.box_size[box].astype(float)
         back = frames.inverse(self.box_pose(box))

@@ -1,4 +1,4 @@
-"""The task of a carrier that works with a person: it takes a box, holds it before the person, and waits for a bunch.
+"""A task in which a robot works with a person: it takes a box, holds it in front of the person, and waits for a bunch.
 
 meet = MeetPerson(physics, robot, plan)
 while not meet.is_done:
@@ -23,27 +23,27 @@ from vinesim.robot.tasks.task import TaskFailed
 from vinesim.world import Physics
 
 REST_TIME = 1.0
-"""[s] For which a bunch must lie in the box. GUESSED"""
+"""[s] Time for which a bunch must be in the box. GUESSED"""
 
 
 @dataclasses.dataclass(frozen=True)
 class MeetPlan:
-    """Which box to bring to which place, and the bunch that the person there picks."""
+    """Plan of the task: which box to bring to which place, and which bunch the person there picks."""
 
     bunch: int
     stand: np.ndarray
-    """[2] m, where the person picks it."""
+    """[2] m, place where the person picks the bunch."""
     box: int
     path_to_box: np.ndarray
-    """[n, 2] m, from the start to a place with room to turn, straight before a long side of the box."""
+    """[n, 2] m, from the start to a place in front of a long side of the box, where the base can turn."""
     path_to_person: np.ndarray
-    """[n, 2] m, from that place to the place where the robot waits."""
+    """[n, 2] m, from the end of ``path_to_box`` to the place where the robot waits."""
     heading: float
-    """[rad] Heading of the robot at the waiting place, with the box towards the person."""
+    """[rad] Heading of the waiting robot, with the box towards the person."""
 
 
 class MeetPerson(BoxHandling):
-    """Brings a box to a person and waits for a bunch in it; ``succeeded`` and ``reason`` give the result."""
+    """Brings a box to a person and waits for a bunch in it. ``succeeded`` and ``reason`` hold the result."""
 
     key_phases = frozenset({"hold the box", "rest"})
 
@@ -52,15 +52,17 @@ class MeetPerson(BoxHandling):
         self.plan = plan
 
     def report(self) -> dict[str, Any]:
-        """See :class:`Task`."""
+        """Returns the result of the task as plain values for JSON: handed over or not, bunch, box, and durations of
+        the phases."""
         return {"handed_over": self.succeeded, "bunch": self.plan.bunch, "box": self.plan.box, **super().report()}
 
     def focus(self) -> np.ndarray:
-        """See :class:`Task`."""
+        """Returns the position of the box [3] m in the world, at which the head camera is to look."""
         return self.box_pose(self.plan.box)[:3]
 
     def run(self) -> Iterator[str]:
-        """See :class:`Task`."""
+        """The task: take the box, bring it to the person, and wait until the bunch rests in it. Yields the name of
+        the phase, once per step."""
         plan = self.plan
         low = float(self.box_pose(plan.box)[2])
         there = plan.path_to_box[-1] if len(plan.path_to_box) else self._base_pose()[:2]

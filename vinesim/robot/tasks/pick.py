@@ -7,8 +7,8 @@
         physics.step()
     assert pick.picked, pick.reason
 
-The hand is moved by :mod:`vinesim.robot.control.cartesian_controller`. The poses of bunch, box and base are read from
-the physics in every step; no joint position is prescribed. The fingers hold by friction, with a commanded force.
+:mod:`vinesim.robot.control.cartesian_controller` moves the hand. The poses of bunch, box and base are read from the
+physics in every step; no joint position is prescribed. The fingers hold the bunch by friction, with a commanded force.
 """
 
 from __future__ import annotations
@@ -31,62 +31,64 @@ from vinesim.world import Physics
 STALK_LENGTH = 0.012
 """[m] Length of the stalk that stays on the bunch."""
 OPENING_MARGIN = 0.015
-"""[m] Gap between the open fingers and the bunch on either side. GUESSED"""
+"""[m] Gap between the open fingers and the bunch, on each side. GUESSED"""
 APPROACH_DISTANCE = 0.20
-"""[m] Length of the straight approach to the bunch, and of the straight retreat with it. GUESSED"""
+"""[m] Length of the straight motion towards the bunch before the grasp, and of the straight motion back after it.
+GUESSED"""
 GRASP_FORCE = 25.0
-"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction of 0.8; the rest is for accelerations."""
+"""[N] Force of each finger. A bunch of 1 kg needs 6 N at a friction coefficient of 0.8; the rest is for
+accelerations."""
 MIN_GRASP_FORCE = 8.0
-"""[N] Contact force of each finger from which on it has grasped something. GUESSED"""
+"""[N] Contact force on each finger from which on the fingers have grasped something. GUESSED"""
 GRASP_TIME = 0.3
-"""[s] Time for which all fingers must feel this force. GUESSED"""
+"""[s] Time for which all fingers must feel :data:`MIN_GRASP_FORCE`. GUESSED"""
 CLOSE_TIMEOUT = 4.0
-"""[s] After which closing fingers have grasped nothing. GUESSED"""
+"""[s] Time in which the closing fingers must grasp the bunch. GUESSED"""
 MAX_CUTS = 5
 """Number of times that the cutter closes before the task fails."""
 POSITION_TOLERANCE = 0.01
-"""[m] A hand this near to its goal has reached it. GUESSED"""
+"""[m] Distance within which the hand has reached its goal. GUESSED"""
 ORIENTATION_TOLERANCE = 0.12
-"""[rad] A hand whose orientation is this near to its goal has reached it. GUESSED"""
+"""[rad] Angle within which the hand has reached the orientation of its goal. GUESSED"""
 CARRY_POSITION = np.array([0.45, 0.12, 1.20])
-"""[m] Position of the left hand while the base drives, in the base's frame; mirrored for the right hand."""
+"""[m] Position of the left hand while the base drives, in the frame of the base. For the right hand it is mirrored."""
 CLEARANCE_ABOVE_RIM = 0.50
-"""[m] Height above the rim of the box from which the hand descends. GUESSED"""
+"""[m] Height of the hand above the rim of the box before it descends into the box. GUESSED"""
 RELEASE_HEIGHT = 0.19
-"""[m] Height of the hand above the bottom of the box at release: vinebot's arm reaches no deeper beside its base, and
-the lower end of a bunch hangs some 0.12 m below the hand.
-"""
+"""[m] Height of the hand above the bottom of the box at release. vinebot's arm reaches no deeper next to its base,
+and the lower end of a bunch is about 0.12 m below the hand."""
 CARRY_SPEED = 0.20
-"""[m/s] Speed of a hand that carries a bunch. GUESSED"""
+"""[m/s] Speed of the hand with a bunch. GUESSED"""
 RELEASE_OPENING = 0.05
-"""[m] By which the fingers open to release; more would touch the walls of the box."""
+"""[m] Distance by which the fingers open for release. With a larger one they would touch the walls of the box."""
 MAX_SLIP = 0.12
-"""[m] A bunch farther from the hand than this has slipped out of it. GUESSED"""
+"""[m] Distance between bunch and hand above which the bunch has slipped out of the fingers. GUESSED"""
 
 
 @dataclasses.dataclass(frozen=True)
 class PickPlan:
-    """Which bunch to pick, with which arm, from where, and into which box."""
+    """Plan of the task: which bunch to pick, with which arm, from where, and into which box."""
 
     bunch: int
     side: str
-    """``"left"`` or ``"right"``."""
+    """Arm: ``"left"`` or ``"right"``."""
     base_pose: np.ndarray
-    """[7] of the base at the pick: the bunch hangs ahead of the arm's shoulder."""
+    """[7] Pose of the base during the pick, in which the bunch is ahead of the arm's shoulder."""
     box: int
     path: np.ndarray
-    """[n, 2] m, of the base, from ``base_pose`` to where the box is beside it, on the arm's side."""
+    """[n, 2] m, path of the base from ``base_pose`` to where the box is next to it, on the arm's side."""
     final_heading: float
-    """[rad] of the base at the end of ``path``."""
+    """[rad] Heading of the base at the end of ``path``."""
 
 
 class PickBunch(Task):
-    """Moves one bunch from its vine into a box; ``picked`` and ``reason`` give the result."""
+    """Moves one bunch from its vine into a box. ``picked`` and ``reason`` hold the result."""
 
     key_phases = frozenset({"cut", "back"})
 
     def __init__(self, physics: Physics, robot: Robot, plan: PickPlan, *, timeout: float = 90.0) -> None:
-        """``robot`` must have its cutters (:meth:`Robot.fit_cutters`); ``timeout`` [s].
+        """``robot``: must have its cutters (:meth:`Robot.fit_cutters`). ``timeout`` [s]: time after which the task
+        fails.
 
         Raises :class:`CommandError` if the arm of ``plan`` has no gripper with a cutter.
         """
@@ -96,7 +98,7 @@ class PickBunch(Task):
         self.arm = CartesianController(robot, plan.side)
         cutter = next((c for c in robot.description.cutters if c.group == self.arm.gripper), None)
         if cutter is None:
-            raise CommandError(f"{robot.name} has no gripper with a cutter on its {plan.side} arm; give one that has")
+            raise CommandError(f"{robot.name} has no gripper with a cutter on its {plan.side} arm; give another robot")
         self._cutter = cutter.frame
         model = physics.model
         bunch = plan.bunch
@@ -106,7 +108,7 @@ class PickBunch(Task):
         self._fingers = robot.description.joint_indices(self.arm.gripper)
         above = np.linalg.norm(robot.frame_pose(self._cutter)[:3] - robot.frame_pose(self.arm.tool)[:3])
         self._grasp_depth = min(float(above) - STALK_LENGTH, 0.6 * self._length)
-        """[m] Distance of the grasp below the upper end of the bunch."""
+        """[m] Distance from the upper end of the bunch down to the point where it is grasped."""
         self._tool_z = np.array([0.0, 0.0, 1.0])
 
     @property
@@ -115,12 +117,14 @@ class PickBunch(Task):
         return self.succeeded
 
     def report(self) -> dict[str, Any]:
-        """See :class:`Task`."""
+        """Returns the result of the task as plain values for JSON: picked or not, bunch, arm, box, and durations of
+        the phases."""
         where = {"bunch": self.plan.bunch, "side": self.plan.side, "box": self.plan.box}
         return {"picked": self.picked, **where, "bunch_kg": round(self.mass, 4), **super().report()}
 
     def focus(self) -> np.ndarray:
-        """See :class:`Task`."""
+        """Returns the point [3] m in the world at which the bunch is to be grasped, and at which the head camera is
+        to look."""
         return self._grasp_point()
 
     @property
@@ -130,14 +134,14 @@ class PickBunch(Task):
 
     @property
     def bunch_pose(self) -> np.ndarray:
-        """Pose [7] of the bunch: its upper end, x along its axis."""
+        """Pose [7] of the bunch: the origin is its upper end, and x points along its axis."""
         if self.physics.state.bunch_attached[self.plan.bunch]:
             return self.physics.state.body_q[self._body].astype(float)
         return self.physics.rigid.bunch_pose(self.plan.bunch)
 
     @property
     def box_pose(self) -> np.ndarray:
-        """Pose [7] of the box: the middle of its underside."""
+        """Pose [7] of the box, whose origin is the middle of its underside."""
         rigid = self.physics.rigid
         return rigid.visual_q()[[link.name for link in rigid.visuals()].index(f"box/{self.plan.box}")]
 
@@ -152,7 +156,8 @@ class PickBunch(Task):
     # ------------------------------------------------------------------ the task
 
     def run(self) -> Iterator[str]:
-        """See :class:`Task`."""
+        """The task: reach for the bunch, grasp it, cut it, drive to the box and put it in. Yields the name of the
+        phase, once per step."""
         ahead = frames.rotate(self._base_pose()[3:], np.array([1.0, 0.0, 0.0]))
         self.arm.reset()
         self.robot.command_gripper(self.arm.gripper, 2.0 * (self._radius + OPENING_MARGIN))
@@ -174,7 +179,7 @@ class PickBunch(Task):
             raise TaskFailed(self._describe_bunch())
 
     def _close_gripper(self, ahead: np.ndarray) -> Iterator[str]:
-        """Close the fingers with :data:`GRASP_FORCE` until all feel the bunch."""
+        """Close the fingers with :data:`GRASP_FORCE` until all of them feel the bunch."""
         rigid = self.robot.rigid
         name = self.robot.name
         stiffness = np.array([self.robot.description.drives[i].stiffness for i in self._fingers])
@@ -187,34 +192,34 @@ class PickBunch(Task):
             steps = steps + 1 if (felt > MIN_GRASP_FORCE).all() else 0
             if self.time > end:
                 raise TaskFailed(
-                    f"the fingers feel {felt.min():.0f} N, at {here.sum():.3f} m between them: nothing to hold"
+                    f"the fingers feel {felt.min():.0f} N at an opening of {here.sum():.3f} m: nothing to hold"
                 )
             self.robot.command_position(here - GRASP_FORCE / stiffness, self._fingers)
             yield "close"
 
     def _cut(self) -> Iterator[str]:
-        """Close the cutter, again if it cut nothing."""
+        """Close the cutter, repeatedly until the bunch is cut off."""
         for _ in range(MAX_CUTS):
             self.robot.command_cutter(self.arm.gripper)
             yield "cut"
             if not self.physics.state.bunch_attached[self.plan.bunch]:
                 return
             yield from self.wait(0.2, "cut")
-        raise TaskFailed(f"the blade closed beside the stalk: {self._describe_stalk()}")
+        raise TaskFailed(f"the blades missed the stalk: {self._describe_stalk()}")
 
     def _drive(self) -> Iterator[str]:
-        """Drive to where the box is in reach."""
+        """Drive to the place where the box is within reach."""
         follower = WaypointFollower(self.robot, self.plan.path, self.plan.final_heading, turn_rate=0.3)
         while not follower.is_done:
             self.arm.hold_position()
             follower.control(self.time)
             if follower.is_stuck:
-                raise TaskFailed("something keeps the base from going on")
+                raise TaskFailed("the base is stuck")
             self._check_grasp()
             yield "drive"
 
     def _place_in_box(self) -> Iterator[str]:
-        """Move over the box, turn the fingers down, descend, release and retreat."""
+        """Move the hand over the box, turn the fingers down, descend, release and retreat."""
         base = self._base_pose()
         down = np.array([0.0, 0.0, -1.0])
         along = frames.rotate(base[3:], np.array([1.0, 0.0, 0.0]))
@@ -244,9 +249,9 @@ class PickBunch(Task):
         timeout: float,
         near: float = POSITION_TOLERANCE,
     ) -> Iterator[str]:
-        """Move the hand to ``goal`` [3] m in the world, its x axis along ``ahead`` [3], within ``timeout`` [s].
+        """Move the hand to ``goal`` [3] m in the world, with its x axis along ``ahead`` [3], within ``timeout`` [s].
 
-        ``near`` [m]: tolerance. Raises :class:`TaskFailed` if it does not arrive or loses the bunch.
+        ``near`` [m]: tolerance. Raises :class:`TaskFailed` if the hand does not arrive or loses the bunch.
         """
         end = self.time + timeout
         self.arm.reset()
@@ -266,32 +271,33 @@ class PickBunch(Task):
             yield phase
 
     def _check_grasp(self) -> None:
-        """:class:`TaskFailed` if the bunch has left its vine and is not in the hand."""
+        """Raise :class:`TaskFailed` if the bunch has left its vine and is not in the hand."""
         if not self.physics.state.bunch_attached[self.plan.bunch]:
             off = float(np.linalg.norm(self._grasp_point() - self.arm.tip_position))
             if off > MAX_SLIP:
                 raise TaskFailed(f"the bunch slipped out of the fingers, it is {off:.2f} m from them")
 
     def _grasp_point(self) -> np.ndarray:
-        """Where the bunch is to be grasped [3] m."""
+        """Returns the point [3] m in the world at which the bunch is to be grasped."""
         return frames.compose(self.bunch_pose, frames.pose([self._grasp_depth, 0.0, 0.0]))[:3]
 
     def _base_pose(self) -> np.ndarray:
-        """Pose [7] of the base in the world."""
+        """Returns the pose [7] of the base in the world."""
         return self.robot.rigid.base_state(self.robot.name)[0]
 
     def _base_to_world(self, point: np.ndarray) -> np.ndarray:
-        """In the world, a point [3] m given in the base's frame for the left arm, mirrored for the right one."""
+        """Convert a point [3] m from the frame of the base to the world. The point is given for the left arm, and
+        mirrored for the right one."""
         mirror = np.array([1.0, 1.0 if self.plan.side == "left" else -1.0, 1.0])
         return frames.compose(self._base_pose(), frames.pose(mirror * point))[:3]
 
     def _describe_stalk(self) -> str:
-        """Text: where the stalk is in the cutter's frame."""
+        """Returns a text with the position of the stalk in the cutter's frame."""
         cutter = self.robot.frame_pose(self._cutter)
         stalk = frames.compose(frames.inverse(cutter), self.bunch_pose)[:3]
         return "its lower end is at ({:.3f}, {:.3f}, {:.3f}) m in the mouth".format(*stalk)
 
     def _describe_bunch(self) -> str:
-        """Text: where the bunch is relative to the box."""
+        """Returns a text with the position of the bunch relative to the box."""
         local = frames.compose(frames.inverse(self.box_pose), self.bunch_pose)[:3]
         return "the bunch lies at ({:.2f}, {:.2f}, {:.2f}) m beside the middle of the box".format(*local)

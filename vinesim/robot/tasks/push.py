@@ -1,4 +1,4 @@
-"""Push a bunch with the fingertips: a scripted motion for demonstrations, benchmarks and tests.
+"""A scripted motion for demonstrations, benchmarks and tests: the fingertips push a bunch.
 
     push = PushBunch(robot, "left", lambda: bunch_position)
     while running:
@@ -24,16 +24,16 @@ from vinesim.robot.drives.controlled_robot import Robot
 log = logging.getLogger(__name__)
 
 FINGER_LENGTH = 0.027
-"""[m] Distance of vinebot's fingertips from its grasping frame."""
+"""[m] Distance of vinebot's fingertips from the frame of its tool."""
 PUSH_ELEVATION = 0.35
-"""[rad] Fingers point up by this angle, so that forearm and wrist stay below the leaves. GUESSED"""
+"""[rad] Angle by which the fingers point upwards, so that forearm and wrist stay below the leaves. GUESSED"""
 CLOSED_OPENING = 0.002
-"""[m] Between closed fingers, which then do not press on their end stops. GUESSED"""
+"""[m] Opening of closed fingers. It is not 0, so that they do not press on their end stops. GUESSED"""
 POSITION_TOLERANCE = 0.003
-"""[m] Fingertips this near to the goal of a phase have reached it. GUESSED"""
+"""[m] Distance within which the fingertips have reached the goal of a phase. GUESSED"""
 
 MISS_DISTANCE = 0.01
-"""[m] Fingertips farther from the goal at the end of an approach have missed. GUESSED"""
+"""[m] Distance from the goal at the end of an approach above which the fingertips have missed. GUESSED"""
 
 
 class Phase(enum.Enum):
@@ -48,10 +48,10 @@ class Phase(enum.Enum):
 
 
 class PushBunch:
-    """One arm touches a target, pushes it, retreats, and begins again.
+    """Moves one arm so that its fingertips touch a target, push it, retreat, and begin again.
 
-    ``target`` returns the centre of the bunch in the world [3] m; it is called once before every approach. The fingers
-    come from the robot's side and from below, where no wire and few leaves are.
+    ``target`` returns the centre of the bunch in the world [3] m. It is called before every approach. The fingers
+    approach from the robot's side and from below, where there is no wire and few leaves.
     """
 
     def __init__(
@@ -70,10 +70,11 @@ class PushBunch:
         repeat: bool = True,
         use_lift: bool = True,
     ) -> None:
-        """``radius`` of the bunch, ``depth`` of the push and ``clearance`` before the touch [m], ``hold_time`` [s];
-        ``speed`` through free space, ``touch_speed`` [m/s] and ``acceleration`` [m/s2] of the fingertips;
-        ``use_lift`` False leaves the torso to another controller, such as that of the other arm.
-        """
+        """``radius`` [m]: of the bunch. ``depth`` [m]: of the push. ``clearance`` [m]: distance from the bunch
+        before the touch. ``hold_time`` [s]: duration for which the bunch is held pushed. ``speed``, ``touch_speed``
+        [m/s], ``acceleration`` [m/s2]: of the fingertips, where ``touch_speed`` is used near the bunch. ``repeat``:
+        whether to begin again after a push. ``use_lift``: whether the torso moves, too; False leaves it to another
+        controller, such as that of the other arm."""
         self.robot = robot
         self.target = target
         self.arm = CartesianController(
@@ -89,30 +90,30 @@ class PushBunch:
         self.repeat = repeat
         self.phase = Phase.APPROACH
         self.push_count = 0
-        """Completed pushes."""
+        """Number of completed pushes."""
         self.missed_count = 0
-        """Approaches that did not reach the target."""
+        """Number of approaches that did not reach the target."""
 
         self._waypoints: dict[Phase, np.ndarray] = {}
         self._started = -np.inf
 
     @property
     def tip(self) -> np.ndarray:
-        """Fingertips in the world [3] m."""
+        """Position of the fingertips in the world [3] m."""
         return self.arm.tip_position
 
     @property
     def goal(self) -> np.ndarray:
-        """Goal of the fingertips in the present phase [3] m; their reference before the first."""
+        """Goal of the fingertips in the present phase [3] m; before the first phase, their reference position."""
         return self._waypoints.get(self.phase, self.arm.reference)
 
     @property
     def error(self) -> float:
-        """Distance of the fingertips from :attr:`goal` [m]."""
+        """Distance between the fingertips and :attr:`goal` [m]."""
         return self.arm.distance_to(self.goal)
 
     def control(self, time: float) -> None:
-        """Command the arm for the step that starts at ``time`` [s]; call it before ``robot.control``."""
+        """Command the arm for the step that starts at ``time`` [s]. Call this before ``robot.control``."""
         if self.phase is Phase.DONE:
             return
         if not self._waypoints:
@@ -126,7 +127,7 @@ class PushBunch:
     # ------------------------------------------------------------------ phases
 
     def _plan(self) -> None:
-        """Compute the waypoints for the present position of the target."""
+        """Compute the waypoints of all phases for the present position of the target."""
         center = np.asarray(self.target(), float)
         ahead = center - self.arm.shoulder_position
         ahead[2] = np.hypot(ahead[0], ahead[1]) * np.tan(PUSH_ELEVATION)
@@ -147,21 +148,24 @@ class PushBunch:
             self.robot.command_gripper(self.arm.gripper, CLOSED_OPENING)
 
     def _begin(self, phase: Phase, time: float) -> None:
+        """Start a phase at ``time`` [s]: set its speed and its timeout."""
         self.phase = phase
         self._started = time
         fast = phase in (Phase.APPROACH, Phase.RETREAT)
         self._phase_speed = self.speed if fast else self.touch_speed
         distance = np.linalg.norm(self.goal - self.arm.reference)
-        # a bunch that resists may keep the tip from arriving; then the timeout ends the phase
+        # A bunch that resists may stop the tip before its goal; then the timeout ends the phase.
         self._phase_timeout = 2.0 * distance / self._phase_speed + 2.0 * self._phase_speed / self.arm.acceleration + 3.0
 
     def _is_phase_over(self, time: float) -> bool:
+        """Returns whether the present phase has reached its goal or its timeout at ``time`` [s]."""
         elapsed = time - self._started
         if self.phase is Phase.HOLD:
             return elapsed >= self.hold_time
         return bool(self.error < POSITION_TOLERANCE or elapsed > self._phase_timeout)
 
     def _advance(self, time: float) -> None:
+        """Start the next phase at ``time`` [s]. After a missed approach, this is the retreat."""
         order = list(Phase)
         phase = order[order.index(self.phase) + 1]
         if self.phase is Phase.APPROACH and self.error > MISS_DISTANCE:

@@ -1,4 +1,4 @@
-"""The logistic task: a carrier with a clamp at either end replaces a full box by an empty one.
+"""The logistic task: a robot with a clamp at either end replaces a full box by an empty one.
 
     exchange = SwapBoxes(physics, robot, plan)
     while not exchange.is_done:
@@ -7,8 +7,9 @@
         physics.step()
     assert exchange.succeeded, exchange.reason
 
-The rear clamp fetches the empty box, the front clamp takes the full one, the base turns round and the rear clamp puts
-the empty one down. The poses of base, clamps and boxes are read from the physics; boxes are held by friction alone.
+The rear clamp fetches the empty box, and the front clamp takes the full one. Then the base turns round, and the rear
+clamp puts the empty box down. The poses of base, clamps and boxes are read from the physics. Boxes are held by friction
+only.
 """
 
 from __future__ import annotations
@@ -26,27 +27,29 @@ from vinesim.robot.tasks.task import TaskFailed
 from vinesim.world import Physics
 
 RELEASE_HEIGHT = 0.004
-"""[m] Height above the ground at which a box is released: it stands on the ground, however the clamp sags."""
+"""[m] Height above the ground at which a box is released. It is so small because the box then stands on the ground
+even if the clamp sags."""
 PLACEMENT_TOLERANCE = 0.05
-"""[m] Largest distance between the empty box and where the full one stood. GUESSED"""
+"""[m] Largest permitted distance between the empty box and the place where the full box stood. GUESSED"""
 
 
 @dataclasses.dataclass(frozen=True)
 class SwapPlan:
-    """Which boxes to exchange, and the paths between them."""
+    """Plan of the task: which boxes to exchange, and the paths between them."""
 
     start: np.ndarray
-    """[7] pose of the base at the beginning."""
+    """[7] Pose of the base at the beginning."""
     full_box: int
     empty_box: int
     path_to_empty: np.ndarray
-    """[n, 2] m, from the start to a place with room to turn, straight before a long side of the empty box."""
+    """[n, 2] m, from the start to a place in front of a long side of the empty box, where the base can turn."""
     path_to_full: np.ndarray
-    """[n, 2] m, from there to such a place before the full box."""
+    """[n, 2] m, from the end of ``path_to_empty`` to a place in front of a long side of the full box, where the base
+    can turn."""
 
 
 class SwapBoxes(BoxHandling):
-    """Replaces a full box by an empty one; ``succeeded`` and ``reason`` give the result."""
+    """Replaces a full box by an empty one. ``succeeded`` and ``reason`` hold the result."""
 
     GROUPS = ("lift_front", "clamp_front", "lift_rear", "clamp_rear")
 
@@ -54,22 +57,24 @@ class SwapBoxes(BoxHandling):
         super().__init__(physics, robot, timeout=timeout)
         self.plan = plan
         self._target_pose = self.box_pose(plan.full_box)
-        """Pose [7] at which the full box stood."""
+        """Pose [7] at which the full box stood at the beginning."""
         self._contents = self._bunches_in(plan.full_box)
 
     def report(self) -> dict[str, Any]:
-        """See :class:`Task`."""
+        """Returns the result of the task as plain values for JSON: exchanged or not, boxes, number of bunches, and
+        durations of the phases."""
         boxes = {"full": self.plan.full_box, "empty": self.plan.empty_box, "bunches": len(self._contents)}
         return {"exchanged": self.succeeded, **boxes, **super().report()}
 
     def focus(self) -> np.ndarray:
-        """See :class:`Task`."""
+        """Returns the position of the full box [3] m in the world, at which the head camera is to look."""
         return self.box_pose(self.plan.full_box)[:3]
 
     # ------------------------------------------------------------------ the task
 
     def run(self) -> Iterator[str]:
-        """See :class:`Task`."""
+        """The task: take the empty box, take the full box, turn, and put the empty box down. Yields the name of the
+        phase, once per step."""
         swap = self.plan
         yield from self._follow_path(
             "to the empty box", swap.path_to_empty, self._away_from(swap.empty_box, swap.path_to_empty[-1])
@@ -100,7 +105,7 @@ class SwapBoxes(BoxHandling):
         yield from self._drive_straight(phase, here, backwards=end == "front")
 
     def _check_result(self) -> None:
-        """:class:`TaskFailed` if a box is not where it should be, or a bunch has fallen out."""
+        """Raise :class:`TaskFailed` if a box is not where it should be, or if a bunch has fallen out."""
         swap = self.plan
         off = float(np.linalg.norm(self.box_pose(swap.empty_box)[:2] - self._target_pose[:2]))
         if off > PLACEMENT_TOLERANCE:

@@ -1,4 +1,5 @@
-"""Tasks of a robot as generators: each commands the robot and yields the name of its phase, once a step.
+"""Base class of a robot's tasks. A task is a generator that commands the robot and yields the name of its phase, once
+per step.
 
     class Wave(Task):
         def run(self):
@@ -9,7 +10,7 @@
         def focus(self):
             return self.robot.frame_pose(self.robot.description.groups["arm_left"].tool)[:3]
 
-A :class:`TaskFailed` that it raises ends the task; its text becomes the reason.
+A :class:`TaskFailed` that is raised in the generator ends the task. Its text becomes the task's ``reason``.
 """
 
 from __future__ import annotations
@@ -27,17 +28,17 @@ log = logging.getLogger(__name__)
 
 
 class TaskFailed(Exception):
-    """The task cannot go on; the text says why."""
+    """A task that cannot continue. The text gives the reason."""
 
 
 class Task(abc.ABC):
-    """Advances :meth:`run` by one step a time; ``reason`` is empty unless the task has failed."""
+    """Base class of tasks. :meth:`run` is advanced by one step in each :meth:`control`."""
 
     key_phases: frozenset[str] = frozenset()
-    """Phases that are worth a picture."""
+    """Names of the phases of which pictures are most useful."""
 
     def __init__(self, robot: Robot, *, timeout: float) -> None:
-        """The task fails after ``timeout`` [s]."""
+        """``timeout`` [s]: time after which the task fails."""
         self.robot = robot
         self.timeout = timeout
         self.time = 0.0
@@ -45,37 +46,39 @@ class Task(abc.ABC):
         self.phase = ""
         """Name of the present phase."""
         self.durations: dict[str, float] = {}
-        """[s] Of each phase, in their order."""
+        """[s] Duration of each phase, by name of the phase, in their order."""
         self.is_done = False
+        """Whether the task has ended, successfully or not."""
         self.reason = ""
-        """Why it failed, if it did."""
+        """Reason of a failure; empty unless the task has failed."""
         self._started: float | None = None
         self._coroutine = self.run()
 
     @property
     def succeeded(self) -> bool:
-        """Whether it ended without a failure."""
+        """Whether the task has ended without a failure."""
         return self.is_done and not self.reason
 
     def frame_score(self) -> float:
-        """How much a picture would show now, 0 to 1: 1 in a key phase."""
+        """How useful a picture would be now, 0 to 1: 1 in a key phase."""
         return float(self.phase in self.key_phases)
 
     def report(self) -> dict[str, Any]:
-        """The result as plain values for JSON."""
+        """Returns the result of the task as plain values for JSON."""
         phases = {phase: round(seconds, 2) for phase, seconds in self.durations.items()}
         return {"succeeded": self.succeeded, "reason": self.reason, "phase": self.phase, "phases_s": phases}
 
     @abc.abstractmethod
     def focus(self) -> np.ndarray:
-        """Point [3] m in the world for the head camera to look at."""
+        """Returns the point [3] m in the world at which the head camera is to look."""
 
     @abc.abstractmethod
     def run(self) -> Iterator[str]:
-        """The task: command the robot and yield the name of the phase, once a step; may raise :class:`TaskFailed`."""
+        """The task itself: command the robot and yield the name of the phase, once per step. May raise
+        :class:`TaskFailed`."""
 
     def control(self, time: float) -> None:
-        """Command the robot for the step that starts at ``time`` [s]; call it before ``robot.control``."""
+        """Command the robot for the step that starts at ``time`` [s]. Call this before ``robot.control``."""
         if self.is_done:
             return
         if self._started is None:
@@ -94,7 +97,7 @@ class Task(abc.ABC):
             log.warning("%s: %s", self.robot.name, self.reason)
 
     def wait(self, seconds: float, phase: str) -> Iterator[str]:
-        """Let ``seconds`` pass."""
+        """Wait for ``seconds`` [s] of simulated time, in the phase ``phase``."""
         end = self.time + seconds
         while self.time < end:
             yield phase

@@ -1,1 +1,1 @@
-"""Subscribed topics: commands to the robot as plain values."""
+"""Command topics and actions of a robot: their messages are converted to plain values."""

@@ -1,7 +1,7 @@
-"""Action servers of trajectory controllers and grippers: control_msgs, as ros2_controllers serve them.
+"""Action servers of trajectory controllers and grippers, with the control_msgs actions of ros2_controllers.
 
-A goal is checked here and executed by the client; its handle waits without a thread or task of its own until the
-client tells how it ended. A newer goal of a controller ends the one before it, which is aborted.
+A goal is checked here and executed by the client. Its goal handle waits, without its own thread or task, for the result
+from the client. A newer goal of a controller ends the older goal, which is aborted.
 """
 
 from __future__ import annotations
@@ -35,13 +35,14 @@ from vinesim.scene.values import ControllerKind, ControllerSpec, RobotSample
 log = logging.getLogger(__name__)
 
 RESULT_TIMEOUT = 10
-"""[s] Time for which a result is kept for clients that request it: the default of rcl since Iron."""
+"""[s] Time for which a result is kept for action clients that request it: the default of rcl since Iron."""
 MAX_GOALS = 32
-"""Largest number of goals of one robot that are executed at the same time. Further ones are rejected."""
+"""Largest number of goals of one robot that are executed at the same time. Further goals are rejected."""
 
 
 class DeferredActionServer(ActionServer):
-    """An action server whose accepted goals are executing, but have no task until there is a result."""
+    """An action server whose accepted goals have the state EXECUTING, but no execution task. :meth:`notify_execute`
+    is called with a callback once the result is known."""
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Callable[..., Any] | None) -> None:
         if execute_callback is not None:
@@ -49,7 +50,7 @@ class DeferredActionServer(ActionServer):
 
 
 class ActiveGoal:
-    """A goal between its acceptance and its result."""
+    """A goal that was accepted and has no result yet."""
 
     def __init__(self, server: ActionServer, handle: ServerGoalHandle, command: JointTrajectory | GripperGoal) -> None:
         self.server = server
@@ -58,7 +59,7 @@ class ActiveGoal:
 
 
 class ControllerActions:
-    """The action servers of these ``controllers``."""
+    """The action servers of a robot's ``controllers``. Accepted goals are put into ``queue``."""
 
     def __init__(self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue) -> None:
         from control_msgs.action import FollowJointTrajectory, GripperCommand
@@ -79,6 +80,7 @@ class ControllerActions:
     def _serve(
         self, node: rclpy.node.Node, action: Any, name: str, take: Callable[..., JointTrajectory | GripperGoal]
     ) -> None:
+        """Create the action server ``name``. ``take`` converts a goal request to a command."""
         server = DeferredActionServer(
             node,
             action,
@@ -93,10 +95,12 @@ class ControllerActions:
     # ------------------------------------------------------------------ in the receiving thread
 
     def _judge(self, take: Callable[..., object], request: Any) -> GoalResponse:
+        """Accept or reject a goal request: it must be valid, and fewer than :data:`MAX_GOALS` goals may be
+        executing."""
         try:
             take(request, goal=b"")
             if len(self._goals) >= MAX_GOALS:
-                raise convert.CommandError(f"{MAX_GOALS} goals are executed already; wait for one to end")
+                raise convert.CommandError(f"{MAX_GOALS} goals are being executed already; wait for one to end")
         except convert.CommandError as error:
             self._queue.refuse(error)
             return GoalResponse.REJECT
@@ -105,6 +109,7 @@ class ControllerActions:
     def _begin(
         self, server: ActionServer, take: Callable[..., JointTrajectory | GripperGoal], handle: ServerGoalHandle
     ) -> None:
+        """Start to execute an accepted goal: queue its command for the client."""
         goal = bytes(handle.goal_id.uuid)
         command = take(handle.request, goal=goal)
         handle.execute()
@@ -113,6 +118,7 @@ class ControllerActions:
         self._queue.put(command)
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
+        """Accept a cancel request and queue it for the client."""
         self._queue.put(CancelGoal(bytes(handle.goal_id.uuid)))
         return CancelResponse.ACCEPT
 
@@ -125,7 +131,7 @@ class ControllerActions:
             return list(self._goals.values())
 
     def publish_feedback(self, sample: RobotSample) -> None:
-        """Publish the progress of trajectory goals to their clients."""
+        """Publish feedback for all trajectory goals."""
         places = {name: i for i, name in enumerate(sample.joints.names)}
         for goal in self.goals:
             if isinstance(goal.command, JointTrajectory):
@@ -136,7 +142,7 @@ class ControllerActions:
                 goal.handle.publish_feedback(message)
 
     def finish(self, result: GoalResult) -> None:
-        """Send the result of a goal to its client. Nothing happens if the goal is not known."""
+        """Send the result of a goal to its action client. Nothing happens for an unknown goal."""
         with self._lock:
             goal = self._goals.pop(result.goal, None)
         if goal is None:
@@ -154,7 +160,8 @@ class ControllerActions:
 
 
 def end_goal(status: GoalStatus, result: Any, handle: ServerGoalHandle) -> Any:
-    """Bring a goal into its last state; a cancel request that came too late leaves it succeeded or aborted."""
+    """Bring a goal handle into its final state and return ``result``. A goal for which a cancel request came too
+    late stays succeeded or aborted."""
     if handle.is_cancel_requested and status is not GoalStatus.SUCCEEDED:
         handle.canceled()
     elif status is GoalStatus.SUCCEEDED:
@@ -164,17 +171,18 @@ def end_goal(status: GoalStatus, result: Any, handle: ServerGoalHandle) -> Any:
     return result
 
 
-# The action simulate_steps (simulation_interfaces/SimulateSteps): steps of a paused simulation, each reported.
+# The action simulate_steps (simulation_interfaces/SimulateSteps): steps of a paused simulation, with feedback for each.
 #
-# A goal is executed by the simulation, and its handle waits without a thread of its own: the node goes on serving.
+# The simulation executes a goal. The goal handle waits without its own thread, so the node can serve other requests.
 
 
 NAME = "simulate_steps"
-"""Topic, relative to the node's namespace."""
+"""Name of the action, relative to the node's namespace."""
 
 
 class StepAction:
-    """The action server. Every goal is accepted: only an accepted one has a result that says why it was not done."""
+    """The action server of ``simulate_steps``. It accepts every goal, because only an accepted goal has a result
+    with the reason of a refusal."""
 
     def __init__(
         self,
@@ -183,8 +191,8 @@ class StepAction:
         numbers: Iterator[int],
         result: Callable[[SimulationReply], Any],
     ) -> None:
-        """``ask`` sends a request to the simulation, with the next of the ``numbers``; ``result`` makes a
-        simulation_interfaces/Result of its answer, which :meth:`answer` takes."""
+        """``ask`` sends a request to the simulation, numbered by the next of ``numbers``. The simulation's replies
+        are passed to :meth:`answer`. ``result`` converts a reply to a simulation_interfaces/Result."""
         from simulation_interfaces.action import SimulateSteps
 
         self._type = SimulateSteps
@@ -192,7 +200,7 @@ class StepAction:
         self._numbers = numbers
         self._result = result
         self._goals: dict[int, ServerGoalHandle] = {}
-        """Goals that are being executed, by the number of their request."""
+        """Goals that are being executed, by the number of their request to the simulation."""
         self._server = DeferredActionServer(
             node,
             SimulateSteps,
@@ -220,7 +228,7 @@ class StepAction:
     # ------------------------------------------------------------------ in any thread
 
     def answer(self, reply: SimulationReply | StepProgress) -> None:
-        """Tell a goal's client how far it is, or how it ended; nothing happens if the goal is not known."""
+        """Publish the progress of a goal as feedback, or send its result. Nothing happens for an unknown goal."""
         if isinstance(reply, StepProgress):
             if (handle := self._goals.get(reply.number)) is not None:
                 feedback = self._type.Feedback(completed_steps=reply.completed, remaining_steps=reply.remaining)

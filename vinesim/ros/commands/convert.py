@@ -1,4 +1,5 @@
-"""Conversion of command messages to plain values: pure functions that raise :class:`CommandError` for unfit ones."""
+"""Conversion of command messages to plain values, by pure functions that raise :class:`CommandError` for invalid
+messages."""
 
 from __future__ import annotations
 
@@ -27,15 +28,15 @@ from vinesim.ros.messages.convert import seconds
 from vinesim.scene.values import LightPattern
 
 MAX_SOUND = 960_000
-"""Bytes of sound in one message: half a minute."""
+"""Largest size of the sound in one message [B]: half a minute."""
 
 
 class CommandError(ValueError):
-    """A command message contradicts itself; the text says how."""
+    """A command message that contradicts itself or the robot. The text gives the reason."""
 
 
 def base_velocity(message: TwistStamped) -> BaseVelocity:
-    """A commanded velocity of the base; it must be finite."""
+    """Convert a velocity command of the base, which must be finite."""
     linear = message.twist.linear
     angular = message.twist.angular
     velocity = np.array([linear.x, linear.y, linear.z, angular.x, angular.y, angular.z])
@@ -45,7 +46,7 @@ def base_velocity(message: TwistStamped) -> BaseVelocity:
 
 
 def lights_pattern(message: String) -> LightsPattern:
-    """A pattern of the indicator lights, by its name."""
+    """Convert the name of a pattern of the indicator lights."""
     try:
         return LightsPattern(LightPattern[message.data.strip().upper()])
     except KeyError:
@@ -54,7 +55,8 @@ def lights_pattern(message: String) -> LightsPattern:
 
 
 def lights_color(message: ColorRGBA) -> LightsColor:
-    """A colour of the indicator lights: sRGB from 0 to 1; with alpha 0 that of the pattern."""
+    """Convert a colour of the indicator lights, sRGB and alpha from 0 to 1. Alpha 0 selects the colour of the
+    pattern."""
     color = message.r, message.g, message.b
     if not all(0.0 <= part <= 1.0 for part in (*color, message.a)):
         raise CommandError(f"colour of lights {(*color, message.a)}; give four numbers from 0 to 1")
@@ -62,7 +64,7 @@ def lights_color(message: ColorRGBA) -> LightsColor:
 
 
 def loudspeaker_sound(message: Any) -> LoudspeakerSound:
-    """Sound for the loudspeaker: whole samples of PCM16, not more than half a minute."""
+    """Convert sound for the loudspeaker: whole samples of PCM16, at most :data:`MAX_SOUND` bytes."""
     pcm = bytes(message.data)
     if len(pcm) % 2 or len(pcm) > MAX_SOUND:
         raise CommandError(f"sound of {len(pcm)} B; give PCM16 of 16 kHz, mono, at most {MAX_SOUND} B at a time")
@@ -70,6 +72,7 @@ def loudspeaker_sound(message: Any) -> LoudspeakerSound:
 
 
 def _joint_values(message: Float64MultiArray, controller: str, joints: Sequence[str], *, nan: bool) -> np.ndarray:
+    """Returns one value for each of ``joints``, which must be finite, or NaN if ``nan``."""
     values = np.array(message.data, float)
     if len(values) != len(joints):
         raise CommandError(f"{controller}: {len(values)} values; give one for each of {', '.join(joints)}")
@@ -79,14 +82,16 @@ def _joint_values(message: Float64MultiArray, controller: str, joints: Sequence[
 
 
 def forward_command(message: Float64MultiArray, controller: str, joints: Sequence[str]) -> ForwardCommand:
-    """Values of a forward controller of these ``joints``: finite, or NaN."""
+    """Convert the values for the ``joints`` of a forward controller. Each is finite, or NaN to leave the joint as it
+    is."""
     return ForwardCommand(controller, _joint_values(message, controller, joints, nan=True))
 
 
 def impedance_command(
     message: Float64MultiArray, controller: str, joints: Sequence[str], what: str
 ) -> ImpedanceCommand:
-    """Gains or equilibrium of an impedance controller of these ``joints``: finite, gains not below zero."""
+    """Convert gains or equilibrium positions for the ``joints`` of an impedance controller. They must be finite, and
+    gains not below 0."""
     values = _joint_values(message, controller, joints, nan=False)
     if what != "equilibrium" and (values < 0.0).any():
         raise CommandError(f"{controller}: {what} below zero: {values.tolist()}; give 0 or more")
@@ -94,24 +99,26 @@ def impedance_command(
 
 
 def elastic_command(message: JointState, controller: str, joint: str) -> ElasticCommand:
-    """Position of one motor: the message's only one, or that of its ``joint``."""
+    """Convert the position of one motor: the only position in the message, or the one named ``joint``."""
     names = list(message.name)
     positions = list(message.position)
     place = names.index(joint) if joint in names else 0
     if place >= len(positions) or (names and joint not in names) or not np.isfinite(positions[place]):
-        raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite one of {joint}")
+        raise CommandError(f"{controller}/{joint}: positions {positions} of {names}; give a finite position of {joint}")
     return ElasticCommand(controller, joint, positions[place])
 
 
 def joint_trajectory(
     message: JointTrajectoryMessage, controller: str, known: Sequence[str], goal: bytes | None = None
 ) -> JointTrajectory:
-    """A trajectory of some of the ``known`` joints: its points fit its joints, and its times rise from 0 on."""
+    """Convert a trajectory for some of the ``known`` joints of a controller. Each point must have one position per
+    joint, and the times must increase from 0."""
     joints = tuple(message.joint_names)
     unknown = [joint for joint in joints if joint not in known]
     if unknown or len(set(joints)) < len(joints) or (message.points and not joints):
         raise CommandError(
-            f"{controller}: a trajectory for {', '.join(joints) or 'nothing'}; it moves each of {', '.join(known)} once"
+            f"{controller}: a trajectory for {', '.join(joints) or 'nothing'}; "
+            f"name joints among {', '.join(known)}, each at most once"
         )
     for i, point in enumerate(message.points):
         if len(point.positions) != len(joints) or len(point.velocities) not in (0, len(joints)):
@@ -122,7 +129,7 @@ def joint_trajectory(
     start = [p.time_from_start.sec + 1e-9 * p.time_from_start.nanosec for p in message.points]
     times = np.array(start, float)
     if (np.diff(times) <= 0.0).any() or (len(times) and times[0] < 0.0):
-        raise CommandError(f"{controller}: time_from_start does not rise from 0 on: {start}")
+        raise CommandError(f"{controller}: time_from_start does not increase from 0: {start}")
     positions = np.array([p.positions for p in message.points], float).reshape(len(times), len(joints))
     with_velocity = len(times) > 0 and all(len(p.velocities) for p in message.points) and len(joints) > 0
     velocities = np.array([p.velocities for p in message.points], float) if with_velocity else None
@@ -132,10 +139,11 @@ def joint_trajectory(
 
 
 def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: bytes) -> JointTrajectory:
-    """A goal of control_msgs/action/FollowJointTrajectory with its tolerances; it needs at least one point."""
+    """Convert a goal of control_msgs/action/FollowJointTrajectory with its tolerances. Its trajectory must have at
+    least one point."""
     plain = joint_trajectory(request.trajectory, controller, known, goal)
     if len(plain.times) == 0:
-        raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the goal before it")
+        raise CommandError(f"{controller}: a goal without points; give at least one, or cancel the previous goal")
     late = request.goal_time_tolerance.sec + 1e-9 * request.goal_time_tolerance.nanosec
     return JointTrajectory(
         controller,
@@ -152,7 +160,8 @@ def trajectory_goal(request: Any, controller: str, known: Sequence[str], goal: b
 
 
 def _tolerances(given: Iterable[Any], joints: tuple[str, ...], controller: str) -> JointTolerances | None:
-    """Tolerances in the order of ``joints``, None if none is given. 0 means none was given, below 0 no limit."""
+    """Returns tolerances in the order of ``joints``, or None if none is given. In ``given``, 0 means not specified
+    and a negative value means unlimited."""
     position = np.full(len(joints), np.inf)
     velocity = np.full(len(joints), np.inf)
     said = False
@@ -170,7 +179,8 @@ def _tolerances(given: Iterable[Any], joints: tuple[str, ...], controller: str) 
 
 
 def gripper_goal(request: Any, controller: str, goal: bytes) -> GripperGoal:
-    """A goal of control_msgs/action/GripperCommand; an effort of 0 or below means all there is."""
+    """Convert a goal of control_msgs/action/GripperCommand. A max_effort of 0 or below means the gripper's own
+    limit."""
     command = request.command
     if not np.isfinite([command.position, command.max_effort]).all():
         raise CommandError(f"{controller}: position {command.position}, max_effort {command.max_effort}: not finite")

@@ -1,4 +1,4 @@
-"""Subscriptions to the robot's command topics; commands are queued as plain values until the client takes them."""
+"""Subscriptions to a robot's command topics. Commands wait in a queue as plain values until the client takes them."""
 
 from __future__ import annotations
 
@@ -32,24 +32,26 @@ from vinesim.scene.values import FORWARD_KINDS, ControllerKind, ControllerSpec
 log = logging.getLogger(__name__)
 
 BASE_COMMAND = "mobile_base_controller/cmd_vel"
-"""Topic of commands for the base, relative to the node's namespace."""
+"""Topic of velocity commands for the base, relative to the node's namespace."""
 MAX_QUEUED = 256
-"""Largest number of queued commands; a client that takes them after every step never loses the oldest."""
+"""Largest number of queued commands. A client that takes commands after every step loses none."""
 
 MAX_LOGGED = 32
-"""Largest number of reasons in the log: some name values, and differ with each message."""
+"""Largest number of refusal reasons that are logged. It is limited because some reasons contain values and differ
+for each message."""
 
 
 class CommandQueue:
-    """Commands on their way to the client: a set-point replaces an older one of its kind, goals are all kept."""
+    """Commands that wait for the client. A newer set-point replaces an older one for the same target; trajectories
+    and goals are all kept."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._queue: deque[Command] = deque(maxlen=MAX_QUEUED)
         self._logged: set[str] = set()
-        """Reasons that were logged already."""
+        """Refusal reasons that were logged already."""
         self.rejected = 0
-        """Messages and goals that contradicted themselves, or that left a full queue before the client read them."""
+        """Number of messages and goals that were invalid, or that were dropped unread because the queue was full."""
 
     def drain(self) -> list[Command]:
         """Take all commands that arrived since the last call, in order of arrival."""
@@ -59,7 +61,7 @@ class CommandQueue:
         return commands
 
     def put(self, command: Command) -> None:
-        """Add a command."""
+        """Add a command. A set-point replaces an older one for the same target."""
         key = _setpoint_key(command)
         with self._lock:
             if key is not None:
@@ -69,16 +71,17 @@ class CommandQueue:
             self._queue.append(command)
 
     def refuse(self, error: convert.CommandError) -> None:
-        """Count a command that contradicts itself; the log has each reason once."""
+        """Count an invalid command. Each reason is logged once."""
         with self._lock:
             self.rejected += 1
         if (reason := str(error)) not in self._logged and len(self._logged) < MAX_LOGGED:
             self._logged.add(reason)
-            log.warning("refused a command, further ones for this reason are only counted: %s", reason)
+            log.warning("refused a command; further commands refused for this reason are only counted: %s", reason)
 
 
 def _setpoint_key(command: Command) -> tuple[str, ...] | None:
-    """What a command sets, if a newer one makes it void; None for trajectories and goals."""
+    """Returns the target of a set-point command: a newer command with the same key replaces it. None for
+    trajectories and goals."""
     match command:
         case BaseVelocity():
             return ("base",)
@@ -94,7 +97,8 @@ def _setpoint_key(command: Command) -> tuple[str, ...] | None:
 
 
 class CommandSubscriptions:
-    """The command topics of a base and of these ``controllers``. ``audio_data``: the message type of sound."""
+    """Subscriptions to the command topics of the base, lights, loudspeaker and ``controllers`` of a robot.
+    ``audio_data``: message type of sound."""
 
     def __init__(
         self, node: rclpy.node.Node, controllers: Sequence[ControllerSpec], queue: CommandQueue, audio_data: type
@@ -134,9 +138,10 @@ class CommandSubscriptions:
         self.types[self._node.resolve_topic_name(topic)] = f"{package}/msg/{name}"
 
     def foreign_types(self) -> dict[str, list[str]]:
-        """Command topics that another node publishes as other message types, and those types.
+        """Returns the command topics that other nodes publish with a wrong message type, and these types
+        (``package/msg/Name``) by topic.
 
-        DDS delivers none of these messages, and reports nothing.
+        DDS does not deliver such messages, and reports no error.
         """
         known = self._node.get_topic_names_and_types()
         return {

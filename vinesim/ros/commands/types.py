@@ -18,11 +18,11 @@ class BaseVelocity:
     """Commanded velocity of the base, in its own axes (TwistStamped on mobile_base_controller/cmd_vel)."""
 
     time: float
-    """Time stamp of the sender [s]; 0 if the sender gave none."""
+    """Header stamp [s]; 0 if the sender gave none."""
     linear: np.ndarray
-    """[3] m/s"""
+    """Linear velocity [3] m/s."""
     angular: np.ndarray
-    """[3] rad/s"""
+    """Angular velocity [3] rad/s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -31,8 +31,8 @@ class ForwardCommand:
 
     controller: str
     values: np.ndarray
-    """[joint] Positions, velocities or efforts [rad or m, rad/s or m/s, N m or N] in the controller's order of joints.
-    NaN leaves a joint alone."""
+    """[joint] Positions, velocities or efforts [rad or m, rad/s or m/s, N m or N] in the controller's order of
+    joints. NaN leaves a joint as it is."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -41,9 +41,10 @@ class ImpedanceCommand:
 
     controller: str
     what: str
-    """``"stiffness"`` [N m/rad or N/m], ``"damping"`` [N m s/rad or N s/m], ``"equilibrium"`` [rad or m]"""
+    """Quantity that is set: ``"stiffness"`` [N m/rad or N/m], ``"damping"`` [N m s/rad or N s/m] or
+    ``"equilibrium"`` [rad or m]."""
     values: np.ndarray
-    """[joint]"""
+    """[joint] Values in the controller's order of joints, in the unit of ``what``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -58,46 +59,48 @@ class ElasticCommand:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointTolerances:
-    """Permitted errors of some joints (control_msgs/JointTolerance), each [joint]; infinite: no limit."""
+    """Largest permitted errors of some joints (control_msgs/JointTolerance); infinite where there is no limit."""
 
     position: np.ndarray
-    """rad or m"""
+    """[joint] Largest permitted position errors, rad or m."""
     velocity: np.ndarray
-    """rad/s or m/s"""
+    """[joint] Largest permitted velocity errors, rad/s or m/s."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointTrajectory:
-    """Way points of some joints (trajectory_msgs/JointTrajectory); no points: stop at the present positions."""
+    """Waypoints of some joints (trajectory_msgs/JointTrajectory). A trajectory without points stops the joints at
+    their present positions."""
 
     controller: str
     time: float
-    """Time of its start [s]; 0: now."""
+    """Start time [s]; 0: at once."""
     joints: tuple[str, ...]
     times: np.ndarray
-    """[point] s after the start, rising"""
+    """[point] Times of the waypoints, s after the start, increasing."""
     positions: np.ndarray
-    """[point, joint] rad or m"""
+    """[point, joint] Positions at the waypoints, rad or m."""
     velocities: np.ndarray | None
-    """[point, joint] rad/s or m/s, or None if no point gives any."""
+    """[point, joint] Velocities at the waypoints, rad/s or m/s; None if the message has none."""
     path_tolerance: JointTolerances | None = None
+    """Tolerance on the way, for a goal of an action; None: the controller's tolerance."""
     goal_tolerance: JointTolerances | None = None
     """Tolerance at the end, for a goal of an action; None: the controller's tolerance."""
     goal_time_tolerance: float | None = None
-    """[s] Permitted delay of the arrival, for a goal of an action; None: the controller's."""
+    """[s] Permitted delay of the arrival, for a goal of an action; None: the controller's permitted delay."""
     goal: bytes | None = None
-    """Id of the action's goal; None: it came on a topic, so no client waits for its result."""
+    """Id of the action goal; None: the trajectory came on a topic, so no action client waits for a result."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GripperGoal:
-    """A goal of a gripper (control_msgs/action/GripperCommand). Its meaning depends on the kind of gripper."""
+    """A goal of control_msgs/action/GripperCommand. The meaning of its values depends on the kind of gripper."""
 
     controller: str
     goal: bytes
     position: float
     max_effort: float | None
-    """Largest effort; None: the own limit of the gripper."""
+    """Largest effort; None: the gripper's own limit."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -124,15 +127,16 @@ class LightsSound:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class LoudspeakerSound:
-    """Sound to be played after the sound that plays now (audio_common_msgs/AudioData on speaker/audio)."""
+    """Sound for the loudspeaker (audio_common_msgs/AudioData on speaker/audio), played after sound that arrived
+    earlier."""
 
     pcm: bytes
-    """PCM16 of 16 kHz, mono."""
+    """Samples as PCM16 of 16 kHz, mono."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CancelGoal:
-    """Request to cancel a goal."""
+    """Request to cancel a goal of an action, by the id of the goal."""
 
     goal: bytes
 
@@ -153,7 +157,7 @@ Command = (
 
 
 class GoalStatus(enum.StrEnum):
-    """How a goal ended, as action_msgs/GoalStatus has it."""
+    """Final state of a goal, named as in action_msgs/GoalStatus."""
 
     SUCCEEDED = "succeeded"
     ABORTED = "aborted"
@@ -162,25 +166,28 @@ class GoalStatus(enum.StrEnum):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GoalResult:
-    """How a goal ended, on its way back to the action server."""
+    """Result of a goal, sent from the client to the action server."""
 
     goal: bytes
     status: GoalStatus
     code: int
     """Error code of control_msgs/action/FollowJointTrajectory."""
     text: str = ""
+    """Reason if the goal did not succeed; otherwise empty."""
     gripper: GripperState | None = None
+    """State of the gripper, for a goal of a gripper; otherwise None."""
 
 
 class SimulationAction(enum.StrEnum):
-    """Kinds of requests of a node to the simulation, named as in simulation_interfaces."""
+    """Kinds of requests from a ROS node to the simulation, named as in simulation_interfaces."""
 
     GET_STATE = "get_simulation_state"
     PLAY = "play"
     PAUSE = "pause"
     STEP = "step_simulation"
     CANCEL_STEPS = "cancel_steps"
-    """End a :attr:`STEP` before its last step. The request has the number of the STEP request, which is answered."""
+    """End a :attr:`STEP` request before its last step. This request has the same number as the STEP request, and
+    only the STEP request is answered."""
     GET_ENTITIES = "get_entities"
     GET_SPAWNABLES = "get_spawnables"
     SPAWN = "spawn_entity"
@@ -190,7 +197,7 @@ class SimulationAction(enum.StrEnum):
 
 
 class Refusal(enum.StrEnum):
-    """Reasons for which a request was not done, as in the results of simulation_interfaces."""
+    """Reasons to refuse a request, as in the results of simulation_interfaces."""
 
     UNSUPPORTED = "feature unsupported"
     NOT_FOUND = "not found"
@@ -206,7 +213,7 @@ class Refusal(enum.StrEnum):
 
 
 class RequestRefused(Exception):
-    """A request was not done: ``kind`` for programs, the text for people."""
+    """The simulation refuses a request. ``kind`` is the reason for programs, the message the reason for people."""
 
     def __init__(self, kind: Refusal, text: str) -> None:
         super().__init__(text)
@@ -224,28 +231,28 @@ class EntityCategory(enum.StrEnum):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Entity:
-    """Something in the world that has a name, a pose and a velocity."""
+    """A named object, robot or person in the world, with its pose and velocity."""
 
     name: str
     category: EntityCategory
     pose: np.ndarray
-    """[7] m, 1 in the map"""
+    """Pose in the map [7] m, 1."""
     velocity: np.ndarray
-    """[6] m/s, rad/s, world axes; NaN where it is not known"""
+    """Linear and angular velocity [6] m/s, rad/s in world axes; NaN if unknown."""
     description: str = ""
-    """What it is, for people."""
+    """Description for people."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Spawnable:
-    """Something that can be added to the world."""
+    """A kind of entity that can be added to the world."""
 
     uri: str
     description: str
     low: tuple[float, float, float]
-    """[m] Lower corner of its bounding box, relative to its pose."""
+    """[m] Lower corner of the entity's bounding box, relative to the entity's pose."""
     high: tuple[float, float, float]
-    """[m] Upper corner of its bounding box, relative to its pose."""
+    """[m] Upper corner of the entity's bounding box, relative to the entity's pose."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -254,16 +261,16 @@ class EntityArguments:
 
     name: str
     pose: np.ndarray | None = None
-    """[7] m, 1 in the map, not checked yet."""
+    """Requested pose in the map [7] m, 1. It has not been checked."""
     velocity: np.ndarray | None = None
-    """[6] m/s, rad/s, world axes, not checked yet."""
+    """Requested linear and angular velocity [6] m/s, rad/s in world axes. It has not been checked."""
     uri: str = ""
     allow_renaming: bool = False
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SimulationRequest:
-    """A request to the simulation; it is answered between two steps."""
+    """A request to the simulation, which answers it between two steps."""
 
     number: int
     action: SimulationAction
@@ -273,14 +280,14 @@ class SimulationRequest:
     """For :attr:`SimulationAction.STEP`: whether the simulation sends a :class:`StepProgress` after each step."""
     entity: EntityArguments | None = None
     keep_state: bool = False
-    """For :attr:`SimulationAction.RESET`: only spawned entities are removed."""
+    """For :attr:`SimulationAction.RESET`: whether spawned entities are removed and everything else stays as it is."""
     keep_spawned: bool = False
-    """For :attr:`SimulationAction.RESET`: spawned entities stay, at the place where they were spawned."""
+    """For :attr:`SimulationAction.RESET`: whether spawned entities are kept, at the pose where they were spawned."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class StepProgress:
-    """How far the steps of the request of the same number are; its answer follows after the last."""
+    """Progress of the step request with the same number. The :class:`SimulationReply` follows after the last step."""
 
     number: int
     completed: int
@@ -289,17 +296,17 @@ class StepProgress:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SimulationReply:
-    """The answer to a request of the same number."""
+    """The answer to the request with the same number."""
 
     number: int
     time: float
-    """[s] of the world"""
+    """Time of the world [s]."""
     is_paused: bool
     refusal: str = ""
-    """Why it was not done, in one line; empty if it was."""
+    """Reason of a refusal, in one line; empty if the request was carried out."""
     kind: Refusal = Refusal.INCORRECT_STATE
-    """Of the refusal, if there is one."""
+    """Reason of a refusal, for programs. It has no meaning if ``refusal`` is empty."""
     name: str = ""
-    """Of the entity that was spawned."""
+    """Name of the entity that was spawned."""
     spawnables: tuple[Spawnable, ...] = ()
     entities: tuple[Entity, ...] = ()

@@ -1,7 +1,7 @@
-"""Messages of what is true of the bunches in a picture; import it when vision_msgs can be imported.
+"""Messages with ground truth about the bunches in a picture. Import this module only when vision_msgs can be imported.
 
-All of one picture have its stamp and its optical frame, and list the same bunches in the same order. The id of a
-detection is the bunch's index, which data sets, label images and ``/tf_environment`` have too.
+All messages for one picture have its stamp and its optical frame, and list the same bunches in the same order. The id
+of a detection is the index of the bunch, as in data sets, label images and ``/tf_environment``.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.values import Box, BunchTruth, CameraFrame
 
 CLASS_ID = str(int(Organ.BUNCH))
-"""Class of all detections; LabelInfo has its name."""
+"""Class id of all detections. LabelInfo contains its name."""
 BUNCH_POINT = np.dtype(
     [
         ("x", "<f4"),
@@ -43,28 +43,31 @@ BUNCH_POINT = np.dtype(
         ("amodal_pixels", "<i4"),
     ]
 )
-"""A bunch as a point of a cloud: where to cut [m], NaN once it is picked; the pixel of that point and whether it is
-seen; the bunch's index; its berries and how many are seen; its pixels and how many it would have if nothing hid it."""
+"""A bunch as a point of a cloud. ``x``, ``y``, ``z``: point where to cut [m], NaN once the bunch is picked. ``u``,
+``v``: pixel of this point. ``seen``: whether this pixel shows the point. ``bunch``: index of the bunch. ``berries``,
+``berries_seen``: its number of berries, and of visible ones. ``pixels``, ``amodal_pixels``: its number of visible
+pixels, and their number if nothing hid the bunch."""
 
 
 def label_info() -> LabelInfo:
-    """Classes of detections; those of a label image are ``label // LABEL_STRIDE`` (:mod:`vinesim.scene.ids`)."""
+    """Returns the classes of detections. In a label image, the class is ``label // LABEL_STRIDE``
+    (:mod:`vinesim.scene.ids`)."""
     return LabelInfo(class_map=[VisionClass(class_id=int(organ), class_name=organ.name.lower()) for organ in Organ])
 
 
 def detections_2d(frame: CameraFrame) -> Detection2DArray:
-    """Boxes of the pixels that show each bunch."""
+    """Returns the bounding boxes of the visible pixels of each bunch."""
     header = convert.header(frame.time, frame.info.frame_id)
     detections = []
     for one in frame.bunches or ():
-        assert one.visible_box is not None, "frames have bunches of which a pixel is seen"
+        assert one.visible_box is not None, "frames list only bunches with a visible pixel"
         box = _box_2d(one.visible_box)
         detections.append(Detection2D(header=header, id=str(one.bunch), bbox=box, results=[_hypothesis(frame, one)]))
     return Detection2DArray(header=header, detections=detections)
 
 
 def detections_3d(frame: CameraFrame) -> Detection3DArray:
-    """Boxes around all parts of each bunch, x down the rachis."""
+    """Returns a bounding box of each bunch with all its parts. The box's x axis points down the rachis."""
     header = convert.header(frame.time, frame.info.frame_id)
     detections = []
     for one in frame.bunches or ():
@@ -76,7 +79,7 @@ def detections_3d(frame: CameraFrame) -> Detection3DArray:
 
 
 def bunch_cloud(frame: CameraFrame) -> PointCloud2:
-    """Cut points and berry counts."""
+    """Returns a cloud with one :data:`BUNCH_POINT` per bunch: where to cut, and its berries and pixels."""
     bunches = frame.bunches or ()
     message, points = convert.cloud(frame.time, frame.info.frame_id, BUNCH_POINT, 1, len(bunches))
     into_camera = frames.conjugate(frame.pose[3:])
@@ -93,7 +96,7 @@ def bunch_cloud(frame: CameraFrame) -> PointCloud2:
 
 
 def _hypothesis(frame: CameraFrame, one: BunchTruth) -> ObjectHypothesisWithPose:
-    """Class, pose in the optical frame, and as score the share of the bunch's pixels that nothing hides."""
+    """Returns class, pose in the optical frame, and score: the share of the bunch's pixels that nothing hides."""
     result = ObjectHypothesisWithPose()
     result.hypothesis.class_id = CLASS_ID
     result.hypothesis.score = 1.0 - one.occlusion
@@ -109,7 +112,7 @@ def _pose(values: np.ndarray) -> Pose:
 
 
 def _box_2d(box: Box) -> BoundingBox2D:
-    """Pixel centres are whole numbers, so a box of one pixel has the size 1."""
+    """Convert a box of pixels. Pixel centres have whole-number coordinates, so the box of one pixel has the size 1."""
     left, top, right, bottom = box
     message = BoundingBox2D(size_x=float(right - left + 1), size_y=float(bottom - top + 1))
     message.center.position.x = 0.5 * (left + right)

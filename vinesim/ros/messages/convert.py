@@ -1,8 +1,8 @@
-"""Conversion of values to ROS messages: pure functions.
+"""Conversion of plain values to ROS messages, by pure functions.
 
-Arrays go into a message through ``array.array``, which rosidl takes as it is (0.03 ms for a 0.9 MB picture; a list of
-numbers takes a thousand times as long). Stamps are the simulation time of the sample (REP-117/118 for what has no
-return, REP-103 for frames).
+Arrays are put into messages as ``array.array``, which rosidl takes without conversion (0.03 ms for a 0.9 MB picture; a
+list of numbers takes a thousand times as long). Header stamps are the simulated time of the sample. Frames follow
+REP-103, and missing returns REP-117 and REP-118.
 """
 
 from __future__ import annotations
@@ -51,8 +51,6 @@ from vinesim.scene.values import (
     Wrench,
 )
 
-"""One point of a depth camera's cloud; rgb is 0x00RRGGBB, which PointCloud2 carries as a float32 (PCL's way)."""
-
 LIDAR_POINT = np.dtype(
     {
         "names": ["x", "y", "z", "intensity", "ring", "time"],
@@ -61,7 +59,7 @@ LIDAR_POINT = np.dtype(
         "itemsize": 24,
     }
 )
-"""One point of a lidar; time [s] counts from the stamp."""
+"""One point of a lidar cloud. ``time`` [s] counts from the header stamp."""
 
 DUAL_LIDAR_POINT = np.dtype(
     {
@@ -71,40 +69,43 @@ DUAL_LIDAR_POINT = np.dtype(
         "itemsize": 24,
     }
 )
-"""The same of a lidar that reports two returns of a shot; return_type: 1 the strongest, 2 the other."""
+"""One point of the cloud of a lidar that reports two returns per shot: a :data:`LIDAR_POINT` with ``return_type``,
+which is 1 for the strongest return and 2 for the other."""
 
 _FIELD_TYPES = {
     "f4": PointField.FLOAT32,
     "i4": PointField.INT32,
     "u1": PointField.UINT8,
     "u2": PointField.UINT16,
-    "u4": PointField.FLOAT32,
+    "u4": PointField.FLOAT32,  # rgb as 0x00RRGGBB, which PointCloud2 carries as a float32, as PCL does
 }
+"""Datatype of a PointField by numpy type."""
 
 
 def stamp(time: float) -> Time:
-    """Simulation time [s] as a message."""
+    """Convert simulation time [s] to a Time message."""
     seconds, nanoseconds = split_time(time)
     return Time(sec=seconds, nanosec=nanoseconds)
 
 
 def seconds(time: Time) -> float:
-    """Time [s] of a message."""
+    """Convert a Time message to seconds."""
     return time.sec + 1e-9 * time.nanosec
 
 
 def header(time: float, frame: str) -> Header:
-    """Stamp and frame."""
+    """Returns a header with the stamp ``time`` [s] and a frame id."""
     return Header(stamp=stamp(time), frame_id=frame)
 
 
 def clock(time: float) -> Clock:
-    """Simulation time [s] for nodes with use_sim_time."""
+    """Returns the /clock message for simulation time ``time`` [s]."""
     return Clock(clock=stamp(time))
 
 
 def joint_state(sample: JointSample) -> JointState:
-    """Positions, velocities and efforts (what the drive transmits, contacts included)."""
+    """Returns positions, velocities and efforts of joints. The effort is what the drive transmits, contacts
+    included."""
     return JointState(
         header=header(sample.time, ""),
         name=list(sample.names),
@@ -115,14 +116,14 @@ def joint_state(sample: JointSample) -> JointState:
 
 
 _PLANAR = (0, 1, 5)
-"""x, y and yaw in a covariance of 6 rows."""
+"""Rows of x, y and yaw in a covariance [6, 6]."""
 UNMEASURED = 1e6
-"""Variance of z, roll and pitch in odometry, which tracks do not measure."""
+"""Variance of z [m2], roll and pitch [rad2] in odometry, which tracks do not measure."""
 
 
 def odometry(sample: RobotSample, base: str, odom: str) -> Odometry:
-    """Odometry of the base: pose in the frame ``odom``, velocity in its own axes, both as measured, and their
-    covariances."""
+    """Returns the measured odometry of the base, with covariances: its pose in the frame ``odom`` and its velocity
+    in the axes of the frame ``base``."""
     message = Odometry(header=header(sample.joints.time, odom), child_frame_id=base)
     pose = message.pose.pose
     set_vector(pose.position, sample.odom_q[:3])
@@ -137,7 +138,7 @@ def odometry(sample: RobotSample, base: str, odom: str) -> Odometry:
 
 
 def wrench(sample: Wrench) -> WrenchStamped:
-    """What a force-torque sensor reads, in its frame."""
+    """Returns the reading of a force-torque sensor, in the sensor's frame."""
     message = WrenchStamped(header=header(sample.time, sample.frame))
     set_vector(message.wrench.force, sample.force)
     set_vector(message.wrench.torque, sample.torque)
@@ -145,7 +146,7 @@ def wrench(sample: Wrench) -> WrenchStamped:
 
 
 def imu(sample: Imu) -> ImuMessage:
-    """What an inertial measurement unit reads; exact, so all covariances are 0."""
+    """Returns the reading of an inertial measurement unit. It is exact, so all covariances are 0."""
     message = ImuMessage(header=header(sample.time, sample.frame))
     set_quaternion(message.orientation, sample.orientation)
     set_vector(message.angular_velocity, sample.angular_velocity)
@@ -154,19 +155,19 @@ def imu(sample: Imu) -> ImuMessage:
 
 
 def intentions(known: Iterable[Intention]) -> String:
-    """What people indicate to do, as JSON; times are those of the world [s]."""
+    """Returns the intentions that people indicate, as JSON. Times are those of the world [s]."""
     people = [{"person": one.person, "intention": one.what, "start": one.start, "end": one.end} for one in known]
     return String(data=json.dumps({"people": people}))
 
 
 def gestures(time: float, shown: Iterable[HandGestures]) -> String:
-    """What the hands of people show since a ``time`` of the world [s], as JSON."""
+    """Returns the gestures that the hands of people show since ``time`` of the world [s], as JSON."""
     people = [{"person": one.person, "left": one.left, "right": one.right} for one in shown]
     return String(data=json.dumps({"time": time, "people": people}))
 
 
 def elastic_state(sample: ElasticSample, joint: int) -> JointState:
-    """One series elastic element: position of the motor, and the torque that its spring carries."""
+    """Returns the state of one series elastic element: position of the motor, and torque of the spring."""
     return JointState(
         header=header(sample.time, ""),
         name=[sample.names[joint]],
@@ -176,7 +177,8 @@ def elastic_state(sample: ElasticSample, joint: int) -> JointState:
 
 
 def reference_points(sample: RobotSample, joints: np.ndarray) -> dict[str, JointTrajectoryPoint]:
-    """Desired and actual state of ``joints`` [k], and the difference, as control_msgs have them."""
+    """Returns the desired and the actual state of ``joints`` [k] (indices), and their difference, under the names of
+    control_msgs."""
     assert sample.reference is not None
     wanted = np.stack([sample.reference.position[joints], sample.reference.velocity[joints]])
     found = np.stack([sample.joints.position[joints], sample.joints.velocity[joints]])
@@ -200,12 +202,13 @@ CONTACT_POINT = np.dtype(
         ("link", "i4"),
     ]
 )
-"""A contact as a point of a cloud: where, the force on the robot [N], the plant's body, its bunch or -1, and the
-robot's link by its number in the URDF or -1."""
+"""A contact as a point of a cloud: position [m], force on the robot [N], index of the plant body, index of its bunch
+or -1, and index of the robot's link in the URDF or -1."""
 
 
 def contact_cloud(sample: RobotSample, links: Mapping[str, int], bunch_of_body: np.ndarray, frame: str) -> PointCloud2:
-    """All contacts of one step, in the world's ``frame``; ``links``: numbers by name, ``bunch_of_body`` [body]."""
+    """Returns all contacts of one step, in the world's ``frame``. ``links``: indices of the robot's links, by name.
+    ``bunch_of_body`` [body]: index of the bunch of each plant body, -1 for none."""
     message, points = cloud(sample.joints.time, frame, CONTACT_POINT, 1, len(sample.contacts))
     for row, contact in zip(points[0], sample.contacts, strict=True):
         row["x"], row["y"], row["z"] = contact.position
@@ -217,32 +220,35 @@ def contact_cloud(sample: RobotSample, links: Mapping[str, int], bunch_of_body: 
 
 
 def rgb_image(frame: CameraFrame) -> Image:
-    """The picture, rgb8."""
+    """Returns the colour picture, encoding rgb8."""
     return image(frame, frame.rgb, "rgb8", np.uint8)
 
 
 def depth_image(frame: CameraFrame) -> Image:
-    """Depth along z [m], 32FC1; NaN no return, -Inf too near, +Inf too far (REP-118)."""
+    """Returns depth along z [m], encoding 32FC1: NaN for no return, -Inf for too near, +Inf for too far (REP-118)."""
     return image(frame, frame.depth, "32FC1", np.float32)
 
 
 def depth_image_millimetres(frame: CameraFrame) -> Image:
-    """Depth along z [mm], 16UC1; 0 where there is none or it is beyond 65.535 m (REP-118)."""
+    """Returns depth along z [mm], encoding 16UC1: 0 where depth is unknown or beyond 65.535 m (REP-118)."""
     return image(frame, depth_millimetres(frame.depth), "16UC1", np.uint16)
 
 
 QUANTIZATION = 100.0
+"""Quantization of inverse depth in compressed depth [1]: the default of compressed_depth_image_transport."""
 MAX_COMPRESSED_DEPTH = 10.0
-"""Of compressed depth, [1] and [m]: the defaults of compressed_depth_image_transport."""
+"""Largest depth in compressed depth [m]: the default of compressed_depth_image_transport."""
 
 
 def compressed_depth(frame: CameraFrame, *, is_millimetres: bool = False) -> CompressedImage:
-    """Depth as compressed_depth_image_transport encodes it: a header of 12 bytes, then a PNG of 16 bits.
+    """Returns depth as compressed_depth_image_transport encodes it: a header of 12 bytes, then a PNG of 16 bits per
+    pixel.
 
-    Millimetres, or the inverse of depth: q = a / depth + b, 0 where there is none and from 10 m on; a and b stand in
-    the header. Nearer than 0.152 m 16 bits cannot hold q, which then is 0.
+    The pixels are millimetres if ``is_millimetres``. Otherwise they are inverse depth, q = a / depth + b, where a and b
+    are in the header. q is 0 where depth is unknown or at least 10 m. It is also 0 for depths below 0.152 m, for which
+    q exceeds 16 bits.
     """
-    import cv2  # here, as a process that sends no pictures should not load it
+    import cv2  # not at the top: a process that publishes no pictures should not load it
 
     scale = offset = 0.0
     if is_millimetres:
@@ -265,13 +271,13 @@ def compressed_depth(frame: CameraFrame, *, is_millimetres: bool = False) -> Com
 
 
 def label_image(frame: CameraFrame) -> Image:
-    """Label of every pixel (:func:`vinesim.scene.ids.label`), 32SC1."""
+    """Returns the label of every pixel (:func:`vinesim.scene.ids.label`), encoding 32SC1."""
     return image(frame, frame.labels, "32SC1", np.int32)
 
 
 def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
-    """The picture as JPEG."""
-    import cv2  # here, as a process that sends no pictures should not load it
+    """Returns the colour picture as JPEG of a ``quality`` from 1 to 100."""
+    import cv2  # not at the top: a process that publishes no pictures should not load it
 
     encoded, data = cv2.imencode(".jpg", frame.rgb[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     if not encoded:
@@ -282,7 +288,8 @@ def compressed_image(frame: CameraFrame, quality: int = 85) -> CompressedImage:
 
 
 def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
-    """Intrinsics and distortion; rectification is the identity, and a rectified picture has the same matrix."""
+    """Returns intrinsics and distortion of a camera. Rectification is the identity, and a rectified picture has the
+    same camera matrix."""
     message = CameraInfoMessage(header=header(time, info.frame_id), width=info.width, height=info.height)
     message.distortion_model, coefficients = distortion_model(info)
     message.d = array.array("d", coefficients)
@@ -293,7 +300,7 @@ def camera_info(info: CameraInfo, time: float) -> CameraInfoMessage:
 
 
 def depth_cloud(frame: CameraFrame) -> PointCloud2:
-    """Depth and colour as an organised cloud in the optical frame; NaN where there is no depth."""
+    """Returns depth and colour as an organised cloud in the optical frame. Points without depth are NaN."""
     message, points = cloud(frame.time, frame.info.frame_id, POINT_DTYPE, frame.info.height, frame.info.width)
     write_points(frame, points)
     message.is_dense = False
@@ -301,9 +308,9 @@ def depth_cloud(frame: CameraFrame) -> PointCloud2:
 
 
 def lidar_cloud(scan: LidarScan) -> PointCloud2:
-    """One revolution: x y z intensity ring time (and return_type), unorganised, every point valid.
+    """Returns the points of one revolution as an unorganised cloud, in which every point is valid.
 
-    Raw, as drivers publish it: each point in the frame that the lidar had at that point's time.
+    The points are raw, as drivers publish them: each point is in the frame that the lidar had at the point's ``time``.
     """
     point = LIDAR_POINT if scan.returned is None else DUAL_LIDAR_POINT
     message, points = cloud(scan.time, scan.frame_id, point, 1, len(scan.xyz))
@@ -320,14 +327,15 @@ def lidar_cloud(scan: LidarScan) -> PointCloud2:
 
 
 def laser_scan(scan: LidarScan) -> LaserScan:
-    """The laser nearest to the horizontal as a scan in its plane: the nearest return of each shot, +Inf for none.
+    """Returns the shots of the laser nearest to the horizontal: the range of the nearest return of each shot, +Inf for
+    none.
 
-    Angles rise, as most programs expect, while the head turns clockwise: the first ray is the last that was fired,
-    which the stamp is of, and ``time_increment`` is negative.
+    Angles increase, as most programs expect, although the lidar turns clockwise. So the first ray is the last one
+    fired, the header stamp is the time of this ray, and ``time_increment`` is negative.
     """
     level = scan.level
     if level is None:
-        raise ValueError(f"lidar {scan.name}: no laser is named that looks level; give LidarScan.level")
+        raise ValueError(f"lidar {scan.name}: the scan names no horizontal laser; give LidarScan.level")
     message = LaserScan(header=header(scan.time + level.delay + (level.count - 1) * level.period, scan.frame_id))
     step = 2.0 * np.pi / level.count
     message.angle_min = level.azimuth + step
@@ -342,7 +350,7 @@ def laser_scan(scan: LidarScan) -> LaserScan:
     points = np.flatnonzero(scan.ring == level.ring)
     shot = np.rint((scan.offset[points] - level.delay) / level.period).astype(int)
     found = np.hypot(scan.xyz[points, 0], scan.xyz[points, 1])
-    far_first = np.argsort(-found, kind="stable")  # of two returns the nearer is written last
+    far_first = np.argsort(-found, kind="stable")  # the nearer of two returns is written last, and so kept
     rays = level.count - 1 - shot[far_first]
     ranges[rays] = found[far_first]
     intensities[rays] = scan.intensity[points][far_first]
@@ -355,7 +363,8 @@ _LEVELS = {"ok": DiagnosticStatus.OK, "warning": DiagnosticStatus.WARN, "error":
 
 
 def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus]) -> DiagnosticArray:
-    """States of the components of a client; their names get the ``prefix``, which names the hardware, too."""
+    """Returns the states of the components of a client. ``prefix`` is put before their names, and is their
+    hardware_id."""
     statuses = []
     for one in components:
         values = [KeyValue(key=key, value=str(value)) for key, value in one.values.items()]
@@ -372,12 +381,12 @@ def diagnostics(time: float, prefix: str, components: Iterable[ComponentStatus])
 
 
 def image(frame: CameraFrame | MultispectralFrame, pixels: np.ndarray, encoding: str, dtype: type) -> Image:
-    """``pixels`` [height, width, ...] of a picture as an image of this encoding."""
+    """Convert the ``pixels`` [height, width, ...] of a picture to an Image message."""
     pixels = np.ascontiguousarray(pixels, dtype)
     if pixels.shape[:2] != (frame.info.height, frame.info.width):
         raise ValueError(
             f"camera {frame.name}: {encoding} picture is {pixels.shape[1]}x{pixels.shape[0]}, "
-            f"its info says {frame.info.width}x{frame.info.height}"
+            f"its camera info is {frame.info.width}x{frame.info.height}"
         )
     message = Image(header=header(frame.time, frame.info.frame_id), encoding=encoding)
     message.height, message.width = pixels.shape[:2]
@@ -388,7 +397,7 @@ def image(frame: CameraFrame | MultispectralFrame, pixels: np.ndarray, encoding:
 
 
 def cloud(time: float, frame: str, point: np.dtype, height: int, width: int) -> tuple[PointCloud2, np.ndarray]:
-    """A cloud without values, and its points [height, width] to write them into."""
+    """Returns an empty PointCloud2 message, and an array of its points [height, width] to be filled."""
     message = PointCloud2(header=header(time, frame), height=height, width=width)
     message.fields = list(_fields(point))
     message.point_step = point.itemsize
@@ -400,6 +409,7 @@ def cloud(time: float, frame: str, point: np.dtype, height: int, width: int) -> 
 
 @functools.cache
 def _fields(point: np.dtype) -> tuple[PointField, ...]:
+    """Returns the fields of a PointCloud2 whose points have the numpy type ``point``."""
     assert point.fields is not None
     described = ((name, kind.str[1:], offset) for name, (kind, offset, *_) in point.fields.items())
     return tuple(
@@ -408,47 +418,50 @@ def _fields(point: np.dtype) -> tuple[PointField, ...]:
 
 
 def _bytes(values: np.ndarray) -> array.array:
+    """Convert an array to ``array.array`` of bytes."""
     data = array.array("B")
     data.frombytes(values.reshape(-1).view(np.uint8).data)
     return data
 
 
 def _doubles(values: np.ndarray) -> array.array:
+    """Convert an array to ``array.array`` of float64."""
     data = array.array("d")
     data.frombytes(np.ascontiguousarray(values, np.float64).view(np.uint8).data)
     return data
 
 
 def _floats(values: np.ndarray) -> array.array:
+    """Convert an array to ``array.array`` of float32."""
     data = array.array("f")
     data.frombytes(np.ascontiguousarray(values, np.float32).view(np.uint8).data)
     return data
 
 
 def set_vector(target: Any, values: np.ndarray) -> None:
-    """Write [3] into the fields x, y and z of a message."""
+    """Write ``values`` [3] into the fields x, y and z of a message."""
     target.x, target.y, target.z = map(float, values)
 
 
 def set_quaternion(target: Any, values: np.ndarray) -> None:
-    """Write [4] into the fields x, y, z and w of a message."""
+    """Write ``values`` [4] into the fields x, y, z and w of a message."""
     target.x, target.y, target.z, target.w = map(float, values)
 
 
-# tf2_msgs/TFMessage with fixed frames and changing poses, patched into its serialised bytes.
+# tf2_msgs/TFMessage with fixed frames and changing poses, which are written into the serialised message.
 #
-# A thousand fresh message objects take 14 ms, a thousand poses written into the bytes 0.01 ms. The layout is that of
-# OMG CDR (XCDR1, little endian): numbers are aligned to their size, counted from the end of the four-byte header,
-# strings are their length with the closing zero, then the characters. Every transform ends with seven doubles, so the
-# body is a multiple of eight bytes and can be seen as an array of doubles or of 32-bit words.
+# A thousand new message objects take 14 ms; a thousand poses written into the bytes take 0.01 ms. The layout is OMG CDR
+# (XCDR1, little endian). Numbers are aligned to their size, counted from the end of the four-byte header. A string is
+# its length with the closing zero, then its characters. Every transform ends with seven doubles, so the length of the
+# body is a multiple of eight bytes, and the body can be viewed as an array of doubles or of 32-bit words.
 
 
 HEADER = b"\x00\x01\x00\x00"
-"""CDR, little endian."""
+"""Header of a serialised message: CDR, little endian."""
 
 
 class SerializedTransforms:
-    """The poses of ``frames``, pairs of (parent, child), ready to be published again and again."""
+    """A serialised TFMessage whose stamps and poses can be replaced. ``frames``: (parent, child) of each transform."""
 
     def __init__(self, frames: Sequence[tuple[str, str]]) -> None:
         body = bytearray(struct.pack("<I", len(frames)))
@@ -465,7 +478,7 @@ class SerializedTransforms:
             body += bytes(56)
         _align(body, 8)
         self._bytes = np.frombuffer(HEADER + bytes(4) + body, np.uint8).copy()
-        # The header is padded to eight bytes here, so that both views are aligned; message() leaves the padding out.
+        # The header is padded to eight bytes here, so that both views are aligned; message() removes the padding.
         inner = self._bytes[8:]
         self._words = inner.view("<u4")
         self._doubles = inner.view("<f8")
@@ -474,7 +487,7 @@ class SerializedTransforms:
         self._length = 4 if not frames else len(body)
 
     def message(self, time: float, poses: np.ndarray) -> bytes:
-        """The serialised TFMessage of ``poses`` [transform, 7], all stamped ``time`` [s]."""
+        """Returns the serialised TFMessage with ``poses`` [transform, 7] m, 1, all stamped ``time`` [s]."""
         poses = np.asarray(poses, float)
         if poses.shape != (len(self._poses), 7):
             raise ValueError(f"poses have shape {poses.shape}, expected {(len(self._poses), 7)}: one per frame")
@@ -486,46 +499,50 @@ class SerializedTransforms:
 
 
 def split_time(time: float) -> tuple[int, int]:
-    """Seconds and nanoseconds of a time [s], rounded to the nearest nanosecond."""
+    """Split a time [s] into seconds and nanoseconds, rounded to the nearest nanosecond."""
     return divmod(round(time * 1e9), 1_000_000_000)
 
 
 def _append_string(body: bytearray, text: str) -> None:
+    """Append a serialised string to a message body."""
     encoded = text.encode() + b"\0"
     _align(body, 4)
     body += struct.pack("<I", len(encoded)) + encoded
 
 
 def _align(body: bytearray, size: int) -> None:
+    """Pad a message body to a multiple of ``size`` bytes."""
     body += bytes(-len(body) % size)
 
 
-# Messages of every step with fixed texts and changing numbers, patched into their serialised bytes.
+# Messages of every step with fixed texts and changing numbers, which are written into the serialised message.
 #
-# An rclpy object of a few dozen numbers takes 0.03 to 0.12 ms to build and as long to convert when it is sent; writing
-# its numbers into the bytes takes 0.01 ms. Where they stand is found once, in a message whose numbers are marks.
+# An rclpy object with a few dozen numbers takes 0.03 to 0.12 ms to build, and as long to serialise. Writing its numbers
+# into the bytes takes 0.01 ms. Their positions are found once, in a serialised message with unmistakable numbers.
 
 
 _MARK_TIME = 1_589_640_193.708529245
-"""[s] Stamp of the message in which numbers are looked for."""
+"""[s] Unmistakable stamp by which the positions of stamps in a serialised message are found."""
 _FIRST_MARK = 1.2345e200
-"""The first number in it; the others are this times 2, 3, ..."""
+"""First of the unmistakable numbers by which the positions of numbers in a serialised message are found; the others
+are its multiples."""
 _NONE = np.zeros(0)
 
 
 class SerializedMessage:
-    """A message with a stamp and ``count`` doubles, ready to be published again and again.
+    """A serialised message whose stamp and ``count`` doubles can be replaced.
 
-    ``build(time, numbers)`` makes it of a time [s] and numbers [count]; every number stands in it as it is, and all
-    else is the same each time. ValueError if a number or the stamp is not found.
+    ``build(time, numbers)`` creates the message from a time [s] and numbers [count]. Every number must appear unchanged
+    in the message, and everything else must always be the same. Raises ValueError if a number or the stamp is not
+    found.
     """
 
     def __init__(self, build: Callable[[float, np.ndarray], Any], count: int) -> None:
         marks = _FIRST_MARK * np.arange(1.0, count + 1.0)
         data = serialize_message(build(_MARK_TIME, marks))
         self._length = len(data)
-        # Numbers are aligned to their size, counted from the end of the four-byte header (OMG CDR, XCDR1): so the
-        # header is padded to eight bytes here, and the end to a multiple of eight.
+        # Numbers are aligned to their size, counted from the end of the four-byte header (OMG CDR, XCDR1). So the
+        # header is padded to eight bytes here, and the length to a multiple of eight.
         self._bytes = np.frombuffer(bytes(4) + data + bytes(-(len(data) + 4) % 8), np.uint8).copy()
         self._words, self._doubles = self._bytes.view("<i4"), self._bytes.view("<f8")
         self._places, self._numbers = np.nonzero(self._doubles[:, None] == marks)
@@ -536,7 +553,7 @@ class SerializedMessage:
         self.count = count
 
     def message(self, time: float, numbers: np.ndarray) -> bytes:
-        """The serialised message at a ``time`` [s] with ``numbers`` [count]."""
+        """Returns the serialised message with the stamp ``time`` [s] and ``numbers`` [count]."""
         if len(numbers) != self.count:
             raise ValueError(f"{len(numbers)} numbers, expected {self.count}")
         seconds, nanoseconds = split_time(time)
@@ -546,13 +563,13 @@ class SerializedMessage:
 
 
 def stamp_writer(build: Callable[[float], Any]) -> Callable[[float], bytes]:
-    """Writes a message of which only the stamp [s] changes."""
+    """Returns a function that serialises a message in which only the stamp [s] changes."""
     template = SerializedMessage(lambda time, _: build(time), 0)
     return lambda time: template.message(time, _NONE)
 
 
 def joint_state_writer(first: JointSample) -> Callable[[JointSample], bytes]:
-    """Writes sensor_msgs/JointState of samples with the joints of the ``first``."""
+    """Returns a function that serialises samples with the same joints as ``first`` to sensor_msgs/JointState."""
     count = len(first.names)
 
     def build(time: float, numbers: np.ndarray) -> Any:
@@ -564,7 +581,7 @@ def joint_state_writer(first: JointSample) -> Callable[[JointSample], bytes]:
 
 
 def odometry_writer(first: RobotSample, base: str, odom: str) -> Callable[[RobotSample], bytes]:
-    """Writes nav_msgs/Odometry of samples of one robot, in the frame ``odom``."""
+    """Returns a function that serialises samples of one robot to nav_msgs/Odometry, in the frame ``odom``."""
 
     def build(time: float, numbers: np.ndarray) -> Any:
         sample = dataclasses.replace(
@@ -583,7 +600,7 @@ def odometry_writer(first: RobotSample, base: str, odom: str) -> Callable[[Robot
 
 
 def imu_writer(first: Imu) -> Callable[[Imu], bytes]:
-    """Writes sensor_msgs/Imu of readings of one sensor."""
+    """Returns a function that serialises readings of one IMU to sensor_msgs/Imu."""
 
     def build(time: float, n: np.ndarray) -> Any:
         return imu(
@@ -597,7 +614,7 @@ def imu_writer(first: Imu) -> Callable[[Imu], bytes]:
 
 
 def wrench_writer(first: Wrench) -> Callable[[Wrench], bytes]:
-    """Writes geometry_msgs/WrenchStamped of readings of one sensor."""
+    """Returns a function that serialises readings of one force-torque sensor to geometry_msgs/WrenchStamped."""
     template = SerializedMessage(
         lambda time, n: wrench(dataclasses.replace(first, time=time, force=n[:3], torque=n[3:])), 6
     )

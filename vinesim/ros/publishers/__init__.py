@@ -1,1 +1,1 @@
-"""One module for each family of published topics."""
+"""Classes that publish topics: one module for each group of topics."""

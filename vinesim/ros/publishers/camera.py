@@ -1,4 +1,4 @@
-"""Topics of one RGB-D camera. Frames are optical: z forward, x right, y down (REP-103)."""
+"""Topics of one RGB-D camera. Its frames are optical: z forward, x right, y down (REP-103)."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LABELS = CameraOutput.LABELS
 
 
 class CameraPublisher:
-    """``<name>/{rgb,depth}/{image_raw,camera_info}``, ``rgb/image_raw/compressed``,
-    ``depth/image_raw/compressedDepth``, ``depth/points``; and the truth: ``labels``, ``label_info`` (latched),
-    ``detections``, ``detections_3d``, ``bunches``.
+    """Publishes ``<name>/{rgb,depth}/{image_raw,camera_info}``, ``rgb/image_raw/compressed``,
+    ``depth/image_raw/compressedDepth`` and ``depth/points``; and as ground truth ``labels``, ``label_info`` (latched),
+    ``detections``, ``detections_3d`` and ``bunches``.
 
-    Its parameters: ``<name>.exact_depth``, ``<name>.depth_encoding_16uc1``, ``<name>.jpeg_quality``.
+    Its parameters are ``<name>.exact_depth``, ``<name>.depth_encoding_16uc1`` and ``<name>.jpeg_quality``.
     """
 
     packages: ClassVar = ("vision_msgs",)
@@ -32,7 +32,7 @@ class CameraPublisher:
     def __init__(
         self, advertise: Advertise, name: str, parameters: Parameters, *, number: int, channels: Sequence[str]
     ) -> None:
-        # vision_msgs can be imported once the node has seen to it
+        # vision_msgs can be imported only after the node has made it importable
         from vision_msgs.msg import Detection2DArray, Detection3DArray, LabelInfo
 
         from vinesim.ros.messages import bunches
@@ -42,10 +42,8 @@ class CameraPublisher:
         advertise(LabelInfo, f"{name}/label_info", TRANSIENT_LOCAL).send(bunches.label_info())
         declare = parameters.declare
         declare(f"{name}.exact_depth", False, "Exact depth instead of depth with the errors of the sensor.")
-        declare(
-            f"{name}.depth_encoding_16uc1", False, "Images of depth in millimetres (16UC1) instead of metres (32FC1)."
-        )
-        declare(f"{name}.jpeg_quality", 85, "Of rgb/image_raw/compressed.", (1, 100))
+        declare(f"{name}.depth_encoding_16uc1", False, "Depth images in millimetres (16UC1) instead of metres (32FC1).")
+        declare(f"{name}.jpeg_quality", 85, "JPEG quality of rgb/image_raw/compressed.", (1, 100))
         self._infos = [advertise(CameraInfo, f"{name}/{kind}/camera_info", SENSOR_DATA) for kind in ("rgb", "depth")]
         self._rgb = advertise(Image, f"{name}/rgb/image_raw", SENSOR_DATA)
         self._depth = advertise(Image, f"{name}/depth/image_raw", SENSOR_DATA)
@@ -70,11 +68,12 @@ class CameraPublisher:
 
     @property
     def truth(self) -> tuple[Topic, ...]:
-        """Labels and detections."""
+        """Topics with ground truth: labels and detections."""
         return self._labels, *self._bunches
 
     def wanted(self) -> CameraOutput:
-        """The outputs that the present subscribers need; a picture if there are none but of camera_info."""
+        """Returns the camera outputs that the present subscribers need. If only camera_info has subscribers, this is
+        the colour picture."""
         outputs = CameraOutput.NONE
         for topic, needs in self._needs.items():
             if topic.subscription_count:
@@ -86,7 +85,7 @@ class CameraPublisher:
         return outputs
 
     def pending(self, frame: CameraFrame) -> Iterator[PendingMessage]:
-        """All messages that can be made of one picture, the cheap ones first."""
+        """Yield all messages that can be made from the outputs in ``frame``, cheap ones first."""
         if self._parameters[f"{self._name}.exact_depth"] and CameraOutput.EXACT_DEPTH in frame.outputs:
             assert frame.exact_depth is not None
             frame = dataclasses.replace(frame, depth=frame.exact_depth)

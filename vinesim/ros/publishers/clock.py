@@ -1,8 +1,8 @@
-"""/clock: time of the world for nodes that run with use_sim_time. Of all nodes of a ROS domain one publishes it.
+"""/clock: time of the world for nodes with use_sim_time. One node of each ROS domain publishes this topic.
 
-A node that has seen no other publisher of /clock for a second becomes one, but sends nothing yet: of two that did so at
-once the one with the greater identifier of its publisher gives way meanwhile, so that two clocks do not mix. When the
-publisher goes, another node follows within a few seconds.
+A node that has found no other publisher of /clock for a second creates one, but sends nothing yet. If two nodes do so
+at the same time, the one whose publisher has the greater identifier withdraws it meanwhile, so that two clocks never
+mix. When the publishing node ends, another node follows within a few seconds.
 """
 
 from __future__ import annotations
@@ -20,19 +20,21 @@ from vinesim.ros.topic import EVERY_STEP, Advertise, PendingMessage, Topic
 
 CLOCK = "/clock"
 LOOK_PERIOD = 0.25
-"""Wall time between two looks at the publishers [s]."""
+"""Wall time between two searches for publishers of /clock [s]."""
 FREE_LOOKS = 4
-"""Looks in a row that find no publisher of /clock before a node becomes it, a second. Looks are counted, not time: a
-process without a processor discovers nothing meanwhile."""
+"""Number of successive searches without another publisher of /clock after which a node creates its own: one second.
+Searches are counted instead of time, because a process that does not run discovers nothing."""
 CLAIM_LOOKS = 3
-"""Looks in a row that find no other publisher before a node that has become it sends its first message."""
+"""Number of successive searches without another publisher after which a node that has created its publisher starts
+to send."""
 FIRST_LOOKS = 13
-"""Looks of a new node before it becomes the publisher, or it might displace one that it does not know yet. Discovery of
-a node on the same machine takes 0.3 s as a rule, but where that fails, until Fast DDS announces it again after 3 s."""
+"""Number of searches of a new node before it may create its publisher, so that it does not displace a publisher that
+it has not discovered yet. Discovery on the same machine usually takes 0.3 s. If that fails, Fast DDS announces the
+publisher again after 3 s."""
 
 
 class ClockPublisher:
-    """This node's part in /clock; its name is absolute under every namespace."""
+    """Publishes /clock if no other node does. The topic name is absolute, whatever the node's namespace."""
 
     def __init__(self, node: rclpy.node.Node, advertise: Advertise, withdraw: Callable[[Topic], None]) -> None:
         self._node = node
@@ -42,18 +44,19 @@ class ClockPublisher:
         self._sends = False
         self._write = stamp_writer(convert.clock)
         self._lone_looks = 0
-        """Looks in a row that found no other publisher."""
+        """Number of successive searches that found no other publisher."""
         self._looks = 0
         self._next_look = 0.0
 
     @property
     def has_subscribers(self) -> bool:
-        """Whether this node publishes /clock, and has subscribers."""
+        """Whether this node publishes /clock, and the topic has subscribers."""
         topic = self._topic
         return topic is not None and self._sends and topic.subscription_count > 0
 
     def update(self) -> None:
-        """Look who publishes /clock, and begin or stop; called by the receiving thread of the node."""
+        """Search for other publishers of /clock, and start or stop publishing. Called by the receiving thread of the
+        node."""
         now = wall.monotonic()
         if now < self._next_look:
             return
@@ -81,7 +84,7 @@ class ClockPublisher:
             self._sends = True
 
     def pending(self, time: float) -> Iterator[PendingMessage]:
-        """The message of a time [s], if this node publishes it."""
+        """Yield the message for a ``time`` of the world [s], if this node publishes /clock."""
         topic = self._topic
         if topic is not None and self._sends:
             yield topic, partial(self._write, time)

@@ -1,4 +1,5 @@
-"""Topics of contacts between a robot and plants: a cloud for programs, arrows and the area of interest for RViz."""
+"""Topics of contacts between a robot and plants: a point cloud for programs, and markers for RViz (arrows, area of
+interest)."""
 
 from __future__ import annotations
 
@@ -19,15 +20,15 @@ from vinesim.ros.topic import EVERY_STEP, RELIABLE, Advertise, PendingMessage
 from vinesim.scene.values import Contact, RobotSample
 
 MARKER_PERIOD = 10
-"""Steps between two arrays of markers: 10 Hz."""
+"""Number of steps between two arrays of markers: 10 Hz."""
 ARROW_SCALE = 0.01
-"""[m/N] Length of an arrow for its force."""
+"""[m/N] Length of an arrow per newton of contact force."""
 CIRCLE_CORNERS = 64
-"""Of the edge of the area of interest."""
+"""Number of corners of the polygon that shows the edge of the area of interest."""
 
 
 class ContactPublisher:
-    """``vine/contacts`` after every step, with or without contacts; ``vine/markers`` at 10 Hz."""
+    """Publishes ``vine/contacts`` after every step, also without contacts, and ``vine/markers`` at 10 Hz."""
 
     def __init__(
         self,
@@ -36,8 +37,9 @@ class ContactPublisher:
         links: dict[str, int] | None = None,
         interest_radius: float | None = None,
     ) -> None:
-        """``bunch_of_body`` [body]: -1 for wood. ``links``: numbers of the robot's links by name. ``interest_radius``
-        [m]: of the area of interest around the robot; None: there is none, as no other client is in the world."""
+        """``bunch_of_body`` [body]: index of the bunch that each plant body belongs to, -1 for wood. ``links``:
+        indices of the robot's links, by name. ``interest_radius`` [m]: radius of the area of interest around the
+        robot; None if there is none, since no other client is in the world."""
         self._contacts = advertise(PointCloud2, "vine/contacts", EVERY_STEP)
         self._markers = advertise(MarkerArray, "vine/markers", RELIABLE)
         self._bunch_of_body = bunch_of_body
@@ -47,25 +49,27 @@ class ContactPublisher:
         self._write_none: Callable[[float], bytes] | None = None
 
     def mute(self, is_muted: bool) -> None:
-        """Whether nothing is sent."""
+        """Stop sending if ``is_muted``, otherwise resume."""
         for topic in (self._contacts, self._markers):
             topic.mute(is_muted)
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
-        """All messages of one step."""
+        """Yield the messages of one step."""
         yield self._contacts, partial(self._cloud, sample)
         self._steps += 1
         if self._steps % MARKER_PERIOD == 0:
             yield self._markers, partial(self._all_markers, sample)
 
     def _all_markers(self, sample: RobotSample) -> MarkerArray:
-        """Those of the message before go; the area of interest is one of them."""
+        """Returns arrows and the area of interest. The first marker deletes those of the previous message."""
         markers = _arrows(sample)
         if self._edge is not None:
             markers.append(_interest(self._edge, sample))
         return MarkerArray(markers=markers)
 
     def _cloud(self, sample: RobotSample) -> PointCloud2 | bytes:
+        """Returns the contacts as a cloud. A cloud without contacts is serialised, with only its stamp replaced in
+        each step."""
         if not sample.contacts:
             if self._write_none is None:
                 self._write_none = stamp_writer(partial(self._no_contacts, sample))
@@ -78,7 +82,8 @@ class ContactPublisher:
 
 
 def _arrows(sample: RobotSample) -> list[Marker]:
-    """One arrow a contact, along the force on the robot; those of the message before go."""
+    """Returns one arrow for each contact, along the force on the robot, after a marker that deletes the previous
+    arrows."""
     markers = [Marker(header=convert.header(sample.joints.time, MAP_FRAME), ns="contacts", action=Marker.DELETEALL)]
     return markers + [_arrow(i, contact, sample.joints.time) for i, contact in enumerate(sample.contacts)]
 
@@ -100,13 +105,14 @@ def _arrow(number: int, contact: Contact, time: float) -> Marker:
 
 
 def _circle(radius: float) -> list[Point]:
-    """Points [:data:`CIRCLE_CORNERS` + 1] of a circle of ``radius`` [m] about the origin, in the ground plane."""
+    """Returns the corners [:data:`CIRCLE_CORNERS` + 1] of a circle of ``radius`` [m] about the origin, in the ground
+    plane."""
     angles = np.linspace(0.0, 2.0 * np.pi, CIRCLE_CORNERS + 1)
     return [Point(x=float(radius * np.cos(angle)), y=float(radius * np.sin(angle))) for angle in angles]
 
 
 def _interest(edge: list[Point], sample: RobotSample) -> Marker:
-    """The edge of the area of interest, around the robot's base."""
+    """Returns the edge of the area of interest as a marker, centred at the robot's base."""
     x, y, z = map(float, sample.base_q[:3])
     return Marker(
         header=convert.header(sample.joints.time, MAP_FRAME),

@@ -15,9 +15,12 @@ from vinesim.scene.values import CameraOutput, LidarScan
 
 
 class LidarPublisher:
-    """``<name>/points``: x y z intensity ring time; return_type too if the lidar reports two returns of a shot.
-    ``scan``, as Nav2 expects it, of the first lidar, or ``<name>/scan``: its laser nearest to the horizontal. Its
-    parameter: ``<name>.exact_ranges``."""
+    """Publishes ``<name>/points`` with the fields x, y, z, intensity, ring and time (and return_type, if the lidar
+    reports two returns per shot). The first lidar also publishes ``scan``, another one ``<name>/scan``: the laser
+    nearest to the horizontal, as Nav2 expects it.
+
+    Its parameter is ``<name>.exact_ranges``.
+    """
 
     packages: ClassVar = ()
     truth: ClassVar = ()
@@ -28,19 +31,20 @@ class LidarPublisher:
         self._parameters = parameters
         self._exact = f"{name}.exact_ranges"
         parameters.declare(
-            self._exact, False, "What the middle of each beam meets, exactly, instead of what the sensor measures."
+            self._exact, False, "Exact range along the middle of each beam, instead of what the sensor measures."
         )
         self._points = advertise(PointCloud2, f"{name}/points", SENSOR_DATA)
         self._scan = advertise(LaserScan, f"{name}/scan" if number else "scan", SENSOR_DATA)
 
     def wanted(self) -> CameraOutput:
-        """Depth as the lidar measures it, or exact, if there are subscribers."""
+        """Returns whether ranges with the errors of the lidar or exact ranges are needed, or ``NONE`` without
+        subscribers."""
         if not (self._points.subscription_count or self._scan.subscription_count):
             return CameraOutput.NONE
         return CameraOutput.EXACT_DEPTH if self._parameters[self._exact] else CameraOutput.DEPTH
 
     def pending(self, scan: LidarScan) -> Iterator[PendingMessage]:
-        """The messages of one revolution."""
+        """Yield the messages of one revolution."""
         yield self._points, partial(convert.lidar_cloud, scan)
         if scan.level is not None:
             yield self._scan, partial(convert.laser_scan, scan)

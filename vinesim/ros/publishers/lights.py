@@ -1,4 +1,4 @@
-"""A robot's indicator lights as markers, which RViz and Foxglove show over the robot's model."""
+"""A robot's indicator lights as markers. RViz and Foxglove draw them over the lamps of the robot's model."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from vinesim.ros.topic import TRANSIENT_LOCAL, Advertise, PendingMessage
 from vinesim.scene.values.signals import UNLIT, Color
 
 GROWTH = 1.05
-"""A marker covers the lamp of the robot's model, as many times as large."""
+"""Size of a marker relative to the lamp that it covers."""
 UNLIT_GREY = 0.15
-"""Of lamps between two flashes."""
+"""Grey value of lamps between two flashes, 0 to 1."""
 
 
 class LightsPublisher:
-    """``indicator_lights/markers``, latched, when what the lamps show changes; none while they are off."""
+    """Publishes the latched topic ``indicator_lights/markers`` when the colour of the lamps changes. While the
+    lights are off, there are no markers."""
 
     def __init__(self, advertise: Advertise, urdf: str) -> None:
         self._topic = advertise(MarkerArray, "indicator_lights/markers", TRANSIENT_LOCAL)
         self._lamps = lamp_markers(urdf)
 
     def pending(self, color: Color | None) -> Iterator[PendingMessage]:
-        """The message of a colour, :data:`UNLIT` between flashes; None: off, as the robot's model shows them."""
+        """Yield the message for a colour. :data:`UNLIT`: between flashes. None: the lights are off, so the lamps
+        look as in the robot's model."""
         yield self._topic, partial(self._markers, color)
 
     def _markers(self, color: Color | None) -> MarkerArray:
@@ -42,9 +44,9 @@ class LightsPublisher:
 
 
 def lamp_markers(urdf: str) -> list[Marker]:
-    """A marker for each visual of a URDF whose material has the word ``indicator``; meshes are left out.
+    """Returns a marker for each visual of a URDF whose material name has the word ``indicator``. Meshes are left out.
 
-    Each is locked to the frame of its link, with the stamp 0: where the link is now.
+    Each marker is locked to the frame of its link. Its stamp is 0, so viewers use the link's latest pose.
     """
     markers = []
     for link in ElementTree.fromstring(urdf).iterfind("link"):
@@ -76,7 +78,7 @@ _FORMS = {"box": Marker.CUBE, "cylinder": Marker.CYLINDER, "sphere": Marker.SPHE
 
 
 def _size(form: ElementTree.Element) -> np.ndarray:
-    """Edges of the box around a form [3] m."""
+    """Returns the edges [3] m of the bounding box of a box, cylinder or sphere."""
     if form.tag == "box":
         return _numbers(form.get("size", "0 0 0"))
     across = 2.0 * float(form.get("radius", "0"))
@@ -84,7 +86,7 @@ def _size(form: ElementTree.Element) -> np.ndarray:
 
 
 def _pose(origin: ElementTree.Element | None) -> Pose:
-    """The pose of a visual in its link."""
+    """Returns the pose of a visual in its link's frame."""
     place, turns = (
         _numbers("0 0 0" if origin is None else origin.get(name, "0 0 0")).tolist() for name in ("xyz", "rpy")
     )

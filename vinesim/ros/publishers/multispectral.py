@@ -1,4 +1,4 @@
-"""Topics of one multispectral camera. Frames are optical: z forward, x right, y down (REP-103)."""
+"""Topics of one multispectral camera. Its frames are optical: z forward, x right, y down (REP-103)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ NDVI = "ndvi"
 
 
 class MultispectralPublisher:
-    """``<name>/<band>/{image_raw,camera_info}``: reflectance (32FC1); ``<name>/ndvi/{image_raw,camera_info}``: NDVI
-    (32FC1); and the truth: ``labels``. ``channels`` are the bands."""
+    """Publishes ``<name>/<band>/{image_raw,camera_info}``: reflectance (32FC1);
+    ``<name>/ndvi/{image_raw,camera_info}``: NDVI (32FC1); and as ground truth ``<name>/labels``. ``channels``: names
+    of the bands."""
 
     packages: ClassVar = ()
 
@@ -34,16 +35,16 @@ class MultispectralPublisher:
 
     @property
     def truth(self) -> tuple[Topic, ...]:
-        """Labels."""
+        """Topic with ground truth: labels."""
         return (self._labels,)
 
     def wanted(self) -> CameraOutput:
-        """A picture, if there are subscribers: all bands are rendered at once."""
+        """Returns ``RGB``, which stands for all bands, if any topic has subscribers. All bands are rendered at once."""
         topics = (*self._infos, *self._bands.values(), self._ndvi, self._labels)
         return CameraOutput.RGB if any(topic.subscription_count for topic in topics) else CameraOutput.NONE
 
     def pending(self, frame: MultispectralFrame) -> Iterator[PendingMessage]:
-        """All messages of one picture, the cheap ones first."""
+        """Yield all messages of one picture, cheap ones first."""
         for topic in self._infos:
             yield topic, partial(convert.camera_info, frame.info, frame.time)
         for name, topic in self._bands.items():

@@ -1,4 +1,5 @@
-"""Topics of a robot's state: description, joints, frames, odometry."""
+"""Topics of a robot's state: description, joints, transforms, odometry, IMUs, wrenches and controllers; and true
+poses of other objects."""
 
 from __future__ import annotations
 
@@ -28,13 +29,14 @@ from vinesim.scene.values import ControllerKind, ControllerSpec, JointSample, Ro
 MAP_FRAME = "map"
 ODOM_FRAME = "odom"
 ODOMETRY = "mobile_base_controller/odom"
-"""Topic."""
+"""Topic of odometry, relative to the node's namespace."""
 EXACT_VARIANCE = 1e-6
-"""[m2, rad2, m2/s2, rad2/s2] Of exact odometry, as of tracks that do not slip: filters invert covariances."""
+"""[m2, rad2, m2/s2, rad2/s2] Variances of exact odometry, as of tracks without slip. They are not 0 because filters
+invert covariances."""
 
 
 class RobotPublisher:
-    """robot_description and tf_static once; joint_states, tf and odometry after every step."""
+    """Publishes robot_description and tf_static once, and joint_states, tf and odometry after every step."""
 
     def __init__(
         self,
@@ -46,21 +48,23 @@ class RobotPublisher:
     ) -> None:
         self._base = base
         self.publishes_map_to_odom = True
-        """Whether ``tf`` holds the true pose of ``odom`` in the map, which else a localisation publishes."""
+        """Whether ``tf`` contains the true pose of ``odom`` in the map. If not, a localisation node is to publish
+        this transform."""
         self.odom_frame = ODOM_FRAME
-        """Frame in which odometry measures, on ``tf`` too."""
+        """Frame id of odometry, also on ``tf``."""
         self.has_exact_odometry = False
-        """Whether odometry measures the motion of the base from now on, without the slip of its tracks."""
+        """Whether odometry measures the true motion of the base, without the slip of its tracks, from the moment
+        this is set."""
         self._odom_q: np.ndarray | None = None
-        """Pose [7] of ``odom`` in the map while odometry is exact: that when it became so."""
+        """Pose [7] of ``odom`` in the map when odometry became exact; None while odometry is not exact."""
         self._pairs: tuple[bool, str, tuple[tuple[str, str], ...]] | None = None
         self._transforms = SerializedTransforms([])
         self._names: tuple[str, ...] | None = None
-        """Joints of the writers of messages."""
+        """Joint names for which :attr:`_write_joints` was made."""
         self._write_joints: Callable[[JointSample], bytes]
         self._write_odometry: Callable[[RobotSample], bytes]
         self._odometry_frame = ""
-        """That of :attr:`_write_odometry`."""
+        """Frame id for which :attr:`_write_odometry` was made."""
 
         self._joints = advertise(JointState, "joint_states", EVERY_STEP)
         self._tf = advertise(tf_message, "tf", EVERY_STEP)
@@ -72,9 +76,9 @@ class RobotPublisher:
         advertise(tf_message, "tf_static", TRANSIENT_LOCAL).send(static.message(0.0, poses))
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
-        """All messages of one step."""
+        """Yield the messages of one step."""
         sample = self._with_odometry(sample)
-        if sample.joints.names is not self._names:  # the same tuple every step
+        if sample.joints.names is not self._names:  # samples of one robot share this tuple
             self._names = sample.joints.names
             self._write_joints = joint_state_writer(sample.joints)
             self._odometry_frame = ""
@@ -86,7 +90,7 @@ class RobotPublisher:
         yield self._odometry, partial(self._write_odometry, sample)
 
     def _with_odometry(self, sample: RobotSample) -> RobotSample:
-        """The sample with the odometry to be published: as it was measured, or exact."""
+        """Returns the sample with the odometry to publish: as measured, or exact."""
         if not self.has_exact_odometry:
             self._odom_q = None
             return sample
@@ -103,6 +107,7 @@ class RobotPublisher:
         )
 
     def _frames(self, sample: RobotSample) -> bytes:
+        """Returns the serialised ``tf`` message of one step."""
         has_map = self.publishes_map_to_odom
         names = has_map, self.odom_frame
         if self._pairs is None or self._pairs[:2] != names or self._pairs[2] is not sample.transforms:
@@ -116,11 +121,12 @@ class RobotPublisher:
         return self._transforms.message(sample.joints.time, poses)
 
 
-# Topics of true poses apart from the robot's own tf.
+# Topics with true poses of objects other than the robot.
 
 
 class GroundTruthPublisher:
-    """``tf_environment`` (what moves) and ``tf_environment_static`` (poles) in the map."""
+    """Publishes true poses in the map: ``tf_environment`` for moving objects and ``tf_environment_static`` for
+    poles."""
 
     def __init__(self, advertise: Advertise, tf_message: type) -> None:
         self._moving = advertise(tf_message, "tf_environment", RELIABLE)
@@ -131,16 +137,18 @@ class GroundTruthPublisher:
         self._is_muted = False
 
     def pending(self, time: float, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
-        """The message of true poses [name, 7] of what moves. Pass the same tuple object as long as the names stay."""
+        """Yield the message with true poses [name, 7] m, 1 of moving objects. Pass the same tuple object as long as
+        the names stay the same: then only the numbers in the serialised message are replaced."""
         yield self._moving, partial(self._message, time, names, poses)
 
     def pending_static(self, names: tuple[str, ...], poses: np.ndarray) -> Iterator[PendingMessage]:
-        """The message of true poses [name, 7] of what never moves."""
+        """Yield the message with true poses [name, 7] m, 1 of static objects."""
         self._poles = names, poses
         yield self._static, self._static_message
 
     def mute(self, is_muted: bool) -> None:
-        """Whether true poses are kept back; late subscribers then receive an empty message of what never moves."""
+        """Stop sending if ``is_muted``, otherwise resume. While muted, subscribers that join late receive an empty
+        message on ``tf_environment_static``."""
         self._is_muted = is_muted
         self._moving.mute(is_muted)
         self._static.send(self._static_message())
@@ -156,20 +164,21 @@ class GroundTruthPublisher:
         return self._transforms.message(time, poses)
 
 
-# Topics of what a robot's body measures: inertial measurement units and force-torque sensors.
+# Topics of a robot's inertial measurement units and force-torque sensors.
 
 
 class ProprioceptionPublisher:
-    """``<imu>`` and ``<sensor>/wrench`` after every step, of the sensors that are named."""
+    """Publishes ``<imu>`` and ``<sensor>/wrench`` after every step, for the IMUs and force-torque sensors that are
+    listed."""
 
     def __init__(self, advertise: Advertise, imus: Sequence[str], wrenches: Sequence[str]) -> None:
         self._imus = {name: advertise(Imu, name, EVERY_STEP) for name in imus}
         self._wrenches = {name: advertise(WrenchStamped, f"{name}/wrench", EVERY_STEP) for name in wrenches}
         self._writers: dict[str, Callable[[Any], bytes]] = {}
-        """By sensor, once it has been read."""
+        """Function that serialises the readings of a sensor, by name; made at the sensor's first reading."""
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
-        """All messages of one step."""
+        """Yield the messages of one step."""
         for imu in sample.imus:
             if imu.name in self._imus:
                 yield self._imus[imu.name], partial(self._write, imu_writer, imu)
@@ -178,6 +187,8 @@ class ProprioceptionPublisher:
                 yield self._wrenches[wrench.name], partial(self._write, wrench_writer, wrench)
 
     def _write(self, writer: Callable[[Any], Callable[[Any], bytes]], reading: Any) -> bytes:
+        """Returns the serialised message of a reading. ``writer`` makes the function that serialises the readings of
+        this sensor."""
         if reading.name not in self._writers:
             self._writers[reading.name] = writer(reading)
         return self._writers[reading.name](reading)
@@ -187,11 +198,12 @@ class ProprioceptionPublisher:
 
 
 STATE_PERIOD = 2
-"""Steps between two states of a trajectory controller: 50 Hz, the default of joint_trajectory_controller."""
+"""Number of steps between two state messages of a trajectory controller: 50 Hz, the default of
+joint_trajectory_controller."""
 
 
 class ControlPublisher:
-    """``<controller>/controller_state`` every other step, ``see/<joint>/state`` after every one."""
+    """Publishes ``<controller>/controller_state`` in every second step, and ``see/<joint>/state`` in every step."""
 
     def __init__(self, advertise: Advertise, controllers: Sequence[ControllerSpec]) -> None:
         from control_msgs.msg import JointTrajectoryControllerState
@@ -210,12 +222,12 @@ class ControlPublisher:
         ]
         self._names: tuple[str, ...] | None = None
         self._places: dict[str, int] = {}
-        """Of joints in the arrays of samples."""
+        """Index of each joint in the arrays of the samples, by name."""
         self._steps = 0
 
     def pending(self, sample: RobotSample) -> Iterator[PendingMessage]:
-        """All messages of one step."""
-        if sample.joints.names is not self._names:  # the same tuple every step
+        """Yield the messages of one step."""
+        if sample.joints.names is not self._names:  # samples of one robot share this tuple
             self._names = sample.joints.names
             self._places = {name: i for i, name in enumerate(self._names)}
         self._steps += 1

@@ -1,4 +1,4 @@
-"""What a robot's microphone records: as messages of audio_common, and how they are to be read."""
+"""Topics of the sound that a robot's microphone records, as messages of audio_common."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from vinesim.ros.topic import RELIABLE, TRANSIENT_LOCAL, Advertise, PendingMessa
 
 
 class SoundPublisher:
-    """``audio``, ``audio_stamped`` and the latched ``audio_info``, as audio_capture of ros-drivers names them."""
+    """Publishes ``audio``, ``audio_stamped`` and the latched ``audio_info``, named as in audio_capture of
+    ros-drivers."""
 
     def __init__(self, advertise: Advertise) -> None:
         from audio_common_msgs.msg import AudioData, AudioDataStamped, AudioInfo
@@ -25,11 +26,11 @@ class SoundPublisher:
         )
 
     def pending_info(self) -> Iterable[PendingMessage]:
-        """How the sound is to be read, once; late subscribers receive it, too."""
+        """Returns the message with the sound format, to be sent once. Subscribers that join late receive it, too."""
         return ((self._info, lambda: self._facts),)
 
     def pending(self, time: float, pcm: bytes) -> Iterable[PendingMessage]:
-        """PCM16 that begins at a ``time`` of the world [s]."""
+        """Returns the messages for sound (PCM16 of 16 kHz, mono) that begins at ``time`` of the world [s]."""
         plain, stamped = self._types
         data = array.array("B", pcm)
 

@@ -1,4 +1,4 @@
-"""Plays an MCAP file of ROS topics (profile ``ros2``), recorded by vinesim or rosbag2, at its own pace."""
+"""Plays an MCAP file of ROS topics (profile ``ros2``), recorded by vinesim or rosbag2, at the recorded pace."""
 
 from __future__ import annotations
 
@@ -25,17 +25,19 @@ from vinesim.ros.tools.subscribing import message_class
 log = logging.getLogger(__name__)
 
 DISCOVERY_TIME = 1.0
-"""Time between the first publisher and the first message, in which subscribers find them [s]."""
+"""Time between the creation of the publishers and the first message, in which subscribers discover them [s]."""
 
 
 class BagError(ValueError):
-    """A file that is no recording of ROS topics; the text names it and says why."""
+    """A file that is no recording of ROS topics. The message names the file and the reason."""
 
 
 def play(path: pathlib.Path, *, rate: float = 1.0, is_stopped: Callable[[], bool] = lambda: False) -> Counter[str]:
-    """Publish all messages of a file, ``rate`` times as fast as recorded; what was published, by topic.
+    """Publish all messages of a file, ``rate`` times as fast as recorded. Returns the number of published messages by
+    topic.
 
-    ``is_stopped`` is asked before each message. :class:`BagError` if the file is no recording of ROS topics.
+    ``is_stopped`` is called before each message; when it returns True, playing ends. Raises :class:`BagError` if the
+    file is no recording of ROS topics.
     """
     middleware.configure()
     message_packages.ensure_importable(message_packages.available_packages())
@@ -48,7 +50,7 @@ def play(path: pathlib.Path, *, rate: float = 1.0, is_stopped: Callable[[], bool
     try:
         with stream:
             return _play(make_reader(stream), rclpy.create_node("vinesim_player", context=context), rate, is_stopped)
-    except (McapError, struct.error) as bad:  # the second of a file that is shorter than a header
+    except (McapError, struct.error) as bad:  # struct.error if the file is shorter than a header
         raise BagError(f"{path}: {bad or 'it is empty'}; give a recording of ROS topics") from None
     finally:
         context.shutdown()

@@ -1,7 +1,7 @@
 """Records ROS topics into an MCAP file as rosbag2 does (profile ``ros2``), without rosbag2.
 
-Messages are stored as they arrive, serialised; the definitions of their types are embedded, so any MCAP reader for
-ROS 2 decodes them. New topics are found while it runs.
+Messages are stored serialised, as they arrive. The file contains the definitions of their types, so any MCAP reader for
+ROS 2 can decode them. Topics that appear during the recording are recorded, too.
 """
 
 from __future__ import annotations
@@ -32,26 +32,27 @@ log = logging.getLogger(__name__)
 DISCOVERY_PERIOD = 0.2
 """Time between two searches for new topics [s]."""
 EXCLUDED = ("/rosout", "/parameter_events")
-"""Topics of every node, recorded only if they are named."""
+"""Topics that every node publishes. They are recorded only if they are named."""
 QUEUE_DEPTH = 1000
-"""Messages of a topic that wait for this node."""
+"""History depth of the subscriptions."""
 
 
 class BagRecorder:
-    """Subscribes to topics and writes what arrives. A context: the file is complete after it."""
+    """Subscribes to topics and writes their messages to a file. It is a context manager; the file is complete at its
+    end."""
 
     def __init__(self, path: pathlib.Path, topics: Sequence[str] = ()) -> None:
-        """``topics``: names or regular expressions that match a whole name; all topics unless given.
+        """``topics``: topic names, or regular expressions that match a whole name; all topics if empty.
 
-        :class:`vinesim.core.errors.WriteError` if the file cannot be written.
+        Raises :class:`vinesim.core.errors.WriteError` if the file cannot be written.
         """
         middleware.configure()
         message_packages.ensure_importable(message_packages.available_packages())
         self._patterns = [re.compile(topic) for topic in topics]
         self.counts: Counter[str] = Counter()
-        """Messages written, by topic."""
+        """Number of messages written, by topic."""
         self.unknown: set[str] = set()
-        """Types whose package is not installed: their topics are not recorded."""
+        """Message types whose package is not installed. Their topics are not recorded."""
         self._path = path
         with writing(path):
             self._file = path.open("wb")
@@ -67,7 +68,8 @@ class BagRecorder:
         self._executor.add_node(self._node)
 
     def spin(self, timeout: float = 0.05) -> None:
-        """Look for new topics when due, and write one message or wait up to ``timeout`` [s] for one."""
+        """Search for new topics when this is due. Then write the next message, or wait up to ``timeout`` [s] for
+        one."""
         if time.monotonic() >= self._next_discovery:
             self._next_discovery = time.monotonic() + DISCOVERY_PERIOD
             for name, types in self._node.get_topic_names_and_types():
@@ -138,7 +140,7 @@ class BagRecorder:
 
 
 def _qos_text(qos: QoSProfile) -> str:
-    """QoS of a channel as rosbag2 (version 9 of its metadata) writes it."""
+    """Returns the QoS of a channel as rosbag2 writes it (version 9 of its metadata)."""
     reliable = qos.reliability == ReliabilityPolicy.RELIABLE
     latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
     return (

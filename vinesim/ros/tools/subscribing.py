@@ -1,4 +1,5 @@
-"""How to subscribe to a topic of which only the name is known: its message class, and QoS that all publishers offer."""
+"""Helpers to subscribe to a topic whose type is not known in advance: its message class, and a QoS that all its
+publishers offer."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 
 def message_class(type_name: str) -> type | None:
-    """The class of ``package/msg/Name``, or None if its package is not installed."""
+    """Returns the class of a message type ``package/msg/Name``, or None if its package is not installed."""
     package, kind, name = type_name.split("/")
     with contextlib.suppress(ImportError, AttributeError):
         return getattr(importlib.import_module(f"{package}.{kind}"), name)
@@ -19,7 +20,8 @@ def message_class(type_name: str) -> type | None:
 
 
 def offered_qos(publishers: Iterable[TopicEndpointInfo], depth: int) -> QoSProfile:
-    """The strictest QoS that every publisher offers, as ``ros2 topic hz`` takes it; ``depth``: messages that wait."""
+    """Returns the strictest QoS that every publisher offers, chosen as in ``ros2 topic hz``. ``depth``: history
+    depth."""
     offered = [one.qos_profile for one in publishers]
     reliable = all(one.reliability == ReliabilityPolicy.RELIABLE for one in offered)
     latched = all(one.durability == DurabilityPolicy.TRANSIENT_LOCAL for one in offered)

@@ -1,20 +1,22 @@
 """A monitor of ROS topics: subscribes with stock rclpy and reports counts, rates, latencies, ages and losses.
 
-``python -m vinesim.ros.tools.topic_monitor --seconds 10`` subscribes to every topic (``--topic`` names some) and
-prints one JSON object: per topic the type and its hash, messages, rate, the fewest messages in any second, bytes, the
-median time from publishing to here (the age, for what was latched), the age of the stamp at arrival by /clock, the
-messages lost (gaps in the publisher's numbering) and whether the stamps ever went back. Without ``--seconds`` it runs
-until its standard input is closed; a line "restart" there begins the counts anew, and for a line "counts" it prints
-the number of messages of each topic, a JSON object on one line.
+``python -m vinesim.ros.tools.topic_monitor --seconds 10`` subscribes to every topic (or to those given by ``--topic``)
+and prints one JSON object. For each topic it contains the type and its hash, the number of messages, the rate, the
+smallest number of messages in any second, bytes, the median time from publishing to arrival (for latched messages:
+their age), the age of the header stamp at arrival by /clock, the number of lost messages (gaps in the publisher's
+sequence numbers), and whether the stamps never decreased. Without ``--seconds`` the monitor runs until its standard
+input is closed. Meanwhile a line "restart" on standard input resets the counts. For a line "counts" the monitor prints
+the number of messages of each topic, as a JSON object on one line.
 
-With ``--announce`` it prints a JSON object when it listens and for the first message of every topic, each on a line,
-as the report then. With ``--once TOPIC`` a topic is left after its first message, so that it costs its publisher
-nothing from then on. With ``--arrivals FILE`` it writes when each message was sent and came, with its stamp and number:
-one array [message, 4] int64 a topic, see :attr:`TopicStats.arrivals`.
+With ``--announce`` the monitor prints a JSON object on one line when it starts to listen and for the first message of
+every topic; its report is on one line, too. With ``--once TOPIC`` it ends the subscription to a topic after the first
+message, so that the topic costs its publisher nothing more. With ``--arrivals FILE`` it writes sending time, arrival
+time, stamp and number of each message: one array [message, 4] int64 per topic, see :attr:`TopicStats.arrivals`.
 
-It takes messages in their serialised form, all that wait of every topic a hundred times a second, so that counting
-costs next to nothing; the first one of every topic is deserialised, to check that it is well-formed. A message arrives
-when the middleware of this process receives it. It runs without vinesim's middleware profile, as any other node.
+A hundred times a second the monitor takes all waiting messages of every topic in serialised form, so that counting
+costs little. The first message of every topic is deserialised, to check that it is well-formed. The arrival time is the
+one at which the middleware of this process receives a message. The monitor runs without vinesim's middleware profile,
+like any other node.
 """
 
 from __future__ import annotations
@@ -41,36 +43,39 @@ from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
 DISCOVERY_PERIOD = 0.05
-"""Time between two searches for new topics, until all that were named are found [s]."""
+"""Time between two searches for new topics, until all named topics are found [s]."""
 EXCLUDED_TOPICS = ("/rosout", "/parameter_events")
-"""Topics of every node, not monitored unless named."""
+"""Topics that every node publishes. They are monitored only if they are named."""
 CLOCK = "/clock"
 POLL_PERIOD = 0.01
-"""Time between two looks at what has come [s]."""
+"""Time between two checks for waiting messages [s]."""
 QUEUE_DEPTH = 1000
-"""Messages of a topic that may wait for this node: seconds of those of every step."""
+"""History depth of the subscriptions: several seconds of a topic that is published in every step."""
 LARGE_QUEUE_DEPTH = 10
-"""The same of :data:`LARGE_TYPES`, whose memory counts: rclpy's default."""
+"""History depth of the subscriptions to :data:`LARGE_TYPES`, which take much memory: rclpy's default."""
 LARGE_TYPES = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2")
+"""Message types with large messages."""
 
 
 class SimulationClock:
-    """Simulated time by the last hundred messages of /clock, which give its rate, too: a world may be slower than real
-    time. The quickest of them is taken for undelayed."""
+    """Estimates simulated time from the last hundred messages of /clock. They also yield its rate, since a world may
+    run slower than real time. The message with the smallest delay is assumed to have none."""
 
     def __init__(self) -> None:
         self._messages: deque[tuple[int, int]] = deque(maxlen=100)
-        """Arrival and stamp [ns]."""
+        """Arrival time and stamp of each message [ns]."""
         self._line: tuple[float, int, int] | None = None
-        """Simulated time per real time; arrival and stamp of the quickest message. None: not known since the last."""
+        """Simulated time per real time [1], and arrival time and stamp [ns] of the message with the smallest delay.
+        None: to be computed again, because a message was added."""
 
     def add(self, arrival: int, stamp: int) -> None:
-        """A /clock message of simulated time ``stamp`` [ns] arrived at wall time ``arrival`` [ns]."""
+        """Add a /clock message with simulated time ``stamp`` [ns] that arrived at wall time ``arrival`` [ns]."""
         self._messages.append((arrival, stamp))
         self._line = None
 
     def age(self, arrival: int, stamp: int) -> int | None:
-        """Simulated time since ``stamp`` at ``arrival`` [ns]; None without a clock."""
+        """Returns the simulated time from ``stamp`` [ns] to the wall time ``arrival`` [ns]; None if no /clock
+        message has arrived."""
         if not self._messages:
             return None
         if self._line is None:
@@ -83,7 +88,8 @@ class SimulationClock:
 
 
 class TopicStats:
-    """Statistics of one topic."""
+    """Statistics of one topic. ``message``: class of its messages. ``publishers``: number of its publishers.
+    ``clock``: estimate of simulated time, for the age of header stamps."""
 
     def __init__(
         self, type_name: str, type_hash: str, message: type, publishers: int, clock: SimulationClock | None = None
@@ -94,18 +100,20 @@ class TopicStats:
         self.first: float | None = None
         """Wall time of the first message [s since the epoch]."""
         self.is_clock = False
-        """Whether these messages set ``clock``."""
+        """Whether the messages of this topic are added to ``clock``."""
         self._clock = clock or SimulationClock()
         self._message = message
         self._stamp_at = _stamp_offset(message)
         self._stamp = (-1, 0)
         self._sequence: int | None = None
         self.arrivals: list[tuple[int, int, int, int]] | None = None
-        """Arrival, sending and stamp [ns], and number of every message, -1 where it has none; None: not kept."""
+        """Arrival time, sending time and stamp [ns], and sequence number of each message; -1 for a missing stamp or
+        number. None: not recorded."""
         self.restart(None)
 
     def restart(self, since: float | None) -> None:
-        """Forget all counts; rates are from the wall time ``since`` [s] on, or from the first message on if None."""
+        """Reset all counts. Rates are then computed from the wall time ``since`` [s], or from the next message on if
+        it is None."""
         self.since = since
         self.count = self.bytes = self.lost = 0
         self.stamps_rise = True
@@ -114,7 +122,7 @@ class TopicStats:
         self._ages: deque[int] = deque(maxlen=10_000)
 
     def add(self, message: bytes, info: dict[str, Any]) -> None:
-        """Count one serialised message with its meta-data from the middleware."""
+        """Count one serialised message. ``info``: its metadata from the middleware."""
         now = info.get("received_timestamp") or time.time_ns()
         if self.first is None:
             from rclpy.serialization import deserialize_message
@@ -140,7 +148,7 @@ class TopicStats:
             self.arrivals.append((now, info["source_timestamp"], simulated, -1 if sequence is None else sequence))
 
     def _add_stamp(self, now: int, stamp: tuple[int, int]) -> int:
-        """Note the stamp of a message; the same in ns."""
+        """Add the stamp (seconds, nanoseconds) of a message that arrived at ``now`` [ns]. Returns the stamp in ns."""
         self.stamps_rise &= stamp >= self._stamp
         self._stamp = stamp
         simulated = stamp[0] * 1_000_000_000 + stamp[1]
@@ -151,8 +159,8 @@ class TopicStats:
         return simulated
 
     def report(self, until: float | None = None) -> dict[str, Any]:
-        """The statistics until a wall time [s] as plain values; ``lost`` is None if several publishers number their
-        messages apart."""
+        """Returns the statistics until the wall time ``until`` [s] as plain values. ``lost`` is None if the topic
+        has several publishers, since each numbers its own messages."""
         now = time.time_ns() * 1e-9 if until is None else until
         span = 0.0 if self.since is None else now - self.since
         return {
@@ -171,7 +179,7 @@ class TopicStats:
 
 
 class TopicMonitor:
-    """Subscribes to topics as they appear."""
+    """Subscribes to topics as they appear, and counts their messages."""
 
     def __init__(
         self,
@@ -181,9 +189,10 @@ class TopicMonitor:
         queue_depth: int | None = None,
         arrivals: bool = False,
     ) -> None:
-        """``topics`` and ``once`` name the topics, all if both are empty; ``announce`` is called with each topic and
-        the wall time of its first message [s]; ``queue_depth``: messages of one topic that may wait for this node, None
-        for :data:`QUEUE_DEPTH` and :data:`LARGE_QUEUE_DEPTH`; ``arrivals``: keep the times of every message."""
+        """``topics``, ``once``: names of topics; all topics if both are empty. Those in ``once`` are monitored until
+        their first message. ``announce``: called with each topic and the wall time of its first message [s].
+        ``queue_depth``: history depth; None: :data:`QUEUE_DEPTH` or :data:`LARGE_QUEUE_DEPTH`. ``arrivals``: whether
+        the times of every message are recorded."""
         from rclpy.context import Context
         from rclpy.node import Node
 
@@ -201,7 +210,8 @@ class TopicMonitor:
         self._subscriptions: dict[str, Any] = {}
 
     def run(self, requests: queue.SimpleQueue[str], seconds: float | None) -> None:
-        """Count messages and obey requests until "stop", or for so many ``seconds`` [s] after the first message."""
+        """Count messages and obey requests, until the request "stop" or until ``seconds`` [s] after the first
+        message."""
         next_look = 0.0
         deadline = None
         while deadline is None or time.monotonic() < deadline:
@@ -224,7 +234,8 @@ class TopicMonitor:
                         self.restart()
 
     def _take(self) -> None:
-        """Count all messages that wait. An executor would take one of them at a time, and look at all topics again."""
+        """Count all waiting messages. This takes them directly, because an executor would take one at a time and
+        check all topics each time."""
         for name, subscription in self._subscriptions.items():
             take = subscription.handle.take_message
             message = subscription.msg_type
@@ -233,23 +244,23 @@ class TopicMonitor:
                 add(*taken)
 
     def restart(self) -> None:
-        """Begin all counts anew."""
+        """Reset all counts."""
         now = time.time()
         for topic in self.stats.values():
             topic.restart(now)
 
     def report(self) -> dict[str, dict[str, Any]]:
-        """The statistics of each topic."""
+        """Returns the statistics of each topic, by topic."""
         now = time.time()
         return {name: topic.report(now) for name, topic in sorted(self.stats.items())}
 
     def save_arrivals(self, path: pathlib.Path) -> None:
-        """Write the times of every message: one array [message, 4] int64 a topic: see :attr:`TopicStats.arrivals`."""
+        """Write the times of every message: one array [message, 4] int64 per topic, see :attr:`TopicStats.arrivals`."""
         rows: dict[str, Any] = {n: np.array(t.arrivals, np.int64).reshape(-1, 4) for n, t in self.stats.items()}
         np.savez(path, **rows)
 
     def close(self) -> None:
-        """Leave the graph."""
+        """Leave the ROS graph."""
         self._node.destroy_node()
         self._context.shutdown()
 
@@ -278,6 +289,8 @@ class TopicMonitor:
         )
 
     def _announce_first(self) -> None:
+        """Announce the topics whose first message has arrived, and end the subscriptions that were for one message
+        only."""
         for name in [name for name in self._unannounced if self.stats[name].first is not None]:
             self._unannounced.remove(name)
             if self._announce is not None:
@@ -295,7 +308,8 @@ def _percentiles_ms(times: Sequence[int]) -> dict[str, float] | None:
 
 
 def _stamp_offset(message: Any) -> int | None:
-    """Where the (first) stamp lies in the serialised message, if it begins with one."""
+    """Returns the offset of the (first) stamp in a serialised message [B], or None if the message does not begin
+    with a stamp."""
     first = next(iter(message.get_fields_and_field_types().values()), "")
     if first in ("std_msgs/Header", "builtin_interfaces/Time"):
         return 4
@@ -316,15 +330,15 @@ class Arguments:
 
 
 def parse(arguments: Sequence[str] | None = None) -> Arguments:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         prog="python -m vinesim.ros.tools.topic_monitor", description="Count what arrives on ROS topics."
     )
-    parser.add_argument("--topic", action="append", default=[], help="monitor this one only (may be repeated)")
-    parser.add_argument("--once", action="append", default=[], help="only until its first message (may be repeated)")
+    parser.add_argument("--topic", action="append", default=[], help="monitor only this topic (may be repeated)")
+    parser.add_argument("--once", action="append", default=[], help="monitor until its first message (may be repeated)")
     parser.add_argument("--announce", action="store_true", help="print a JSON line for each topic's first message")
-    parser.add_argument("--queue", type=int, help="messages of a topic that may wait for it")
-    parser.add_argument("--seconds", type=float, help="from the first message on; default: until stdin is closed")
+    parser.add_argument("--queue", type=int, help="history depth of the subscriptions")
+    parser.add_argument("--seconds", type=float, help="duration from the first message; default: until stdin closes")
     parser.add_argument("--out", type=pathlib.Path, help="write the JSON here instead of to stdout")
     parser.add_argument("--arrivals", type=pathlib.Path, help="write the times of every message here (.npz)")
     given = parser.parse_args(arguments)
@@ -332,7 +346,7 @@ def parse(arguments: Sequence[str] | None = None) -> Arguments:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Monitor and report; the exit status."""
+    """Monitor topics and write the report. Returns the exit status."""
     given = parse(arguments)
     reason = middleware.unavailable_reason()
     if reason is not None:
@@ -362,7 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _read_requests(requests: queue.SimpleQueue[str]) -> None:
-    """Pass the lines of standard input on, and "stop" at its end."""
+    """Put each line of standard input into ``requests``, and "stop" at the end of the input."""
     for line in sys.stdin:
         requests.put(line.strip())
     requests.put("stop")

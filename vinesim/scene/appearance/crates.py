@@ -17,11 +17,11 @@ from vinesim.scene.values import Shape
 
 
 class Crate(Table, frozen=True):
-    """Dimensions [m] and paints of a harvest crate; the scene gives its outer size."""
+    """Dimensions [m] and paints of a harvest crate. The scene contains its outer size."""
 
     source: str
     paints: Annotated[tuple[Paint, ...], msgspec.Meta(min_length=1)]
-    """Paints, which the crates take in turn."""
+    """Paints. Crate i of the scene has paint i modulo the number of paints."""
     wall: float
     """Thickness of walls and bottom."""
     slat: float
@@ -46,7 +46,8 @@ class Crate(Table, frozen=True):
 
 @functools.lru_cache(256)
 def crate_shapes(size: tuple[float, float, float], number: int, name: str = "crate") -> tuple[Shape, ...]:
-    """Shapes of a slatted, open crate of outer ``size`` [m]; its origin is in the middle of the underside."""
+    """Returns the shapes of a slatted, open crate of outer ``size`` [m]. The origin is in the middle of its underside.
+    ``number``: index of the crate."""
     one = load_toml(find_data_file("figures", name, ".toml"), Crate, AppearanceError)
     t = one.wall
     look = surface_fields(one.paints[number % len(one.paints)])
@@ -77,7 +78,8 @@ def crate_shapes(size: tuple[float, float, float], number: int, name: str = "cra
             thin = sign * (side - 0.45 * t)
 
             def wall(a: float, b: float, low: float, high: float, depth: float, outer=outer, along=along) -> None:
-                """Add a box from ``a`` to ``b`` along the wall, ``low`` to ``high``, ``depth`` to the outer face."""
+                """Add a box to a wall: from ``a`` to ``b`` along the wall, from ``low`` to ``high``, of thickness
+                ``depth`` from the outer face inwards."""
                 first = (a, min(outer, depth), low)
                 second = (b, max(outer, depth), high)
                 order = [1, 0, 2] if along else [0, 1, 2]

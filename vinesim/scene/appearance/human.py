@@ -62,7 +62,7 @@ class HumanFile(Table, frozen=True):
     height: float
     paints: dict[str, Paint]
     outfits: dict[str, dict[str, Point]]
-    """By outfit: the colour [sRGB, 0 to 1] of each paint by name."""
+    """For each outfit: colour [sRGB, 0 to 1] of each paint, by name."""
     parts: dict[str, tuple[ShapeSpec, ...]]
     limbs: Limbs
     fingers: dict[str, Finger]
@@ -74,7 +74,7 @@ class HumanModel:
     """Shapes of a person of one height [m], by part, and the joints between the tracked parts."""
 
     parts: dict[str, tuple[Shape, ...]]
-    """Shapes by link: head, chest, ``left_hand``, ``neck``, ``left_upper_arm``, ``left_index_1`` to ``_3``, others."""
+    """Shapes by link, for example ``head``, ``chest``, ``left_hand``, ``left_upper_arm``, ``left_index_1``."""
     limbs: Limbs
     root: np.ndarray
     """[finger, 7] pose of the first phalanx in the palm's frame; fingers of the left hand, then of the right."""
@@ -85,19 +85,21 @@ class HumanModel:
 
 
 def outfit_names(name: str = "worker") -> tuple[str, ...]:
-    """Names of the outfits that people can wear."""
+    """Returns the names of the outfits that people can wear."""
     return tuple(_load_file(find_data_file("figures", name, ".toml")).outfits)
 
 
 def outfit_of(actor: str, name: str = "worker") -> str:
-    """The outfit of an actor that has chosen none. It follows from the actor's name and is equal on all clients."""
+    """Returns the outfit of an actor that has not chosen one. It is computed from the actor's name, so it is equal on
+    all clients."""
     outfits = outfit_names(name)
     return outfits[zlib.crc32(actor.encode()) % len(outfits)]
 
 
 @functools.lru_cache(64)
 def load_human_model(height: float, name: str = "worker", outfit: str = "") -> HumanModel:
-    """The human model of ``height`` [m] in an outfit (empty: the first one), from ``data/figures``.
+    """Returns the human model of ``height`` [m] in an outfit (empty: the first outfit in the file), from
+    ``data/figures``.
 
     Raises :class:`AppearanceError` if the file cannot be read or has no such outfit.
     """
@@ -118,9 +120,9 @@ def load_human_model(height: float, name: str = "worker", outfit: str = "") -> H
 
 @functools.lru_cache(16)
 def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[str]]]:
-    """The human model of ``height`` [m], and by part the paint name of every shape.
+    """Returns the human model of ``height`` [m], and for each part the paint names of its shapes.
 
-    All outfits share the meshes of this model; :func:`load_human_model` gives them their colours.
+    All outfits share the meshes of this model; :func:`load_human_model` sets the colours.
     """
     file = _load_file(find_data_file("figures", name, ".toml"))
     scale = height / file.height
@@ -160,9 +162,9 @@ def _build_model(height: float, name: str) -> tuple[HumanModel, dict[str, list[s
 
 
 def _paints_of(spec: ShapeSpec, shapes: list[Shape]) -> list[str]:
-    """The paint name of each of the ``shapes`` that were built from ``spec``.
+    """Returns the paint name of each of the ``shapes`` that were built from ``spec``.
 
-    A loft gives one shape for each paint, and a spec with a twin gives all shapes twice.
+    A loft has one shape for each paint. A spec with a twin has all shapes twice.
     """
     names = [spec.paint] if isinstance(spec.paint, str) else list(dict.fromkeys(spec.paint))
     return names * (len(shapes) // len(names))
@@ -170,7 +172,7 @@ def _paints_of(spec: ShapeSpec, shapes: list[Shape]) -> list[str]:
 
 @functools.cache
 def _load_file(path: pathlib.Path) -> HumanFile:
-    """The checked content of a file, which serves people of all heights."""
+    """Returns the checked content of a figure file, which is used for people of all heights."""
     file = load_toml(path, HumanFile, AppearanceError)
     for part, specs in file.parts.items():
         for i, spec in enumerate(specs):
@@ -186,7 +188,7 @@ def _load_file(path: pathlib.Path) -> HumanFile:
 
 
 def _scaled(value: Any, scale: float) -> Any:
-    """All numbers of nested tables and lists times ``scale``."""
+    """Returns nested tables and lists with all numbers multiplied by ``scale``."""
     if isinstance(value, dict):
         return {key: _scaled(one, scale) for key, one in value.items()}
     return [scale * one for one in value] if isinstance(value, (list, tuple)) else scale * value

@@ -10,9 +10,10 @@ from vinesim.scene.values import Mesh, Shape
 
 
 def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
-    """Shapes of one description: one shape, or a mesh for each paint of a loft; with ``twin`` also the mirrored ones.
+    """Returns the shapes of one description: one shape, or for a loft a mesh for each paint. With ``twin`` the mirrored
+    shapes follow.
 
-    ``scale`` [1] multiplies all lengths. ``mirror`` mirrors the shapes to the other side (y).
+    ``scale`` [1] multiplies all lengths. ``mirror``: whether the shapes are mirrored to the other side (y).
     """
     sides = (False, True) if spec.twin else (mirror,)
     if spec.kind == "loft":
@@ -33,7 +34,7 @@ def build_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror
 
 
 def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror: bool) -> list[Shape]:
-    """Meshes through the rings of a loft, one for each paint. If the rings are whole, lids close both ends."""
+    """Returns the meshes through the rings of a loft, one for each paint. Whole rings have lids at both ends."""
     place, rear, front, wide, aside = np.array([(*ring, 0.0)[:5] for ring in spec.rings]).T
     whole = spec.arc[1] - spec.arc[0] >= 360.0
     first, last = (np.radians(arc) for arc in (spec.arc, spec.arc_end or spec.arc))
@@ -82,11 +83,12 @@ def loft_shapes(spec: ShapeSpec, paints: dict[str, Paint], scale: float, mirror:
 
 
 CREASE_ANGLE = np.radians(50.0)
-"""Faces that meet at a larger angle [rad] form an edge; other faces form one smooth surface."""
+"""Angle [rad] between adjacent faces above which they form an edge. Below it they form one smooth surface."""
 
 
 def smooth_normals(vertices: np.ndarray, faces: np.ndarray, crease: float = float(CREASE_ANGLE)) -> np.ndarray:
-    """Unit normals [face, 3, 3] at the corners of a mesh: the area-weighted mean over the faces around each corner.
+    """Returns the unit normals [face, 3, 3] at the corners of a mesh: the area-weighted mean over the faces around each
+    corner.
 
     Args:
         vertices: [vertex, 3] m.

@@ -15,19 +15,19 @@ MAX_SURFACE_FACES = 4000
 
 _MAX_NEIGHBOURS = 10_000_000
 """Largest number of pairs of corners that share a point, for received triangles. The memory for smooth normals grows
-with it; meshes of robots have a tenth of this number."""
+with this number. Meshes of robots have up to a tenth of it."""
 
 
 def smooth_surface(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, ...]) -> Mesh:
-    """A mesh [m] of ``vertices`` [vertex, 3] and ``faces`` [face, 3], scaled, with smooth normals.
+    """Returns a mesh [m] of ``vertices`` [vertex, 3] and ``faces`` [face, 3], scaled, with smooth normals.
 
-    Near vertices are merged until the mesh has at most :data:`MAX_SURFACE_FACES`.
+    Vertices that are close to each other are merged until the mesh has at most :data:`MAX_SURFACE_FACES` faces.
     """
     return _with_normals(*_simplify(vertices, faces, scale))
 
 
 def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
-    """As :func:`read_surface`, from received triangles with ``corners`` [face, 3, 3] instead of a file.
+    """Returns the mesh of :func:`read_surface` for received triangles with ``corners`` [face, 3, 3] m.
 
     Raises :class:`TrianglesError` if the triangles cannot be simplified or too many of them meet at one point.
     """
@@ -38,12 +38,12 @@ def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
     vertices, faces = _simplify(np.asarray(merged.vertices), np.asarray(merged.faces), scale)
     _, count = np.unique(np.round(vertices[faces.ravel()], 6), axis=0, return_counts=True)
     if not 1 <= len(faces) <= 4 * MAX_SURFACE_FACES or (count.astype(float) ** 2).sum() > _MAX_NEIGHBOURS:
-        raise TrianglesError(f"{len(corners)} triangles that lie on one another or vanish")
+        raise TrianglesError(f"{len(corners)} triangles that coincide or have no area")
     return _with_normals(vertices, faces)
 
 
 def read_surface(file: str, scale: tuple[float, ...]) -> Mesh:
-    """As :func:`smooth_surface`, for the mesh in ``file``."""
+    """Returns the mesh of :func:`smooth_surface` for the mesh in ``file``."""
     import trimesh
 
     mesh = cast("trimesh.Trimesh", trimesh.load(file, force="mesh", process=True))

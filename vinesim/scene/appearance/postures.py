@@ -51,16 +51,15 @@ def _load_postures() -> PostureFile:
 
 
 def posture_names() -> tuple[str, ...]:
-    """Names of the postures of :func:`apply_posture`."""
+    """Returns the names of the postures of :func:`apply_posture`."""
     return tuple(_load_postures().postures)
 
 
 def apply_posture(standing: HumanPose, name: str, height: float) -> HumanPose:
-    """The pose of a person of this height [m] in a posture of ``data/figures/postures.toml``.
+    """Returns the pose of a person of ``height`` [m] in the posture ``name`` of ``data/figures/postures.toml``.
 
-    ``standing`` is the pose of the same person standing upright; it gives the place and the points that the posture
-    leaves out.
-    :class:`AppearanceError` if there is no posture of that name.
+    ``standing``: pose of the same person standing upright. The result has the position of ``standing``, and its poses
+    of points that the posture does not define. Raises :class:`AppearanceError` if there is no posture of that name.
     """
     file = _load_postures()
     if name not in file.postures:

@@ -20,7 +20,7 @@ _Z_TO_X = frames.exp(np.array([0.0, 0.5 * np.pi, 0.0]))
 
 
 class AppearanceError(DataError):
-    """A figure that cannot be drawn; one line with file, place, finding and remedy."""
+    """Raised for a figure file that cannot be used. The message is one line with file, field, error and correction."""
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -46,7 +46,7 @@ class ShapeSpec(Table, frozen=True, kw_only=True):
     end: Point = (0.0, 0.0, 0.0)
     """End of the axis of a cone or a cylinder."""
     radius: tuple[float, float] = (0.0, 0.0)
-    """Radii at both ends of a cone; a cylinder has the first one."""
+    """Radii at both ends of a cone. A cylinder has the first radius at both ends."""
     at: Point = (0.0, 0.0, 0.0)
     """Centre of an ellipsoid or a box."""
     half: Point = (0.0, 0.0, 0.0)
@@ -54,25 +54,28 @@ class ShapeSpec(Table, frozen=True, kw_only=True):
     turn: Point = (0.0, 0.0, 0.0)
     """Rotation vector of an ellipsoid or a box [rad]."""
     twin: bool = False
-    """Whether there is a second shape, mirrored to the other side."""
+    """Whether there is also a mirrored shape on the other side of the body."""
     along: Literal["x", "z"] = "z"
     """Axis of a loft: z (front is x) or x (front is z); left is y."""
     rings: tuple[tuple[float, ...], ...] = ()
-    """Rings of a loft: position on the axis, rear, front, half width, and offset to the left (0 unless given)."""
+    """[m] Rings of a loft. Each has: position on the axis, extent to the rear, extent to the front, half width, and
+    offset to the left (default 0)."""
     arc: tuple[float, float] = (-180.0, 180.0)
     """Range of angles that a loft covers [degrees], counter-clockwise about its axis from the front."""
     arc_end: tuple[float, float] | None = None
-    """Range of angles at the last ring, if it differs from ``arc`` at the first; between them it changes linearly."""
+    """Range of angles at the last ring, if it differs from ``arc``. Then ``arc`` applies at the first ring, and the
+    range changes linearly between the two."""
     swell: float = 0.0
     """Distance by which a loft's rings are widened, for a patch on top of another loft."""
     sides: int = 20
     """Number of edges of a whole ring."""
     square: float = 2.0
-    """Exponent of the rings: 2 gives an ellipse, a larger one a rounded rectangle."""
+    """Exponent of the rings: 2 for an ellipse, larger for a rounded rectangle."""
 
 
 def check_spec(paints: dict[str, Paint], spec: ShapeSpec, place: str) -> None:
-    """Raise :class:`AppearanceError` naming ``place`` if paints are unknown or the rings of a loft are wrong."""
+    """Raise :class:`AppearanceError`, with a message that names ``place``, if paints are unknown or the rings of a loft
+    are wrong."""
     names = (spec.paint,) if isinstance(spec.paint, str) else spec.paint
     if missing := [name for name in names if name not in paints]:
         raise AppearanceError(f"{place}.paint is {missing[0]!r}; give one of: {', '.join(paints)}")
@@ -87,14 +90,14 @@ def check_spec(paints: dict[str, Paint], spec: ShapeSpec, place: str) -> None:
 
 
 def surface_fields(paint: Paint) -> tuple[tuple[float, float, float, float], str, str]:
-    """The fields ``rgba``, ``file`` and ``surface`` of a :class:`Shape` with this paint."""
+    """Returns the fields ``rgba``, ``file`` and ``surface`` of a :class:`Shape` with this paint."""
     return (*paint.rgb, 1.0), "", paint.surface
 
 
 def rod_shape(
     start: ArrayLike, end: ArrayLike, radius: tuple[float, float], scale: float, paint: Paint, kind: str = "cone"
 ) -> Shape:
-    """A round cone or a cylinder from one point [3] to another; all lengths [m] are multiplied by ``scale``."""
+    """Returns a round cone or a cylinder from one point [3] to another; all lengths [m] are multiplied by ``scale``."""
     a = scale * np.asarray(start, float)
     b = scale * np.asarray(end, float)
     half = 0.5 * float(np.linalg.norm(b - a))

@@ -24,7 +24,7 @@ class ShearsFile(Table, frozen=True):
     bolt: Point
     """[m] Position of the hinge of both halves, in the palm's frame."""
     opening: float
-    """Angle of either half from its closed position when the shears are open [rad]."""
+    """Angle of each half from its closed position when the shears are open [rad]."""
     mouth: Point
     """[m] Middle of the space between the open blades, in the palm's frame."""
     mouth_half: Point
@@ -55,7 +55,7 @@ class ShearsModel:
 
 @functools.cache
 def load_shears(name: str = "shears") -> ShearsModel:
-    """The shears of ``data/figures``; :class:`AppearanceError` if the file cannot be read."""
+    """Returns the shears of ``data/figures``. Raises :class:`AppearanceError` if the file cannot be read."""
     path = find_data_file("figures", name, ".toml")
     file = load_toml(path, ShearsFile, AppearanceError)
     parts = {}

@@ -18,14 +18,14 @@ class FixedStructure:
     """Vines with their random streams, their trunks and arms, and all fixed parts."""
 
     foot: np.ndarray
-    """[vine, 3] m, where the trunk meets the ground."""
+    """[vine, 3] m, position of the trunk's base on the ground."""
     row: np.ndarray
     """[vine] index of the vine's row."""
     rngs: list[np.random.Generator]
     arms: np.ndarray
-    """[vine, arm, point, 3] m"""
+    """[vine, arm, point, 3] m, points along the axis of each arm."""
     trunk: np.ndarray
-    """[vine, point, 3] m"""
+    """[vine, point, 3] m, points along the axis of each trunk."""
     fixed: dict[str, np.ndarray]
 
 
@@ -96,7 +96,7 @@ def _cone_chains(
     tension: float = 0.0,
     shear_modulus: float = 0.0,
 ) -> dict[str, np.ndarray]:
-    """Round cones along polylines [chain, point, 3]."""
+    """Returns the ``fixed_`` arrays of round cones along polylines [chain, point, 3] m."""
     pieces = points.shape[1] - 1
     pairs = np.broadcast_to(np.stack([radius[:-1], radius[1:]], -1), (len(points), pieces, 2))
     return {
@@ -111,7 +111,8 @@ def _cone_chains(
 
 
 def _wires(scene: Scene, parameters: VineParameters) -> list[dict[str, np.ndarray]]:
-    """A net at the roof (tendone), or a fruiting wire and pairs of catch wires in each row (vsp)."""
+    """Returns the wires of a scene: an overhead net (tendone), or a fruiting wire and pairs of catch wires in each row
+    (vsp)."""
     layout = scene.layout
     trellis = parameters.trellis
     wide = (layout.vines - 1) * layout.vine_spacing

@@ -15,7 +15,8 @@ from vinesim.scene.plant_parameters import Range, VineParameters
 from vinesim.scene.spec import Scene
 
 Sampler = Callable[..., np.ndarray]
-"""Function of a shape that draws random numbers [shoot, *shape]; each shoot uses the stream of its vine."""
+"""Function that draws random numbers [shoot, *shape] for a given ``shape``. Each shoot uses the random stream of its
+vine."""
 
 MIN_GAP = 0.02
 """Smallest gap between a bunch and neighbouring bunches, poles and trunks [m]."""
@@ -32,7 +33,7 @@ def sample_fruit(
     uniform: Sampler,
     normal: Sampler,
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Draw two bunches for every shoot; :func:`choose_bunches` keeps some of them.
+    """Draw two bunches for every shoot at random. :func:`choose_bunches` then selects some of them.
 
     Returns:
         ``fruit``, ``bunch_at``, ``peduncle`` and ``bunch_axis`` as in :class:`~vinesim.scene.generation.shoots.Shoots`,
@@ -88,7 +89,7 @@ def sample_fruit(
 
 
 def _fraction(value: np.ndarray, within: Range) -> np.ndarray:
-    """Position of ``value`` between the ends of a range, from 0 to 1."""
+    """Returns the position of ``value`` between the ends of a range, from 0 to 1."""
     low, high = within.value
     return (value - low) / (high - low)
 
@@ -101,9 +102,10 @@ def choose_bunches(
     burden: np.ndarray,
     fruit: dict[str, np.ndarray],
 ) -> np.ndarray:
-    """Thin each vine to its number of bunches.
+    """Select the bunches that each vine keeps.
 
-    A bunch is not kept if it touches a pole, a trunk or a bunch already kept, or if its upright shoot would buckle.
+    A bunch is not kept if it touches a pole, a trunk or a bunch that is already kept, or if its upright shoot would
+    buckle.
     """
     layout = scene.layout
     low, high = scene.fruit.bunches

@@ -42,25 +42,25 @@ class Bodies:
     organ: np.ndarray
     """[shoot, slot] :class:`Organ`."""
     origin: np.ndarray
-    """[shoot, slot, 3] m"""
+    """[shoot, slot, 3] m, world position of the body's origin."""
     turn: np.ndarray
-    """[shoot, slot, 4] quaternion."""
+    """[shoot, slot, 4] orientation of the body in the world, quaternion xyzw."""
     length: np.ndarray
-    """[shoot, slot] m"""
+    """[shoot, slot] m, length of the body."""
     radius: np.ndarray
-    """[shoot, slot, 2] m, where the body begins and ends."""
+    """[shoot, slot, 2] m, radius of the body at its start and at its end."""
     mass: np.ndarray
-    """[shoot, slot] kg"""
+    """[shoot, slot] kg, mass of the body."""
     com: np.ndarray
     """[shoot, slot, 3] m, in the body's frame."""
     inertia: np.ndarray
-    """[shoot, slot, 3] kg m^2"""
+    """[shoot, slot, 3] kg m^2, principal moments of inertia about the centre of mass."""
     stiffness: np.ndarray
-    """[shoot, slot, 3] N m/rad"""
+    """[shoot, slot, 3] N m/rad, stiffness of the body's joint."""
     half: np.ndarray
     """[shoot, slot, 3] N m/rad, spring of the half of a segment beyond its middle."""
     damping: np.ndarray
-    """[shoot, slot, 3] N m s/rad"""
+    """[shoot, slot, 3] N m s/rad, damping of the body's joint."""
     drag: np.ndarray
     """[shoot, slot] m^2, drag area Cd A."""
     head: dict[str, np.ndarray]
@@ -68,7 +68,7 @@ class Bodies:
 
 
 def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
-    """Bodies of main axes, laterals, peduncles and bunches, with the drag of wood and bunches."""
+    """Returns the bodies of main axes, laterals, peduncles and bunches, with the drag of wood and bunches."""
     count = len(shoots.vine)
     cane = parameters.cane
     peduncle = parameters.peduncle
@@ -110,7 +110,7 @@ def build_bodies(parameters: VineParameters, shoots: Shoots) -> Bodies:
 
 
 def _allocate(count: int) -> Bodies:
-    """A table of zeros for ``count`` shoots, with all bodies present."""
+    """Returns a table of zeros for ``count`` shoots, with all bodies present."""
     shape = (count, SLOT_COUNT)
     return Bodies(
         present=np.ones(shape, bool),
@@ -136,7 +136,7 @@ def _allocate(count: int) -> Bodies:
 
 
 def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """Parent slots [shoot, segment] of a rod that grows on slot ``first`` [shoot].
+    """Returns the parent slots [shoot, segment] of a rod that grows on slot ``first`` [shoot].
 
     ``chain`` [segment - 1] are the rod's own slots.
     """
@@ -204,7 +204,7 @@ def _fill_rod(
         points: [shoot, segment + 1, 3] m, ends of the segments.
         radius: [shoot, segment + 1] m, radii at these points.
         modulus: [segment] Pa, Young's modulus.
-        wood: gives density and damping.
+        wood: parameters with density and damping of the wood.
         up: [shoot, 3] direction that the z axes lean to.
         parent: [shoot, segment] slots of the parents.
     """

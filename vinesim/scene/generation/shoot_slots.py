@@ -1,4 +1,4 @@
-"""Slots (columns) of the table of shoots, one for each segment, bunch or cluster.
+"""Slots (columns) of the table of bodies [shoot, slot]: one for each segment, bunch or berry cluster.
 
 Every shoot has the same slots: main axis, lateral, and for each of two bunches the peduncle, the bunch and its
 clusters.
@@ -29,12 +29,12 @@ SLOT_COUNT = CORE_SLOTS + MAX_BUNCHES * MAX_CLUSTERS
 
 
 def peduncle_slots(which: int) -> slice:
-    """Slots of one peduncle, followed by the slot of its bunch."""
+    """Returns the slots of one peduncle, followed by the slot of its bunch."""
     first = AXIS_SEGMENTS + LATERAL_SEGMENTS + which * (PEDUNCLE_SEGMENTS + 1)
     return slice(first, first + PEDUNCLE_SEGMENTS + 1)
 
 
 def cluster_slots(which: int) -> slice:
-    """Slots of one bunch's berry clusters."""
+    """Returns the slots of one bunch's berry clusters."""
     first = CORE_SLOTS + which * MAX_CLUSTERS
     return slice(first, first + MAX_CLUSTERS)

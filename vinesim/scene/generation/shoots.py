@@ -27,11 +27,11 @@ class Shoots:
 
     vine: np.ndarray
     piece: np.ndarray
-    """[shoot] piece of an arm that the shoot grows on, counted over all arms"""
+    """[shoot] index of the piece of an arm on which the shoot grows, counted over all arms"""
     up: np.ndarray
     """[shoot, 3] direction that the bodies' z axes lean to."""
     points: np.ndarray
-    """[shoot, AXIS_SEGMENTS + 1, 3] m, main axis."""
+    """[shoot, AXIS_SEGMENTS + 1, 3] m, points along the main axis."""
     length: np.ndarray
     base: np.ndarray
     """[shoot] radius at the base [m]"""
@@ -40,9 +40,9 @@ class Shoots:
     lateral_at: np.ndarray
     """[shoot] segment of the main axis whose tip carries the lateral"""
     lateral_points: np.ndarray
-    """[shoot, LATERAL_SEGMENTS + 1, 3] m"""
+    """[shoot, LATERAL_SEGMENTS + 1, 3] m, points along the lateral."""
     has_bunch: np.ndarray
-    """[shoot, MAX_BUNCHES] bool"""
+    """[shoot, MAX_BUNCHES] bool: the shoot has this bunch."""
     bunch_at: np.ndarray
     """[shoot, MAX_BUNCHES] segment of the main axis whose tip carries the peduncle"""
     peduncle: np.ndarray
@@ -143,7 +143,8 @@ def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStru
 def _grow_main_axis(
     scene: Scene, start: np.ndarray, heading: np.ndarray, length: np.ndarray, noise: np.ndarray, foot: np.ndarray
 ) -> np.ndarray:
-    """Points of the main axes. Shoots in a tendone are held by the net, shoots in a hedge between its catch wires."""
+    """Returns the points of the main axes. The net holds shoots in a tendone, pairs of catch wires hold shoots in a
+    hedge."""
     layout = scene.layout
     tendone = scene.training == "tendone"
     points = np.empty((len(start), AXIS_SEGMENTS + 1, 3))
@@ -170,7 +171,8 @@ def _grow_main_axis(
 def _grow_lateral(
     points: np.ndarray, at: np.ndarray, up: np.ndarray, length: np.ndarray, sign: np.ndarray, noise: np.ndarray
 ) -> np.ndarray:
-    """Points of the laterals, which leave the main axis at 45 degrees and wander a little."""
+    """Returns the points of the laterals, which branch off the main axis at 45 degrees, with small random changes of
+    direction."""
     rows = np.arange(len(points))
     start = points[rows, at + 1]
     axis = frames.normalize(points[rows, at + 1] - points[rows, at])

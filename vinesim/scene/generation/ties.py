@@ -12,13 +12,14 @@ from vinesim.scene.plant_parameters import VineParameters
 from vinesim.scene.spec import Scene
 
 TIED_SEGMENT = 10
-"""Segment of a shoot at whose beginning a string binds the shoot to the net."""
+"""Index of the segment of a shoot that a string binds to the net, at the segment's start."""
 
 
 def find_ties(
     scene: Scene, parameters: VineParameters, structure: FixedStructure, shoots: Shoots, bodies: Bodies
 ) -> dict[str, np.ndarray]:
-    """Tie shoots to the wires that they pass closely: to the net in a tendone, to the catch wires in a hedge.
+    """Tie shoots to nearby wires: to the net in a tendone, to the catch wires in a hedge. Returns the ``tie_`` arrays
+    of the model.
 
     Each tie is bound to the nearest piece of wire. A shoot between two catch wires is bound to one of them.
     """
@@ -50,7 +51,7 @@ def find_ties(
         crossings.append((share, np.where(found, np.abs(apart), np.inf)))
     share, apart = (np.stack(values, -1) for values in zip(*crossings, strict=True))
     tied = apart < trellis.tie_reach.value
-    if tendone:  # a string binds each shoot beyond its middle, or a long one would fall over
+    if tendone:  # a string binds each shoot beyond its middle; otherwise a long shoot would fall over
         share[:, TIED_SEGMENT, 0] = 0.0
         tied[:, TIED_SEGMENT, 0] = np.abs(start[:, TIED_SEGMENT, 2] - layout.height) < trellis.tie_string.value
     shoot, slot, which = np.nonzero(tied)
@@ -69,7 +70,8 @@ def find_ties(
 
 
 def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarray) -> np.ndarray:
-    """The piece of wire along x (``axis`` [k] 0) or y (1) that is nearest to each of ``points`` [k, 3] m."""
+    """Returns the index [k] of the piece of wire that is nearest to each of ``points`` [k, 3] m, among the wires along
+    x (``axis`` [k] is 0) or y (1)."""
     fixed = structure.fixed
     wires = np.flatnonzero(fixed["fixed_organ"] == int(Organ.WIRE))
     start = fixed["fixed_start"][wires]
@@ -89,9 +91,10 @@ def _nearest_wire(structure: FixedStructure, points: np.ndarray, axis: np.ndarra
 
 
 def _crossing(start: np.ndarray, end: np.ndarray, first: float, step: float) -> tuple[np.ndarray, np.ndarray]:
-    """Crossings of the pieces from ``start`` to ``end`` [...] with lines at ``first`` + n ``step``.
+    """Find where pieces cross lines. ``start``, ``end`` [...] m: the coordinates of their ends across the lines, which
+    are at ``first`` + n ``step``.
 
-    Returns the share of the piece's length at the crossing, and whether it crosses a line [...] bool.
+    Returns the share [...] of the piece's length at the crossing, and [...] bool whether the piece crosses a line.
     """
     low = (start - first) / step
     high = (end - first) / step

@@ -1,8 +1,8 @@
-"""Generates the model of a scene: poles, wires and old wood are fixed, every shoot is a tree with leaves and bunches.
+"""Generates the model of a scene. Poles, wires and old wood are fixed; every shoot is a tree with leaves and bunches.
 
 Shoots are rows of a table, all with the same slots (:mod:`~vinesim.scene.generation.shoot_slots`). Slots that a shoot
-does not use are masked out at the end, so that only the drawing of random numbers loops over plants. Each vine draws
-from its own random stream, named by (seed, row, place), so its numbers do not depend on the number of vines.
+does not use are removed at the end. So only the drawing of random numbers loops over plants. Each vine has its own
+random stream, seeded by (seed, row, place), so its numbers do not depend on the number of vines.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from vinesim.scene.spec import Scene, Sun, Wind
 
 
 def generate(scene: Scene) -> Model:
-    """The model of a scene, from :mod:`vinesim.core.disk_cache` if it is there.
+    """Returns the model of a scene, from the disk cache (:mod:`vinesim.core.disk_cache`) if the cache contains it.
 
-    The same scene gives the same bits on every machine.
+    The model of a scene has the same bits on every machine.
 
-    Raises :class:`~vinesim.core.toml_loader.DataError` if its plant parameters cannot be read.
+    Raises :class:`~vinesim.core.toml_loader.DataError` if the scene's plant parameters cannot be read.
     """
     parameters = plant_parameters.load_plant(scene.plants)
 
@@ -53,13 +53,13 @@ def generate(scene: Scene) -> Model:
 
 
 def generate_uncached(scene: Scene) -> Model:
-    """The model of a scene as from :func:`generate`, but without the cache, for scenes that are needed only once."""
+    """Returns the same model as :func:`generate` without using the cache. For scenes that are needed only once."""
     return _generate(scene, plant_parameters.load_plant(scene.plants))
 
 
 @functools.cache
 def _code_digest() -> str:
-    """Digest of the code that generates models and of the grape varieties."""
+    """Returns the digest of the code that generates models and of the grape varieties."""
     package = pathlib.Path(builder.__file__).parent
     others = [pathlib.Path(str(module.__file__)) for module in (frames, array_fields, portable_math)]
     return disk_cache.source_digest(package, *others, repr(berries.VARIETIES))

@@ -1,1 +1,1 @@
-"""Imports plants from OpenAlea, Helios or a scanner as trees with wood."""
+"""Imports plants from files of OpenAlea, Helios or a scanner, as trees of bodies with properties of wood."""

@@ -1,9 +1,10 @@
 """Reads plants of Helios (Bailey 2019, Front. Plant Sci. 10:1185): cylinder files, and the XML of a plant's structure.
 
-``writeQSMCylinderFile`` writes every internode as a cylinder, in 17 columns separated by tabs, as TreeQSM does. Where a
-new branch begins, its parent column still names the row above, although the branch starts elsewhere. The reader joins
-such a cylinder to the one on which it starts. ``writePlantStructureXML`` contains points only for shoots whose nodes
-were prescribed; for other shoots it contains angles for Helios to grow them, which this reader cannot use.
+``writeQSMCylinderFile`` writes every internode as a cylinder, in 17 columns separated by tabs, as TreeQSM does. For the
+first cylinder of a branch, the parent column also names the previous row, although the branch starts elsewhere. The
+reader joins such a cylinder to the cylinder on whose surface it starts. ``writePlantStructureXML`` contains points only
+for shoots whose nodes were prescribed; for other shoots it contains angles from which Helios grows them. This reader
+cannot use these angles.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ _NEAR = 0.01
 
 
 def read_cylinders(path: pathlib.Path) -> Skeleton:
-    """The skeleton of a plant from a cylinder file (TreeQSM, or Helios' ``writeQSMCylinderFile``), lengths in metres.
+    """Returns the skeleton of a plant from a cylinder file (TreeQSM, or Helios' ``writeQSMCylinderFile``) with lengths
+    in metres.
 
-    :class:`PlantFileError` for a row that is not a cylinder or does not start on one.
+    Raises :class:`PlantFileError` for a row that is not a cylinder or does not start on another cylinder.
     """
     rows = []
     for number, line in enumerate(path.read_text("utf-8", "replace").splitlines()[1:], 2):
@@ -53,7 +55,7 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
         if not (0 <= one < i and np.linalg.norm(end[one] - start[i]) <= table[one, 0] + _NEAR):
             one = _bearer(path, table, start, way, i)
             moved += 1
-        # a branch from the beginning of a cylinder grows on the end of the one below
+        # a branch from the start of a cylinder grows on the end of that cylinder's parent
         on_end = np.linalg.norm(end[one] - start[i]) <= np.linalg.norm(start[one] - start[i])
         joined[i] = one + 1 if on_end else joined[one]
     notes = (f"{moved} branches were joined to the cylinder that they start on, not to their named parent",)
@@ -69,7 +71,7 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
 
 
 def _bearer(path: pathlib.Path, table: np.ndarray, start: np.ndarray, way: np.ndarray, i: int) -> int:
-    """The cylinder before ``i`` on whose surface or axis cylinder ``i`` starts."""
+    """Returns the index of the earlier cylinder on whose surface or axis cylinder ``i`` starts."""
     share = np.clip(((start[i] - start[:i]) * way[:i]).sum(1) / (way[:i] ** 2).sum(1), 0.0, 1.0)
     off = np.linalg.norm(start[:i] + share[:, None] * way[:i] - start[i], axis=1) - table[:i, 0]
     nearest = int(np.argmin(off))
@@ -81,7 +83,8 @@ def _bearer(path: pathlib.Path, table: np.ndarray, start: np.ndarray, way: np.nd
 
 
 def read_helios_xml(path: pathlib.Path) -> Skeleton:
-    """The skeleton of a plant from Helios' ``writePlantStructureXML``, if it contains the points of every shoot."""
+    """Returns the skeleton of a plant from Helios' ``writePlantStructureXML``. The file must contain the points of
+    every shoot."""
     try:
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as bad:
@@ -131,7 +134,7 @@ def read_helios_xml(path: pathlib.Path) -> Skeleton:
 
 
 def _numbers(path: pathlib.Path, where: ElementTree.Element, tag: str, count: int | None = None) -> np.ndarray:
-    """The numbers in an element below ``where``."""
+    """Returns the numbers in the child element ``tag`` of ``where``. ``count``: their required number."""
     found = where.find(tag)
     try:
         numbers = np.array((found.text or "").split() if found is not None else [], float)

@@ -47,7 +47,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """One plant, its base at the origin and z up."""
 
     source: str
-    """Name and format of the file that it was read from."""
+    """Name and format of the file from which the plant was read."""
     shape: Literal["drawn", "slack"] = "drawn"
     """Shape given by the points: the plant as it hangs under its weight (``drawn``) or without weight (``slack``)."""
     piece: Annotated[float, msgspec.Meta(gt=0.0)] = 0.06
@@ -55,7 +55,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     notes: tuple[str, ...] = ()
     """What was repaired or left out when the file was read."""
     filled: tuple[int, ...] = ()
-    """Nodes whose diameter is missing in the file and was filled in."""
+    """Nodes without a diameter in the file; their diameters were filled in."""
     nodes: tuple[tuple[int, float, float, float, float], ...]
     """Parent (-1: the base), x, y, z [m] and diameter [m] of each node, parents first."""
     bunches: tuple[tuple[int, float], ...] = ()
@@ -63,7 +63,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     wood: Wood
 
     def skeleton(self) -> Skeleton:
-        """The plant's skeleton as arrays."""
+        """Returns the plant's skeleton as arrays."""
         table = np.array(self.nodes, float).reshape(-1, 5)
         bunch = np.zeros(len(table))
         for node, mass in self.bunches:
@@ -71,7 +71,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
         return Skeleton(table[:, 1:4], table[:, 0].astype(int), table[:, 4], bunch, self.source, self.notes)
 
     def write(self, path: str | pathlib.Path) -> None:
-        """Write the plant as a TOML file; :class:`~vinesim.core.errors.WriteError` if that fails."""
+        """Write the plant as a TOML file. Raises :class:`~vinesim.core.errors.WriteError` if that fails."""
         lines = [
             f"source = {json.dumps(self.source, ensure_ascii=False)}",
             f'shape = "{self.shape}"',
@@ -118,8 +118,7 @@ def import_plant(
         old_wood: wood thicker than this is fixed [m]; 1.5 times the thickest cane unless given.
 
     Raises:
-        PlantFileError: with file, place, finding and remedy.
-        UsageError: for an argument out of range.
+        PlantFileError: for a file that cannot be used. UsageError: for an argument out of range.
     """
     path = pathlib.Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -161,7 +160,7 @@ def import_plant(
 
 
 def _fill_wood(plants: str, old_wood: float | None) -> Wood:
-    """Moduli, density, damping and drag from plant parameters, marked as filled in."""
+    """Returns moduli, density, damping and drag from plant parameters, marked as filled in."""
     cane = plant_parameters.load_plant(plants).cane
     numbers = {}
     for name in ("woody_modulus", "green_modulus", "woody_share", "density", "damping", "drag"):
@@ -176,9 +175,10 @@ def _fill_wood(plants: str, old_wood: float | None) -> Wood:
 
 
 def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.ndarray]:
-    """Diameters [node] m without gaps, and which of them were filled in [node] bool.
+    """Returns diameters [node] m with missing ones filled in, and which of them were filled in [node] bool.
 
-    Between two known diameters it interpolates over the length of the wood; elsewhere it uses a cane's taper.
+    A missing diameter between two known ones is interpolated over the length of the wood; elsewhere it follows a cane's
+    taper.
     """
     parent = skeleton.parent
     diameter = skeleton.diameter.copy()
@@ -213,7 +213,7 @@ def _fill_diameters(skeleton: Skeleton, plants: str) -> tuple[np.ndarray, np.nda
 
 @functools.cache
 def load_imported_plant(path: str) -> ImportedPlant:
-    """The imported plant in a TOML file; :class:`PlantFileError` if the file cannot be used."""
+    """Returns the imported plant in a TOML file. Raises :class:`PlantFileError` if the file cannot be used."""
     file = pathlib.Path(path)
     if not file.is_file():
         raise PlantFileError(f"{file}: no such file; write it with: vinesim scene import-plant")

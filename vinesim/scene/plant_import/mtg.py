@@ -2,8 +2,8 @@
 
 The reader takes every entity with coordinates (XX, YY, ZZ), whatever its class; the point is the end of the entity. The
 wood of an entity runs to this point from the point of its parent, or of the nearest ancestor with coordinates. Classes,
-scales and all other features are ignored. Grammar: Godin et al. 1997, AMAPmod. As in OpenAlea's own reader, ``+`` is a
-branch that ends with its columns.
+scales and all other features are ignored. Grammar: Godin et al. 1997, AMAPmod. As in OpenAlea's own reader, ``+``
+begins a branch, which ends at the first line that begins in an earlier column.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_n
 _SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
 _STEP = re.compile(r"(\^|/|<<|<|\+\+|\+)([A-Za-z]+)?(\d+)?")
 _DIAMETERS = {"diameter": 1.0, "diam": 1.0, "topdia": 1.0, "radius": 2.0}
-"""Factor to a diameter, by the name of a feature for the thickness of wood, in lower case."""
+"""Features (in lower case) that contain the thickness of wood, with the factor that converts them to a diameter."""
 _BUNCH = "bunch"
 """Name of the feature with the mass [kg] of a bunch that hangs from an entity."""
 
@@ -27,12 +27,12 @@ _BUNCH = "bunch"
 @dataclasses.dataclass
 class _Entity:
     below: int
-    """The entity on which this one grows or of which it is a part, -1 for none."""
+    """Index of the entity on which this entity grows or of which it is a part; -1 for none."""
     values: dict[str, float]
 
 
 def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
-    """The skeleton of the plant in an MTG file.
+    """Returns the skeleton of the plant in an MTG file.
 
     Args:
         path: the file.
@@ -71,7 +71,7 @@ def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
 
 def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
-    """Names of the features, and the lines of the section MTG with their numbers."""
+    """Returns the names of the features, and the lines of the section MTG with their line numbers."""
     section = ""
     features = []
     lines = []
@@ -94,7 +94,7 @@ def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
 def _table_head(
     path: pathlib.Path, features: list[str], lines: list[tuple[int, str]]
 ) -> tuple[list[tuple[int, str]], dict[int, str]]:
-    """The lines below the head of the table, and the feature of each column that follows the topology."""
+    """Returns the lines below the table's head, and the feature of each column after the topology columns."""
     number, head = lines[0]
     cells = head.split("\t")
     if cells[0].strip() not in ("ENTITY-CODE", "TOPO"):
@@ -107,7 +107,7 @@ def _table_head(
 
 
 def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[int, str]) -> list[_Entity]:
-    """All entities, each with the entity on which it grows or of which it is a part."""
+    """Returns all entities, each with the index of the entity on which it grows or of which it is a part."""
     entities: list[_Entity] = []
     first_feature = min(columns, default=1 << 30)
     last: list[int] = []  # by column, the entity that the next line continues
@@ -140,7 +140,7 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
 
 
 def _steps(place: str, code: str) -> list[tuple[str, int]]:
-    """Operators and indices of one code: ``^<E2+U1`` gives ``^``, ``<2`` and ``+1``."""
+    """Returns operators and indices of one code. For ``^<E2+U1`` these are ``^``, ``<2`` and ``+1``."""
     found = []
     at = 0
     while at < len(code):
@@ -159,7 +159,7 @@ def _steps(place: str, code: str) -> list[tuple[str, int]]:
 
 
 def _features(place: str, cells: list[str], columns: dict[int, str]) -> dict[str, float]:
-    """The features of one line that this reader uses."""
+    """Returns the features of one line that this reader uses, by name."""
     values = {}
     for i, name in columns.items():
         if i < len(cells) and cells[i].strip() and (name in ("xx", "yy", "zz", _BUNCH) or name in _DIAMETERS):

@@ -34,7 +34,7 @@ _TYPES = {
 
 
 def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
-    """The skeleton in a PLY file; ``unit`` and ``diameter_unit`` [m] as for
+    """Returns the skeleton in a PLY file; ``unit`` and ``diameter_unit`` [m] as for
     :func:`~vinesim.scene.plant_import.mtg.read_mtg`."""
     elements = _read(path)
     vertex, position = _vertices(path, elements)
@@ -58,9 +58,9 @@ def read_ply(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
 
 
 def read_points(path: pathlib.Path) -> np.ndarray:
-    """Points [n, 3] of a PLY file's vertices, or of a text file with x, y and z in each line.
+    """Returns the vertices [n, 3] of a PLY file, or the points of a text file with x, y and z in each line.
 
-    :class:`PlantFileError` if the file cannot be read.
+    Raises :class:`PlantFileError` if the file cannot be read.
     """
     if not path.is_file():
         raise PlantFileError(f"{path}: no such file; give points as PLY, or as text with x, y and z in a line")
@@ -81,7 +81,7 @@ def read_points(path: pathlib.Path) -> np.ndarray:
 
 
 def _vertices(path: pathlib.Path, elements: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """The table of vertices, and their positions [vertex, 3] in the file's unit."""
+    """Returns the table of vertices, and their positions [vertex, 3] in the file's unit."""
     vertex = elements.get("vertex")
     if vertex is None or not {"x", "y", "z"} <= set(vertex.dtype.names or ()):
         raise PlantFileError(f"{path}: has no element 'vertex' with x, y and z; give them")
@@ -89,7 +89,7 @@ def _vertices(path: pathlib.Path, elements: dict[str, np.ndarray]) -> tuple[np.n
 
 
 def _parents(path: pathlib.Path, position: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Parents [vertex] in the tree of the edges ``pairs`` [k, 2]; its root is the lowest vertex."""
+    """Returns the parents [vertex] in the tree that the edges ``pairs`` [k, 2] form. Its root is the lowest vertex."""
     count = len(position)
     if len(pairs) != count - 1 or pairs.min(initial=0) < 0 or pairs.max(initial=0) >= count:
         raise PlantFileError(
@@ -112,7 +112,7 @@ def _parents(path: pathlib.Path, position: np.ndarray, pairs: np.ndarray) -> np.
 
 
 def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
-    """Elements of a PLY file as tables, up to the first element with lists."""
+    """Returns the elements of a PLY file as tables, up to the first element with lists."""
     data = path.read_bytes()
     head, found, body = data.partition(b"end_header\n")
     lines = [line.split() for line in head.decode("ascii", "replace").splitlines()]
@@ -133,7 +133,7 @@ def _read(path: pathlib.Path) -> dict[str, np.ndarray]:
     row = 0
     for name, count, properties in elements:
         if not properties or any(not kind for _, kind in properties):
-            break  # lists have no fixed size, and everything needed comes before them
+            break  # lists have no fixed size, and all needed elements come before them
         kind = np.dtype(properties)
         try:
             if format == "ascii":

@@ -12,11 +12,12 @@ from vinesim.core.toml_loader import DataError
 MAX_NODES = 20_000
 """Largest number of points of one plant."""
 MAX_HEIGHT = 30.0
-"""[m] A plant that reaches further from its base is refused, because its unit must be wrong."""
+"""[m] Largest distance of a plant's points from its base. A larger plant is refused, because its unit of length must be
+wrong."""
 
 
 class PlantFileError(DataError):
-    """A plant file that cannot be used; one line with file, place, finding and remedy."""
+    """Raised for a plant file that cannot be used. The message is one line with file, place, error and correction."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -24,7 +25,7 @@ class Skeleton:
     """The wood of one plant as points joined to their parents; a parent comes before its children."""
 
     position: np.ndarray
-    """[node, 3] m, z up."""
+    """[node, 3] m, position of each node, z up."""
     parent: np.ndarray
     """[node] index of the node below; -1 for the base, which is the first node."""
     diameter: np.ndarray
@@ -37,7 +38,7 @@ class Skeleton:
 
 
 def check_skeleton(path: pathlib.Path, skeleton: Skeleton) -> Skeleton:
-    """Return ``skeleton``; raises :class:`PlantFileError` if it is not one connected plant."""
+    """Check that ``skeleton`` is one connected plant, and return it. Raises :class:`PlantFileError` otherwise."""
     nodes = np.arange(len(skeleton.parent))
     if len(nodes) < 2:
         raise PlantFileError(f"{path}: has {len(nodes)} points with coordinates; give a plant of at least 2")
@@ -82,7 +83,7 @@ def sort_nodes(
     format: str,
     notes: tuple[str, ...] = (),
 ) -> Skeleton:
-    """A checked skeleton from nodes in any order, sorted so that the base is first and parents precede children."""
+    """Sort nodes so that the base is first and parents precede children. Returns the checked skeleton."""
     count = len(parent)
     if ((parent < -1) | (parent >= count)).any():
         node = _first((parent < -1) | (parent >= count))

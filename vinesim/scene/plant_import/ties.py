@@ -42,7 +42,8 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
     near, wire = np.nonzero(apart <= gap)
     tied: dict[tuple[int, int], list[np.ndarray]] = {}
     rows = []
-    # closest first, rounded to 0.1 mm, so that rounding errors do not choose among pieces that run along a wire
+    # closest first; distances are rounded to 0.1 mm, so that the choice among pieces along a wire does not depend on
+    # rounding errors
     for i in np.argsort(apart[near, wire].round(4), kind="stable").tolist():
         cane = near[i]
         line = wires[wire[i]]
@@ -64,7 +65,8 @@ def tie_to_wires(plant: Model, vineyard: Model, gap: float, trellis: Trellis) ->
 
 
 def _wires_near(vineyard: Model, points: np.ndarray, reach: float) -> np.ndarray:
-    """Pieces of wire [k] whose bounding box is within ``reach`` [m] of the bounding box of ``points`` [p, 3]."""
+    """Returns the pieces of wire [k] with a bounding box within ``reach`` [m] of the bounding box of ``points`` [p, 3]
+    m."""
     ends = np.stack([vineyard.fixed_start, vineyard.fixed_end]).astype(float)
     thick = reach + vineyard.fixed_radius.max(1, initial=0.0)[:, None]
     near = (ends.min(0) <= points.max(0) + thick) & (ends.max(0) >= points.min(0) - thick)
@@ -74,7 +76,8 @@ def _wires_near(vineyard: Model, points: np.ndarray, reach: float) -> np.ndarray
 def _nearest(
     start: np.ndarray, way: np.ndarray, wire_start: np.ndarray, wire_way: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Nearest points of pieces [k] to wires [w]: position as a fraction of the piece [k, w], and distance [k, w] m.
+    """Returns for each piece [k] and wire [w] the point of the piece nearest to the wire, as a fraction of the piece's
+    length [k, w], and its distance [k, w] m.
 
     Segments from ``start`` [k, 3] along ``way`` [k, 3], and from ``wire_start`` [w, 3] along ``wire_way`` [w, 3]
     (Ericson 2005, Real-Time Collision Detection, 5.1.9).

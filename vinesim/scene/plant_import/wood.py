@@ -1,4 +1,4 @@
-"""Builds models of imported plants: thick wood is fixed, every thinner part that grows on it is a tree of bodies."""
+"""Builds models of imported plants. Thick wood is fixed; every thinner part that grows on it is a tree of bodies."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vinesim.scene.plant_parameters import Cane, Leaf, VineParameters
 from vinesim.scene.spec import Scene
 
 _SHORT = 0.3
-"""Wood between two forks that is shorter than this becomes part of the fork [piece lengths]."""
+"""Length of wood between two forks below which the wood is dropped and the forks are merged [piece lengths]."""
 _PEDUNCLE_SEGMENTS = 2
 _OFFSETS = {
     "tree_first": "body",
@@ -30,7 +30,7 @@ _OFFSETS = {
     "tie_body": "body",
     "leaf_body": "body",
 }
-"""Fields of a model that hold indices, and the axis that they index; negative values mean none."""
+"""Fields of a model that contain indices, with the axis that each indexes. Negative values mean none."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -53,10 +53,10 @@ def build_model(
     variety: int,
     leaves: tuple[Scene, np.random.Generator] | None = None,
 ) -> Model:
-    """The plant at a ``pose`` [7]: its trees, and the old wood on which they grow.
+    """Returns the model of a plant at a ``pose`` [7]: its trees, and the old wood on which they grow.
 
-    ``parameters`` describe its peduncles and its bunches, which are of ``variety``. ``leaves`` gives the scene, whose
-    season and training determine the leaves, and their random numbers; without it the plant has no leaves.
+    ``parameters``: properties of its peduncles and bunches. ``variety``: variety of its bunches. ``leaves``: the scene,
+    whose season and training determine the leaves, and a random generator; None for a plant without leaves.
     """
     points = _cut(plant)
     old = _old_wood(points, plant.wood)
@@ -99,12 +99,13 @@ def join_models(first: Model, second: Model) -> Model:
 
 
 def _on(old: np.ndarray, parent: np.ndarray) -> np.ndarray:
-    """Whether each node grows on old wood or on the base [node] bool."""
+    """Returns whether each node grows on old wood or on the base [node] bool."""
     return old[parent] | (parent == 0)
 
 
 def _old_wood(points: _Points, wood: Wood) -> np.ndarray:
-    """Whether each node is fixed [node] bool: it and all wood below it are thick."""
+    """Returns whether each node is fixed [node] bool: the wood of the node and all wood between it and the base are
+    thick."""
     old = 2.0 * points.radius > wood.old_wood.value
     for node in range(1, len(old)):
         old[node] &= old[points.parent[node]]
@@ -112,7 +113,8 @@ def _old_wood(points: _Points, wood: Wood) -> np.ndarray:
 
 
 def _main_axis(points: _Points, members: np.ndarray) -> np.ndarray:
-    """The nodes on the way to the furthest of the connected nodes ``members`` [node] bool."""
+    """Returns the nodes on the path to the node that is furthest from the base, among the connected nodes ``members``
+    [node] bool."""
     on = np.zeros(len(members), bool)
     node = int(np.argmax(np.where(members, points.way, -1.0)))
     while node >= 0 and members[node]:
@@ -122,7 +124,8 @@ def _main_axis(points: _Points, members: np.ndarray) -> np.ndarray:
 
 
 def _cut(plant: ImportedPlant) -> _Points:
-    """The skeleton with nodes about one piece apart: wood between forks is cut evenly, very short wood is dropped."""
+    """Returns the skeleton with nodes about one piece length apart. Wood between forks is cut evenly, very short wood
+    is dropped."""
     skeleton = plant.skeleton()
     parent = skeleton.parent
     position = skeleton.position
@@ -170,7 +173,7 @@ def _tree(
     variety: int,
     leaves: tuple[Scene, np.random.Generator] | None,
 ) -> TreeBuilder:
-    """The tree whose first piece ends at ``root``."""
+    """Returns the tree that begins with the piece that ends at the node ``root``."""
     below = int(points.parent[root])
     turns = {below: frames.from_x_axis(place[root] - place[below])}
     tree = TreeBuilder(frames.pose(place[below], turns[below]), vine)
@@ -213,7 +216,8 @@ def _tree(
 
 
 def _turned(turn: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Orientation [4] of a piece along a direction: that of the piece before, rotated by the smallest angle."""
+    """Returns the orientation [4] of a piece in the direction ``along`` [3]: the orientation ``turn`` of the previous
+    piece, rotated by the smallest angle."""
     along = along / np.linalg.norm(along)
     x = frames.rotate(turn, np.array([1.0, 0.0, 0.0]))
     axis = np.cross(x, along)
@@ -226,7 +230,7 @@ def _turned(turn: np.ndarray, along: np.ndarray) -> np.ndarray:
 def _hang(
     tree: TreeBuilder, body: int, turn: np.ndarray, mass: float, parameters: VineParameters, variety: int
 ) -> None:
-    """Hang a bunch below a piece, on a peduncle of mean size."""
+    """Add a bunch below a piece of wood, on a peduncle of mean size."""
     stalk = parameters.peduncle
     thick = 0.5 * float(stalk.diameter.at(0.5))
     down = frames.multiply(frames.conjugate(turn), frames.from_x_axis(np.array([0.0, 0.0, -1.0])))
@@ -267,9 +271,10 @@ class Nodes:
 
 
 def find_nodes(parent: np.ndarray, radius: np.ndarray, way: np.ndarray, members: np.ndarray, cane: Cane) -> Nodes:
-    """Nodes of the pieces ``members`` [point] bool, on wood as thin as a cane; thicker wood is older and bare.
+    """Returns the nodes on the pieces ``members`` [point] bool that are as thin as a cane. Thicker wood is older and
+    has no leaves.
 
-    At a fork the branch that reaches furthest continues the axis. The others are side shoots if their parent is thin.
+    At a fork the longest branch continues the axis. The other branches are side shoots if their parent is thin.
 
     Args:
         parent: [point] index of the point below; parents come first.
@@ -291,7 +296,7 @@ def find_nodes(parent: np.ndarray, radius: np.ndarray, way: np.ndarray, members:
     for first in np.flatnonzero(thin):
         bearer = parent[first]
         if thin[bearer] and heir[bearer] == first:
-            continue  # an axis goes on
+            continue  # the piece continues an axis
         axis = [int(first)]
         while heir[axis[-1]] >= 0 and thin[heir[axis[-1]]]:
             axis.append(int(heir[axis[-1]]))
@@ -323,7 +328,7 @@ def add_leaves(
         nodes: nodes at which leaves grow.
         body: [k] body of each node's piece.
         turn: [k, 4] orientation of that body in the world.
-        scene: gives season and training.
+        scene: its season and training are used.
         leaf: parameters of leaves.
         rng: random numbers for the leaves of this tree.
     """

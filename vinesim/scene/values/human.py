@@ -27,14 +27,17 @@ class HumanPose:
     """Left ankle, x to the toes."""
     right_foot: np.ndarray
     left_closed: bool = False
-    """Whether the left hand is closed: it grasps what it touches and holds it until this is false again."""
+    """Whether the left hand is closed. When it closes, it grasps the plant or object that it touches, and holds it
+    until it opens."""
     right_closed: bool = False
     left_fingers: tuple[float, ...] = (0.0,) * 5
-    """Bend of thumb, index, middle, ring and little finger: 0 straight, 1 fully bent. It affects only the looks."""
+    """Bend of thumb, index, middle, ring and little finger: 0 straight, 1 fully bent. It affects only the drawn
+    hand."""
     right_fingers: tuple[float, ...] = (0.0,) * 5
     left_busy: bool = False
-    """The human's own client reports that the hand pushes a robot or holds an object: ``left`` is then the palm, not
-    the controller, and the remote copy is placed there without contacts. Unused on the human's own client."""
+    """Whether the left hand pushes a robot or holds an object, as the person's own client reports. If so, ``left`` is
+    the pose of the palm, not of the controller, and other clients place their copy of the hand there without contacts.
+    The person's own client does not use this field."""
     right_busy: bool = False
     left_shears: bool = False
     """Whether the left hand has shears: when the hand closes, the shears cut, and the hand grasps nothing."""
@@ -46,7 +49,7 @@ class HumanPose:
         return np.stack([getattr(self, name) for name in POINT_NAMES])
 
     def with_points(self, points: np.ndarray) -> HumanPose:
-        """A copy with the poses ``points`` [7, 7]; the states of hands and fingers stay."""
+        """Returns a copy with the poses ``points`` [7, 7]; the states of hands and fingers stay."""
         return dataclasses.replace(self, **dict(zip(POINT_NAMES, points, strict=True)))
 
 
@@ -59,9 +62,9 @@ class HumanSpec:
     """Description of a person for the physics."""
 
     name: str
-    """The actor's name, which prefixes the names of everything it owns."""
+    """The actor's name, which is a prefix of the names of its bodies."""
     index: int
-    """Index of the person in its label."""
+    """Index of the person in labels of label images."""
     pose: HumanPose
     """Pose at the start."""
     height: float = 1.75
@@ -71,7 +74,7 @@ class HumanSpec:
     force: float | None = None
     """Largest force of a hand [N]; None: ``PhysicsParameters.hand_force``."""
     outfit: str = ""
-    """Outfit, one of :func:`vinesim.scene.appearance.outfit_names`; empty: it follows from the person's name."""
+    """Outfit, one of :func:`vinesim.scene.appearance.outfit_names`; empty: chosen by the person's name."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -97,8 +100,8 @@ class Haptic:
     hand: str
     """``"left"`` or ``"right"``."""
     onset: bool
-    """Whether the contact has just begun; otherwise it lasts."""
+    """Whether the contact has just begun. If not, the command is for a lasting contact."""
     amplitude: float
     """0 to 1, force as a fraction of the hand's largest force; an onset is always strong enough to be felt."""
     duration: float
-    """[s]"""
+    """[s] Duration of the vibration."""

@@ -7,7 +7,8 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Measurement:
-    """One line of ``vinesim bench``: a figure of vinesim, and of a peer run in the same process on the same scene."""
+    """One line of ``vinesim bench``: a number measured for vinesim, and for a peer program that runs in the same
+    process on the same scene."""
 
     bench: str
     case: str

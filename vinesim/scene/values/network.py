@@ -1,4 +1,4 @@
-"""States of robots, people, trees and objects as they cross the network."""
+"""States of robots, people, trees and objects as sent over the network."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class RobotUpdate:
     base_qd: np.ndarray
     """[6] velocity of the base, world axes."""
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, joint positions."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] rad/s or m/s, joint velocities."""
     lights: Lights = LIGHTS_OFF
 
 
@@ -57,19 +57,19 @@ class TreeUpdate:
     """Authority sequence number, u16 with wraparound; every touch increments it."""
     time: float
     resting: bool
-    """True in the last record, which is sent reliably; no further records follow."""
+    """Whether the tree is at rest. Such a record is the last one for the tree and is sent reliably."""
     touched: bool
     """Whether the owner of the tree, or an object of the owner, is in contact with the tree."""
     joint_q: np.ndarray
-    """[body of the tree, 4]"""
+    """[body of the tree, 4] joint rotations, quaternions xyzw."""
     joint_qd: np.ndarray
-    """[body of the tree, 3] rad/s"""
+    """[body of the tree, 3] rad/s, joint rates."""
     root: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
     """[k] indices within the tree of the bodies that were cut off their parents, ascending."""
     root_x: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] m, positions of the origins of these bodies in the world."""
+    """[k, 3] m, world positions of the origins of the cut bodies ``root``."""
     root_xd: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 3)))
-    """[k, 3] m/s, velocities of these origins."""
+    """[k, 3] m/s, velocities of the origins of the cut bodies ``root``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

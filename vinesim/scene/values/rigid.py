@@ -1,4 +1,4 @@
-"""Rigid bodies as sensors see them: shapes, meshes, names."""
+"""Visible rigid bodies: shapes, meshes, names."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from vinesim.scene.ids import Organ
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Mesh:
-    """Triangles; they face the side from which their corners run counter-clockwise."""
+    """Triangles of a surface. A triangle's front is the side from which its corners are in counter-clockwise order."""
 
     corners: np.ndarray
-    """[face, 3, 3] m"""
+    """[face, 3, 3] m, corners of each triangle."""
     normals: np.ndarray
     """[face, 3, 3] unit normals of the smooth surface at each corner."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Shape:
-    """One visible or touchable primitive, in the frame of the link or body that carries it.
+    """One primitive for sensors or collisions, in the frame of its link or body.
 
     ``kind`` is ``"capsule"`` (size: radius, half length along z), ``"sphere"`` (radius), ``"ellipsoid"``
     (half axes), ``"box"`` (half edges), ``"cylinder"`` (radius, half length along z), ``"cone"`` with round ends
@@ -31,12 +31,12 @@ class Shape:
     kind: str
     size: tuple[float, ...]
     pose: np.ndarray
-    """[7] m, 1"""
+    """[7] m, xyzw: pose of the shape in the frame of its link or body."""
     rgba: tuple[float, float, float, float] = (0.6, 0.6, 0.6, 1.0)
-    """sRGB"""
+    """Colour (sRGB) and opacity, 0 to 1."""
     file: str = ""
     surface: str = ""
-    """Surface, one of :data:`vinesim.scene.appearance.SURFACES`; empty: the usual surface of such an object."""
+    """Surface, one of :data:`vinesim.scene.appearance.SURFACES`; empty: a default for the kind of object."""
     mesh: Mesh | None = None
     is_indicator: bool = False
     """Whether the shape is one of a robot's indicator lights."""
@@ -51,16 +51,16 @@ class RigidBox:
     size: np.ndarray
     """[3] m, outer length, width, height."""
     mass: float
-    """[kg]"""
+    """[kg] Mass of the box."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RigidVisual:
-    """One rigid body as sensors see it: name, organ, index and shapes."""
+    """One visible rigid body: name, organ, index and shapes."""
 
     name: str
     """Full name, ``actor/link`` or ``box/3``."""
     organ: Organ
     index: int
-    """Index of the robot, human or box in its label."""
+    """Index of the robot, human or box in labels of label images."""
     shapes: tuple[Shape, ...]

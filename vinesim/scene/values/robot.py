@@ -31,7 +31,8 @@ class Drive:
     armature: float = 0.0
     """Inertia of motor and gear at the joint [kg m2 or kg]. It grows with the square of the gear ratio.
 
-    A stiff servo at its effort limit needs it: a hand of 0.02 kg m2 alone under 40 N m gains 20 rad/s in a tick.
+    A stiff servo at its effort limit needs an armature: a hand of 0.02 kg m2 without one gains 20 rad/s in a tick under
+    40 N m.
     """
     series_stiffness: float = 0.0
     """Stiffness of the spring between gear and joint [N m/rad or N/m]; 0: the position gain is used instead."""
@@ -44,9 +45,9 @@ class RobotSpec:
     """Description of a robot for the physics. ``robot/description/description.py`` makes one from a URDF."""
 
     name: str
-    """The actor's name, which prefixes the names of everything it owns."""
+    """The actor's name, which is a prefix of the names of its bodies."""
     index: int
-    """Index of the robot in its label."""
+    """Index of the robot in labels of label images."""
     urdf: str
     """URDF as text, every mesh by absolute path."""
     base: str
@@ -67,7 +68,7 @@ class RobotSpec:
 
 
 class ControllerKind(enum.StrEnum):
-    """What a controller of a robot does, in the words of ros2_controllers where they have one."""
+    """Kind of a robot's controller, with the name of ros2_controllers if one exists."""
 
     JOINT_TRAJECTORY = "joint_trajectory"
     GRIPPER = "gripper"
@@ -89,9 +90,9 @@ class ControllerSpec:
     name: str
     kind: ControllerKind
     joints: tuple[str, ...]
-    """In the order of its commands; none for a gripper that has no joints, such as a cutter."""
+    """Joints in the order of the controller's commands; empty for a gripper without joints, such as a cutter."""
     group: str = ""
-    """The joint group, if it is one of a gripper."""
+    """Joint group of the gripper, if the controller is one of a gripper."""
     gripper: str = ""
     """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
 
@@ -103,9 +104,9 @@ class JointSample:
     time: float
     names: tuple[str, ...]
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, joint positions."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] rad/s or m/s, joint velocities."""
     effort: np.ndarray
     """[joint] N m or N, effort of the drive; at rest it is the gravity load minus J^T f of the contacts."""
     contact: np.ndarray
@@ -117,22 +118,22 @@ class JointReference:
     """References of a robot's controllers for its joints in one step, in the order of joint arrays."""
 
     position: np.ndarray
-    """[joint] rad or m"""
+    """[joint] rad or m, joint positions."""
     velocity: np.ndarray
-    """[joint] rad/s or m/s"""
+    """[joint] rad/s or m/s, joint velocities."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class GripperState:
-    """How far a gripper's goal is, or how it ended (control_msgs/GripperCommand).
+    """Progress or result of a gripper's goal (control_msgs/GripperCommand).
 
-    What the values mean is said by the controller of each kind, in :mod:`vinesim.robot.control.gripper_controllers`.
+    :mod:`vinesim.robot.control.gripper_controllers` defines the meaning of the values for each kind of gripper.
     """
 
     position: float
     effort: float
     stalled: bool = False
-    """It stopped before its goal."""
+    """Whether the gripper stopped before it reached its goal."""
     reached_goal: bool = False
 
     @property
@@ -148,7 +149,7 @@ class ElasticSample:
     time: float
     names: tuple[str, ...]
     stiffness: np.ndarray
-    """[joint] N m/rad or N/m"""
+    """[joint] N m/rad or N/m, stiffness of the spring."""
     motor: np.ndarray
     """[joint] rad or m, position of the motor after its gear; the link is at ``motor - deflection``."""
     deflection: np.ndarray
@@ -180,9 +181,9 @@ class Imu:
     orientation: np.ndarray
     """[4] orientation of the frame in the world."""
     angular_velocity: np.ndarray
-    """[3] rad/s in the frame."""
+    """[3] rad/s, angular velocity in the axes of the sensor's frame."""
     linear_acceleration: np.ndarray
-    """[3] m/s2 in the frame; at rest it is 9.81 upwards (REP-145)."""
+    """[3] m/s2, acceleration in the axes of the sensor's frame; at rest 9.81 upwards (REP-145)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -12,17 +12,18 @@ import numpy as np
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 
 MIN_BERRY_PIXELS = 4
-"""Smallest number of visible pixels with which a berry counts as seen."""
+"""Smallest number of visible pixels of a berry that counts as visible."""
 
 Box = tuple[int, int, int, int]
 """First column, first row, last column, last row (inclusive)."""
 MIN_CAMERA_SIZE = 16
 MAX_CAMERA_SIZE = 4096
-"""Bounds of the width and height of a camera's picture [px]."""
+"""Smallest and largest width and height of a camera's picture [px]."""
 
 
 class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sensor of a robot, as a table of its TOML file says: its name in topics, the link it sits in, its data file."""
+    """A sensor of a robot, as described by a table of the robot's TOML file: name in topics, link on which it is
+    mounted, data file."""
 
     name: str
     frame: str
@@ -33,12 +34,12 @@ class RenderedMount(SensorMount, frozen=True, forbid_unknown_fields=True):
     """A sensor that is rendered: one of :data:`SENSOR_KINDS`."""
 
     kind: ClassVar[str]
-    """Name of its kind."""
+    """Name of the kind of sensor, a key of :data:`SENSOR_KINDS`."""
     rate: float | None = None
-    """Frames a second [Hz]; the sensor's own unless given."""
+    """Frame rate [Hz]; by default the rate in the sensor's data file."""
 
     def fault(self) -> tuple[str, str] | None:
-        """What is wrong with its values, and the remedy; None if they are fit."""
+        """Returns the name of an invalid field and how to correct it; None if all values are valid."""
         if self.rate is not None and not 0.01 <= self.rate <= 1000.0:
             return f"the rate {self.rate}", "give 0.01 to 1000 Hz"
         return None
@@ -48,7 +49,7 @@ class PictureMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
     """A sensor that delivers pictures."""
 
     size: tuple[int, int] | None = None
-    """Width and height [px] with the same angle of view; the sensor's own unless given."""
+    """Width and height [px] with the same angle of view; by default those in the sensor's data file."""
 
     def fault(self) -> tuple[str, str] | None:
         """See :meth:`RenderedMount.fault`."""
@@ -59,7 +60,8 @@ class PictureMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
 
 
 class SensorFrame(Protocol):
-    """What a sensor delivers at once; a frozen dataclass, so that its time can be replaced."""
+    """One measurement of a sensor, such as a picture or a scan. It is a frozen dataclass, so that its time can be
+    replaced."""
 
     @property
     def time(self) -> float:
@@ -73,7 +75,7 @@ class SensorFrame(Protocol):
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
-        """The arrays that two runs in lockstep must have equal to the bit."""
+        """Returns the arrays that are equal to the bit in two lockstep runs."""
         ...
 
 
@@ -97,13 +99,13 @@ class SensorMode(enum.StrEnum):
     """Whether simulated time waits for cameras and lidars."""
 
     LIVE = "live"
-    """Sensors deliver frames as fast as they can, up to their rates. Time waits only if they fall below a least
-    rate."""
+    """Sensors deliver frames as fast as they can, up to their rates. Simulated time waits only for sensors slower than
+    ``SensorPacing.least_rate``."""
     PACED = "paced"
     """Every sensor delivers all frames of its rate in simulated time, as in Gazebo."""
     LOCKSTEP = "lockstep"
-    """Every frame shows exactly its step. Time waits until the frame is rendered and sent, so two runs are equal to
-    the bit. All sensors always render."""
+    """Every frame shows exactly the step at its time. Simulated time waits until the frame is rendered and sent, so two
+    runs are equal to the bit. All sensors always render."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -116,7 +118,8 @@ class SensorPacing:
 
 
 class CameraOutput(enum.Flag):
-    """Parts of a :class:`CameraFrame`: a camera makes only those that are asked for. Others render if any is."""
+    """Parts of a :class:`CameraFrame`. A camera renders only the requested parts. Other sensors render completely if
+    any part is requested."""
 
     RGB = enum.auto()
     DEPTH = enum.auto()
@@ -139,7 +142,7 @@ class BunchTruth:
     """
 
     bunch: int
-    """Index in the model."""
+    """Index of the bunch in the model."""
     variety: int
     """Index into :data:`vinesim.scene.berries.VARIETIES`."""
     tree: int
@@ -176,7 +179,7 @@ class BunchTruth:
 
     @property
     def pixels(self) -> int:
-        """Number of pixels that show the bunch."""
+        """Number of pixels in which the bunch is visible."""
         return int(self.visible.sum())
 
     @property
@@ -207,7 +210,7 @@ class CameraFrame:
     pose: np.ndarray
     """[7] pose of the optical frame in the world when the picture was taken."""
     rgb: np.ndarray
-    """[height, width, 3] uint8"""
+    """[height, width, 3] uint8, colours in sRGB."""
     depth: np.ndarray
     """[height, width] float32 m along z; NaN: no return, -Inf: too near, +Inf: too far (REP-118)."""
     labels: np.ndarray
@@ -283,17 +286,18 @@ class LidarScan:
     xyz: np.ndarray
     """[point, 3] float32 m, in the lidar's frame (x forward, z up) at the firing of each point."""
     intensity: np.ndarray
-    """[point] float32 0..255"""
+    """[point] float32, intensity of each echo, 0 to 255."""
     ring: np.ndarray
-    """[point] uint16"""
+    """[point] uint16, number of the laser of each point."""
     offset: np.ndarray
     """[point] float32 s, time of each point's firing after ``time``."""
     labels: np.ndarray
-    """[point] int32"""
+    """[point] int32, :func:`vinesim.scene.ids.label` of each point."""
     level: LevelLaser | None = None
     """The laser nearest to the horizontal, None if unknown."""
     returned: np.ndarray | None = None
-    """[point] uint8: 1 for the strongest echo of a shot, 2 for another echo; None if a shot reports one at most."""
+    """[point] uint8: 1 for the strongest echo of a shot, 2 for another echo; None for lidars that report at most one
+    echo."""
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
@@ -302,7 +306,7 @@ class LidarScan:
 
     @property
     def organs(self) -> np.ndarray:
-        """[point] :class:`~vinesim.scene.ids.Organ` that each point lies on."""
+        """[point] :class:`~vinesim.scene.ids.Organ` that each point is on."""
         return self.labels // LABEL_STRIDE
 
 
@@ -312,16 +316,16 @@ class Band:
 
     name: str
     centre: float
-    """[nm]"""
+    """[nm] Wavelength at the maximum of the response."""
     width: float
-    """Between the wavelengths at which the response is half of its greatest [nm]."""
+    """Full width at half maximum of the response [nm]."""
     irradiance: float
-    """Of a level surface in the open, sun and sky [W/(m2 nm)]."""
+    """Irradiance by sun and sky of a level surface without shadow [W/(m2 nm)]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class MultispectralFrame:
-    """One picture in several bands, which all show the same at the same pixel."""
+    """One picture in several spectral bands with the same optics, so that a pixel shows the same point in all bands."""
 
     time: float
     name: str
@@ -329,10 +333,10 @@ class MultispectralFrame:
     pose: np.ndarray
     """[7] optical frame in the world when the picture was taken."""
     bands: tuple[Band, ...]
-    """By wavelength."""
+    """Bands, sorted by wavelength."""
     reflectance: np.ndarray
-    """[band, height, width] float32: light over that of a level white panel in the open. In shadow it is less than what
-    the surface reflects, on a leaf that faces a low sun it is more."""
+    """[band, height, width] float32: radiance divided by that of a level white panel without shadow. It is smaller than
+    the surface's reflectance in shadow, and larger on a leaf that faces a low sun."""
     labels: np.ndarray
     """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
 
@@ -348,7 +352,8 @@ class MultispectralFrame:
         return self.reflectance * (irradiance / np.float32(np.pi))[:, None, None]
 
     def band(self, name: str) -> np.ndarray:
-        """Reflectance [height, width] in a band; :class:`KeyError` if there is none of that name."""
+        """Returns the reflectance [height, width] in the band ``name``. Raises :class:`KeyError` if there is no such
+        band."""
         return self.reflectance[{band.name: k for k, band in enumerate(self.bands)}[name]]
 
     @property
@@ -361,7 +366,7 @@ class MultispectralFrame:
 
 
 class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
-    """An RGB-D camera, and in which quality it is rendered live."""
+    """An RGB-D camera on a robot, with the quality of its live pictures."""
 
     kind: ClassVar[str] = "camera"
     quality: Literal["fast", "full", "still"] = "fast"
@@ -381,22 +386,24 @@ class MultispectralMount(PictureMount, frozen=True, forbid_unknown_fields=True):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SensorKind:
-    """A kind of sensor, as all layers know it. The layers above are named, not imported: each imports its own part."""
+    """A kind of sensor, described for all layers. Modules of higher layers are given by name, because this layer must
+    not import them."""
 
     table: str
-    """Its array of tables in the TOML file of a robot."""
+    """Name of the array of tables with sensors of this kind in a robot's TOML file."""
     mount: type[RenderedMount]
-    """One such table."""
+    """Class of one such table."""
     maker: str
     """Module of vinesim.sensors whose ``MAKER`` is the :class:`vinesim.sensors.sensor.SensorMaker`."""
     publisher: str
     """Module of vinesim.ros.publishers whose ``PUBLISHER`` is the :class:`vinesim.ros.sensor_node.SensorPublisher`."""
     whole: CameraOutput
-    """What is rendered of it where every frame counts: in lockstep."""
+    """Parts that are rendered in lockstep, where all frames are rendered completely."""
     topics: tuple[str, ...]
-    """Topics below its name that a user watches all the time; the first alone shows that it works."""
+    """Topics below the sensor's name that a user usually watches. A message on the first one shows that the sensor
+    works."""
     costly_topics: tuple[str, ...] = ()
-    """Topics below its name that a user looks at now and then."""
+    """Topics below the sensor's name that need much bandwidth or computation, and that a user watches rarely."""
 
 
 SENSOR_KINDS: dict[str, SensorKind] = {
@@ -426,4 +433,5 @@ SENSOR_KINDS: dict[str, SensorKind] = {
         topics=("ndvi/image_raw", "ndvi/camera_info"),
     ),
 }
-"""All kinds by name. A robot's sensors are in this order, those of one kind in the order of its file."""
+"""All kinds of sensors, by name. A robot's sensors are listed in this order; sensors of one kind in the order of the
+robot's file."""

@@ -6,7 +6,7 @@ import dataclasses
 import enum
 
 Color = tuple[int, int, int]
-"""sRGB, each 0 to 255."""
+"""Colour: red, green and blue in sRGB, each 0 to 255."""
 
 UNLIT: Color = (0, 0, 0)
 """Colour of a lamp between two flashes."""
@@ -49,10 +49,12 @@ class Lights:
     pattern: LightPattern = LightPattern.OFF
     color: Color = UNLIT
     has_sound: bool = False
-    """Whether a tone is heard while the lamps are lit. The hearers generate the tone; no sound crosses the network."""
+    """Whether a tone sounds while the lamps are lit. Clients that play the tone generate it; no sound is sent over the
+    network."""
 
     def shown(self, time: float) -> Color | None:
-        """The colour at world ``time`` [s], :data:`UNLIT` between flashes; None: lights are off, as in the URDF.
+        """Returns the colour at world ``time`` [s], :data:`UNLIT` between flashes; None if the lights are off and keep
+        their colour in the URDF.
 
         All clients show the same flashes, because these depend only on the time.
         """
@@ -61,7 +63,7 @@ class Lights:
         return self.color if time * FREQUENCY[self.pattern] % 1.0 < 0.5 else UNLIT
 
     def tone(self, time: float) -> float:
-        """Frequency [Hz] of the tone at world ``time`` [s]; 0: no tone."""
+        """Returns the frequency [Hz] of the tone at world ``time`` [s]; 0: no tone."""
         return TONE.get(self.pattern, 0.0) if self.has_sound and self.shown(time) != UNLIT else 0.0
 
 
@@ -76,9 +78,9 @@ class Intention:
     what: str
     """One of :data:`INTENTIONS`."""
     start: float
-    """[s] World time at which it began."""
+    """[s] World time at which the intention began."""
     end: float | None = None
-    """[s] World time at which it ended; None while it lasts."""
+    """[s] World time at which the intention ended; None while it lasts."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The state of one part of a client, as diagnostics show it."""
+"""The state of one part of a client, for diagnostics."""
 
 from __future__ import annotations
 

@@ -12,17 +12,18 @@ from vinesim.scene.wind import Wind
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class WindState:
-    """The wind at one instant, and how much of each tree's sway is drawn instead of simulated."""
+    """The wind at one instant, and for each tree the share of its sway that is drawn instead of simulated."""
 
     wind: Wind
     time: float
-    """[s] World time."""
+    """[s] World time of this state."""
     strength: float
     """[1] Strength that rises from 0 to 1 when a wind begins and falls back to 0 when it ends."""
     tree_air: np.ndarray
     """[tree, 3] m/s, air velocity that acts on the simulated pose of each tree."""
     tree_drawn: np.ndarray
-    """[tree] 1: the tree is drawn where the wind would hold it; 0: it is drawn where it is simulated."""
+    """[tree] Share of the sway that is drawn. 1: the tree is drawn with the full sway; 0: it is drawn in its simulated
+    pose."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -37,10 +38,11 @@ class SegmentPoses:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Snapshot:
-    """The whole world at one instant, as sensors need it: taken by the physics thread, read by any other."""
+    """The whole world at one instant, with the data that sensors need. The physics thread makes it; any thread may read
+    it."""
 
     time: float
-    """[s] World time."""
+    """[s] World time of this state."""
     tick: int
     body_q: np.ndarray
     """[body, 7] m, 1, poses of plant bodies."""
@@ -53,10 +55,10 @@ class Snapshot:
     moved_trees: np.ndarray
     """[k] Indices of the trees that are awake; all other trees stand still."""
     wind: WindState | None = None
-    """None: the air is calm. Otherwise ``body_q`` lacks the sway of trees on which wind is not simulated; see
-    :mod:`vinesim.wind.sway`."""
+    """The wind; None in calm air. In wind ``body_q`` does not contain the sway of trees on which wind is not simulated;
+    see :mod:`vinesim.wind.sway`."""
     wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
-    """Poses of displaced segments of wires; all other segments are where they were drawn."""
+    """Poses of displaced segments of wires; all other segments have their rest poses."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -68,28 +70,28 @@ class Contact:
     body: int
     """Index of the plant body in the model."""
     position: np.ndarray
-    """[3] m, world"""
+    """[3] m, contact point in the world."""
     force: np.ndarray
-    """[3] N on the rigid body, world axes; the plant feels the opposite force."""
+    """[3] N on the rigid body, world axes; the opposite force acts on the plant."""
     distance: float
     """Gap [m], negative if the bodies overlap."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Detachment:
-    """A part came off its plant: a bunch off its peduncle, or a cane off its tree."""
+    """The event that a bunch or a piece of wood was detached from its plant."""
 
     tick: int
     tree: int
     body: int
-    """Body that came off, together with everything that grows on it."""
+    """Body that was detached, together with its descendants."""
     bunch: int
     """Index of the bunch, -1 for a cane."""
     cause: str
-    """``"pull"`` (too much force), ``"bend"`` (too much moment), ``"blade"`` (a cutter closed on it), ``"command"``."""
+    """``"pull"`` (too large force), ``"bend"`` (too large moment), ``"blade"`` (a cutter) or ``"command"``."""
     actor: str
-    """Actor who caused it; empty if unknown."""
+    """Name of the actor who caused the detachment; empty if unknown."""
     force: np.ndarray
-    """[3] N, last force of the joint on the part that came off, world axes."""
+    """[3] N, last force of the joint on the detached part, world axes."""
     moment: np.ndarray
-    """[3] N m, last moment about the joint on that part."""
+    """[3] N m, last moment about the joint on the detached part."""

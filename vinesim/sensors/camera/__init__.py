@@ -1,1 +1,1 @@
-"""RGB-D cameras: rasterisers, light, exposure, stereo depth, point clouds."""
+"""RGB-D and multispectral cameras: pictures, light and shadows, exposure, stereo depth."""

@@ -1,7 +1,7 @@
-"""RGB-D cameras: a picture, labels, exact depth, and depth as the sensor measures it.
+"""RGB-D cameras: a picture, labels, exact depth, and depth as the sensor would measure it.
 
-Depth follows REP-118: metres along the optical axis; -Inf nearer than the sensor can measure, +Inf farther than it can,
-which includes the open sky; NaN for a pixel that should have measured and did not
+Depth follows REP-118: metres along the optical axis; -Inf for surfaces nearer than the sensor's range, +Inf for
+surfaces beyond its range and for the sky; NaN for a pixel within the range whose measurement failed
 (:mod:`vinesim.sensors.camera.stereo`).
 """
 
@@ -38,7 +38,7 @@ from vinesim.sensors.sensor import SensorMaker, SensorSetting
 
 
 class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One kind of camera (``data/cameras``)."""
+    """The data sheet of one model of camera, from a file in ``data/cameras``."""
 
     model: str
     width: Annotated[Number, "px", (1.0, 8192.0)]
@@ -51,18 +51,18 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Largest depth that is measured."""
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     stereo: StereoSpec | None = None
-    """How the camera measures depth. Unless given, it measures exactly."""
+    """Model of the depth measurement; None: depth is exact."""
     distortion: Annotated[spec_file.Numbers | None, "1", (-1000.0, 1000.0)] = None
     """Coefficients of the lens distortion, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8
-    (rational_polynomial). A pinhole unless given. Colour, depth and labels are distorted alike."""
+    (rational_polynomial); None: a pinhole. Colour, depth and labels have equal distortion."""
 
     @classmethod
     def load(cls, name: str) -> CameraSpec:
-        """The spec in the file ``name``, or the one of that name in ``data/cameras``."""
+        """Read a camera's data sheet: ``name`` is the path of a file, or the name of a file in ``data/cameras``."""
         spec = spec_file.load("cameras", name, cls)
         if not 0.0 <= spec.nearest.value < spec.farthest.value:
             raise spec_file.SensorError(
-                f"camera {name!r} measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
+                f"camera {name!r} measures from {spec.nearest.value} to {spec.farthest.value} m, an empty range; "
                 "give 0 <= nearest < farthest"
             )
         try:
@@ -72,16 +72,17 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
         return spec
 
     def ideal(self) -> CameraSpec:
-        """The same camera with exact depth at any distance."""
+        """Returns the data sheet of a camera like this one that measures depth exactly at any distance."""
         number = msgspec.structs.replace
         near = number(self.nearest, value=0.0)
         far = number(self.farthest, value=1000.0)
         return msgspec.structs.replace(self, nearest=near, farthest=far, stereo=None)
 
     def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
-        """Intrinsics with the principal point in the middle.
+        """Returns the intrinsics, with the principal point in the middle of the picture.
 
-        ``scale`` enlarges the picture; ``size`` gives it this width and height [px], with the same horizontal angle.
+        ``scale``: factor on width and height; ``size``: width and height [px] that replace the camera's, with an equal
+        horizontal field of view.
         """
         width = round(self.width.value * scale)
         height = round(self.height.value * scale)
@@ -102,21 +103,20 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 @dataclasses.dataclass(frozen=True)
 class Quality:
-    """Settings that trade the cost of a picture against its looks. Exact depth and labels are the same in all
-    qualities."""
+    """Rendering settings that trade computing time against the look of a picture; exact depth and labels do not depend
+    on them."""
 
     taps: int
-    """Number of shadow samples for each pixel. 0 stands for a smooth filter of two widths, -1 for a filter of one
-    width."""
+    """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
     block: int
-    """Side of a block of pixels in which each primitive is lit once."""
+    """Width and height [px] of the blocks of pixels within which each primitive is shaded once."""
     samples: int
     """Number of colour samples along each side of a pixel."""
     shadow_texel_divisor: int
-    """Divisor of the texel size of the near shadow map."""
+    """Divisor of the texel size of the near shadow map; 2 doubles the map's resolution."""
     is_live: bool
-    """Whether a CPU lights eight points at once (:mod:`vinesim.sensors.camera.live_light`), and computes the second
-    view of a stereo camera from the first one instead of rendering it."""
+    """Whether, on a CPU, eight points are shaded at once (:mod:`vinesim.sensors.camera.live_light`), and the second
+    view of a stereo camera is computed from the first one instead of rendered."""
 
 
 QUALITIES = {
@@ -124,12 +124,12 @@ QUALITIES = {
     "full": Quality(taps=0, block=1, samples=1, shadow_texel_divisor=1, is_live=False),
     "still": Quality(taps=12, block=2, samples=2, shadow_texel_divisor=2, is_live=False),
 }
-"""Qualities by name: ``fast`` for live robots, ``full`` for spectators, ``still`` for pictures that are not live."""
+"""Qualities by name: ``fast`` for robots' cameras, ``full`` for spectators, ``still`` for pictures and data sets."""
 
 
 @functools.cache
 def load_camera_kernels() -> None:
-    """Compile the CPU kernels of cameras, or read them from the cache. Threads must not call it at the same time."""
+    """Compile the CPU kernels of cameras, or load them from the cache. Only one thread may do so at a time."""
     for module in (
         camera_raster,
         camera_raster_plants,
@@ -145,27 +145,27 @@ def load_camera_kernels() -> None:
 
 @dataclasses.dataclass
 class Camera:
-    """One RGB-D camera."""
+    """One RGB-D camera, which renders frames of the vineyard's primitives from given poses."""
 
     spec: CameraSpec
     info: CameraInfo
     name: str = "camera"
     sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
-    """Unit vector towards the sun, or a function that gives it for a time [s]."""
+    """Unit vector towards the sun, or a function from simulated time [s] to that vector."""
     quality: str = "full"
     """Name of one of :data:`QUALITIES`."""
     shadow_period: float | None = None
-    """Period at which shadows of moving things are redrawn [s]; 0 for every frame. Unless given, 0.2, and 0 for
-    stills."""
+    """Period [s] at which shadows of moving objects are redrawn; 0: in every frame; None: 0.2, and 0 for quality
+    ``still``."""
     exposure: float | None = None
-    """Fixed exposure; automatic unless given. 0.75 suits a sunny noon."""
+    """Fixed exposure, a factor on radiance (0.75 suits a sunny noon); None: automatic exposure."""
     device: str = "cpu"
     threads: int | None = None
-    """Number of CPU threads that draw. Unless given, the number of cores that this process may use, up to four. The
-    result is the same to the bit for every number."""
+    """Number of CPU threads that draw; None: the number of cores that this process may use, at most four. The picture
+    does not depend on it."""
     seed: int = 0
     image_index: int = 0
-    """Number of the next image. The noise of the measurement follows from (seed, name, this number)."""
+    """Index of the next image. The seed, the camera's name and this index determine the noise of a measurement."""
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
@@ -212,8 +212,8 @@ class Camera:
         return self.spec.rate.value
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> CameraFrame:
-        """See :class:`vinesim.sensors.sensor.Sensor`. The frame has the ground truth of the bunches if ``outputs`` ask
-        for it."""
+        """Render a frame as :class:`vinesim.sensors.sensor.Sensor` defines it, with the ground truth of the bunches if
+        ``outputs`` contain it."""
         frame = self.render(primitives, pose, snapshot.time, outputs=outputs)
         if CameraOutput.BUNCHES in outputs:
             bunches = visible_bunches(primitives, snapshot, self.info, frame.pose, self.rasterizer)
@@ -223,13 +223,13 @@ class Camera:
     def render(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0, *, outputs: CameraOutput = CameraOutput.ALL
     ) -> CameraFrame:
-        """The frame seen from ``pose`` [7], the optical frame in the world.
+        """Render a frame from ``pose`` [7], the pose of the optical frame in the world, at simulated ``time`` [s].
 
-        Only ``outputs`` are rendered; the other arrays of the frame have the size 0.
+        Only ``outputs`` are rendered; all other arrays of the frame have the size 0.
         """
         pose = np.array(pose, float)
         shape = (self._drawn.height, self._drawn.width)
-        # a stereo camera matches by the texture of the picture
+        # the model of a stereo camera needs the texture of the picture
         is_lit = CameraOutput.RGB in outputs or (CameraOutput.DEPTH in outputs and self._stereo is not None)
         measures = self._stereo is not None and CameraOutput.DEPTH in outputs
         picture = self.render_on_device(primitives, pose, time, is_lit=is_lit, measures=measures)
@@ -272,8 +272,8 @@ class Camera:
         )
 
     def _download(self, *arrays: wp.array | None) -> list[np.ndarray]:
-        """Copies of arrays for the host; an empty array for None. From a GPU all are copied at once, through pinned
-        memory."""
+        """Copy device arrays to the host, with an empty array for None. A GPU copies all of them at once, through
+        pinned memory."""
         if self.device == "cpu":
             return [np.zeros(0, np.float32) if a is None else a.numpy().copy() for a in arrays]
         copies = []
@@ -298,10 +298,10 @@ class Camera:
         is_lit: bool = True,
         measures: bool = False,
     ) -> wp.array | None:
-        """The colours [pixel, 3] without distortion, on the device. With a GPU the call does not wait for them.
+        """Render from ``pose`` [7] without lens distortion and return the colours [pixel, 3] on the device.
 
-        Unless ``is_lit``, it renders depth and labels alone and returns None. ``measures``: the noise of a stereo
-        measurement is drawn at the same time.
+        With a GPU the call returns before rendering ends. Without ``is_lit``, only depth and labels are rendered, and
+        the result is None. ``measures``: draw also the random numbers for a stereo measurement.
         """
         if self.device == "cpu":
             load_camera_kernels()
@@ -333,17 +333,17 @@ class Camera:
     def update_shadows(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0
     ) -> tuple[ShadowMap, ShadowMap]:
-        """The near and the far shadow map. A map that is no longer valid at ``time`` [s] for ``pose`` [7] is drawn
-        again."""
+        """Returns the near and the far shadow map, after redrawing each map that is no longer valid at ``time`` [s] for
+        a camera at ``pose`` [7]."""
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         return self._sunlight.update(primitives, pose[:3], forward, time)
 
     def _shade(self, primitives: Primitives, near: ShadowMap, far: ShadowMap, lens: Pinhole) -> None:
-        """Light the rows that ``lens`` draws."""
+        """Shade the pixels in the rows that ``lens`` draws."""
         seen = self._supersampled
         block = self._quality.block
         across, down = (-(-n // block) for n in (seen.width, lens.end_row - lens.first_row))
-        run = across if self.device == "cpu" else 1  # a thread takes a row: structs are passed once a thread
+        run = across if self.device == "cpu" else 1  # on a CPU one thread takes a row, to pass the structs less often
         wp.launch(
             deferred.shade_pixels,
             across * down // run,

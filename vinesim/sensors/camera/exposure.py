@@ -1,4 +1,4 @@
-"""From light to pixels: metering, white balance, the halo of lamps, tone."""
+"""Conversion of radiance to 8-bit colours: light metering, exposure, white balance, glare of lamps, tone curve."""
 
 from __future__ import annotations
 
@@ -14,34 +14,35 @@ from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives
 
 NOON_EXPOSURE = 0.75
-"""Exposure that suits a sunny noon."""
+"""Exposure (factor on radiance) that suits a sunny noon."""
 KEY_VALUE = 0.13
-"""Geometric mean of the exposed light in a usual picture; white is 1."""
+"""Geometric mean of the exposed luminance at which automatic exposure aims; white is 1."""
 ADAPTED_SHARE = 0.5
-"""Share of the difference to the key value, in stops, that automatic exposure makes up: dark scenes stay darker than
-bright ones."""
+"""Share of the difference to the key value, in stops, that automatic exposure corrects. Below 1, dark scenes stay
+darker than bright ones."""
 LOW_SUN_SHARE = 0.7
-"""Share of the loss of light under a low sun, in stops, that the usual exposure makes up in advance."""
+"""Share of the loss of daylight under a low sun, in stops, that :func:`usual_exposure` corrects."""
 MIN_EXPOSURE = 0.25
 MAX_EXPOSURE = 8.0
-"""Largest exposure; ``MIN_EXPOSURE`` is the smallest."""
+"""Largest value of automatic exposure; ``MIN_EXPOSURE`` is the smallest."""
 ADAPTATION_TIME = 0.25
-"""Time constant with which exposure, in stops, follows its target [s]."""
+"""Time constant [s] with which automatic exposure, in stops, follows its target."""
 _METERING_STRIDE = 8
-"""Metering uses one pixel out of a square of this side [px]."""
+"""Distance [px] between pixels that the light meter samples, in rows and columns."""
 _GLARE = ((2.0, 0.5), (9.0, 0.12))
-"""Widths [1/100 of the picture's height] and strengths of the light that a lens scatters."""
+"""Gaussian halos around lamps by light that a lens scatters: standard deviation [1/100 of the picture's height] and
+strength of each."""
 _GLARE_REACH = 4.0
-"""Reach of the scattered light, in multiples of its width."""
+"""Radius of a halo around a lamp [standard deviations]."""
 
 
 def usual_exposure(brightness: float) -> float:
-    """Exposure that suits daylight of this ``brightness``, relative to that of a sunny noon."""
+    """Returns the exposure that suits daylight of this ``brightness``, where a sunny noon has brightness 1."""
     return NOON_EXPOSURE * max(brightness, 0.01) ** -LOW_SUN_SHARE
 
 
 class Exposure:
-    """The exposure of one camera: automatic, unless ``fixed``."""
+    """Exposure and tone mapping of one camera; exposure is automatic unless a ``fixed`` value is given."""
 
     def __init__(
         self,
@@ -52,7 +53,8 @@ class Exposure:
         device: str = "cpu",
         workers: ThreadPool | None = None,
     ) -> None:
-        """``width`` and ``height`` of the picture [px]; ``samples``: number of samples along each side of a pixel."""
+        """``width``, ``height``: of the picture [px]; ``samples``: number of colour samples along each side of a pixel;
+        ``fixed``: fixed exposure; ``workers``: threads that share the rows on a CPU."""
         self.width = width
         self.height = height
         self.samples = samples
@@ -61,7 +63,7 @@ class Exposure:
         self._workers = workers or ThreadPool(1)
         self.radiance = wp.empty(width * height * samples * samples, dtype=wp.vec3, device=device)
         self._numbers = self.radiance.view(float) if device == "cpu" else None
-        """The memory of ``radiance`` as plain numbers [sample, 3]; None on a GPU."""
+        """View of ``radiance`` as scalars [sample, 3], for vectorised kernels; None on a GPU."""
         self._rgb = wp.empty((width * height, 3), dtype=wp.uint8, device=device)
         self._sum = wp.zeros(2, dtype=wp.int64, device=device)
         self._exposure = wp.array([fixed or 0.0], dtype=float, device=device)
@@ -69,9 +71,10 @@ class Exposure:
         self._time: float | None = None
 
     def tone_map(self, balance: np.ndarray, time: float, brightness: float = 1.0) -> wp.array:
-        """The picture [pixel, 3] uint8 of :attr:`radiance`, taken at ``time`` [s]. It stays on the device.
+        """Convert :attr:`radiance`, rendered for ``time`` [s], to a picture [pixel, 3] uint8 on the device.
 
-        ``balance``: factors [3] on linear light. ``brightness``: of the daylight, relative to a sunny noon.
+        ``balance``: white balance, factors [3] on linear light; ``brightness``: brightness of the daylight, 1 at a
+        sunny noon.
         """
         if self.fixed is None:
             since = np.inf if self._time is None else time - self._time
@@ -110,7 +113,7 @@ class Exposure:
         return self._rgb
 
     def _tone_map_rows(self, balance: wp.vec3, first: int, end: int) -> None:
-        """Turn the light of some rows into colours."""
+        """Convert the radiance of rows ``first`` to ``end`` - 1 to 8-bit colours."""
         if self.device == "cpu" and self.samples == 1:
             wp.launch(
                 tone_rows.tone_map_rows,
@@ -131,8 +134,10 @@ class Exposure:
         )
 
     def add_glare(self, primitives: Primitives, seen: wp.array) -> None:
-        """Spread some light of the lamps in the picture over their surroundings, as a lens does. ``seen`` [sample]:
-        primitives."""
+        """Add the glare of a lens to :attr:`radiance`: halos around the lamps in the picture.
+
+        ``seen``: [sample] index of the visible primitive.
+        """
         lamps = primitives.lamp_primitives
         if not len(lamps):
             return
@@ -148,9 +153,10 @@ class Exposure:
 
 
 def glare(picture: np.ndarray, lit: np.ndarray) -> None:
-    """Spread the light of the pixels that are ``lit`` [height, width] over ``picture`` [height, width, 3], in place.
+    """Add halos around the lamps to the radiance ``picture`` [height, width, 3], in place; ``lit`` [height, width]:
+    pixels that show lamps.
 
-    Lamps cover few pixels. The matrix products here contain only the rows and columns of lamps: they cost 2 ms, while a
+    Lamps cover few pixels. The matrix products here contain only rows and columns with lamps and take 2 ms, while a
     blur of the whole picture takes 150 ms.
     """
     rows = np.flatnonzero(lit.any(1))
@@ -165,8 +171,11 @@ def glare(picture: np.ndarray, lit: np.ndarray) -> None:
 
 
 def _gaussian(sources: np.ndarray, size: int, sigma: float) -> tuple[np.ndarray, slice]:
-    """Weights [place, source] with which light from ``sources`` [px] spreads to the places that it reaches, and these
-    places."""
+    """Returns Gaussian weights [target, source] from rows (or columns) ``sources`` [px] to all rows (or columns) within
+    reach, and the range of these target rows.
+
+    ``size``: number of rows [px]; ``sigma``: standard deviation [px].
+    """
     reach = int(_GLARE_REACH * sigma) + 1
     places = slice(max(int(sources[0]) - reach, 0), min(int(sources[-1]) + reach + 1, size))
     away = (np.arange(places.start, places.stop)[:, None] - sources) / sigma

@@ -1,5 +1,4 @@
-"""Light of live pictures on a CPU: points are sorted by the kind of surface that they lie on, and each kind has its own
-kernel."""
+"""Shading of live pictures on a CPU: points are sorted by class of surface, and each class has its own kernel."""
 
 from __future__ import annotations
 
@@ -18,12 +17,12 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 from vinesim.sensors.raster.camera_rasterizer import BANDS_PER_THREAD, CameraRasterizer
 
 _ROWS = 4
-"""Number of rows of blocks of 2 x 2 pixels whose points form one list: long enough to fill batches, short enough for
+"""Number of rows of 2 x 2 pixel blocks whose points form one list: enough points to fill SIMD lanes, few enough for
 caches."""
 
 
 class LiveLight:
-    """Lights the points that one rasteriser sees, and holds the buffers for it."""
+    """Shades the pixels that one camera's rasteriser has found, and holds the buffers for this."""
 
     def __init__(self, seen: CameraRasterizer) -> None:
         self._seen = seen
@@ -38,7 +37,7 @@ class LiveLight:
         points.count = wp.empty((self.list_count, light_points.CLASS_COUNT), dtype=wp.int32, device="cpu")
         self._tables = light_points.FloatTables()
         self._sources: list[wp.array] = []
-        """Arrays that the memory of the tables belongs to."""
+        """Arrays that own the memory of the tables, kept so that the memory is not freed."""
 
     def shade(
         self,
@@ -48,7 +47,7 @@ class LiveLight:
         lens: Pinhole,
         radiance: wp.array,
     ) -> None:
-        """Write the light of all pixels to ``radiance`` [pixel] linear RGB."""
+        """Write the radiance of all pixels to ``radiance`` [pixel], linear RGB."""
         self._update_tables(primitives, light)
         workers = self._seen.workers
         parts = min(BANDS_PER_THREAD * workers.size if workers.size > 1 else 1, self.list_count)
@@ -66,7 +65,7 @@ class LiveLight:
         first: int,
         end: int,
     ) -> None:
-        """Sort and light the points of some lists."""
+        """Sort and shade the points of lists ``first`` to ``end`` - 1."""
         points = self._points
         tables = self._tables
         materials = primitives.materials
@@ -85,7 +84,8 @@ class LiveLight:
         launch(light_points.light_others, [primitives.shapes, materials, *solid], [radiance])
 
     def _update_tables(self, primitives: Primitives, light: Light) -> None:
-        """Make views of the primitives' present arrays. The arrays are replaced whenever the list of bodies changes."""
+        """Make views of the primitives' arrays again if the arrays were replaced, because rigid bodies were added or
+        removed."""
         shapes = primitives.shapes
         materials = primitives.materials
         sources = [shapes.a, shapes.b, shapes.c, shapes.d, materials.tint]
@@ -101,7 +101,8 @@ class LiveLight:
 
 
 def shadow_maps(near: ShadowMap, far: ShadowMap, depth: wp.array) -> light_points.ShadowMaps:
-    """Both maps and the array that holds the depths of the near one, then those of the far one."""
+    """Returns the kernel struct of both shadow maps; ``depth``: depths of the near map, followed by those of the far
+    map."""
     maps = light_points.ShadowMaps()
     maps.near = near
     maps.far = far
@@ -110,6 +111,6 @@ def shadow_maps(near: ShadowMap, far: ShadowMap, depth: wp.array) -> light_point
 
 
 def _numbers(vectors: wp.array) -> wp.array:
-    """The memory of an array of vectors as plain numbers [vector, component]."""
+    """Returns a view of an array of vectors as scalars [vector, component]."""
     shape = int(np.prod(vectors.shape)), int(vectors.dtype._length_)
     return wp.array(ptr=vectors.ptr, dtype=float, shape=shape, device="cpu", copy=False)

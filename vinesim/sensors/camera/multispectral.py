@@ -1,11 +1,10 @@
-"""Multispectral cameras: the surface that each pixel sees, the light that falls on it, and its reflectance in each
-band.
+"""Multispectral cameras: surface, illumination and reflectance in each band, for each pixel.
 
-A pixel's value is reflectance x illumination. Illumination is that of the RGB picture (sun, shadow maps, sky through
-the canopy, light from the ground, light through leaves), averaged over its colours. The same share of the light falls
-on a pixel in every band, so a ratio of bands such as the NDVI is the same in the sun and in the shade. Reflectances
-follow from the surface alone. Not modelled: the bluer light of shadows, light that leaves pass on to leaves,
-highlights, haze, and the distances between the lenses.
+A pixel's value is reflectance times illumination. The illumination is that of the RGB picture (sun, shadow maps, sky
+through the canopy, light from the ground, light through leaves), averaged over its three colours. It is equal in all
+bands, so a ratio of bands such as the NDVI is equal in sun and shade. Reflectances depend only on the kind of surface.
+Not modelled: the bluer light of shadows, light that passes from leaf to leaf, highlights, haze, and the distances
+between the lenses.
 """
 
 from __future__ import annotations
@@ -33,14 +32,15 @@ from vinesim.sensors.raster.primitive_arrays import LEAF
 from vinesim.sensors.sensor import Export, SensorMaker, SensorSetting
 
 FULL_SCALE = 32768
-"""Value of a reflectance of 1 in 16-bit images, as in MicaSense's own images."""
+"""Value in 16-bit images that stands for a reflectance of 1, as in MicaSense's images."""
 SHADOW_PERIOD = 0.2
-"""Period at which shadows of moving things are redrawn [s]."""
+"""Period [s] at which shadows of moving objects are redrawn."""
 DARK_BERRY = 0.55
-"""Ratio of green to red in the picture's berries: up to this value they count as dark, from 1 on as green. GUESSED."""
+"""Ratio of green to red colour up to which a berry counts as dark; from ratio 1 on it counts as green. GUESSED."""
 GREEN_AGE = 0.42
 DRY_AGE = 1.0
-"""Age of leaves from which on they are dry; up to ``GREEN_AGE`` they are green. As in the picture."""
+"""Age (``Model.leaf_age``) from which a leaf is dry; up to ``GREEN_AGE`` it is green. Both values are those of the RGB
+picture."""
 SURFACES = (
     "leaf",
     "leaf_dry",
@@ -59,7 +59,7 @@ SURFACES = (
     "straw",
     "sky",
 )
-"""Surfaces whose reflectance a data file gives."""
+"""Names of the surfaces for which a data file contains reflectances."""
 _OF_MATERIAL = {
     materials.FOLIAGE: "leaf",
     materials.BERRY: "berry_green",
@@ -82,24 +82,24 @@ _OF_MATERIAL = {
 }
 _SURFACE_OF_MATERIAL = np.array([SURFACES.index(_OF_MATERIAL[kind]) for kind in sorted(_OF_MATERIAL)])
 _SECOND = {"leaf": "leaf_dry", "berry_green": "berry_dark", "soil": "grass"}
-"""The surface that a surface changes into. The share of the change, from 0 to 1, is given for each primitive or
-pixel."""
+"""Pairs of surfaces between which reflectance is interpolated, such as green and dry leaves; each primitive or pixel
+has a weight from 0 (first surface) to 1 (second surface)."""
 _SECOND_OF_SURFACE = np.array([SURFACES.index(_SECOND.get(name, name)) for name in SURFACES])
 
 
 class BandSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One band, with a Gaussian response."""
+    """One spectral band with a Gaussian response."""
 
     name: str
     centre: Annotated[Number, "nm", (300.0, 1100.0)]
     width: Annotated[Number, "nm", (1.0, 500.0)]
-    """Distance between the two wavelengths at which the response is half of its maximum."""
+    """Full width of the response at half of its maximum."""
     irradiance: Annotated[Number, "W/(m^2 nm)", (0.0, 3.0)]
-    """Irradiance of a level surface in the open, by sun and sky."""
+    """Irradiance of a level surface in the open by sun and sky."""
 
 
 class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One kind of multispectral camera (``data/multispectral``)."""
+    """The data sheet of one model of multispectral camera, from a file in ``data/multispectral``."""
 
     model: str
     width: Annotated[Number, "px", (1.0, 8192.0)]
@@ -108,30 +108,31 @@ class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
     fy: Annotated[Number, "px", (1.0, 1e6)]
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     bits: Annotated[Number, "1", (1, 16)]
-    """Resolution of the converter in bits."""
+    """Resolution of the analogue-digital converter in bits."""
     brightest: Annotated[Number, "1", (0.1, 10.0)]
-    """Reflectance at full scale; a brighter surface gives this value."""
+    """Reflectance at full scale, to which brighter surfaces are clipped."""
     full_well: Annotated[Number, "1", (10.0, 1e9)]
-    """Number of electrons of a pixel at full scale. A number of electrons has its square root as standard deviation."""
+    """Number of electrons of a pixel at full scale, for shot noise (standard deviation: square root of the number)."""
     read_noise: Annotated[Number, "1", (0.0, 1e4)]
-    """Standard deviation of a dark pixel [electron]."""
+    """Read noise: standard deviation of a pixel without light [electron]."""
     transmission: Annotated[Number, "1", (0.0, 2.0)]
-    """Light that a leaf transmits, relative to the light that it reflects, in all bands."""
+    """Transmittance of a leaf divided by its reflectance, equal in all bands."""
     bands: tuple[BandSpec, ...]
-    """Bands in the order of wavelength; one is named ``red``, one ``nir``."""
+    """Bands sorted by wavelength; they include bands named ``red`` and ``nir``, for the NDVI."""
     reflectance: dict[str, Annotated[spec_file.Numbers, "1", (0.0, 1.0)]]
-    """Diffuse reflectance: for each of :data:`SURFACES` one number for each band."""
+    """Diffuse reflectances: for each of :data:`SURFACES` one number for each band."""
 
     @classmethod
     def load(cls, name: str) -> MultispectralSpec:
-        """The spec in the file ``name``, or the one of that name in ``data/multispectral``."""
+        """Read a camera's data sheet: ``name`` is the path of a file, or the name of a file in
+        ``data/multispectral``."""
         spec = spec_file.load("multispectral", name, cls)
         names = [band.name for band in spec.bands]
         if not {"red", "nir"} <= set(names) or len(set(names)) < len(names):
             raise spec_file.SensorError(f"{name}: the bands are {names}; give different names, with red and nir")
         centres = [band.centre.value for band in spec.bands]
         if sorted(centres) != centres:
-            raise spec_file.SensorError(f"{name}: the bands are at {centres} nm; give them by wavelength")
+            raise spec_file.SensorError(f"{name}: the bands are at {centres} nm; give them sorted by wavelength")
         if wrong := sorted(set(spec.reflectance) ^ set(SURFACES)):
             raise spec_file.SensorError(
                 f"{name}: reflectance.{wrong[0]} is missing or unknown; give one for each of {', '.join(SURFACES)}"
@@ -144,8 +145,10 @@ class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
         return spec
 
     def info(self, frame_id: str, size: tuple[int, int] | None = None) -> CameraInfo:
-        """Intrinsics with the principal point in the middle. ``size`` [px] sets another size with the same horizontal
-        angle."""
+        """Returns the intrinsics, with the principal point in the middle of the picture.
+
+        ``size``: width and height [px] that replace the camera's, with an equal horizontal field of view.
+        """
         width, height = size or (round(self.width.value), round(self.height.value))
         scale = width / self.width.value
         middle = 0.5 * (width - 1), 0.5 * (height - 1)
@@ -153,7 +156,7 @@ class MultispectralSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True,
 
 
 class MultispectralCamera:
-    """One multispectral camera."""
+    """One multispectral camera, which renders frames of the vineyard's primitives from given poses."""
 
     def __init__(
         self,
@@ -165,14 +168,14 @@ class MultispectralCamera:
         is_exact: bool = False,
         shadow_period: float = SHADOW_PERIOD,
     ) -> None:
-        """``is_exact``: measure without noise, quantisation and saturation. ``shadow_period``: period at which shadows
-        of moving things are redrawn [s]."""
+        """``is_exact``: measure without noise, quantisation and saturation; ``shadow_period``: period [s] at which
+        shadows of moving objects are redrawn."""
         self.spec = spec
         self.info = info
         self.name = name
         self.is_exact = is_exact
         self.image_index = setting.number
-        """Number of the next image. The noise follows from (seed, name, this number)."""
+        """Index of the next image. The seed, the camera's name and this index determine the noise."""
         self._seed = setting.seed
         self._device = device = setting.device
         threads = min(usable_cores(), MAX_THREADS) if setting.threads is None else setting.threads
@@ -182,14 +185,14 @@ class MultispectralCamera:
         self._light = wp.empty(info.width * info.height, dtype=float, device=device)
         self._sod = wp.empty(info.width * info.height, dtype=float, device=device)
         self._reflectance = np.array([spec.reflectance[name].value for name in SURFACES], np.float32)
-        """[surface, band] Reflectances."""
+        """[surface, band] Reflectances of :data:`SURFACES`."""
         self.bands = tuple(Band(b.name, b.centre.value, b.width.value, b.irradiance.value) for b in spec.bands)
         self._layout: tuple[Primitives, int] | None = None
         self._surface = np.zeros(0, int)
         """[primitive + 2] Index of each primitive's surface. The last two entries are the ground (primitive -2) and the
         sky (-1)."""
         self._turned = np.zeros(0, np.float32)
-        """[primitive + 2] Share by which each primitive has changed into the second surface of :data:`_SECOND`."""
+        """[primitive + 2] Weight (0 to 1) of the second surface of a pair in :data:`_SECOND`, for each primitive."""
 
     @property
     def rate(self) -> float:
@@ -199,11 +202,11 @@ class MultispectralCamera:
     def frame(
         self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput
     ) -> MultispectralFrame:
-        """See :class:`vinesim.sensors.sensor.Sensor`. The frame has all bands, whichever ``outputs`` are needed."""
+        """Render a frame as :class:`vinesim.sensors.sensor.Sensor` defines it; the frame always has all bands."""
         return self.render(primitives, pose, snapshot.time)
 
     def render(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> MultispectralFrame:
-        """The picture from ``pose`` [7], the optical frame in the world."""
+        """Render a frame from ``pose`` [7], the pose of the optical frame in the world, at simulated ``time`` [s]."""
         if self._device == "cpu":
             load_kernels()
         pose = np.array(pose, float)
@@ -235,9 +238,9 @@ class MultispectralCamera:
         return frame
 
     def _illuminate(self, primitives: Primitives, near: ShadowMap, far: ShadowMap, lens: Pinhole) -> None:
-        """Compute the light that falls on the rows of ``lens``."""
+        """Compute the illumination of the pixels in the rows that ``lens`` draws."""
         seen = self._seen
-        run = seen.width if self._device == "cpu" else 1  # a thread takes a row: structs are passed once a thread
+        run = seen.width if self._device == "cpu" else 1  # on a CPU one thread takes a row, to pass structs less often
         wp.launch(
             illumination.illuminate_pixels,
             seen.width * (lens.end_row - lens.first_row) // run,
@@ -275,7 +278,7 @@ class MultispectralCamera:
         self._turned = np.append(turned, [0.0, 0.0]).astype(np.float32)
 
     def _measure(self, exact: np.ndarray) -> np.ndarray:
-        """Measured reflectances from exact ones [band, height, width]: with noise, quantisation and saturation."""
+        """Returns exact reflectances [band, height, width] with added noise, quantisation and saturation."""
         spec = self.spec
         rng = spec_file.noise_rng(self._seed, self.name, self.image_index)
         scale = np.float32(spec.full_well.value / spec.brightest.value)
@@ -287,7 +290,7 @@ class MultispectralCamera:
 
 
 def ndvi_colours(ndvi: np.ndarray) -> np.ndarray:
-    """NDVI [height, width] as RGB uint8: -1 blue, 0 grey brown, 0.4 yellow, 1 dark green."""
+    """Returns the NDVI [height, width] as RGB uint8: -1 is blue, 0 grey brown, 0.4 yellow, 1 dark green."""
     at = np.array([-1.0, 0.0, 0.4, 0.7, 1.0])
     colours = np.array([[40, 70, 160], [130, 110, 95], [240, 225, 110], [90, 170, 60], [0, 80, 30]], float)
     return np.stack([np.interp(ndvi, at, colours[:, k]) for k in range(3)], -1).astype(np.uint8)
@@ -295,7 +298,8 @@ def ndvi_colours(ndvi: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def load_kernels() -> None:
-    """Compile the CPU kernels, or read them from the cache. Threads must not call it at the same time."""
+    """Compile the CPU kernels of multispectral cameras, or load them from the cache. Only one thread may do so at a
+    time."""
     load_camera_kernels()
     wp.load_module(illumination, device="cpu")
 
@@ -306,7 +310,7 @@ def _make(mount: MultispectralMount, setting: SensorSetting) -> MultispectralCam
 
 
 def _export(frame: MultispectralFrame) -> Export:
-    """One 16-bit image for each band, and the NDVI in colours."""
+    """Returns what a data set stores of a frame: a 16-bit image of each band, and the NDVI in colours."""
     scaled = np.clip(np.rint(frame.reflectance * FULL_SCALE), 0, 65535).astype(np.uint16)
     images: dict[str, np.ndarray] = {band.name: scaled[k] for k, band in enumerate(frame.bands)}
     bands: list[dict[str, Any]] = [

@@ -1,9 +1,9 @@
-"""Depth as a stereo camera measures it: RealSense D400 and its kind.
+"""Model of the depth measured by stereo cameras such as RealSense D400.
 
-Noise follows sigma_z = z^2 sigma_d / (f B), where sigma_d is the error of disparity. The first imager is assumed to be
-at the camera's place, the second to its right by the baseline. Points that the second imager cannot see (to the left of
-near things) have no depth. A window of the matcher sees one surface: it smooths uneven surfaces, loses thin ones, and
-lets near edges grow.
+Noise follows sigma_z = z^2 sigma_d / (f B), where sigma_d is the error of disparity. The first imager is at the
+camera's pose, the second to its right by the baseline. Points that are hidden from the second imager (to the left of
+near objects) have no depth. The matcher finds one surface in each window, so uneven surfaces are smoothed, thin ones
+are lost, and near surfaces grow at their edges.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from vinesim.sensors.raster.primitive_arrays import PosedPrimitives
 
 
 class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """How a stereo camera measures (table ``[stereo]`` in ``data/cameras``); pixels are those of its imagers."""
+    """Parameters of a stereo camera's measurement (table ``[stereo]`` in ``data/cameras``), in pixels of its
+    imagers."""
 
     baseline: Annotated[Number, "m", (0.001, 2.0)]
-    """Distance between both imagers."""
+    """Distance between the two imagers."""
     focal: Annotated[Number, "px", (10.0, 10000.0)]
     """Focal length of the imagers, at the resolution at which their pictures are matched."""
     field: Annotated[Number, "deg", (10.0, 170.0)]
@@ -40,26 +41,27 @@ class StereoSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     step: Annotated[Number, "px", (0.0, 10.0)]
     """Resolution of disparity; 0 for no quantisation."""
     window: Annotated[Number, "px", (1.0, 63.0)]
-    """Side of the matching window. Noise is the same within a window, and a window sees one surface."""
+    """Width of the matching window. The matcher finds one surface in a window, and noise is correlated over its width.
+    """
     fattening: Annotated[Number, "1", (0.1, 10.0)]
-    """Weight of the nearest surface in a window, relative to the others. Above 1 near edges grow."""
+    """Weight of the nearest surface in a window, relative to other surfaces. Above 1 near surfaces grow at edges."""
     support: Annotated[Number, "1", (0.0, 1.0)]
-    """Share of a window that must show the same surface."""
+    """Share of a window that one surface must cover for a match."""
     slant_kept: Annotated[Number, "deg", (0.0, 90.0)]
-    """Every surface is measured up to this angle between ray and normal."""
+    """Angle between ray and normal up to which slant never prevents a match."""
     slant_lost: Annotated[Number, "deg", (0.0, 90.0)]
-    """No surface is measured from this angle on."""
+    """Angle between ray and normal from which no surface is matched."""
     contrast: Annotated[Number, "1", (0.0, 255.0)]
-    """Grey levels within a window below which the scene has no texture; only the projector's texture is matched
-    then."""
+    """Range of grey levels within a window below which the scene has no texture, so that only the projector's texture
+    can be matched."""
     projector: Annotated[Number, "m", (0.0, 100.0)]
-    """Distance up to which the projector's texture is seen; from twice this distance on, none of it is seen."""
+    """Distance up to which the projector's texture is always matched; from twice this distance on it never is."""
     saturation: Annotated[Number, "1", (0.0, 256.0)]
-    """Grey level from which on a window is overexposed."""
+    """Mean grey level of a window from which the window is overexposed."""
 
 
 class Stereo:
-    """The depth sensor of one camera: second imager, matching and noise."""
+    """The depth measurement of one stereo camera: second imager, matching and noise."""
 
     def __init__(
         self,
@@ -71,10 +73,10 @@ class Stereo:
         second_from_first: bool = False,
         workers: ThreadPool | None = None,
     ) -> None:
-        """``reach``: nearest and farthest depth [m].
+        """``reach``: nearest and farthest measured depth [m].
 
-        ``second_from_first``: the view of the second imager is not drawn but computed from the depth of the first one
-        (on a CPU). ``workers`` share the rows; the result is the same to the bit for every number of workers.
+        ``second_from_first``: compute the second imager's view from the first imager's depth instead of rendering it
+        (on a CPU); ``workers``: threads that share the rows, without effect on the result.
         """
         self.info = info
         self.device = device
@@ -96,7 +98,7 @@ class Stereo:
         s.contrast = spec.contrast.value
         s.projector = spec.projector.value
         s.saturation = spec.saturation.value
-        # the second imager must look as far left as the first sees the nearest things, or to the end of its field
+        # the second imager's picture must extend to the left as far as nearest surfaces appear there, within its field
         left = -info.cx / info.fx
         right = (info.width - 1 - info.cx) / info.fx
         edge = max(-float(np.tan(np.radians(0.5 * spec.field.value))), left - s.baseline / max(reach[0], 1e-3))
@@ -130,9 +132,9 @@ class Stereo:
         rgb: np.ndarray,
         rng: np.random.Generator | None,
     ) -> np.ndarray:
-        """Measured depth [height, width] m from exact ``depth`` [height, width] m and the picture ``rgb``.
+        """Returns the measured depth [height, width] m for exact ``depth`` [height, width] m and the picture ``rgb``.
 
-        If ``rng`` is None, the noise of the last :meth:`draw_noise` is used.
+        ``rng``: source of the noise; None: the noise of the last :meth:`draw_noise` is used.
         """
         if rng is not None:
             self.draw_noise(rng)
@@ -144,9 +146,9 @@ class Stereo:
         return self._depth.numpy().reshape(self.info.height, self.info.width).copy()
 
     def measure_on_device(self, primitives: PosedPrimitives, lens: Pinhole, depth: wp.array, rgb: wp.array) -> wp.array:
-        """As :meth:`measure` on a GPU: from and to arrays [pixel] there, with the noise of the last :meth:`draw_noise`.
+        """Compute the measured depth [pixel] m on a GPU from arrays [pixel] on that GPU, as :meth:`measure` does.
 
-        The call does not wait for the result.
+        The noise is that of the last :meth:`draw_noise`. The call does not wait for the result.
         """
         second = self._second_pinhole(lens)
         self._second.draw(primitives, second)
@@ -183,8 +185,10 @@ class Stereo:
         cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY, dst=self._grey.numpy().reshape(depth.shape))
 
     def draw_noise(self, rng: np.random.Generator) -> None:
-        """Draw the noise of the next measurement. It does not depend on the picture. A GPU draws other numbers than a
-        CPU."""
+        """Draw the noise of the next measurement, which does not depend on the picture.
+
+        A GPU draws other random numbers than a CPU.
+        """
         if self.device == "cpu":
             self._noise.numpy()[:] = self._correlated_noise(rng)
             return
@@ -227,7 +231,7 @@ class Stereo:
         self._workers.share([functools.partial(measure, *ends) for ends in itertools.pairwise(bounds)])
 
     def _second_pinhole(self, lens: Pinhole) -> Pinhole:
-        """The second imager: parallel to the first, and to its right by the baseline."""
+        """Returns the lens of the second imager: parallel to the first imager, and to its right by the baseline."""
         other = Pinhole()
         turn = np.array(lens.rotation).reshape(3, 3)
         other.eye = wp.vec3(*map(float, np.array(lens.eye) + self._parameters.baseline * turn[0]))
@@ -245,7 +249,8 @@ class Stereo:
         return other
 
     def _correlated_noise(self, rng: np.random.Generator) -> np.ndarray:
-        """Two fields [2, row, column] of normal numbers with variance 1, correlated within a window."""
+        """Returns two fields [2, row, column] of normal numbers with variance 1 that are correlated over the width of a
+        matching window."""
         _, rows, columns = self._noise.shape
         wide = self._window - 1
         raw = rng.standard_normal((2, rows + wide, columns + wide), np.float32)
@@ -257,8 +262,11 @@ class Stereo:
 
 
 def _imager_pixels(cells: tuple[int, int], scale: float, info: CameraInfo) -> stereo_rows.ImagerPixels:
-    """The pixels of a picture in which the ``cells`` (rows, columns) of an imager lie; one pixel is ``scale`` cells
-    wide."""
+    """Returns the mapping from an imager's rows and columns to those of a picture.
+
+    ``cells``: numbers of rows and columns of the imager; ``scale``: width of a pixel of the picture in pixels of the
+    imager.
+    """
     o = stereo_rows.ImagerPixels()
     for name, count, size in (("row", cells[0], info.height), ("column", cells[1], info.width)):
         ends = np.ceil(np.arange(count + 1, dtype=np.float32) / np.float32(scale)).astype(np.int32)

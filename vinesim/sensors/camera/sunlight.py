@@ -1,7 +1,8 @@
 """Sun, sky and the cached shadow maps of one camera.
 
-Two maps follow the camera: a fine one around what it looks at, a coarse one of the plants far around. A map is drawn
-again only when the camera has left its middle, or when something inside it has moved, and then at a bounded rate.
+Two shadow maps follow the camera: a fine one around the point that the camera looks at, and a coarse one of the plants
+farther away. A map is redrawn only when the camera has left the map's middle, or when an object inside the map has
+moved, and then at a bounded rate.
 """
 
 from __future__ import annotations
@@ -19,18 +20,17 @@ from vinesim.sensors.primitives import textures
 from vinesim.sensors.primitives.scene_primitives import Primitives
 
 DEFAULT_SUN = (-0.41, -0.52, 0.75)
-"""Direction towards the sun: south-west, half-way up."""
+"""Vector towards the sun: in the south-west, about 50 degrees high."""
 
 
 Window = tuple[int, int, int, int]
-"""A part of a shadow map: first column, last column + 1, first row, last row + 1."""
+"""A rectangle of texels in a shadow map: first column, last column + 1, first row, last row + 1."""
 _TILES = 8
-"""A map is redrawn in tiles; this is the number of tiles across and down."""
+"""Number of tiles across (and down) into which a shadow map is divided to redraw only parts of it."""
 _NOTHING = 1.0e9
-"""Depth of texels where nothing casts a shadow [m]."""
+"""Depth [m] of texels on which no primitive is drawn."""
 _GPU_THREADS = (8, 16)
-"""On a GPU: number of threads that share the primitives of a cluster, and of threads that share the rows of a
-primitive."""
+"""Numbers of GPU threads that share the primitives of a cluster, and that share the rows of a primitive."""
 
 
 def _vector(v: np.ndarray) -> wp.vec3:
@@ -42,7 +42,8 @@ def _pairs(x: np.ndarray, y: np.ndarray, device: str) -> wp.array:
 
 
 class ShadowSquare:
-    """One square shadow map: depths seen from the sun, around a focus that moves in steps."""
+    """One cached square shadow map around a point in front of the camera; the map moves in steps and is redrawn
+    then."""
 
     def __init__(
         self,
@@ -55,7 +56,10 @@ class ShadowSquare:
         device: str,
         workers: ThreadPool,
     ) -> None:
-        """``depth`` [side * side] holds the map."""
+        """``texel``: width of a texel [m]; ``side``: number of texels along a side; ``ahead``: distance of the map's
+        centre in front of the camera [m]; ``slack``: distance [m] that the centre may move before the map is redrawn;
+        ``rigid``: draw rigid bodies, too, and redraw the map when objects move; ``depth``: [side * side] memory of the
+        map."""
         self.ahead = ahead
         self.slack = slack
         self.rigid = rigid
@@ -69,10 +73,11 @@ class ShadowSquare:
         self.struct.side = side
         self.half = 0.5 * texel * side
         self._drawn_balls = np.zeros((0, 4), np.float32)
-        """Bounding spheres of all clusters when the map was last drawn. A GPU draws the whole map and keeps none."""
+        """[cluster, 4] Bounding spheres of all clusters when the map was last drawn; empty on a GPU, which always
+        redraws the whole map."""
 
     def set_sun(self, sun: np.ndarray) -> None:
-        """Turn to the sun, a unit vector towards it. Everything drawn so far becomes invalid."""
+        """Set the unit vector towards the sun, ``sun`` [3]; the whole map becomes invalid."""
         self.right = np.cross(sun, [0.0, 0.0, 1.0]) if abs(sun[2]) < 0.999 else np.array([1.0, 0.0, 0.0])
         self.right /= np.linalg.norm(self.right)
         self.up = np.cross(self.right, sun)
@@ -83,7 +88,11 @@ class ShadowSquare:
         self.struct.right, self.struct.up, self.struct.sun = _vector(self.right), _vector(self.up), _vector(sun)
 
     def follow(self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float, period: float) -> None:
-        """Draw the map again, or the part of it that changed, if it is no longer valid for this camera at ``time``."""
+        """Redraw the map, or its changed part, if it is no longer valid for a camera at ``eye`` [3] m that looks along
+        ``forward`` [3] at ``time`` [s].
+
+        ``period``: least time [s] between redraws because of moving objects.
+        """
         wanted = eye + self.ahead * forward
         strayed = not np.linalg.norm(wanted - self.focus) <= self.slack
         other = self.built != primitives.layout_version
@@ -104,20 +113,21 @@ class ShadowSquare:
         self._draw(primitives, windows)
 
     def _whole(self) -> list[Window]:
-        """Windows that cover the map, one for each thread."""
+        """Returns rectangles that cover the whole map, one for each thread."""
         side = self.struct.side
         count = self._workers.size
         return [(0, side, side * i // count, side * (i + 1) // count) for i in range(count)]
 
     def _texels(self, ball: np.ndarray) -> np.ndarray:
-        """[ball, 4] Least and largest column and row that the shadows of some spheres [ball, 4] may touch."""
+        """Returns bounds [ball, 4] of the shadows of spheres ``ball`` [ball, 4] in texels: least and largest column,
+        least and largest row."""
         apart = ball[:, :3] - self.focus
         middle = np.stack([apart @ self.right, apart @ self.up], 1) / self.struct.texel + 0.5 * self.struct.side
         reach = ball[:, 3:] / self.struct.texel + float(shadow_maps.SHADOW_MARGIN) + 1.0
         return np.stack([middle - reach, middle + reach], 2).reshape(-1, 4)
 
     def _changed_windows(self, primitives: Primitives) -> list[Window]:
-        """Windows that contain all shadows that moved since the map was drawn, both at their old and at their new
+        """Returns rectangles that contain all shadows that moved since the map was drawn, at their old and new
         places."""
         moved = primitives.cluster_version > self.version
         balls = primitives.ball.numpy()[moved]
@@ -127,7 +137,8 @@ class ShadowSquare:
         texels = self._texels(balls[balls[:, 3] > 0.0])
         texels = texels[(texels[:, ::2] < side).all(1) & (texels[:, 1::2] > 0.0).all(1)]
         tile = np.clip(texels, 0.0, side - 1.0).astype(int) * _TILES // side
-        dirty = np.zeros((_TILES + 1, _TILES + 1), int)  # +1 and -1 at the corners of each box; summed up below
+        # +1 and -1 at the corners of each rectangle; cumulative sums follow
+        dirty = np.zeros((_TILES + 1, _TILES + 1), int)
         for row, column, value in ((2, 0, 1), (2, 1, -1), (3, 0, -1), (3, 1, 1)):
             np.add.at(dirty, (tile[:, row] + (row == 3), tile[:, column] + (column == 1)), value)
         dirty = dirty.cumsum(0).cumsum(1)[:-1] > 0
@@ -139,7 +150,7 @@ class ShadowSquare:
         return windows
 
     def _casters_inside(self, primitives: Primitives, window: Window) -> np.ndarray:
-        """Clusters whose shadows may fall into a window [k]."""
+        """Returns the clusters [k] whose shadows may touch the rectangle ``window``."""
         ball = primitives.ball.numpy()
         texels = self._texels(ball)
         inside = (ball[:, 3] > 0.0) & (texels[:, 0] < window[1]) & (texels[:, 1] > window[0])
@@ -149,7 +160,7 @@ class ShadowSquare:
         return np.flatnonzero(inside)
 
     def _casters(self, primitives: Primitives) -> wp.array:
-        """All clusters that this map shows, wherever they are."""
+        """Returns all clusters of the kinds that this map draws, at any place."""
         if self._known != primitives.layout_version:
             every = np.arange(len(primitives.cluster_first), dtype=np.int32)
             mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
@@ -164,14 +175,14 @@ class ShadowSquare:
         self._workers.share([functools.partial(self._draw_window, primitives, window) for window in windows])
 
     def _draw_window(self, primitives: Primitives, window: Window) -> None:
-        """Clear and draw some columns and rows of the map."""
+        """Clear and redraw the rectangle ``window`` of the map."""
         if self.device == "cpu":
             which = wp.array(self._casters_inside(primitives, window).astype(np.int32), device="cpu")
             lanes = 1
             slices = 1
             square = self.struct.depth.numpy().reshape(self.struct.side, self.struct.side)
             square[window[2] : window[3], window[0] : window[1]] = _NOTHING
-        else:  # a GPU culls faster than it receives a list, and needs a thread for every row
+        else:  # culling on the GPU takes less time than a transfer of a list; one thread for each row
             which = self._casters(primitives)
             (lanes, slices) = _GPU_THREADS
             self.struct.depth.fill_(_NOTHING)
@@ -187,33 +198,37 @@ class ShadowSquare:
 
 
 SunPath = Callable[[float], tuple[float, float, float]]
-"""Unit vector towards the sun at a simulated time [s]."""
+"""Function from simulated time [s] to the unit vector towards the sun."""
 _MIN_COS_CHANGE = np.cos(np.radians(0.25))
-"""The light is computed again when the sun has moved by a quarter of a degree: once a minute."""
+"""Cosine of the motion of the sun (a quarter of a degree, or one minute) after which the light is computed again."""
 _NOON_SUN = np.array([3.3, 2.95, 2.35])
-"""Light of the sun when the sine of its elevation is :data:`_NOON_SINE`; a white sheet in full light has the value
-1."""
+"""Linear RGB of sunlight when the sine of the sun's elevation is :data:`_NOON_SINE`, in units in which a white sheet in
+full light has radiance 1."""
 _NOON_SINE = 0.75
 _OPTICAL_DEPTH = np.array([0.10, 0.15, 0.27])
-"""Optical depth of clear country air at 610, 550 and 465 nm: Rayleigh scattering and some haze."""
+"""Optical depth of clear country air at 610, 550 and 465 nm (red, green, blue): Rayleigh scattering and some haze."""
 _SKY_COLOUR = np.array([0.52, 0.70, 1.0])
 _HAZE_COLOUR = np.array([0.50, 0.60, 0.72])
 _GROUND_COLOUR = np.array([0.26, 0.21, 0.13])
 _CANOPY_COLOUR = np.array([0.14, 0.19, 0.075])
 _WHITE_BALANCE_SHARE = 0.6
-"""Share of the light's colour that a camera's white balance removes."""
+"""Share of the daylight's colour cast that a camera's white balance removes, 0 to 1."""
 
 
 def air_mass(height: float) -> float:
-    """Air mass on the path of sunlight, 1 from the zenith. ``height`` is the sine of the sun's elevation (Kasten and
-    Young 1989)."""
+    """Returns the relative air mass on the path of sunlight, 1 for a sun in the zenith (Kasten and Young 1989).
+
+    ``height``: sine of the sun's elevation.
+    """
     degrees = np.degrees(np.arcsin(np.clip(height, 0.0, 1.0)))
     return float(1.0 / (max(height, 0.0) + 0.50572 * (degrees + 6.07995) ** -1.6364))
 
 
 def daylight(height: float) -> tuple[np.ndarray, float]:
-    """Colour [3] of direct sunlight, and brightness of the sky relative to noon. ``height`` is the sine of the
-    elevation."""
+    """Returns the linear RGB [3] of direct sunlight, and the brightness of the sky relative to noon.
+
+    ``height``: sine of the sun's elevation.
+    """
     sun = (
         _NOON_SUN
         * np.exp(-_OPTICAL_DEPTH * (air_mass(height) - air_mass(_NOON_SINE)))
@@ -224,25 +239,25 @@ def daylight(height: float) -> tuple[np.ndarray, float]:
 
 @dataclasses.dataclass(frozen=True)
 class OutdoorLight:
-    """Daylight at one elevation of the sun. Colours are linear RGB [3]."""
+    """Daylight for one elevation of the sun. Colours are linear RGB [3]."""
 
     sun: np.ndarray
     sky: np.ndarray
     haze: np.ndarray
     ground: np.ndarray
-    """Light from the ground."""
+    """Light that the ground reflects."""
     canopy: np.ndarray
-    """Light through the canopy."""
+    """Light that the canopy transmits."""
     dim: float
     """Brightness of the sky, relative to noon."""
     brightness: float
-    """Light that falls on the ground, relative to that at noon."""
+    """Illuminance of the ground, relative to noon."""
     balance: np.ndarray
-    """White balance of a camera: factors on linear light."""
+    """White balance of a camera in this light: factors [3] on linear RGB."""
 
     @classmethod
     def of(cls, height: float) -> OutdoorLight:
-        """The light when ``height`` is the sine of the sun's elevation."""
+        """Returns the daylight for ``height``, the sine of the sun's elevation."""
         sun, dim = daylight(height)
         falls = sun * max(height, 0.05) + _SKY_COLOUR * dim
         usual = _NOON_SUN * _NOON_SINE + _SKY_COLOUR
@@ -260,7 +275,7 @@ class OutdoorLight:
 
 
 class Sunlight:
-    """Sun, sky and shadow maps for one camera."""
+    """Light of sun and sky, and the two shadow maps, for one camera."""
 
     def __init__(
         self,
@@ -272,10 +287,10 @@ class Sunlight:
         device: str = "cpu",
         workers: ThreadPool | None = None,
     ) -> None:
-        """``sun``: vector towards the sun, or a function that gives it for a time [s].
+        """``sun``: vector towards the sun, or a function from simulated time [s] to that vector.
 
-        ``taps`` are as in :class:`vinesim.kernels.shading.deferred.Light`; ``period`` [s] as in :class:`Camera`;
-        ``fine``: divisor of the texel size of the near shadow map.
+        ``taps``: ``shadow_taps`` of :class:`vinesim.kernels.shading.deferred.Light`; ``period``: least time [s] between
+        redraws of shadows; ``fine``: divisor of the texel size of the near shadow map.
         """
         self._path: SunPath = sun if callable(sun) else lambda time: sun
         self.period = period
@@ -284,7 +299,7 @@ class Sunlight:
         self.balance = np.ones(3)
         """White balance: factors [3] on linear light."""
         self.brightness = 1.0
-        """Light that falls on the ground, relative to that at noon."""
+        """Illuminance of the ground, relative to noon."""
         light = deferred.Light()
         light.shadow_taps = taps
         k = np.arange(max(taps, 1))
@@ -297,14 +312,14 @@ class Sunlight:
         workers = workers or ThreadPool(1)
         side = 1024 * fine
         self.depth = wp.empty(side * side + 1024 * 1024, dtype=float, device=device)
-        """Depths of both shadow maps [texel]: the near one, then the far one."""
+        """[texel] Depths [m] of the near shadow map, followed by those of the far one."""
         near = self.depth[: side * side]
         far = self.depth[side * side :]
         self._near = ShadowSquare(0.007 / fine, side, 2.5, 0.8, True, near, device, workers)
         self._far = ShadowSquare(0.035, 1024, 12.0, 4.0, False, far, device, workers)
 
     def _update_light(self, time: float) -> None:
-        """Compute the light again if the sun has moved."""
+        """Compute the daylight again if the sun has moved by a quarter of a degree since the last time."""
         direction = np.asarray(self._path(time), float)
         direction = direction / np.linalg.norm(direction)
         if direction @ self._direction > _MIN_COS_CHANGE:
@@ -330,7 +345,8 @@ class Sunlight:
     def update(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
-        """The fine and the coarse shadow map for a camera at ``eye`` that looks along ``forward``."""
+        """Update the light, and return the fine and the coarse shadow map for a camera at ``eye`` [3] m that looks
+        along ``forward`` [3]."""
         self._update_light(time)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)

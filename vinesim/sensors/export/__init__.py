@@ -1,1 +1,1 @@
-"""Pictures and annotations as files, data sets."""
+"""Files of pictures and annotations, and data sets."""

@@ -1,5 +1,5 @@
-"""Ground truth as files: JSON records, COCO with run-length masks, YOLO boxes, images of ids, and an overlay for
-people."""
+"""Ground truth in file formats: JSON records, COCO with run-length masks, YOLO boxes, images of ids, and an overlay to
+look at."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
 from vinesim.sensors.ground_truth import PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
-"""Fields of a bunch in annotations, in addition to those of COCO."""
+"""Fields of an annotated bunch in COCO files, in addition to the fields that COCO defines."""
 MIN_ANNOTATED_PIXELS = 16
-"""Least number of pixels that must show a bunch for it to be annotated (COCO, YOLO); records name all bunches."""
+"""Least number of visible pixels of an annotated bunch (COCO, YOLO); JSON records contain also smaller bunches."""
 
 CATEGORIES = [{"id": int(Organ.BUNCH), "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
-"""The categories of COCO; their ids are numbers of :class:`Organ`."""
+"""List of categories for COCO files; the ids are numbers of :class:`Organ`."""
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:
-    """A mask [height, width] as COCO's compressed run lengths."""
+    """Returns a mask [height, width] encoded as COCO's compressed run lengths."""
     from pycocotools import mask as coco
 
     encoded = coco.encode(np.asfortranarray(mask, np.uint8))
@@ -34,7 +34,8 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
 
 
 def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, Any]:
-    """Intrinsics as sensor_msgs/CameraInfo names them [px], and the pose of the optical frame in the world."""
+    """Returns intrinsics [px], named as in sensor_msgs/CameraInfo, and the ``pose`` [7] of the optical frame, for
+    JSON."""
     distortion, coefficients = distortion_model(info)
     return {
         "model": model,
@@ -52,9 +53,10 @@ def camera_record(model: str, info: CameraInfo, pose: np.ndarray) -> dict[str, A
 def bunch_records(
     truths: Iterable[BunchTruth], info: CameraInfo, ripeness: np.ndarray | None = None
 ) -> list[dict[str, Any]]:
-    """Bunches of one picture as JSON: metres in world axes; boxes are [column, row, width, height] px.
+    """Returns the ground truth of a picture's bunches for JSON: points in m in the world, boxes as [column, row, width,
+    height] px.
 
-    ``ripeness`` [bunch]: from 0, green, to 1, ripe; all are ripe unless given.
+    ``ripeness``: [bunch] from 0 (green) to 1 (ripe); None: all bunches are ripe.
     """
     return [
         {
@@ -88,8 +90,11 @@ def bunch_records(
 
 
 def actor_records(actors: list[dict[str, Any]], labels: np.ndarray) -> list[dict[str, Any]]:
-    """Records of the actors and boxes in a picture with these ``labels`` [height, width], with their pixels and visible
-    boxes."""
+    """Returns the records of those ``actors`` (and crates) that are visible in a picture, with pixel counts and
+    bounding boxes added.
+
+    ``labels``: [height, width] labels of the picture.
+    """
     found = []
     for one in actors:
         rows, columns = np.nonzero(labels == one["label"])
@@ -99,12 +104,13 @@ def actor_records(actors: list[dict[str, Any]], labels: np.ndarray) -> list[dict
 
 
 def _xywh(box: Box | None) -> list[int] | None:
-    """A box in COCO's format: column, row, width, height [px]."""
+    """Returns a bounding box in COCO's format: column, row, width, height [px]."""
     return None if box is None else [box[0], box[1], box[2] - box[0] + 1, box[3] - box[1] + 1]
 
 
 def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int) -> str:
-    """One line for each annotated bunch: class 0, middle and size of its visible box in shares of the picture."""
+    """Returns the text of a YOLO label file: for each annotated bunch a line with class 0, and centre and size of its
+    visible bounding box as shares of the picture's width and height."""
     lines = []
     for one in annotated_bunches(bunches):
         x, y, w, h = one["box"]
@@ -114,15 +120,15 @@ def yolo_labels(bunches: list[dict[str, Any]], width: int, height: int) -> str:
 
 
 def annotated_bunches(bunches: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The bunches of a record that are large enough to be annotated."""
+    """Returns those of the ``bunches`` in a record that have at least :data:`MIN_ANNOTATED_PIXELS` visible pixels."""
     return [one for one in bunches if one["pixels"] >= MIN_ANNOTATED_PIXELS]
 
 
 def coco_json(read: Callable[[], Iterable[dict[str, Any]]]) -> Iterator[str]:
-    """The text of a COCO instances (and keypoints) file, piece by piece, from the records of its images.
+    """Yield the text of a COCO instances (and keypoints) file, piece by piece, from the records of its images.
 
-    ``read`` yields the records of all images, in order. It is called twice, so that only one record at a time is in
-    memory.
+    ``read`` returns an iterator of the records of all images, in order. It is called twice, so that only one record at
+    a time is in memory.
     """
     info = {"description": "vinesim", "berry_pixels": MIN_BERRY_PIXELS, "least_pixels": MIN_ANNOTATED_PIXELS}
     yield f'{{"info": {json.dumps(info)}, "licenses": [], "categories": {json.dumps(CATEGORIES)},\n"images": ['
@@ -166,18 +172,21 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
 
 
 def encode_labels(labels: np.ndarray) -> np.ndarray:
-    """Labels [height, width] as RGB, with ``id = R + 256 G + 65536 B``, as in COCO's panoptic images."""
+    """Returns labels [height, width] encoded as RGB with ``id = R + 256 G + 65536 B``, as in COCO's panoptic images."""
     return np.stack([labels & 255, labels >> 8 & 255, labels >> 16 & 255], -1).astype(np.uint8)
 
 
 def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:
-    """[height, width] uint16: number of the berry in its bunch, plus one; 0 where no berry is seen."""
+    """Returns an image [height, width] uint16 with the berry's index in its bunch plus one, and 0 where no berry is
+    visible."""
     return (seen.berries + 1).astype(np.uint16)
 
 
 def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
-    """A picture with its ground truth drawn in: visible boxes in green, amodal boxes where they differ in white, cut
-    points as yellow discs (rings where hidden). Each bunch has its number, the berries seen and the hidden share.
+    """Returns the picture ``rgb`` with the ground truth drawn on it.
+
+    Visible boxes are green, amodal boxes that differ are white, cut points are yellow discs (rings where hidden). Text
+    at each bunch: index, visible and total number of berries, hidden share.
     """
     scale = max(1, round(1280 / rgb.shape[1]))
     image = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
@@ -202,6 +211,6 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
 
 
 def json_text(value: dict[str, Any]) -> str:
-    """A value as JSON, one line for each entry of the outermost object."""
+    """Returns ``value`` as JSON with one line for each entry of the outermost object."""
     lines = ",\n".join(f"  {json.dumps(k)}: {json.dumps(v)}" for k, v in value.items())
     return f"{{\n{lines}\n}}\n"

@@ -1,9 +1,10 @@
-"""Data sets: random pictures of random vineyards with their ground truth, in files that a killed run leaves whole.
+"""Data sets: random pictures of random vineyards with ground truth, in files that a killed run leaves complete.
 
-The content of an image follows from the plan and the image's number alone: any process may draw it, in any order, and
-gets the same bits. An image is complete when its record exists, which is written last, and its files have the sizes
-that the record names. So files that were deleted, truncated or half copied since then are drawn again. Checksums would
-also find changed bytes, but would read the whole data set at every start; sizes need one system call for each file.
+The content of an image depends only on the plan and the image's index: any process may render the images, in any order,
+with equal results. An image is complete when its record exists, which is written last, and its files have the sizes in
+the record. Files that were deleted, truncated or partly copied are rendered again. Checksums would also find changed
+bytes, but would require reading the whole data set at every start; a check of sizes needs one system call for each
+file.
 """
 
 from __future__ import annotations
@@ -39,46 +40,47 @@ from vinesim.sensors.sensor import SensorSetting, export_frame
 from vinesim.sensors.spec_file import SensorError
 
 IMAGES_PER_VINEYARD = 5
-"""Number of images of one vineyard before the next one is generated."""
+"""Number of images that are rendered of one vineyard, before the next vineyard is generated."""
 MIN_IMAGE_SIZE = 16
 MAX_IMAGE_SIZE = 4096
 """Largest width and height of pictures [px]; ``MIN_IMAGE_SIZE`` is the smallest."""
 CAMERA_HEIGHT = (0.7, 1.7)
-"""Height of the camera above the ground [m]: robots' arms and heads."""
+"""Lowest and highest height of the camera above the ground [m], as on arms and heads of robots."""
 BUNCH_DISTANCE = (0.35, 1.8)
-"""Distance from the camera to the bunch it looks at [m]."""
+"""Least and largest distance [m] from the camera to the bunch at which it looks."""
 MAX_ACTOR_DISTANCE = 2.5
-"""Largest horizontal distance [m] from the centre of the activity to the bunch in view."""
+"""Largest horizontal distance [m] from the actors' place of work to the bunch in view."""
 MIN_CLEARANCE = 0.15
-"""A picture is rejected if more than a fiftieth of it is nearer than this [m]."""
+"""Depth [m] below which at most a fiftieth of a picture's pixels may be; other views are rejected."""
 LATITUDE = np.radians(41.6)
 """Latitude [rad] of the vineyards near Aprilia, Italy, where CANOPIES picks; it determines the sun's path."""
 MIN_ACTOR_SHARE = 0.01
-"""Least share of the pixels that show actors or boxes, in pictures of scenes that have some."""
+"""Least share of a picture's pixels that show actors or boxes, in scenes that have any."""
 _MAX_TRIES = 60
 _TRIES_WITH_ACTORS = 30
 _FOLDERS = ("images", "labels", "depth", "measured", "ids", "berries", "records")
 _SUFFIXES = {"labels": ".txt", "records": ".json"}
-"""Suffixes of the files in folders that hold no PNGs."""
+"""File suffixes in the folders of a data set that do not contain PNG files."""
 SPLITS = ("train", "val", "test")
 _VAL_VINEYARD = 1
 _TEST_VINEYARD = 2
 _SPLIT_PERIOD = 10
-"""Of every ten vineyards in the order of their numbers, the second is for validation and the third for tests."""
+"""Number of vineyards after which the split repeats: the second of them is for validation, the third for tests."""
 
 
 class DatasetError(SensorError):
-    """A data set cannot be made or continued. The text is one line."""
+    """Error: a data set cannot be made or continued. The message is one line."""
 
 
 def split_of(image: int) -> str:
-    """The split that an image belongs to: one for all images of a vineyard, whatever the number of images."""
+    """Returns the split (``train``, ``val``, ``test``) of an image; all images of a vineyard belong to one split."""
     place = image // IMAGES_PER_VINEYARD % _SPLIT_PERIOD
     return {_VAL_VINEYARD: "val", _TEST_VINEYARD: "test"}.get(place, "train")
 
 
 def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
-    """Intrinsics of a camera at another size [px]: with the same horizontal field of view, and square pixels."""
+    """Returns the intrinsics of a camera whose picture has another ``size`` [px], with an equal horizontal field of
+    view and square pixels."""
     width, height = size or (int(spec.width.value), int(spec.height.value))
     if not (MIN_IMAGE_SIZE <= width <= MAX_IMAGE_SIZE and MIN_IMAGE_SIZE <= height <= MAX_IMAGE_SIZE):
         raise SensorError(
@@ -89,40 +91,41 @@ def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> Camera
 
 
 class SnapshotSource(Protocol):
-    """Random scenes with actors and wind. Sensors draw the snapshots and do not depend on how they are made."""
+    """Interface of a generator of random scenes with actors and wind, which provides the snapshots that sensors
+    render."""
 
     def settings(self) -> dict[str, Any]:
-        """All settings that decide the scenes, as JSON."""
+        """Returns all settings that determine the scenes, for JSON."""
         ...
 
     def snapshot(self, model: Model, rng: np.random.Generator) -> tuple[Snapshot, np.ndarray, dict[str, Any]] | None:
-        """A snapshot, the point [2] m of the ground to look at, and a record of the scene; None for the vineyard at
-        rest.
+        """Returns a snapshot, the point [2] m of the ground near which the camera shall look, and a record of the
+        scene.
 
-        The result follows from the model and the random numbers alone. ``actors`` of the record have the form that
-        :func:`formats.actors` takes.
+        None stands for the vineyard at rest. The result depends only on ``model`` and the random numbers of ``rng``.
+        Entry ``actors`` of the record has the form that :func:`formats.actor_records` takes.
         """
         ...
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class DatasetPlan:
-    """The settings of a data set. Image ``n`` of equal plans is the same image."""
+    """The settings of a data set. Equal plans have equal images."""
 
     scene: Scene
     seed: int
     camera: str
     size: tuple[int, int] | None = None
-    """Width and height [px]; the camera's own unless given."""
+    """Width and height of the pictures [px]; None: those of the camera."""
     snapshot_source: SnapshotSource | None = None
-    """Actors and wind; without it all plants hang at rest."""
+    """Generator of scenes with actors and wind; None: all plants hang at rest."""
     renderer: str = "warp"
     device: str = "cpu"
     sensors: tuple[RenderedMount, ...] = ()
-    """Further sensors that look from the camera's place."""
+    """Further sensors, which are rendered from the camera's pose."""
 
     def settings(self) -> dict[str, Any]:
-        """All settings that decide the images, as JSON."""
+        """Returns all settings that determine the images, for JSON."""
         info = resized_intrinsics(CameraSpec.load(self.camera), self.size)
         return {
             "vinesim": __version__,
@@ -131,14 +134,14 @@ class DatasetPlan:
             "camera": self.camera,
             "size": [info.width, info.height],
             "renderer": self.renderer,
-            "device": self.device.partition(":")[0],  # the same on each of several GPUs
+            "device": self.device.partition(":")[0],  # without the index, because all GPUs render equal images
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
         }
 
     def vineyard(self, number: int) -> Scene:
-        """The scene with another seed, other leaves and varieties: one row of each variety that there is, in any
-        order."""
+        """Returns the scene of vineyard ``number``: with its own seed and leaves, and one row of each grape variety in
+        random order."""
         rng = np.random.default_rng([self.seed, 1, number])
         names = [VARIETIES[k].name for k in rng.permutation(len(VARIETIES))]
         season = Season(leafiness=round(rng.uniform(0.5, 1.0), 3), yellow=round(rng.uniform(0.0, 0.5), 3))
@@ -147,7 +150,7 @@ class DatasetPlan:
 
 
 class VineyardRenderer:
-    """One vineyard of a plan, ready to be rendered."""
+    """Generates one vineyard of a plan and renders its images."""
 
     def __init__(self, plan: DatasetPlan, number: int) -> None:
         self.plan = plan
@@ -164,7 +167,7 @@ class VineyardRenderer:
         self.info = resized_intrinsics(self.spec, plan.size)
 
     def write_image(self, image: int, folder: pathlib.Path) -> None:
-        """Write all files of one image, its record last."""
+        """Render image ``image`` and write all its files into ``folder``, the record last."""
         rng = np.random.default_rng([self.plan.seed, 2, image])
         hour, sun = _random_sun(rng)
         snapshot, near, activity = self._pose_scene(image)
@@ -222,8 +225,10 @@ class VineyardRenderer:
         write_files({folder / name: [data] for name, data in files.items()})
 
     def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
-        """Pose the primitives for one image, independently of the image before. Returns snapshot, place [2] m, and
-        record."""
+        """Pose the primitives for one image, whatever image was rendered before.
+
+        Returns the snapshot, the point [2] m of the ground near which to look (None: anywhere), and the scene's record.
+        """
         all_trees = np.arange(len(self.model.tree_first))
         self.primitives.update(self.rest, all_trees)
         source = self.plan.snapshot_source
@@ -236,10 +241,10 @@ class VineyardRenderer:
     def _choose_view(
         self, rng: np.random.Generator, snapshot: Snapshot, near: np.ndarray | None, actors: list[tuple[float, float]]
     ) -> ground_truth.PixelBuffers:
-        """A view from a free place near a hanging bunch, with that bunch in sight.
+        """Returns the view of a random hanging bunch from a free place near it, in which the bunch is visible.
 
-        If there are actors, the bunch hangs ``near`` them, and one of the ``actors`` [m] is in sight too, provided
-        that such a place is soon found.
+        ``near``: point [2] m of the ground near which the bunch hangs; ``actors``: positions [m], one of which is in
+        view too, unless too many tries fail.
         """
         model = self.model
         hanging = np.flatnonzero(snapshot.bunch_attached)
@@ -255,7 +260,7 @@ class VineyardRenderer:
             height = rng.uniform(*CAMERA_HEIGHT)
             away = rng.uniform(*BUNCH_DISTANCE)
             around = rng.uniform(0.0, 2.0 * np.pi)
-            if actors and attempt < _TRIES_WITH_ACTORS:  # a person is behind the bunch
+            if actors and attempt < _TRIES_WITH_ACTORS:  # look from the side opposite to an actor
                 behind = np.array(actors[rng.integers(len(actors))]) - middle[:2]
                 around = np.arctan2(-behind[1], -behind[0]) + rng.normal(0.0, 0.3)
             rise = height - middle[2]
@@ -281,8 +286,8 @@ class VineyardRenderer:
 
 
 def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, float]]:
-    """A random hour of solar time [h] on a day from August to October, and the direction towards the sun, 6 degrees up
-    or more."""
+    """Returns a random solar time [h] on a day from August to October, and the unit vector towards the sun, which is at
+    least 6 degrees high."""
     declination = np.radians(rng.uniform(-8.0, 16.0))
     lowest = np.sin(np.radians(6.0)) - np.sin(LATITUDE) * np.sin(declination)
     half_day = float(np.degrees(np.arccos(lowest / (np.cos(LATITUDE) * np.cos(declination))))) / 15.0
@@ -294,21 +299,22 @@ def _random_sun(rng: np.random.Generator) -> tuple[float, tuple[float, float, fl
 
 
 class _RecordedFiles(msgspec.Struct):
-    """The part of a record that lists the files of its image."""
+    """The part of an image's JSON record that lists the image's files."""
 
     files: dict[str, int]
-    """Size of each file [B], by name."""
+    """Size of each file [byte], by path relative to the data set's folder."""
 
 
 def _file_of(kind: str, image: int) -> str:
-    """Path of a file of an image, relative to the data set's folder."""
+    """Returns the path of the file of an image in folder ``kind``, relative to the data set's folder."""
     return f"{kind}/{image:06d}{_SUFFIXES.get(kind, '.png')}"
 
 
 def prepare_folder(plan: DatasetPlan, folder: pathlib.Path, images: int) -> None:
-    """Make the folder for a number of images, or continue one that was begun with the same plan and has no more images.
+    """Create the folder of a data set with ``images`` images, or prepare to continue one that exists.
 
-    :class:`DatasetError` if neither is possible.
+    An existing folder must have been begun with the same plan, and must not contain more images. Raises
+    :class:`DatasetError` otherwise.
     """
     file = folder / "dataset.json"
     settings = plan.settings()
@@ -345,8 +351,8 @@ def _check_same_settings(file: pathlib.Path, wanted: dict[str, Any]) -> None:
 
 
 def _check_no_more_images(folder: pathlib.Path, images: int) -> None:
-    """Refuse fewer images than the folder holds: readers of its lists and readers of its folders would see different
-    data sets."""
+    """Raise :class:`DatasetError` if the folder contains more than ``images`` images, because its lists would then not
+    name all images in its folders."""
     records = (path.stem for path in (folder / "records").glob("*.json"))
     there = 1 + max((int(stem) for stem in records if stem.isdigit()), default=-1)
     if images < there:
@@ -357,12 +363,13 @@ def _check_no_more_images(folder: pathlib.Path, images: int) -> None:
 
 
 def missing_images(folder: pathlib.Path, images: int) -> list[int]:
-    """Numbers of the first ``images`` images that are missing, or whose files are no longer as they were written."""
+    """Returns the indices of those among the first ``images`` images that are missing or have missing or changed
+    files."""
     return [n for n in range(images) if not _is_whole(folder, n)]
 
 
 def _is_whole(folder: pathlib.Path, image: int) -> bool:
-    """Whether the record of an image is there, and each of its files has the size that the record says."""
+    """Returns whether the record of an image exists, and each of the image's files has the size in the record."""
     expected = {_file_of(kind, image) for kind in _FOLDERS if kind != "records"}
     try:
         record = msgspec.json.decode((folder / _file_of("records", image)).read_bytes(), type=_RecordedFiles)
@@ -374,8 +381,10 @@ def _is_whole(folder: pathlib.Path, image: int) -> bool:
 
 
 def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]) -> Iterator[int]:
-    """Render images, in order; yields the number of each image when it is done. :class:`WriteError` if one cannot be
-    written."""
+    """Render and write ``images`` in order, and yield the index of each image when it is complete.
+
+    Raises :class:`WriteError` if an image cannot be written.
+    """
     number = -1
     vineyard = None
     for image in images:
@@ -390,10 +399,11 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
 
 
 def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
-    """Write ``annotations.json`` (COCO) from the records of the first ``images`` images; ``data.yaml`` (YOLO); its
-    lists.
+    """Write ``annotations.json`` (COCO) from the records of the first ``images`` images, ``data.yaml`` (YOLO) and the
+    lists of images that ``data.yaml`` names.
 
-    Returns the path of the annotations. :class:`WriteError` if one of these files cannot be written; then none is.
+    Returns the path of ``annotations.json``. Raises :class:`WriteError` if one of the files cannot be written; then no
+    file is written.
     """
 
     def read() -> Iterator[dict[str, Any]]:
@@ -401,7 +411,7 @@ def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
             yield json.loads((folder / _file_of("records", number)).read_text(encoding="utf-8"))
 
     target = folder / "annotations.json"
-    # Without `path`, Ultralytics takes the folder of data.yaml. It resolves a relative `path` from where it runs.
+    # Without `path`, Ultralytics uses the folder of data.yaml; a relative `path` would count from its working folder.
     yaml = "".join(f"{split}: {split}.txt\n" for split in SPLITS) + "names:\n  0: bunch\n"
     files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, formats.coco_json(read))}
     for split in SPLITS:  # `./` is relative to the list

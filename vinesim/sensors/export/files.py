@@ -1,4 +1,4 @@
-"""Files that are never seen half-written: they are written under other names, and renamed when all are complete."""
+"""Atomic writing of files: they are written under temporary names, and renamed when all of them are complete."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from collections.abc import Iterable, Mapping
 
 
 def write_files(files: Mapping[pathlib.Path, Iterable[bytes]]) -> None:
-    """Write files from their pieces; they appear in the given order, when all are complete.
+    """Write several files, each given as pieces of bytes; they appear in the given order when all of them are complete.
 
-    :class:`OSError` if one cannot be written; then files that were there before stay as they were.
+    Raises :class:`OSError` if a file cannot be written; then existing files do not change.
     """
     parts = {path: path.with_name(f".{path.name}.{os.getpid()}.part") for path in files}
     try:
@@ -27,7 +27,7 @@ def write_files(files: Mapping[pathlib.Path, Iterable[bytes]]) -> None:
 
 
 def remove_partial_files(folder: pathlib.Path) -> None:
-    """Remove the half-written files that killed processes have left anywhere in a folder, as far as possible."""
+    """Delete the partial files that killed processes have left in a folder and its subfolders, as far as possible."""
     for part in folder.glob("**/.*.part"):
         _remove(part)
 

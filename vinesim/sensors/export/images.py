@@ -1,5 +1,4 @@
-"""Pictures as files: colour, depth (as colours, and as raw millimetres) and label colours; and overview pictures of a
-scene."""
+"""PNG files of pictures: colour, depth (as colours and as millimetres), label colours; overview pictures of a scene."""
 
 from __future__ import annotations
 
@@ -20,7 +19,8 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 def look_at(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """Pose [7] of an optical frame at ``eye`` that looks ``at`` a point, with a level horizon."""
+    """Returns the pose [7] of an optical frame at ``eye`` [3] m that looks at the point ``at`` [3] m, with a level
+    horizon."""
     eye = np.asarray(eye, float)
     at = np.asarray(at, float)
     forward = frames.normalize(at - eye)
@@ -31,7 +31,8 @@ def look_at(eye: np.ndarray, at: np.ndarray) -> np.ndarray:
 
 
 def depth_colours(depth: np.ndarray, farthest: float = 6.0) -> np.ndarray:
-    """Depth [height, width] m as RGB: near is red, ``farthest`` [m] blue; unmeasured black, too far white."""
+    """Returns depth [height, width] m as RGB: from red (near) to blue (``farthest`` [m]), NaN black, beyond range
+    white."""
     with np.errstate(invalid="ignore"):
         share = np.clip(1.0 - depth / farthest, 0.0, 1.0)
     tone = np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0) * 255.0
@@ -59,8 +60,8 @@ _ORGAN_COLOUR = {
 
 
 def label_colours(labels: np.ndarray) -> np.ndarray:
-    """Labels [height, width] as RGB: one colour for each organ. The instance changes its brightness, or for bunches its
-    hue."""
+    """Returns labels [height, width] as RGB: a colour for each organ, varied in brightness (for bunches in hue) by
+    instance."""
     organ = labels // LABEL_STRIDE
     index = labels % LABEL_STRIDE
     table = np.array([_ORGAN_COLOUR[o] for o in Organ], np.float32)
@@ -75,7 +76,7 @@ def label_colours(labels: np.ndarray) -> np.ndarray:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """RGB uint8 or grey uint16 as a PNG file; :class:`ValueError` for anything else."""
+    """Returns an image, RGB uint8 or grey uint16, encoded as PNG; :class:`ValueError` for other types."""
     data = image[..., ::-1] if image.ndim == 3 else image
     done, encoded = cv2.imencode(".png", np.ascontiguousarray(data))
     if not done:
@@ -86,16 +87,18 @@ def encode_png(image: np.ndarray) -> bytes:
 
 
 def write_png(path: str | pathlib.Path, image: np.ndarray) -> pathlib.Path:
-    """Write RGB uint8 or grey uint16; :class:`OSError` if the path cannot be written, with nothing half-written."""
+    """Write an image, RGB uint8 or grey uint16, as a PNG file. Raises :class:`OSError` without leaving a partial
+    file."""
     path = pathlib.Path(path)
     write_files({path: [encode_png(image)]})
     return path
 
 
 def save_frame(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "frame") -> list[pathlib.Path]:
-    """Write ``<stem>_rgb``, ``_depth`` (colours), ``_depth_mm`` (16UC1) and ``_labels`` PNGs; returns their paths.
+    """Write the PNG files ``<stem>_rgb``, ``<stem>_depth`` (colours), ``<stem>_depth_mm`` (16UC1) and
+    ``<stem>_labels``.
 
-    An empty ``stem`` leaves plain names: ``rgb.png`` and so on.
+    With an empty ``stem`` the names are ``rgb.png`` and so on. Returns the paths.
     """
     folder = pathlib.Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -110,7 +113,8 @@ def save_frame(frame: CameraFrame, folder: str | pathlib.Path, stem: str = "fram
 
 
 def overview_pose(model: Model) -> np.ndarray:
-    """Pose [7] of an optical frame that gives an overview of a scene: in the alley, at eye height, along the rows."""
+    """Returns the pose [7] of an optical frame for an overview of a scene: in the alley, at eye height, looking along
+    the rows."""
     spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2], np.zeros((1, 2))])
     low = spots.min(0)
     high = spots.max(0)
@@ -132,9 +136,9 @@ def render_overview(
     quality: str = "still",
     primitives: Primitives | None = None,
 ) -> np.ndarray:
-    """A picture of a scene [height, width, 3]; written to ``out`` if given.
+    """Render a picture of a scene [height, width, 3] uint8, and write it to the file ``out`` if given.
 
-    ``pose`` [7] is the optical frame (default :func:`overview_pose`), ``view_angle`` the horizontal field of view
+    ``pose``: [7] pose of the optical frame (default :func:`overview_pose`); ``view_angle``: horizontal field of view
     [rad].
     """
     primitives = primitives or Primitives(model)

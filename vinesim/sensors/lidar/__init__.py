@@ -1,1 +1,1 @@
-"""Spinning lidars."""
+"""Spinning lidars: firings, rasterised rays, echoes and returns, scans of a moving world."""

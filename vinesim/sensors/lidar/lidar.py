@@ -1,11 +1,11 @@
-"""Spinning lidars: firing times and angles from a table, beams with a width, echoes, and what is reported.
+"""Spinning lidars: firing times and angles from a table, beams with a width, echoes and reported returns.
 
-Each shot is a handful of rays over the beam's footprint. Surfaces that are closer to each other along the beam than the
-pulse is long give one echo, whose range lies in between: these are the mixed returns at the edges of leaves. Points are
-raw, as drivers give them: each in the lidar's frame at its own firing, with the time of that firing.
+Each laser shot is sampled by a few rays over the beam's footprint. Surfaces that are closer to each other along the
+beam than the pulse is long cause one echo with a range in between: the mixed returns at edges of leaves. Points are
+raw, as in the messages of lidar drivers: each in the lidar's frame at the time of its own firing, with that time.
 
-The code has two exchangeable halves: a :class:`RayGrid` finds the surfaces that rays meet, a :class:`Lidar` computes
-the returns.
+Two classes share the work and can be exchanged: a :class:`RayGrid` finds the surfaces that rays hit, and a
+:class:`Lidar` computes the returns.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from vinesim.sensors.sensor import SensorMaker, SensorSetting
 from vinesim.sensors.spec_file import Numbers
 
 MAX_RAYS = 8
-"""Most rays of one shot."""
+"""Largest number of rays that sample one laser shot."""
 FOOTPRINT_RANGE = 3.0
-"""Range at which beams have their real width [m]. All rays leave from one point, so beams are narrower at less range,
-and wider at more."""
+"""Range [m] at which the simulated beam has the real width. All rays start from one point, so the simulated beam is
+narrower than the real one at shorter range, and wider at longer range."""
 MAX_SHARED_TRANSLATION = 4e-3
 MAX_SHARED_ROTATION = 3.5e-3
-"""[rad] Successive firings share one pose, that of the middle firing, if the lidar turns by less than this between them
-and moves by less than ``MAX_SHARED_TRANSLATION`` [m].
+"""Rotation [rad] of the lidar's mount between firings below which the firings are computed from one pose, that of the
+middle firing; ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
 
-The error is at most half a step of the head, and the clusters nearby need not be searched for every firing.
+The error is at most half a step of the head, and clusters nearby need not be searched for every firing.
 """
 _BANDS_PER_THREAD = 2
 """Average number of bands of firings for each thread. A thread that has finished a band takes the next one."""
@@ -52,15 +52,15 @@ _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
 class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One kind of lidar (``data/lidars``)."""
+    """The data sheet of one model of lidar, from a file in ``data/lidars``."""
 
     model: str
     elevation: Annotated[Numbers, "deg", (-90.0, 90.0)]
     """Elevation of each laser, in the order of firing."""
     azimuth: Annotated[Numbers, "deg", (-180.0, 180.0)] | None = None
-    """Azimuth of each laser, counter-clockwise from the direction of the head."""
+    """Azimuth of each laser, counter-clockwise from the direction of the head; None: all zero."""
     laser_period: Annotated[Number, "s", (0.0, 0.01)]
-    """Time between the shots of two lasers."""
+    """Time between the shots of two successive lasers within a firing."""
     firing_period: Annotated[Number, "s", (1e-6, 0.1)]
     """Time between two firings; a firing is one shot of every laser."""
     rate: Annotated[Number, "Hz", (0.1, 200.0)]
@@ -68,27 +68,27 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     nearest: Annotated[Number, "m", (0.0, 100.0)]
     farthest: Annotated[Number, "m", (0.1, 500.0)]
     rays: Annotated[Number, "1", (1, MAX_RAYS)]
-    """Number of rays of one shot."""
+    """Number of rays that sample one laser shot."""
     aperture: Annotated[Numbers, "m", (0.0, 0.1)]
     """Width and height of the beam where it leaves the lidar."""
     divergence: Annotated[Numbers, "mrad", (0.0, 50.0)]
-    """Growth of width and height with range: full angles, to 1/e^2 of the power on the axis."""
+    """Full angles of divergence of the beam, horizontal and vertical, at 1/e^2 of the power on the axis."""
     merge: Annotated[Number, "m", (0.0, 10.0)]
-    """Surfaces that are closer to each other than this along the beam give one echo."""
+    """Distance along the beam below which two surfaces cause one echo."""
     separation: Annotated[Number, "m", (0.0, 10.0)]
     """Least distance along the beam between two returns of one shot."""
     returns: Literal["strongest", "last", "dual"] = "strongest"
     """Which echoes of a shot are reported; ``dual``: the strongest and the last, or the two strongest."""
     noise: Annotated[Number, "m", (0.0, 1.0)]
-    """Standard deviation of the range of a strong echo."""
+    """Least standard deviation of the range, that of a strong echo."""
     weak_noise: Annotated[Number, "m", (0.0, 1.0)]
-    """Standard deviation of the range of the weakest echo. Between the strongest and the weakest echo it falls with the
-    root of the signal."""
+    """Standard deviation of the range of the weakest detectable echo; for stronger echoes it decreases with the square
+    root of the signal, down to ``noise``."""
     step: Annotated[Number, "m", (0.0, 1.0)]
-    """Resolution of the range."""
+    """Quantisation step of the range."""
     weakest: Annotated[Number, "1/m^2", (0.0, 1.0)]
-    """Signal from which on an echo is detected: reflectance, times the cosine of the incidence angle, over the square
-    of the range."""
+    """Signal from which an echo is detected; the signal is reflectance times the cosine of the incidence angle, divided
+    by the square of the range."""
     flicker: Annotated[Number, "1", (0.0, 2.0)]
     """Standard deviation of the logarithm of the signal, from shot to shot."""
     reflectance: dict[str, Annotated[Number, "1"]]
@@ -96,7 +96,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
     @classmethod
     def load(cls, name: str) -> LidarSpec:
-        """The spec in the file ``name``, or the one of that name in ``data/lidars``."""
+        """Read a lidar's data sheet: ``name`` is the path of a file, or the name of a file in ``data/lidars``."""
         spec = spec_file.load("lidars", name, cls)
         organs = {o.name.lower() for o in Organ if o != Organ.NOTHING}
         if set(spec.reflectance) != organs:
@@ -109,7 +109,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
                 raise spec_file.SensorError(f"{name}: reflectance.{what} is {organ.value:g}; give 0 to 10")
         if not spec.nearest.value < spec.farthest.value:
             raise spec_file.SensorError(
-                f"{name}: measures from {spec.nearest.value} to {spec.farthest.value} m, which is no range; "
+                f"{name}: measures from {spec.nearest.value} to {spec.farthest.value} m, an empty range; "
                 "give nearest < farthest"
             )
         lasers = len(spec.elevation.value)
@@ -124,7 +124,8 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return spec
 
     def ideal(self) -> LidarSpec:
-        """The same table of firings, with thin beams that measure exactly and detect every echo."""
+        """Returns the data sheet of a lidar with equal firings whose beams have no width, measure exactly and detect
+        every echo."""
 
         def but(number: Number, value: float) -> Number:
             return msgspec.structs.replace(number, value=value)
@@ -137,26 +138,27 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class RayGrid(Protocol):
-    """Finds the surfaces that the rays of a turning head meet.
-    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer` unless another one is given."""
+    """Interface of an object that finds the surfaces that the rays of a spinning head hit, such as
+    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer`."""
 
     direction: wp.array
     """[column * row] Unit vectors of the rays, in the head's frame."""
     distance: wp.array
-    """[column * row] m Distance to the nearest hit of each ray."""
+    """[column * row] Distance to the nearest hit of each ray [m]."""
     primitive: wp.array
-    """[column * row] Index of the primitive that each ray meets; -2 for the ground, -1 for nothing."""
+    """[column * row] Index of the primitive that each ray hits; -2: the ground, -1: no hit."""
 
     def cast(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
-        """Fill distances and primitives of ``count`` columns from ``first`` on, with the head at ``pose`` [7].
+        """Compute distances and primitives of ``count`` columns from column ``first`` on, with the head at ``pose``
+        [7].
 
-        Several threads may call it at the same time for different columns.
+        ``reach``: largest distance of a hit [m]. Several threads may call this at the same time for different columns.
         """
         ...
 
 
 class Lidar:
-    """One lidar: a table of firings, and the returns of the present revolution."""
+    """One spinning lidar: its table of firings, and the returns of the present revolution."""
 
     def __init__(
         self,
@@ -169,11 +171,11 @@ class Lidar:
         threads: int | None = None,
         grid: Callable[[np.ndarray, np.ndarray, float, int, str], RayGrid] = LidarRasterizer,
     ) -> None:
-        """Noise follows from (``seed``, ``name``, number of the revolution).
+        """``seed`` and ``name`` determine the noise of each revolution.
 
-        ``threads``: number of CPU threads that share the shots; unless given, the number of cores that this process may
-        use, up to four. The result is the same to the bit for every number.
-        ``grid(elevation, azimuth, step, columns, device)`` makes the :class:`RayGrid`: see :class:`LidarRasterizer`.
+        ``threads``: number of CPU threads that share the firings, without effect on the result; None: the number of
+        cores that this process may use, at most four. ``grid(elevation, azimuth, step, columns, device)`` makes the
+        :class:`RayGrid`; its arguments are those of :class:`LidarRasterizer`.
         """
         self.spec = spec
         self.name = name
@@ -181,9 +183,9 @@ class Lidar:
         self.device = device
         self.seed = seed
         self.is_exact = False
-        """Whether later revolutions measure exactly what the middle of each beam meets."""
+        """Whether revolutions that begin later measure exactly, without noise and along the middle of each beam."""
         self.revolution = 0
-        """Number of the present revolution."""
+        """Index of the present revolution."""
         self.lasers = len(spec.elevation.value)
         self.firing_period = spec.firing_period.value
         """Time between two firings [s]."""
@@ -192,7 +194,7 @@ class Lidar:
         within = np.arange(self.lasers) * spec.laser_period.value
         offset = np.arange(self.firings)[:, None] * spec.firing_period.value + within
         self.offset = offset.ravel().astype(np.float32)
-        """[shot] s Time of each shot after the first."""
+        """[shot] Time of each shot after the first shot of the revolution [s]."""
         elevation = np.radians(spec.elevation.value)
         order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
         self.ring = np.tile(order, self.firings).astype(np.uint16)
@@ -210,7 +212,7 @@ class Lidar:
             spec.nearest.value,
             spec.farthest.value,
         )
-        """The laser nearest to the horizontal."""
+        """Properties of the laser that is nearest to the horizontal, for 2D scans."""
         across, up = self._footprint()
         self.ray_grid = grid(
             (elevation[:, None] + up).ravel(),
@@ -219,12 +221,12 @@ class Lidar:
             self.firings,
             device,
         )
-        """Finds what the rays meet. It has a column for each firing; a column has the rays of each laser's shot."""
+        """Finds the hits of the rays. It has a column for each firing, with all rays of all lasers' shots as rows."""
         self._workers = ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1)
-        wp.load_module(lidar_echoes, device=device)  # threads must not do so at the same time
+        wp.load_module(lidar_echoes, device=device)  # here, because only one thread may load a module at a time
         self._measuring, self._exact = self._receiver_parameters(spec), self._receiver_parameters(spec.ideal())
         self._receiver = self._measuring
-        """Receiver of the present revolution."""
+        """Parameters of the receiver in the present revolution: with errors, or exact."""
         kept = 2 if spec.returns == "dual" else 1
         self._noise = wp.zeros((len(self.offset), 3), dtype=float, device=device)
         self._xyz = wp.zeros((len(self.offset), kept), dtype=wp.vec3, device=device)
@@ -232,9 +234,10 @@ class Lidar:
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
 
     def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
-        """Offset of each ray of a shot in its beam, across and up [ray] rad: one in the middle, the others on a ring.
+        """Returns the angles [ray] rad across and up of each ray of a shot from the beam's axis.
 
-        Each ray has an equal share of the energy of a Gaussian beam.
+        The first ray is along the axis, all others are on a ring around it. Each ray represents an equal share of the
+        energy of a Gaussian beam.
         """
         count = round(self.spec.rays.value)
         ring = np.sqrt(-0.5 * np.log(0.5 * (1.0 - 1.0 / count))) if count > 1 else 0.0
@@ -244,8 +247,8 @@ class Lidar:
         return np.append(0.0, ring * wide * np.cos(turn)), np.append(0.0, ring * high * np.sin(turn))
 
     def _receiver_parameters(self, spec: LidarSpec) -> lidar_echoes.Receiver:
-        """Parameters of the receiver for the numbers of ``spec``. It evaluates as many rays of each shot as ``spec``
-        has."""
+        """Returns the kernel's receiver parameters for data sheet ``spec``; ``spec.rays`` rays of each shot are
+        evaluated."""
         receiver = lidar_echoes.Receiver()
         reflectance = np.zeros(len(Organ), np.float32)
         for organ, number in spec.reflectance.items():
@@ -264,22 +267,24 @@ class Lidar:
         return self.spec.rate.value
 
     def scan(self, primitives: Primitives, pose: np.ndarray, time: float = 0.0) -> LidarScan:
-        """One revolution from ``pose`` [7] of the lidar in the world (x forward, z up), with everything at rest."""
+        """Compute one revolution from ``pose`` [7] of the lidar in the world (x forward, z up), in a world that stands
+        still, with ``time`` [s] as the time of the first firing."""
         pose = np.array(pose, float)
         self.begin_revolution()
         self.fire(primitives, 0, np.broadcast_to(pose, (self.firings, 7)))
         return self.finish_revolution(pose, time)
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> LidarScan:
-        """See :class:`vinesim.sensors.sensor.Sensor`. The frame is a revolution with everything at rest."""
+        """Compute a frame as :class:`vinesim.sensors.sensor.Sensor` defines it: one revolution in a world that stands
+        still."""
         return self.scan(primitives, pose, snapshot.time)
 
     def sweep(self, rate: float | None) -> SpinningScan:
-        """See :class:`vinesim.sensors.sensor.SweptSensor`."""
+        """Returns a sweep as :class:`vinesim.sensors.sensor.SweptSensor` defines it: revolutions in a moving world."""
         return SpinningScan(self, rate)
 
     def begin_revolution(self) -> None:
-        """Begin a new revolution. It measures exactly if :attr:`is_exact`, else with the errors of the lidar."""
+        """Begin a new revolution, which measures exactly if :attr:`is_exact`, else with the errors of the lidar."""
         self._receiver = self._exact if self.is_exact else self._measuring
         noise = spec_file.noise_rng(self.seed, self.name, self.revolution).standard_normal(
             (len(self.offset), 3), np.float32
@@ -287,7 +292,7 @@ class Lidar:
         self._noise.assign(noise)
 
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
-        """Fire the firings from ``first`` on, one for each pose [firing, 7] of the lidar."""
+        """Compute the firings from index ``first`` on, one for each pose in ``poses`` [firing, 7] of the lidar."""
         poses = np.array(poses, float)
         if not np.isfinite(poses).all():
             wrong = poses[~np.isfinite(poses).all(1)][0]
@@ -299,7 +304,8 @@ class Lidar:
             self._fire(primitives, first + start, len(part), part[len(part) // 2])
 
     def _firings_per_pose(self, poses: np.ndarray) -> int:
-        """Number of successive firings that may be taken from one place; it follows from the speed of the lidar."""
+        """Returns the number of successive firings that may be computed from one pose, because the lidar moves
+        slowly."""
         if len(poses) < 2:
             return 1
         way = np.linalg.norm(np.diff(poses[:, :3], axis=0), axis=1).max() / MAX_SHARED_TRANSLATION
@@ -307,7 +313,7 @@ class Lidar:
         return max(int(1.0 / max(way, turn, 1e-6)), 1)
 
     def _fire(self, primitives: Primitives, first: int, count: int, pose: np.ndarray) -> None:
-        """Fire ``count`` firings from one ``pose`` [7], in bands that threads take one after the other."""
+        """Compute ``count`` firings from index ``first`` on from one ``pose`` [7], in bands that threads share."""
         size = self._workers.size
         bands = max(min(_BANDS_PER_THREAD * size, count // _MIN_BAND), 1) if size > 1 else 1
         ends = [first + count * i // bands for i in range(bands + 1)]
@@ -315,7 +321,7 @@ class Lidar:
         self._workers.share([functools.partial(fire_band, i, j - i) for i, j in itertools.pairwise(ends)])
 
     def _fire_band(self, primitives: Primitives, pose: np.ndarray, first: int, count: int) -> None:
-        """Fire ``count`` firings from ``first`` on."""
+        """Compute ``count`` firings from index ``first`` on from one ``pose`` [7], in the calling thread."""
         grid = self.ray_grid
         grid.cast(primitives, pose, first, count, self.spec.farthest.value)
         wp.launch(
@@ -340,7 +346,8 @@ class Lidar:
         )
 
     def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
-        """The returns since :meth:`begin_revolution`. ``pose`` [7] and ``time`` [s] are those of the first firing."""
+        """Returns the scan since :meth:`begin_revolution`; ``pose`` [7] and ``time`` [s] are those of the first
+        firing."""
         labels = self._label.numpy()
         shot, which = np.nonzero(labels >= 0)
         self.revolution += 1

@@ -1,7 +1,7 @@
-"""A spinning head's rays, rasterised: the nearest primitive along each ray of a grid of azimuths and elevations.
+"""Rasteriser of a spinning lidar: finds the nearest primitive along each ray of a grid of azimuths and elevations.
 
-A row has the rays of one elevation; columns follow each other in even steps of azimuth. Each row has its own first
-azimuth, as have lasers that fire in turn, and the sub-rays of one beam. The test oracle is
+A row contains the rays of one elevation; columns are equal steps of azimuth. Each row has its own first azimuth,
+because lasers fire one after another and a beam consists of several rays. Tests compare the results with
 :class:`~vinesim.sensors.primitives.ray_caster.RayCaster`.
 """
 
@@ -11,6 +11,7 @@ import numpy as np
 import warp as wp
 
 from vinesim.core import frames
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.lidar import lidar_raster
 from vinesim.kernels.lidar.lidar_raster import ELEVATION_SLOTS, LidarHead
 from vinesim.kernels.raster import primitives as shapes
@@ -20,20 +21,20 @@ from vinesim.sensors.raster.camera_rasterizer import MAX_DEPTH
 
 
 def _as_floats(vectors: wp.array) -> wp.array:
-    """The memory of an array of vectors as plain numbers [n, 3]."""
+    """Returns a view of an array of vectors as scalars [n, 3]."""
     return wp.array(ptr=vectors.ptr, shape=(len(vectors), 3), dtype=float, device=vectors.device, copy=False)
 
 
 class LidarRasterizer:
-    """The rays of one revolution, and the latest hit of each."""
+    """The rays of one revolution of a lidar, and the last computed hit of each ray."""
 
     def __init__(
         self, elevation: np.ndarray, azimuth: np.ndarray, step: float, columns: int, device: str = "cpu"
     ) -> None:
-        """Ray (column k, row r) leaves at ``elevation[r]`` and ``azimuth[r] + k * step`` [rad], in the head's frame:
-        x forward, z up, azimuth counter-clockwise seen from above.
+        """The ray of column k and row r has ``elevation[r]`` and azimuth ``azimuth[r] + k * step`` [rad] in the head's
+        frame: x forward, z up, azimuth counter-clockwise seen from above.
         """
-        wp.load_module(lidar_raster, device=device)  # threads must not do so at the same time
+        wp.load_module(lidar_raster, device=device)  # here, because only one thread may load a module at a time
         elevation = np.asarray(elevation, float)
         azimuth = np.asarray(azimuth, float)
         self.rows = len(elevation)
@@ -46,9 +47,9 @@ class LidarRasterizer:
         self.direction = wp.array(rays, dtype=wp.vec3, device=device)
         """[column * row] Unit vectors of the rays in the head's frame: column by column, in the order of firing."""
         self.distance = wp.zeros(columns * self.rows, dtype=float, device=device)
-        """[column * row] m Distance to the nearest hit; 1e30 where nothing is hit."""
+        """[column * row] Distance to the nearest hit [m]; 1e30 without a hit."""
         self.primitive = wp.full(columns * self.rows, -1, dtype=wp.int32, device=device)
-        """[column * row] Index of the primitive that was hit; -2 for the ground, -1 for nothing."""
+        """[column * row] Index of the primitive that was hit; -2: the ground, -1: no hit."""
         self._keys = wp.empty(columns * self.rows, dtype=wp.int64, device=device)
         order = np.argsort(elevation, kind="stable")
         tangent = np.clip(np.tan(elevation[order]), -1.0e6, 1.0e6).astype(np.float32)
@@ -74,11 +75,10 @@ class LidarRasterizer:
         count: int | None = None,
         reach: float = MAX_DEPTH,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Fire ``count`` columns from ``first`` on (all of them unless given), with the head at ``pose`` [7] in the
-        world.
+        """Find the hits of ``count`` columns (by default all) from column ``first`` on, with the head at ``pose`` [7].
 
-        Fills these columns of :attr:`distance` and :attr:`primitive`, and returns them [count, row]. Several threads
-        may call it at the same time for different columns.
+        Writes these columns of :attr:`distance` and :attr:`primitive`, and returns them as [count, row]. ``reach``:
+        largest distance of a hit [m]. Several threads may call this at the same time for different columns.
         """
         count = self.columns - first if count is None else count
         head = self._head_at(pose, reach, first, first + count)
@@ -124,9 +124,10 @@ class LidarRasterizer:
         return self.distance[part].numpy().reshape(shape), self.primitive[part].numpy().reshape(shape)
 
     def _head_at(self, pose: np.ndarray, reach: float, first: int, end: int) -> LidarHead:
-        """Kernel struct of the head at ``pose`` [7] that fires the columns from ``first`` to before ``end``."""
+        """Returns the kernel struct of the head at ``pose`` [7] for columns ``first`` to ``end`` - 1; ``reach``:
+        largest distance of a hit [m]."""
         head = LidarHead()
-        for name in LidarHead.vars:
+        for name in struct_fields(LidarHead):
             setattr(head, name, getattr(self._head, name))
         head.eye = wp.vec3(*map(float, pose[:3]))
         head.rotation = wp.mat33(*map(float, frames.to_matrix(frames.normalize(pose[3:])).T.ravel()))

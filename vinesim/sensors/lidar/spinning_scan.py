@@ -1,7 +1,8 @@
-"""A spinning lidar in a moving world: each sector is fired at its own time, from the pose of the lidar at that time.
+"""A spinning lidar in a moving world: each sector of a revolution is computed for its own time and pose of the lidar.
 
-A scan is therefore sheared by motion, of the world and of the lidar (rolling shutter). Poses of the lidar are kept and
-interpolated to each firing, however late it is computed; plants and objects are as in the latest snapshot.
+Motion of the lidar and of the world therefore distorts a scan (rolling shutter). Recorded poses of the lidar are
+interpolated to the time of each firing, also if the firing is computed later; plants and objects are as in the newest
+snapshot.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from vinesim.sensors.primitives.scene_primitives import Primitives
 
 
 class SpinningHead(Protocol):
-    """The lidar that is fired: :class:`vinesim.sensors.lidar.lidar.Lidar`."""
+    """Interface of a lidar for :class:`SpinningScan`, implemented by :class:`vinesim.sensors.lidar.lidar.Lidar`."""
 
     is_exact: bool
     revolution: int
@@ -31,27 +32,27 @@ class SpinningHead(Protocol):
         ...
 
     def begin_revolution(self) -> None:
-        """Begin a revolution."""
+        """Begin a new revolution, with an empty scan."""
         ...
 
     def fire(self, primitives: Primitives, first: int, poses: np.ndarray) -> None:
-        """Fire the firings from ``first`` on, one for each pose [firing, 7]."""
+        """Compute the firings from index ``first`` on, one for each pose in ``poses`` [firing, 7]."""
         ...
 
     def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
-        """The returns of the revolution. ``pose`` [7] and ``time`` [s] are those of the first firing."""
+        """Returns the scan of the revolution; ``pose`` [7] and ``time`` [s] are those of its first firing."""
         ...
 
 
 class PoseHistory:
-    """Recent poses of a sensor."""
+    """Recent poses of a sensor with their times, for interpolation."""
 
     def __init__(self) -> None:
         self._times: list[float] = []
         self._poses: list[np.ndarray] = []
 
     def add(self, time: float, pose: np.ndarray) -> None:
-        """Add ``pose`` [7] at ``time`` [s]. Poses of later times are removed: there are some after time was set
+        """Add ``pose`` [7] at ``time`` [s], and remove poses with later times, which exist if simulated time was set
         back."""
         kept = int(np.searchsorted(self._times, time))
         del self._times[kept:], self._poses[kept:]
@@ -59,13 +60,13 @@ class PoseHistory:
         self._poses.append(np.array(pose, float))
 
     def discard_before(self, before: float) -> None:
-        """Remove poses that are not needed for times from ``before`` on [s]."""
+        """Remove poses that are not needed to interpolate at times after ``before`` [s]."""
         old = max(int(np.searchsorted(self._times, before, side="right")) - 1, 0)
         del self._times[:old], self._poses[:old]
 
     def interpolate(self, times: np.ndarray) -> np.ndarray:
-        """Poses [k, 7] at ``times`` [k] s, linear between known poses (normalised quaternions), constant beyond
-        them."""
+        """Returns poses [k, 7] at ``times`` [k] s, interpolated linearly between recorded poses (with normalised
+        quaternions) and constant before the first and after the last one."""
         known = np.asarray(self._times)
         poses = np.stack(self._poses)
         after = np.clip(np.searchsorted(known, times), 1, max(len(known) - 1, 1))
@@ -81,15 +82,15 @@ class PoseHistory:
 
 
 class SpinningScan:
-    """Revolutions of one lidar, fired sector by sector."""
+    """Computes the revolutions of one lidar sector by sector while the world moves."""
 
     def __init__(self, lidar: SpinningHead, rate: float | None = None) -> None:
-        """``rate``: number of revolutions to deliver per second [Hz], at most that of the lidar, and that unless
-        given."""
+        """``rate``: number of revolutions to deliver per second [Hz], at most the lidar's own rate, which is the
+        default."""
         self.lidar = lidar
         self.pose_history = PoseHistory()
         self.dropped = 0
-        """Number of revolutions that ended before their first firing could be computed."""
+        """Number of revolutions that were left out, because their time had passed before they could begin."""
         self._set_period(1.0 / rate if rate else 0.0)
         self._start: float | None = None
         self._next_column = 0
@@ -99,26 +100,29 @@ class SpinningScan:
         self.pose_history.add(time, pose)
 
     def set_demand(self, period: float, outputs: CameraOutput) -> None:
-        """Set the time from one revolution to the next [s], and whether exact depth is the only output that is
-        needed."""
+        """Set the time [s] from one delivered revolution to the next, and the needed ``outputs``.
+
+        If exact depth is the only output, revolutions measure exactly.
+        """
         self._set_period(period)
         self.lidar.is_exact = outputs == CameraOutput.EXACT_DEPTH
 
     def _set_period(self, period: float) -> None:
-        """Set the time from one revolution to the next; never less than the lidar takes for one."""
+        """Set the time [s] from one delivered revolution to the next, at least the duration of one revolution."""
         self._period = max(1.0 / self.lidar.rate, period)
 
     def cancel(self, now: float) -> None:
-        """Abandon the present revolution at ``now`` [s]."""
+        """Abandon the present revolution at simulated time ``now`` [s]."""
         self._start = None
         self.pose_history.discard_before(now)
 
     def is_due(self, now: float) -> bool:
-        """Whether firings are due at ``now`` [s]; none are while the next revolution has not begun."""
+        """Returns whether firings are due at simulated time ``now`` [s]; between revolutions no firing is due."""
         return self._start is None or now >= self._start - 1e-9 or now < self._start - self._period
 
     def advance(self, primitives: Primitives, now: float) -> Iterator[LidarScan]:
-        """Fire what is due at simulation time ``now`` [s]; yields the revolutions that this completes."""
+        """Compute all firings that are due at simulated time ``now`` [s], and yield the revolutions that become
+        complete."""
         if self._start is None or now < self._start - self._period:
             self._begin(now)
         while self._start is not None:

@@ -1,1 +1,1 @@
-"""The vineyard as analytic primitives, and rays through them."""
+"""The vineyard, its actors and objects as analytic primitives for cameras and lidars, and a ray caster."""

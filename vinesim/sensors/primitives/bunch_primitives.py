@@ -1,4 +1,4 @@
-"""Bunches as primitives: berries as spheroids, rachis and pedicels as round cones, on the bodies that carry them."""
+"""Bunches as primitives on their bodies: berries are spheroids; rachis and pedicels (berry stalks) are round cones."""
 
 from __future__ import annotations
 
@@ -17,39 +17,40 @@ from vinesim.sensors.primitives.primitive_batches import Batch, make_batch, stac
 from vinesim.sensors.raster.primitive_arrays import CONE, SPHEROID
 
 _BATCH_SIZE = 256
-"""Number of bunches that are laid out together: numpy then works on rows, and temporary arrays stay small."""
+"""Number of bunches whose primitives are computed together: enough for fast NumPy calls, few enough for small arrays.
+"""
 _RACHIS_RADIUS = (0.0028, 0.0013)
 """Radius of the rachis at the peduncle and at its tip [m]: GUESSED."""
 _MIN_PEDICEL = 0.002
-"""A pedicel shorter than this [m] is not drawn."""
+"""Length [m] below which a pedicel (berry stalk) is not drawn."""
 _GREEN = np.array([0.085, 0.150, 0.022])
 """Colour of a hard green berry, linear RGB reflectance: GUESSED by eye."""
 _SHOT_BERRY_SIZE = 0.45
 """Size of a berry without seeds, relative to a ripe berry [1]: GUESSED."""
 _RIPENESS_SPREAD = 0.10
-"""Standard deviation of ripeness within a bunch: berries soften and colour one by one. GUESSED."""
+"""Standard deviation of the ripeness (0 to 1) of berries within a bunch. GUESSED."""
 _SHOT_BERRY_SHARE = 0.06
 """Share of the berries of a completely unripe bunch that have stayed small and green ("shot berries"). GUESSED."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Ripeness:
-    """Ripeness of fruit: 0 is green and hard, 1 is as the variety is harvested."""
+    """Ripeness of all bunches of a vineyard, from 0 (green and hard) to 1 (as the variety is harvested)."""
 
     bunch: np.ndarray
     """[bunch] Mean ripeness of the berries of each bunch."""
     seed: int = 0
-    """Seed of the differences between berries."""
+    """Seed of the random differences in ripeness between berries of a bunch."""
 
     @classmethod
     def random(cls, count: int, seed: int) -> Ripeness:
-        """Ripeness in a vineyard before harvest: most bunches are ripe, some are turning, few are green."""
+        """Returns the ripeness in a vineyard before harvest: most bunches are ripe, some are turning, few are green."""
         rng = np.random.default_rng([seed, 3])
         return cls(np.round(rng.beta(2.2, 0.7, count), 3), seed)
 
 
 def bunch_bodies(model: Model, bunch: int) -> np.ndarray:
-    """Bodies that carry one bunch's berries [piece]: the bunch's own body, then its clusters."""
+    """Returns the bodies [piece] that carry the berries of ``bunch``: the bunch's own body, then its berry clusters."""
     first = int(model.bunch_cluster[bunch])
     count = int(model.bunch_clusters[bunch])
     return np.append(model.bunch_body[bunch], np.arange(first, first + count))
@@ -63,15 +64,16 @@ def bunch_batches(
     group: np.ndarray,
     ripeness: Ripeness | None = None,
 ) -> list[Batch]:
-    """Berries, rachises and pedicels of some bunches, each in its segments (:func:`bunch_bodies`).
+    """Returns the primitives of berries, rachises and pedicels of some bunches, each on its segment
+    (:func:`bunch_bodies`).
 
     Args:
         model: constants of the vineyard.
         which: numbers of the bunches [k].
         poses: [k][segment, 7] pose of each segment in the frame of its carrier; identity unless given.
         carrier: [k][segment] row of the pose that moves each segment. A bunch without clusters has one segment.
-        group: [k] group of each bunch; groups do not mix in a cluster of primitives.
-        ripeness: ripeness of the fruit; all of it is ripe unless given.
+        group: [k] group of each bunch; a cluster of primitives contains one group only.
+        ripeness: ripeness of the fruit; None: all fruit is ripe.
     """
     found: list[Batch] = []
     for first in range(0, len(which), _BATCH_SIZE):
@@ -84,8 +86,7 @@ def bunch_batches(
 
 
 class _Bunches:
-    """Some bunches [k], and the segment that carries each point of them. The segments of all bunches are in one
-    list."""
+    """A batch of bunches [k] and their segments (bodies that carry the berries), all segments in one list."""
 
     def __init__(
         self,
@@ -114,12 +115,15 @@ class _Bunches:
         self._length = model.bunch_length[which].astype(float)
 
     def segment_at(self, position: np.ndarray, bunch: np.ndarray) -> np.ndarray:
-        """[n] Segment that carries each of the points ``position`` [n, 3] m of the bunches ``bunch`` [n] (indices into
-        these k)."""
+        """Returns the segment [n] that carries each of the points ``position`` [n, 3] m, given in their bunches'
+        frames.
+
+        ``bunch``: [n] index of each point's bunch in this batch.
+        """
         return self._first_segment[bunch] + segment_of(position, self._length[bunch], self._segments[bunch])
 
     def placed(self, points: np.ndarray, segment: np.ndarray, bunch: np.ndarray) -> np.ndarray:
-        """Points [n, 3] m, given in the frames of bunches, in the frames of their carriers."""
+        """Transform ``points`` [n, 3] m from the frames of their bunches to the frames of their carriers."""
         along = (self._length / self._segments)[bunch] * (segment - self._first_segment[bunch])
         own = points - along[:, None] * np.array([1.0, 0.0, 0.0])
         if self._poses is None:
@@ -127,11 +131,12 @@ class _Bunches:
         return self._poses[segment, :3] + frames.rotate(self._poses[segment, 3:], own)
 
     def rotated(self, vectors: np.ndarray, segment: np.ndarray) -> np.ndarray:
-        """Vectors [n, 3], given in the frames of bunches, in the frames of their carriers."""
+        """Rotate ``vectors`` [n, 3] from the frames of their bunches to the frames of their carriers."""
         return vectors if self._poses is None else frames.rotate(self._poses[segment, 3:], vectors)
 
     def common(self, segment: np.ndarray, bunch: np.ndarray) -> dict[str, Any]:
-        """Columns that primitives [n] of every kind get from their segment and bunch."""
+        """Returns the properties of primitives [n] that depend only on their segment and bunch, as for
+        :func:`make_batch`."""
         which = self.which[bunch]
         return {
             "organ": int(Organ.BUNCH),
@@ -142,7 +147,7 @@ class _Bunches:
         }
 
     def rachis(self) -> Batch:
-        """Round cones of the rachises, the axes on which the pedicels sit."""
+        """Returns the primitives of the rachises (axes of the bunches): round cones."""
         lines = [one.rachis for one in self.layouts]
         start, end = (np.concatenate([r[:, k : k - 1 or None].reshape(-1, 3) for r in lines]) for k in (0, 1))
         radius = np.concatenate([np.tile(np.linspace(*_RACHIS_RADIUS, r.shape[1] - 1), len(r)) for r in lines])
@@ -160,28 +165,28 @@ class _Bunches:
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class _Berries:
-    """All berries [n] of some bunches [k]."""
+    """All berries [n] of a batch of bunches [k]."""
 
     bunch: np.ndarray
-    """[n] Bunch of each berry, an index into these k."""
+    """[n] Index of each berry's bunch in the batch."""
     segment: np.ndarray
     """[n] Segment that carries each berry."""
     position: np.ndarray
-    """[n, 3] m Centre, in the bunch's frame."""
+    """[n, 3] Centre in the bunch's frame [m]."""
     radius: np.ndarray
-    """[n] m Radius."""
+    """[n] Radius [m]."""
     axis: np.ndarray
     """[n, 3] Axis of the spheroid, a unit vector."""
     foot: np.ndarray
-    """[n, 3] m Place on the rachis where the pedicel begins."""
+    """[n, 3] Point on the rachis where the pedicel begins [m]."""
     elongation: np.ndarray
-    """[n] Length over width."""
+    """[n] Length of the spheroid divided by its width."""
     colour: np.ndarray
     """[n, 3] Colour, linear RGB reflectance."""
     seed: np.ndarray
     """[n] Seed of the pattern of the skin, 0 to 1."""
     depth: np.ndarray
-    """[n] How far out in the bunch the berry sits, 0 to 1."""
+    """[n] Relative distance of the berry from the bunch's axis, 0 to 1."""
     occlusion: np.ndarray
     """[n, 4] Occlusion by other berries, see :func:`_neighbour_occlusion`."""
 
@@ -219,7 +224,7 @@ class _Berries:
         )
 
     def fruit(self, bunches: _Bunches) -> Batch:
-        """One spheroid for each berry."""
+        """Returns the primitives of the berries: one spheroid for each."""
         return make_batch(
             SPHEROID,
             stack_columns(bunches.placed(self.position, self.segment, self.bunch), self.radius),
@@ -232,7 +237,7 @@ class _Berries:
         )
 
     def pedicels(self, bunches: _Bunches) -> Batch:
-        """Round cones from the rachis to those berries that do not touch it."""
+        """Returns the primitives of the pedicels: round cones from the rachis to all berries that do not touch it."""
         end = self.position - self.axis * (self.radius * self.elongation * 0.95)[:, None]
         free = np.linalg.norm(end - self.foot, axis=1) > _MIN_PEDICEL
         segment = self.segment[free]
@@ -248,8 +253,11 @@ class _Berries:
 
 
 def _ripe_colours(variety: np.ndarray, rngs: list[np.random.Generator], count: np.ndarray) -> np.ndarray:
-    """Colours [n, 3] of ripe berries, scattered around the colours of their ``variety`` [n, 3]; ``count`` [k]: number
-    of berries of each bunch."""
+    """Returns random colours [n, 3] of ripe berries around the mean colours ``variety`` [n, 3] of their grape
+    varieties.
+
+    ``rngs``: [k] random generator of each bunch; ``count``: [k] number of berries of each bunch.
+    """
     tone, blush = (np.concatenate([rng.normal(size=n) for rng, n in zip(rngs, count, strict=True)]) for _ in (0, 1))
     colour = variety * (1.0 + 0.10 * tone[:, None])
     reddish = (colour[:, :1] > 2.0 * colour[:, 1:2]) * np.clip(0.5 * blush[:, None], 0.0, 1.0)
@@ -259,8 +267,11 @@ def _ripe_colours(variety: np.ndarray, rngs: list[np.random.Generator], count: n
 def _apply_ripeness(
     colour: np.ndarray, radius: np.ndarray, ripeness: Ripeness, which: np.ndarray, count: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and radii of berries that are not all ripe. Each berry is part of the way from green to ripe; some
-    berries stay green."""
+    """Returns colours [n, 3] and radii [n] m of berries after unripeness is applied to those of ripe berries.
+
+    Each berry is interpolated between green and ripe; a small share stays small and green. ``which``: [k] indices of
+    the bunches; ``count``: [k] number of berries of each bunch.
+    """
     owner = np.repeat(np.arange(len(which)), count)
     draws = zip(which, count, strict=True)
     draw = np.concatenate([np.random.default_rng([ripeness.seed, 4, int(b)]).uniform(size=(n, 2)) for b, n in draws])
@@ -274,7 +285,7 @@ def _apply_ripeness(
 
 
 def _quantile_80(away: np.ndarray) -> float:
-    """The 80 % quantile, computed faster than by np.quantile."""
+    """Returns the 80 % quantile of ``away`` [n], faster than ``np.quantile``."""
     at = 0.8 * (len(away) - 1)
     low = int(at)
     ends = np.partition(away, [low, min(low + 1, len(away) - 1)])
@@ -282,15 +293,16 @@ def _quantile_80(away: np.ndarray) -> float:
 
 
 def _padded_neighbours(neighbours: np.ndarray) -> np.ndarray:
-    """Eight neighbours of each berry [n, 8]; -1 fills rows that have fewer."""
+    """Returns the indices of up to eight neighbours of each berry [n, 8]; missing ones are -1."""
     missing = 8 - neighbours.shape[1]
     return np.pad(neighbours, ((0, 0), (0, missing)), constant_values=-1) if missing else neighbours
 
 
 def _neighbour_occlusion(position: np.ndarray, radius: np.ndarray, neighbours: np.ndarray) -> np.ndarray:
-    """Share of the light that the nearest neighbours take from each berry, as (v, w) [n, 4]: share(n) = w + v . n.
+    """Returns the share of light that neighbouring berries hide from each berry, as (v, w) [n, 4].
 
-    A touching sphere of equal size takes (1/4 + 0.85 cos) r^2 / l^2 as seen from the berry's surface.
+    At a surface point with unit normal m the hidden share is w + v . m. A neighbour of radius r at distance l hides
+    (1/4 + 0.85 cos) r^2 / l^2, with the cosine between m and the direction to the neighbour.
     """
     there = neighbours >= 0
     apart = position[np.maximum(neighbours, 0)] - position[:, None]

@@ -10,15 +10,15 @@ from vinesim.kernels.shading import shadow_maps
 _HEIGHT = 3.0
 """Height of the grid above the ground [m]."""
 _BLADE_AREA = 1.1
-"""Area of a blade over the square of its length from petiole to tip [1]: GUESSED, mean of the outlines."""
+"""Area of a leaf blade divided by the square of its length from petiole to tip [1]: GUESSED, mean of the outlines."""
 
 
 class LeafDensity:
     """Leaf area per volume [1/m] in the cells of a grid that covers a vineyard."""
 
     def __init__(self, blades: np.ndarray, low: np.ndarray, high: np.ndarray, device: str = "cpu") -> None:
-        """``blades`` [leaf, 4]: position [m] and length [m] of each blade. ``low`` and ``high`` [2] m: corners of the
-        ground that the grid covers."""
+        """``blades``: [leaf, 4] position [m] and length [m] of each leaf blade; ``low``, ``high``: [2] lowest and
+        highest x and y [m] of the grid."""
         self._device = device
         cell = max(0.15, float((high - low).max()) / 600.0)
         size = np.maximum(((high - low) / cell).astype(int) + 1, 1)
@@ -32,7 +32,7 @@ class LeafDensity:
         self._cell = float(cell)
 
     def visible_sky(self, points: np.ndarray) -> np.ndarray:
-        """Share of the sky light [k] that reaches ``points`` [k, 3] m."""
+        """Returns the share of the sky light [k] that reaches ``points`` [k, 3] m through the leaves, 0 to 1."""
         share = wp.zeros(len(points), dtype=float, device=self._device)
         position = wp.array(np.ascontiguousarray(points, np.float32), dtype=wp.vec3, device=self._device)
         wp.launch(

@@ -1,4 +1,4 @@
-"""Canes, peduncles and leaves as primitives."""
+"""Canes, peduncles (stalks of bunches) and leaves as primitives."""
 
 from __future__ import annotations
 
@@ -15,11 +15,12 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 
 _CANE_TINT = (0.30, 0.17, 0.08)
 STEM_TINT = (0.19, 0.22, 0.075)
-"""Linear RGB reflectance of brown canes, and of green stems, peduncles and rachises: GUESSED by eye."""
+"""Colours [linear RGB reflectance] of brown canes (``_CANE_TINT``) and of green stems, peduncles and rachises: GUESSED
+by eye."""
 
 
 def cane_batch(model: Model) -> Batch:
-    """One round cone for each piece of cane and peduncle."""
+    """Returns the primitives of canes and peduncles: one round cone for each segment."""
     bodies = np.flatnonzero((model.body_organ != int(Organ.BUNCH)) & (model.body_length > 0.0))
     rng = np.random.default_rng(5)
     seed = rng.uniform(size=len(model.tree_first))
@@ -28,7 +29,7 @@ def cane_batch(model: Model) -> Batch:
     index = tree.copy()
     bunch_of = model.bunch_of_body()[bodies]
     index = np.where(bunch_of >= 0, bunch_of, index)
-    # shoots ripen from the base: green towards the tip, brown where the wood is thick
+    # shoots become brown from the base: they are green towards the tip, brown where the wood is thick
     green = np.clip(1.6 - model.body_radius[bodies].mean(1) / 0.0022, 0.0, 1.0) * (seed[tree] < 0.6)
     green = np.where(organ == int(Organ.PEDUNCLE), 1.0, green)[:, None]
     tint = (1.0 - green) * np.array(_CANE_TINT) * (0.7 + 0.6 * seed[tree, None]) + green * np.array(STEM_TINT)
@@ -50,7 +51,7 @@ def cane_batch(model: Model) -> Batch:
 
 
 def leaf_batches(model: Model) -> list[Batch]:
-    """Blades, their petioles, and the nodes from which they grow."""
+    """Returns the primitives of leaf blades, their petioles, and the cane nodes from which they grow."""
     count = len(model.leaf_body)
     if not count:
         return []

@@ -1,4 +1,4 @@
-"""Primitives before they are laid out in clusters: batches of one kind, in the frames of their carriers."""
+"""Batches of primitives of one kind, in the frames of their carriers, before they are grouped in clusters."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from vinesim.sensors.raster.primitive_arrays import CONE
 
 @dataclasses.dataclass
 class Batch:
-    """Primitives of one kind, in the frames of their carriers. Primitives of different groups or bunches never share a
-    cluster."""
+    """Primitives [n] of one kind, in the frames of their carriers (bodies that move them)."""
 
     kind: int
     """Kind of the primitives, a number of :data:`vinesim.sensors.raster.primitive_arrays.KINDS`."""
     a: np.ndarray
-    """[n, 4] float32; ``a`` to ``d`` have the meaning given in :mod:`vinesim.kernels.raster.primitives`."""
+    """[n, 4] float32; :mod:`vinesim.kernels.raster.primitives` defines the meaning of ``a`` to ``d`` for each kind."""
     b: np.ndarray
     c: np.ndarray
     d: np.ndarray
@@ -30,13 +29,13 @@ class Batch:
     organ: np.ndarray
     """[n] int32, a number of :class:`vinesim.scene.ids.Organ`."""
     label: np.ndarray
-    """[n] int32, as of :func:`vinesim.scene.ids.label`."""
+    """[n] int32, label as defined by :func:`vinesim.scene.ids.label`."""
     carrier: np.ndarray
-    """[n] int32, row of the pose that moves the primitive."""
+    """[n] int32, row in the array of poses of the body that moves the primitive."""
     group: np.ndarray
-    """[n] int32. Primitives of different groups never share a cluster."""
+    """[n] int32, group; a cluster contains primitives of one group only."""
     bunch: np.ndarray
-    """[n] int32, bunch that the primitive belongs to while the bunch hangs; -1 for none."""
+    """[n] int32, bunch with which the primitive disappears when the bunch is picked; -1 for none."""
 
     def __len__(self) -> int:
         return len(self.a)
@@ -57,7 +56,8 @@ def make_batch(
     group: ArrayLike,
     bunch: ArrayLike = -1,
 ) -> Batch:
-    """A batch of primitives of one ``kind``; scalars and single rows are broadcast to the count of ``a`` [n, 4]."""
+    """Returns a batch of primitives of one ``kind``; scalars and single rows are broadcast to the length of ``a`` [n,
+    4]."""
     a = np.atleast_2d(np.asarray(a, np.float32))
     n = len(a)
 
@@ -84,14 +84,16 @@ def make_batch(
 
 
 def stack_columns(*parts: ArrayLike) -> np.ndarray:
-    """Vectors [n, k] and scalars, one or [n], as columns of one array, side by side."""
+    """Returns an array [n, ...] whose columns are those of ``parts`` side by side: vectors [n, k], and scalars, single
+    or [n]."""
     columns = [np.asarray(p, float).reshape(-1, 1) if np.ndim(p) < 2 else np.asarray(p, float) for p in parts]
     n = max(len(c) for c in columns)
     return np.concatenate([np.broadcast_to(c, (n, c.shape[1])) for c in columns], 1)
 
 
 def placeholder_batch(static_carrier: int) -> Batch:
-    """A primitive far below the ground that stands in for a world without plants, so that no array is ever empty."""
+    """Returns a batch with one primitive far below the ground, for a world without plants, so that no array is
+    empty."""
     return make_batch(
         CONE,
         [[0.0, 0.0, float(primitives.HIDDEN_HEIGHT), 1e-6]],

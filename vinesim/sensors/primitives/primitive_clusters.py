@@ -1,4 +1,4 @@
-"""Batches of primitives laid out in clusters: runs of at most 24 primitives of one kind, tree and bunch."""
+"""Grouping of primitives in clusters: runs of at most 24 primitives of one kind, group and bunch."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ MAX_CLUSTER = 24
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ClusterLayout:
-    """All primitives in the order of their clusters, in the frames of their carriers."""
+    """Primitives sorted by cluster, in the frames of their carriers (bodies that move them), and their clusters."""
 
     a: np.ndarray
-    """[primitive, 4] float32; ``a`` to ``d`` have the meaning given in :mod:`vinesim.kernels.raster.primitives`."""
+    """[primitive, 4] float32; :mod:`vinesim.kernels.raster.primitives` defines the meaning of ``a`` to ``d``."""
     b: np.ndarray
     c: np.ndarray
     d: np.ndarray
@@ -29,9 +29,9 @@ class ClusterLayout:
     organ: np.ndarray
     """[primitive] int32, a number of :class:`vinesim.scene.ids.Organ`."""
     label: np.ndarray
-    """[primitive] int32, as of :func:`vinesim.scene.ids.label`."""
+    """[primitive] int32, label as defined by :func:`vinesim.scene.ids.label`."""
     carrier: np.ndarray
-    """[primitive] int32, row of the pose that moves the primitive."""
+    """[primitive] int32, row in the array of poses of the body that moves the primitive."""
     first: np.ndarray
     """[cluster] int32, index of the cluster's first primitive."""
     size: np.ndarray
@@ -41,15 +41,15 @@ class ClusterLayout:
     owner: np.ndarray
     """[cluster] int32, tree that moves the cluster; -1 for clusters that no tree moves."""
     bunch: np.ndarray
-    """[cluster] int32, bunch that the cluster belongs to while the bunch hangs; -1 for none."""
+    """[cluster] int32, bunch with which the cluster disappears when the bunch is picked; -1 for none."""
     is_rigid: np.ndarray
     """[cluster] bool, whether the cluster is part of a rigid body."""
 
 
 def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int) -> ClusterLayout:
-    """Clusters of the plants and the static scene (``fixed``), then of rigid bodies (``moving``).
+    """Group primitives in clusters: first plants and the static scene (``fixed``), then rigid bodies (``moving``).
 
-    Neither groups nor bunches mix in a cluster. ``static_carrier`` is the carrier of primitives that never move.
+    A cluster contains one kind, group and bunch only. ``static_carrier``: carrier of primitives that never move.
     """
     whole: dict[str, list[np.ndarray]] = {
         name: [] for name in ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
@@ -81,7 +81,10 @@ def lay_out(fixed: Sequence[Batch], moving: Sequence[Batch], static_carrier: int
 
 
 def join_rigid(layouts: Sequence[ClusterLayout], carriers: Sequence[int], first_row: int) -> ClusterLayout:
-    """Join layouts of rigid bodies, each on its own carrier. The first primitive has the index ``first_row``."""
+    """Join the layouts of several rigid bodies into one, each body on its own carrier.
+
+    ``carriers``: carrier of each layout; ``first_row``: index of the first primitive among all primitives of the scene.
+    """
     joined = {
         field.name: np.concatenate([getattr(one, field.name) for one in layouts])
         for field in dataclasses.fields(ClusterLayout)
@@ -94,8 +97,8 @@ def join_rigid(layouts: Sequence[ClusterLayout], carriers: Sequence[int], first_
 
 
 def _runs(group: np.ndarray, bunch: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """First index and size [cluster] of runs of primitives of equal group and bunch, cut after :data:`MAX_CLUSTER`
-    primitives."""
+    """Returns first index and size [cluster] of runs of primitives with equal ``group`` and ``bunch`` [primitive], at
+    most :data:`MAX_CLUSTER` long."""
     starts = np.flatnonzero(np.r_[True, (group[1:] != group[:-1]) | (bunch[1:] != bunch[:-1])])
     lengths = np.diff(np.r_[starts, len(group)])
     parts = (lengths + MAX_CLUSTER - 1) // MAX_CLUSTER

@@ -1,4 +1,4 @@
-"""Rays through the vineyard: one bounding volume hierarchy over plants, one over links, refitted when things move."""
+"""Ray caster: bounding volume hierarchies over plants and over rigid bodies, which are refitted after motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSO
 
 
 def enclosing_primitive(primitives: Primitives, point: np.ndarray) -> int:
-    """Index of a solid primitive that contains a point [3] m, -1 if none does. Leaves and meshes contain no points."""
+    """Returns the index of a solid primitive that contains ``point`` [3] m, or -1; leaves and meshes are not solid."""
     point = np.asarray(point, float)
     reach = primitives.ball.numpy()
     near = np.flatnonzero(np.linalg.norm(reach[:, :3] - point, axis=1) <= reach[:, 3])
@@ -33,8 +33,10 @@ def enclosing_primitive(primitives: Primitives, point: np.ndarray) -> int:
 
 
 def _contains(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """[k] Whether each of some primitives [k] of one kind contains a point (vectors as in
-    :mod:`vinesim.kernels.raster.primitives`)."""
+    """Returns [k] whether each of k primitives of one ``kind`` contains ``point`` [3] m.
+
+    ``a``, ``b``, ``c``: [k, 4] vectors of the primitives as in :mod:`vinesim.kernels.raster.primitives`.
+    """
     away = point - a[:, :3]
     if kind == SPHEROID:
         along = (away * b[:, :3]).sum(1)
@@ -53,7 +55,7 @@ def _contains(kind: int, a: np.ndarray, b: np.ndarray, c: np.ndarray, point: np.
 
 
 class RayCaster:
-    """Finds the exact nearest hit of any ray."""
+    """Finds the exact nearest hit of any ray with the primitives of a scene."""
 
     def __init__(self, primitives: Primitives) -> None:
         self.primitives = primitives
@@ -62,7 +64,7 @@ class RayCaster:
         self._refit()
 
     def hierarchies(self) -> ray_cast.Hierarchies:
-        """The hierarchies, refitted to the present poses."""
+        """Returns the bounding volume hierarchies for kernels, refitted to the present poses of the primitives."""
         if self._pose_version != self.primitives.pose_version or self._layout_version != self.primitives.layout_version:
             self._refit()
         return self._struct
@@ -88,8 +90,11 @@ class RayCaster:
     def cast(
         self, origin: np.ndarray, direction: np.ndarray, reach: float = MAX_DEPTH
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Nearest hits of rays: distance [ray] in lengths of ``direction`` (inf: nothing is hit), and index of the
-        primitive [ray] (-2 the ground, -1 none)."""
+        """Returns the nearest hits of rays: distance [ray] in lengths of ``direction`` (inf: no hit), and index of the
+        primitive [ray] (-2: the ground, -1: no hit).
+
+        ``origin``: [ray, 3] m; ``direction``: [ray, 3] vectors of any length; ``reach``: largest distance of a hit.
+        """
         p = self.primitives
         direction = np.ascontiguousarray(direction, np.float32).reshape(-1, 3)
         origin = np.ascontiguousarray(np.broadcast_to(np.asarray(origin, np.float32), direction.shape))
@@ -107,8 +112,8 @@ class RayCaster:
         return np.where(found == -1, np.inf, distance.numpy()), found
 
     def cast_camera(self, lens: Pinhole) -> tuple[np.ndarray, np.ndarray]:
-        """Depth [height, width] m (inf: nothing is hit) and index of the primitive [height, width] in a camera's
-        picture; as :meth:`cast`."""
+        """Returns depth [height, width] m (inf: no hit) and index of the primitive [height, width] (-2: the ground, -1:
+        no hit) in the picture of a camera."""
         p = self.primitives
         count = lens.width * lens.height
         depth = wp.empty(count, dtype=float, device=p.device)

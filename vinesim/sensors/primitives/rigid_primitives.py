@@ -1,4 +1,4 @@
-"""Robots, boxes, people and picked bunches as primitives carried by rigid bodies."""
+"""Robots, crates, people and picked bunches as primitives that rigid bodies carry."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from vinesim.sensors.primitives.primitive_batches import Batch, make_batch
 from vinesim.sensors.raster.primitive_arrays import BOX, CONE, CYLINDER, ELLIPSOID, TRIANGLE
 
 _DEFAULT_SURFACE = {Organ.BOX: "plastic", Organ.HUMAN: "cloth"}
-"""Surface of bodies that name none, by organ; robots are painted."""
+"""Visible surface, by organ, of shapes without a named surface; the default of robots is paint."""
 _MATERIALS = {
     "paint": int(materials.PAINT),
     "plastic": int(materials.PLASTIC),
@@ -43,9 +43,10 @@ def rigid_batches(
     shape: dict[int, np.ndarray],
     ripeness: Ripeness | None = None,
 ) -> list[Batch]:
-    """Shapes of all rigid bodies. Their carriers and groups are numbered from the given numbers on.
+    """Returns the primitives of all rigid bodies in ``visuals``.
 
-    ``shape`` has for each picked bunch the poses [piece, 7] of its pieces, in the bunch's frame.
+    ``first``, ``groups``: first carrier and first group, one of each for every body; ``shape``: by picked bunch, poses
+    [piece, 7] of the bunch's pieces in the bunch's frame; ``ripeness``: None means that all fruit is ripe.
     """
     batches: list[Batch] = []
     for k, visual in enumerate(visuals):
@@ -72,7 +73,10 @@ def rigid_batches(
 
 
 def _rigid_shape(shape: Shape, common: dict) -> Batch:
-    """One primitive, or the triangles of a mesh, in the frame of the body."""
+    """Returns one shape of a rigid body as a batch, in the body's frame: one primitive, or the triangles of a mesh.
+
+    ``common``: properties that all shapes of the body share, as for :func:`make_batch`.
+    """
     size = shape.size
     pose = np.asarray(shape.pose, float)
     centre = pose[:3]
@@ -99,10 +103,10 @@ def _rigid_shape(shape: Shape, common: dict) -> Batch:
 
 
 def pack_normals(normals: np.ndarray) -> np.ndarray:
-    """Unit vectors [..., 3], each packed in one float, as :func:`vinesim.kernels.shading.materials.unpack_normal` reads
-    them.
+    """Pack unit vectors [..., 3] into one float each, for
+    :func:`vinesim.kernels.shading.solid_materials.unpack_normal`.
 
-    The mapping is octahedral (Meyer et al. 2010), with eleven bits for each coordinate: exact to 0.001 rad.
+    The mapping is octahedral (Meyer et al. 2010), with eleven bits for each coordinate: accurate to 0.001 rad.
     """
     flat = normals / np.maximum(np.abs(normals).sum(-1, keepdims=True), 1e-12)
     side = np.where(flat[..., :2] >= 0.0, 1.0, -1.0)
@@ -115,7 +119,7 @@ _meshes: dict[tuple[str, tuple[float, ...]], Mesh] = {}
 
 
 def _load_mesh(file: str, scale: tuple[float, ...]) -> Mesh:
-    """A mesh file [m], with few enough faces."""
+    """Read a mesh file, scale it to metres, and reduce its number of faces if it is too large for sensors."""
     key = (file, scale)
     if key not in _meshes:
         if not pathlib.Path(file).is_file():

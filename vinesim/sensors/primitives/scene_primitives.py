@@ -1,9 +1,9 @@
-"""Everything a camera or lidar can see, as analytic primitives carried by plant bodies and rigid bodies.
+"""The visible scene as analytic primitives that plant bodies and rigid bodies carry, for cameras and lidars.
 
-:class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model` and follows the world through
-:meth:`Primitives.update`: one Warp launch moves the clusters of the trees and rigid bodies that moved, and nothing
-else. Plants come from :mod:`vinesim.core.disk_cache` if they were laid out before. When the list of rigid bodies
-changes, only rigid bodies are laid out again.
+:class:`Primitives` is built once from a :class:`~vinesim.scene.model.Model`. :meth:`Primitives.update` then moves it
+with the world, in one Warp launch for the clusters of trees and rigid bodies that moved. Plants are read from
+:mod:`vinesim.core.disk_cache` if their primitives were computed before. When rigid bodies are added or removed, only
+the primitives of rigid bodies are computed again.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
 from vinesim.wires.wire_segments import wire_segments
 
 _SKY_OF_RIGID = 0.7
-"""Share of the sky's light that reaches robots, people and boxes: GUESSED, since none is computed for them."""
+"""Share of the sky light that reaches robots, people and crates: GUESSED, because it is computed only for plants."""
 _RIGID_ROOM = 2048
-"""Number of rigid primitives for which there is room from the start."""
+"""Initial capacity for primitives of rigid bodies."""
 _PRIMITIVE_COLUMNS = {
     **{f"local_{name}": wp.vec4 for name in "abcd"},
     **dict.fromkeys("abcd", wp.vec4),
@@ -53,10 +53,11 @@ _PRIMITIVE_COLUMNS = {
     "sky": wp.float32,
     **dict.fromkeys(("kind", "carrier", "label", "organ", "material"), wp.int32),
 }
-"""Columns of the table of primitives: name -> type. Names with ``local_`` are in the frame of the carrier, others in
-the world."""
+"""Columns of the table of primitives: name -> type. Columns ``local_*`` are in the frame of the carrier, ``a`` to ``d``
+in the world."""
 _ONLY_IN_COLUMNS = ("a", "b", "c", "d", "material", "tint", "organ", "label", "carrier")
-"""Fields of :class:`ClusterLayout` that have a value for each primitive."""
+"""Fields of :class:`ClusterLayout` with a value for each primitive; after loading they are only in the device's
+columns."""
 _CLUSTER_COLUMNS = {**dict.fromkeys(("first", "size", "cluster_kind", "shown"), wp.int32), "ball": wp.vec4}
 """Columns of the table of clusters: name -> type."""
 _TEXTURES = (
@@ -69,7 +70,8 @@ _TEXTURES = (
     "ground_y",
     "ground_cell",
 )
-"""Fields of ``Materials`` that are the same for all primitives."""
+"""Fields of ``Materials`` that do not depend on the primitives: textures, rows of vines, visible sky above the ground.
+"""
 
 
 class Primitives:
@@ -86,39 +88,38 @@ class Primitives:
         renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness``:
-        that of the fruit, all of it ripe unless given; ``renderer``: see
+        ripeness of the fruit, None for ripe fruit; ``renderer``: name of a renderer, see
         :mod:`~vinesim.sensors.raster.renderer_selection`.
         """
         self.model = model
         self.device = device
         self._ripeness = ripeness
         self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
-        """Fills the pixels of cameras; None if :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`
-        fills them itself."""
+        """Rasteriser that finds the primitive in each pixel of a camera; None: the CPU kernels of
+        :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`."""
         self._bodies = len(model.body_mass)
         self._wires = wire_segments(model)
         self._static_carrier = self._bodies + len(self._wires)
-        """Carrier of the static scene. Carriers before it are bodies of plants, then segments of wires; those behind it
-        are rigid bodies."""
+        """Index of the carrier of the static scene. Lower indices are bodies of plants, then segments of wires; higher
+        indices are rigid bodies."""
         self._wires_away = np.zeros(0, int)
-        """Segments of wires [k] that were away from where they were drawn."""
+        """Segments of wires [k] that were deflected at the last update."""
         self._visuals: tuple[RigidVisual, ...] = ()
         self._attached = np.ones(len(model.bunch_body), bool)
         self._picked_shapes: dict[int, np.ndarray] = {}
         self._rigid: dict[tuple[Organ, int, int], tuple[tuple[Shape, ...], ClusterLayout | None]] = {}
-        """Shapes and clusters of each rigid body. Key: organ, index, identity of the shapes."""
+        """Shapes and clusters of each rigid body, by organ, index and identity of the tuple of shapes."""
         self._moved = np.zeros(0, np.int64)
         outline, hull = textures.leaf_outlines()
         self._outline = wp.array(outline, device=device)
         self._hull = wp.array(hull, dtype=wp.vec2, device=device)
         self._body_q = State.at_rest(model).body_q
         self.pose_version = 0
-        """Number of changes of any pose."""
+        """Counter that increases when any primitive moves."""
         self.layout_version = 0
-        """Number of changes of the set of primitives."""
+        """Counter that increases when primitives are added or removed."""
         self._columns: dict[str, wp.array] = {}
-        """Columns of the tables of primitives and clusters, by name, with room for more rigid bodies than there are
-        now."""
+        """Columns of the tables of primitives and clusters, by name, with spare capacity for rigid bodies."""
         self._poses = np.zeros((0, 7), np.float32)
         self._textures = materials.Materials()
         self._textures.rows = wp.vec2(*row_layout(model))
@@ -141,16 +142,16 @@ class Primitives:
         return len(self.label)
 
     def counts_by_kind(self) -> dict[str, int]:
-        """Number of primitives of each kind."""
+        """Returns the number of primitives of each kind."""
         kinds = self.shapes.kind.numpy()
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
     def clusters_shown(self) -> np.ndarray:
-        """[cluster] Whether each cluster is drawn; clusters of picked bunches are not."""
+        """Returns [cluster] whether each cluster is drawn; clusters of picked bunches on their vines are not."""
         return self.ball.numpy()[:, 3] > 0.0
 
     def local_columns(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
-        """Some primitives in the frames of their carriers: ``a`` to ``d`` [n, 4] (see
+        """Returns the primitives ``rows`` [n] in the frames of their carriers: ``a`` to ``d`` [n, 4] (see
         :mod:`vinesim.kernels.raster.primitives`), ``tint`` [n, 3], ``sky``, ``material``, ``label``, ``carrier`` [n].
         """
         names = {name: f"local_{name}" for name in "abcd"}
@@ -158,16 +159,22 @@ class Primitives:
         return {name: self._columns[column].numpy()[rows] for name, column in names.items()}
 
     def carrier_poses(self, primitive: np.ndarray) -> np.ndarray:
-        """Poses [..., 7] m, 1 of the carriers of some primitives [...]. A carrier is a body of a plant, a segment of
-        wire, a rigid body, or the world."""
+        """Returns the world poses [..., 7] of the carriers of primitives ``primitive`` [...].
+
+        A carrier is the body that moves the primitive: a body of a plant, a segment of wire, a rigid body, or the
+        static scene.
+        """
         return self._poses[self._carrier.numpy()[primitive]].astype(float)
 
     # -- building
 
     def _bake(self, grass: float) -> disk_cache.Arrays:
-        """Lay out plants and the static scene in clusters, and compute the share of the sky that is visible through the
-        leaves. It is computed in the shape at rest: for each primitive, for the far end of each piece of wood, and for
-        the ground."""
+        """Compute clusters of primitives of plants and the static scene, and the share of the sky that is visible
+        through the leaves, both for plants at rest.
+
+        The visible share is computed for each primitive, for the far end of each segment of wood, and for the ground.
+        ``grass``: tufts per square metre.
+        """
         low, high = _ground_extent(self.model)
         layout = lay_out(self._plant_batches(grass, low, high), [], self._static_carrier)
         baked = {field.name: getattr(layout, field.name) for field in dataclasses.fields(layout)}
@@ -182,7 +189,7 @@ class Primitives:
         kind = self.shapes.kind.numpy()
         blades = posed[(layout.organ == int(Organ.LEAF)) & (kind == LEAF)]
         canopy = LeafDensity(blades, low, high, self.device)
-        # light is continuous from one piece of wood to the next: cones store the sky at their far end too
+        # cones also store the visible sky at their far end, so that light is continuous from segment to segment
         wood = np.flatnonzero(kind == CONE)
         far = canopy.visible_sky(self.shapes.b.numpy()[wood, :3])
         baked["c"][wood, 2:] = np.stack([far, np.ones(len(wood))], 1)
@@ -194,7 +201,8 @@ class Primitives:
         return baked
 
     def _plant_batches(self, grass: float, low: np.ndarray, high: np.ndarray) -> list[Batch]:
-        """Plants, trellis, grass and fallen leaves on the ground from ``low`` to ``high`` [2] m."""
+        """Returns the primitives of plants and trellis, and of grass and fallen leaves on the ground between the
+        corners ``low`` and ``high`` [2] m."""
         model = self.model
         static = self._static_carrier
         batches = [cane_batch(model), *leaf_batches(model)]
@@ -209,7 +217,7 @@ class Primitives:
         return [b for b in batches if len(b)] or [placeholder_batch(static)]
 
     def _open(self, baked: disk_cache.Arrays) -> None:
-        """Take over the result of :meth:`_bake`. Poses are not yet applied."""
+        """Use the result of :meth:`_bake`, just computed or read from the cache; poses are not applied yet."""
         low, high = _ground_extent(self.model)
         low = low - 3.0
         high = high + 3.0
@@ -218,14 +226,14 @@ class Primitives:
         self._textures.ground_y = float(low[1])
         self._textures.ground_cell = float(_ground_step(low, high))
         self.plant_count = len(baked["label"])
-        """Number of primitives of plants and of the static scene; those of rigid bodies follow them."""
+        """Number of primitives of plants and the static scene; primitives of rigid bodies have higher indices."""
         names = [field.name for field in dataclasses.fields(ClusterLayout)]
         plants = ClusterLayout(**{name: baked[name] for name in names})
         self._columns = {}
         self._reserve(plants, 0)
         self._write(plants, baked["sky"], 0, 0)
         self._plant_lamps = np.flatnonzero(plants.material == int(materials.LAMP))
-        nothing = np.zeros(0, np.float32)  # the columns hold the values: hundreds of megabytes in a large vineyard
+        nothing = np.zeros(0, np.float32)  # the device's columns hold these hundreds of megabytes of a large vineyard
         self._plants = dataclasses.replace(plants, **dict.fromkeys(_ONLY_IN_COLUMNS, nothing))
         owners = len(self.model.tree_first) + len(self.model.fixed_start)  # trees, then pieces of wire
         self._by_owner = np.argsort(self._plants.owner, kind="stable")
@@ -234,7 +242,8 @@ class Primitives:
         self._build(())
 
     def _build(self, visuals: tuple[RigidVisual, ...]) -> None:
-        """Lay out the primitives of rigid bodies behind those of the plants, which stay as they are."""
+        """Compute the primitives of the rigid bodies ``visuals``, which follow the unchanged primitives of the
+        plants."""
         plants = self._plants
         rows = self.plant_count
         clusters = len(plants.first)
@@ -264,12 +273,12 @@ class Primitives:
         if self.layout_version:
             version[:clusters] = self.cluster_version[:clusters]
         self.cluster_version = version
-        """[cluster] :attr:`pose_version` at the last motion of each cluster."""
+        """[cluster] Value of :attr:`pose_version` at the last motion of each cluster."""
         lamps = self._plant_lamps
         if not empty:
             lamps = np.concatenate([lamps, np.flatnonzero(rigid.material == int(materials.LAMP)) + rows])
         self.lamp_primitives = lamps
-        """Primitives that emit light."""
+        """Indices of the primitives that emit light."""
         self._bind()
         poses = np.zeros((self._static_carrier + 1 + len(visuals), 7), np.float32)
         poses[:, 6] = 1.0
@@ -279,13 +288,13 @@ class Primitives:
             poses[: self._bodies], poses[self._bodies : self._static_carrier] = self._body_q, self._wires.rest_q
         self._pose_array = wp.array(poses, dtype=wp.transform, device=self.device)
         self._poses = self._pose_array.numpy() if self._pose_array.device.is_cpu else poses
-        """[carrier, 7] Pose of each carrier. On a CPU the kernels read the same memory."""
+        """[carrier, 7] World pose of each carrier. On a CPU this is the memory that kernels read."""
         self._visuals = visuals
         self.layout_version += 1
 
     def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
-        """Carrier and clusters of each rigid body that has a shape. A body that was there before is not laid out
-        again."""
+        """Returns carrier and clusters of each rigid body in ``visuals`` that has shapes; for known bodies the cached
+        clusters."""
         picked = self._picked_bunch_shapes(visuals)
         known = {}
         found = []
@@ -302,8 +311,8 @@ class Primitives:
         return found
 
     def _reserve(self, plants: ClusterLayout, rigid: int) -> None:
-        """Allocate device memory for the plants and for twice the number ``rigid`` of primitives; values of plants are
-        kept."""
+        """Allocate device memory for the plants and for twice ``rigid`` primitives of rigid bodies; values of plants
+        are copied."""
         kept = self._columns
         room = max(2 * rigid, _RIGID_ROOM)
         for names, count in ((_PRIMITIVE_COLUMNS, self.plant_count), (_CLUSTER_COLUMNS, len(plants.first))):
@@ -314,7 +323,10 @@ class Primitives:
                 self._columns = self._columns | {name: column}
 
     def _write(self, layout: ClusterLayout, sky: np.ndarray, row: int, cluster: int) -> None:
-        """Write primitives and clusters of a layout to the device, from the ``row`` and the ``cluster`` on."""
+        """Write a layout to the device: primitives from index ``row`` on, clusters from index ``cluster`` on.
+
+        ``sky``: [primitive] share of the sky that is visible.
+        """
         values = {name: getattr(layout, name) for name in ("material", "tint", "organ", "label", "carrier")}
         values |= {f"local_{name}": getattr(layout, name) for name in "abcd"}
         values |= {"kind": np.repeat(layout.kind, layout.size), "sky": sky}
@@ -327,7 +339,7 @@ class Primitives:
             self._columns[name][cluster:end].assign(np.ascontiguousarray(column.astype(np.int32)))
 
     def _bind(self) -> None:
-        """Make the structs of the present primitives and clusters, in the memory of the columns."""
+        """Make the kernel structs of the present primitives and clusters, as views of the device's columns."""
         column = {name: self._columns[name][: len(self.label)] for name in _PRIMITIVE_COLUMNS}
         column |= {name: self._columns[name][: len(self.cluster_first)] for name in _CLUSTER_COLUMNS}
         self._local = primitives.Shapes()
@@ -358,8 +370,8 @@ class Primitives:
             setattr(self.materials, name, getattr(self._textures, name))
 
     def _picked_bunch_shapes(self, visuals: tuple[RigidVisual, ...]) -> dict[int, np.ndarray]:
-        """Poses [piece, 7] of the pieces of each picked bunch, in the bunch's frame, as they were when it was first
-        seen detached."""
+        """Returns by picked bunch the poses [piece, 7] of its pieces in the bunch's frame, as they were when the bunch
+        first appeared as a rigid body."""
         picked = {}
         for bunch in (visual.index for visual in visuals if visual.organ == Organ.BUNCH):
             q = np.asarray(self._body_q[bunch_bodies(self.model, bunch)], float)
@@ -370,10 +382,10 @@ class Primitives:
     # -- following the world
 
     def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
-        """Take over the poses of ``snapshot``; returns the clusters [k] that moved.
+        """Move the primitives to the poses of ``snapshot``, and return the clusters [k] that moved.
 
-        ``moved`` are the trees that may have moved since the last call (default: the moved trees of this snapshot and
-        of the one before). A caller that skips snapshots must collect the moved trees of all skipped ones.
+        ``moved``: trees that may have moved since the last call (default: the moved trees of this snapshot and of the
+        one before). A caller that skips snapshots must collect the moved trees of all skipped snapshots.
         """
         body_q = snapshot.body_q
         visual_q = np.asarray(snapshot.visual_q, np.float32).reshape(-1, 7)
@@ -383,7 +395,7 @@ class Primitives:
         if new_visuals:
             self._body_q = body_q
             self._build(snapshot.visuals)
-            # a new world, or one that was set back, need not list the trees that moved
+            # the snapshot of a new world, or of a world that was set back, may not list all trees that moved
             differs = (np.asarray(body_q, np.float32) != self._poses[: self._bodies]).any(1)
             trees = np.union1d(trees, self.model.body_tree[differs])
         attached = np.asarray(snapshot.bunch_attached, bool)
@@ -408,7 +420,8 @@ class Primitives:
         return dirty
 
     def _clusters_of(self, owners: np.ndarray) -> np.ndarray:
-        """Clusters [k] that the given owners move. Owners are trees, and behind all trees the pieces of wire."""
+        """Returns the clusters [k] that ``owners`` move: indices of trees, or number of trees plus index of a fixed
+        piece (wire)."""
         start = self._owner_start[owners]
         size = self._owner_start[owners + 1] - self._owner_start[owners]
         inner = np.arange(size.sum()) - np.repeat(np.cumsum(size) - size, size)
@@ -435,27 +448,31 @@ class Primitives:
 
 
 def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
-    """[cluster] int32 Whether each cluster is to be drawn. It is not if the bunch [cluster] that it belongs to (-1 for
-    none) no longer hangs."""
+    """Returns [cluster] int32: 0 for clusters whose bunch no longer hangs on its vine, else 1.
+
+    ``bunch``: [cluster] bunch of each cluster, -1 for none; ``attached``: [bunch] whether the bunch hangs.
+    """
     if not len(attached):
         return np.ones(len(bunch), np.int32)
     return ((bunch < 0) | attached[bunch]).astype(np.int32)
 
 
 def _ground_extent(model: Model) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest x and y [2] m of vines and posts."""
+    """Returns lowest and highest x and y [2] m of the area with vines and posts."""
     spots = np.concatenate([model.tree_pose[:, :2], model.fixed_start[:, :2], model.fixed_end[:, :2]])
     return (spots.min(0), spots.max(0)) if len(spots) else (np.zeros(2), np.zeros(2))
 
 
 def _ground_step(low: np.ndarray, high: np.ndarray) -> float:
-    """Spacing [m] of the table of the share of the sky that is visible from the ground."""
+    """Returns the spacing [m] of the table with the share of the sky that is visible from the ground."""
     return max(0.2, float((high - low).max()) / 500.0)
 
 
 def _digest(model: Model, grass: float, device: str) -> str:
-    """Digest of everything that the primitives of plants depend on. A GPU rounds their light differently, so the device
-    counts."""
+    """Returns a digest, for the disk cache, of all inputs of the plants' primitives.
+
+    It includes the kind of device, because a GPU rounds the visible share of the sky differently.
+    """
     package = pathlib.Path(__file__).parents[2]
     folders = ("scene", "sensors/primitives", "sensors/raster", "kernels/raster")
     code = [package / part for part in (*folders, "core/frames.py", "wires/wire_segments.py")]
@@ -466,7 +483,10 @@ def _digest(model: Model, grass: float, device: str) -> str:
 
 
 def rest_snapshot(model: Model, visuals: tuple[RigidVisual, ...] = (), visual_q: np.ndarray | None = None) -> Snapshot:
-    """Snapshot of the vineyard at rest, for pictures and tests without physics."""
+    """Returns a snapshot of the vineyard at rest, for pictures and tests without physics.
+
+    ``visuals``, ``visual_q``: rigid bodies with visible shapes and their poses [visual, 7].
+    """
     return Snapshot(
         time=0.0,
         tick=0,

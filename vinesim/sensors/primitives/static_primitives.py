@@ -1,4 +1,4 @@
-"""Posts, wires, trunks and arms as primitives; grass and herbs. Only wires under tension move."""
+"""Posts, wires, trunks, arms, grass and fallen leaves as primitives. Of these, only wires under tension move."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from vinesim.sensors.raster.primitive_arrays import CONE, LEAF
 from vinesim.wires.wire_segments import WireSegments, cut
 
 _CELL_SIZE = 2.5
-"""Side of the squares by which primitives that never move are clustered [m]."""
+"""Width [m] of the squares of ground by which primitives that never move are grouped in clusters."""
 _MAX_SEGMENT = 0.5
-"""Longest piece into which primitives that never move are cut [m]."""
+"""Largest length [m] of a primitive that never moves; longer pieces are cut."""
 _TRELLIS = {
     Organ.POLE: (int(materials.POST), (0.36, 0.33, 0.29)),
     Organ.WIRE: (int(materials.WIRE), (0.33, 0.34, 0.35)),
@@ -26,18 +26,19 @@ _TRELLIS = {
 
 
 def _ground_cells(position: np.ndarray, first: int) -> np.ndarray:
-    """[n] Group number of each position: one number for each square of the ground."""
+    """Returns the group [n] of each position [n, 3] m: one number, from ``first`` on, for each square of the ground."""
     cell = np.floor(position[:, :2] / _CELL_SIZE).astype(np.int64)
     cell -= cell.min(0, initial=0)
     return (first + cell[:, 1] * (cell[:, 0].max(initial=0) + 1) + cell[:, 0]).astype(np.int32)
 
 
 def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
-    """All trellis and wood that never moves; for wires under tension see :func:`wire_batch`."""
+    """Returns the primitives of trellis and wood that never move; :func:`wire_batch` makes those of wires under
+    tension."""
     still = np.flatnonzero(model.fixed_tension <= 0.0)
     if not len(still):
         return []
-    # long pieces are cut: a box around a whole one would contain half of the vineyard
+    # long pieces are cut: the bounding box of a whole one would contain half of the vineyard
     length = np.linalg.norm(model.fixed_end - model.fixed_start, axis=1)[still]
     whole, begin, stop = cut(length, _MAX_SEGMENT)
     values = _cones(model, still[whole], begin, stop)
@@ -46,7 +47,11 @@ def trellis_batches(model: Model, static_carrier: int) -> list[Batch]:
 
 
 def wire_batch(model: Model, segments: WireSegments, first_carrier: int, first_group: int) -> Batch | None:
-    """The segments of wires under tension. Each has its own carrier; the segments of a piece of wire form a group."""
+    """Returns the primitives of the segments of wires under tension; None without such wires.
+
+    Each segment has its own carrier, numbered from ``first_carrier`` on; the segments of one wire form a group,
+    numbered from ``first_group`` on.
+    """
     if not len(segments):
         return None
     values = _cones(model, segments.piece, segments.start, segments.end)
@@ -57,7 +62,11 @@ def wire_batch(model: Model, segments: WireSegments, first_carrier: int, first_g
 
 
 def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray) -> dict[str, np.ndarray]:
-    """Columns of parts of fixed pieces [part], as drawn. A part lies between two shares of its piece's length."""
+    """Returns the properties of cones for parts [part] of fixed pieces (posts, wires, wood), as for :func:`make_batch`.
+
+    ``piece``: [part] index of the fixed piece; ``begin``, ``stop``: [part] start and end as shares of the piece's
+    length.
+    """
     way = model.fixed_end - model.fixed_start
     length = np.linalg.norm(way, axis=1)[piece]
     start, end = (model.fixed_start[piece] + share[:, None] * way[piece] for share in (begin, stop))
@@ -69,7 +78,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
     material, tint = (np.array([table[o][k] for o in organ]) for k in (0, 1))
     rng = np.random.default_rng(3)
     seed = rng.uniform(size=int(model.fixed_index.max()) + 1)[index] * 7.0
-    # bark is continuous from piece to piece: distances count from the foot of a post, and along a wire
+    # texture is continuous from part to part: distances count from the foot of a post, or along a wire
     upright = np.abs(end - start)[:, 2] > 0.5 * np.linalg.norm(end - start, axis=1)
     return {
         "a": stack_columns(start, thick),
@@ -83,7 +92,7 @@ def _cones(model: Model, piece: np.ndarray, begin: np.ndarray, stop: np.ndarray)
 
 
 def row_layout(model: Model) -> tuple[float, float]:
-    """Where the first row of vines stands, and the spacing of the rows [m], both along y."""
+    """Returns the y coordinate [m] of the first row of vines, and the spacing [m] of the rows along y."""
     y = np.unique(np.round(model.fixed_start[model.fixed_organ == int(Organ.TRUNK), 1], 1))
     if len(y) == 0:
         return 0.0, 2.5
@@ -91,8 +100,8 @@ def row_layout(model: Model) -> tuple[float, float]:
 
 
 def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
-    """Greenness of the ground, as :func:`vinesim.kernels.shading.materials.row_greenness` computes it to colour the
-    ground."""
+    """Returns the change of the ground's share of sod at ``y`` [n] m across the rows, equal to
+    :func:`vinesim.kernels.shading.materials.row_greenness`."""
     lane = (y - rows[0]) / rows[1]
     away = np.abs(lane - np.round(lane)) * rows[1]
     track = np.abs(away - 0.5 * rows[1] + 0.7)
@@ -100,7 +109,10 @@ def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
 
 
 def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: int) -> Batch | None:
-    """Fallen leaves, more of them when many leaves are old: ``age`` is the mean of :attr:`Model.leaf_age`."""
+    """Returns the primitives of fallen leaves on the ground between the corners ``low`` and ``high`` [2] m.
+
+    Their number grows with ``age``, the mean of :attr:`Model.leaf_age`; None without fallen leaves.
+    """
     low = low - 1.0
     high = high + 1.0
     n = int(min((1.0 + 12.0 * age) * np.prod(high - low), 30_000))
@@ -136,7 +148,10 @@ def litter_batch(low: np.ndarray, high: np.ndarray, age: float, static_carrier: 
 def grass_batch(
     rows: tuple[float, float], low: np.ndarray, high: np.ndarray, density: float, static_carrier: int
 ) -> Batch | None:
-    """Tufts of grass and herbs where the ground is green; they carry the ground's label."""
+    """Returns the primitives of grass tufts and herbs, with the ground's label, on the green parts of the ground.
+
+    ``rows``: y of the first row and spacing of rows [m]; ``low``, ``high``: corners [2] m; ``density``: tufts [1/m^2].
+    """
     low = low - 3.0
     high = high + 3.0
     count = int(min(density * np.prod(high - low), 60_000))
@@ -145,7 +160,7 @@ def grass_batch(
     rng = np.random.default_rng(23)
     position = low + (high - low) * rng.uniform(size=(count, 2))
     noise = textures.sample_noise(position[:, 0] * 0.21, position[:, 1] * 0.21)
-    # greenness as in the colour of the ground
+    # the same greenness as in the ground's colour
     green = noise[:, 0] * 0.55 + 0.2 * noise[:, 2] + 0.125 + _row_greenness(rows, position[:, 1])
     position = position[green > 0.40 + 0.24 * rng.uniform(size=count)]
     n = len(position)

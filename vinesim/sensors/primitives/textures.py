@@ -1,7 +1,7 @@
-"""Baked tables that make analytic primitives look like plants: leaf outlines and veins, noise, soil, sky.
+"""Computed textures that make analytic primitives look like plants: leaf outlines and veins, noise, soil, sky.
 
-All are computed from fixed seeds, tile without seams where they repeat, and hold linear values. They are kept in
-:mod:`vinesim.core.disk_cache`: computing them takes seconds.
+Textures are computed from fixed seeds, have linear values, and tile without seams if they repeat. They are stored in
+:mod:`vinesim.core.disk_cache`, because computing them takes seconds.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from vinesim.scene import leaves
 
 GRASS_OUTLINE = leaves.SHAPE_COUNT
 HERB_OUTLINE = leaves.SHAPE_COUNT + 1
-"""Numbers of the outlines that are not vine leaves: a tuft of grass, a broad weed."""
+"""Indices of the outlines that are not vine leaves: a tuft of grass (``GRASS_OUTLINE``) and a broad-leaved herb."""
 OUTLINE_COUNT = leaves.SHAPE_COUNT + 2
 TEXTURE_SIZE = 256
-"""Texels along each side of the tables."""
+"""Number of texels along each side of square textures."""
 _DISTANCE_STEPS = 400.0
 SKY_ROWS = 512
 SKY_COLUMNS = 1024
@@ -30,36 +30,40 @@ _SUPERSAMPLING = 4
 
 @functools.cache
 def _digest() -> str:
-    """Digest of the code that makes the tables."""
+    """Returns a digest, for the disk cache, of the code that computes the textures."""
     return disk_cache.source_digest(pathlib.Path(__file__), pathlib.Path(leaves.__file__), cv2.__version__)
 
 
 def _on_disk(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
-    """A function that returns the tables computed by ``make``, which are kept on disk."""
+    """Decorator: returns a function that reads the arrays of ``make`` from the disk cache, or computes and stores
+    them."""
     name = make.__name__.strip("_").replace("_", "-")
     return lambda: disk_cache.load_or_make(name, _digest(), make)
 
 
 def _cached(make: Callable[[], disk_cache.Arrays]) -> Callable[[], disk_cache.Arrays]:
-    """As :func:`_on_disk`; the tables are kept in this process, too."""
+    """Decorator like :func:`_on_disk` that also keeps the arrays in the memory of this process."""
     return functools.cache(_on_disk(make))
 
 
 def _grid(side: int) -> tuple[np.ndarray, np.ndarray]:
-    """Leaf coordinates u in [-1, 1], v in [-0.75, 1.25] of texel centres; the unit reaches from petiole to tip."""
+    """Returns the coordinates u in [-1, 1], v in [-0.75, 1.25] of the centres of a leaf texture's texels.
+
+    The unit is the length of the midrib from petiole to tip; ``side``: number of texels along a side.
+    """
     step = (np.arange(side) + 0.5) / side * 2.0
     u, v = np.meshgrid(step - 1.0, step - 0.75)
     return u, v
 
 
 def leaf_scale(shape: int | np.ndarray) -> np.ndarray:
-    """Length from petiole to tip in units of ``Model.leaf_size``, by outline [shape]."""
+    """Returns the length from petiole to tip, in units of ``Model.leaf_size``, of leaves with outline ``shape``."""
     tips = np.array([leaves.blade_outline(np.zeros(1), i)[0] for i in range(leaves.SHAPE_COUNT)])
     return tips[shape]
 
 
 def _signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Signed distance to the edge of a finely sampled mask, positive inside [leaf units], [SIDE, SIDE]."""
+    """Returns the signed distance [SIDE, SIDE] in leaf units to the edge of a finely sampled mask, positive inside."""
     inside = mask.astype(np.uint8)
     pixels = cv2.distanceTransform(inside, cv2.DIST_L2, 5) - cv2.distanceTransform(1 - inside, cv2.DIST_L2, 5)
     return cv2.resize(pixels, (TEXTURE_SIZE, TEXTURE_SIZE), interpolation=cv2.INTER_AREA) * (
@@ -68,7 +72,7 @@ def _signed_distance(mask: np.ndarray) -> np.ndarray:
 
 
 def _grass_mask() -> np.ndarray:
-    """Mask of a tuft of grass: bent blades that taper, rooted along the lower edge."""
+    """Returns the finely sampled mask of a tuft of grass: bent, tapering blades that grow from the lower edge."""
     rng = np.random.default_rng(31)
     side = TEXTURE_SIZE * _SUPERSAMPLING
     mask = np.zeros((side, side), np.uint8)
@@ -86,7 +90,8 @@ def _grass_mask() -> np.ndarray:
 
 
 def leaf_outlines() -> tuple[np.ndarray, np.ndarray]:
-    """Signed distances [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and octagons around them [outline, 8, 2]."""
+    """Returns signed distances to the edge of all leaf outlines [outline, SIDE, SIDE] int8 in 1/400 leaf unit, and
+    octagons around the outlines [outline, 8, 2] in leaf units."""
     baked = _leaf_outlines()
     return baked["distance"], baked["hull"]
 
@@ -118,13 +123,14 @@ def _leaf_outlines() -> disk_cache.Arrays:
 
 
 def _smooth_noise(rng: np.random.Generator, sigma: float) -> np.ndarray:
-    """Smooth noise of unit variance [SIDE, SIDE]."""
+    """Returns Gaussian-filtered noise [SIDE, SIDE] of unit variance; ``sigma``: width of the filter [texel]."""
     noise = cv2.GaussianBlur(rng.normal(size=(TEXTURE_SIZE, TEXTURE_SIZE)).astype(np.float32), (0, 0), sigma)
     return noise / noise.std()
 
 
 def leaf_texture() -> np.ndarray:
-    """Vein strength, relief slope along u and v, tone: [outline, SIDE/2, SIDE/2, 4] float32."""
+    """Returns the texture of leaves [outline, SIDE/2, SIDE/2, 4] float32: vein strength, slope of the relief along u
+    and v, tone."""
     return _leaf_texture()["table"]
 
 
@@ -163,14 +169,15 @@ def _leaf_texture() -> disk_cache.Arrays:
 
 
 def _segment(u: np.ndarray, v: np.ndarray, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to a segment and position along it, 0 to 1."""
+    """Returns the distance of points (u, v) to the segment from ``a`` to ``b``, and the position along it, 0 to 1."""
     d = b - a
     along = np.clip(((u - a[0]) * d[0] + (v - a[1]) * d[1]) / (d @ d), 0.0, 1.0)
     return np.hypot(u - a[0] - along * d[0], v - a[1] - along * d[1]), along
 
 
 def _periodic_noise(rng: np.random.Generator, lowest: float, power: float) -> np.ndarray:
-    """Periodic noise with a 1/f^power spectrum above a lowest frequency; zero mean, unit variance."""
+    """Returns periodic noise [SIDE, SIDE] with a 1/f^power spectrum above the frequency ``lowest``, of zero mean and
+    unit variance."""
     cycles = np.fft.fftfreq(TEXTURE_SIZE) * TEXTURE_SIZE
     f = np.hypot(*np.meshgrid(cycles, cycles))
     gain = np.where(f >= lowest, 1.0 / np.maximum(f, lowest) ** power, 0.0)
@@ -179,7 +186,7 @@ def _periodic_noise(rng: np.random.Generator, lowest: float, power: float) -> np
 
 
 def noise_texture() -> np.ndarray:
-    """Four octaves of periodic noise around 0.5, coarse to fine: [SIDE, SIDE, 4] float32 in 0..1."""
+    """Returns four octaves of periodic noise, from coarse to fine: [SIDE, SIDE, 4] float32 from 0 to 1, mean 0.5."""
     return _noise_texture()["table"]
 
 
@@ -191,7 +198,8 @@ def _noise_texture() -> disk_cache.Arrays:
 
 
 def soil_texture() -> np.ndarray:
-    """Clods, sod, slope along x and y of 1.25 m of ground: [SIDE, SIDE, 4] float32."""
+    """Returns the texture of 1.25 m x 1.25 m of ground [SIDE, SIDE, 4] float32: tone of clods, sod, slopes along x and
+    y."""
     return _soil_texture()["table"]
 
 
@@ -217,11 +225,13 @@ def _soil_texture() -> disk_cache.Arrays:
     return {"table": np.stack([tone, green, -0.9 * slope_x, -0.9 * slope_y], -1).astype(np.float32)}
 
 
-@_on_disk  # 13 MB, needed only for a moment when the sun has moved
+@_on_disk  # 13 MB, needed only while the sky is computed after the sun has moved
 def _sky_layers() -> disk_cache.Arrays:
-    """Parts of the sky that do not depend on the sun: ``cloud``, the share of clouds; ``ridges``, ``trees`` and
-    ``tree_share`` in front of the sky, which reach up to some row: the shares, and the colour of the trees. float64, in
-    which they are mixed."""
+    """Compute the parts of the sky's texture that do not depend on the sun, as float64.
+
+    Array ``cloud`` is the share of clouds, ``ridges`` and ``tree_share`` are the shares of hills and of trees in front
+    of the sky, in the lowest :data:`_RIDGE_ROWS` rows, and ``trees`` is the colour of the trees.
+    """
     height, azimuth = (np.ascontiguousarray(part) for part in np.broadcast_arrays(*_sky_directions()))
     flat = np.sqrt(1.0 - height**2)
     far = 0.22 / (height + 0.12)
@@ -248,21 +258,21 @@ def _sky_layers() -> disk_cache.Arrays:
 
 
 _RIDGE_ROWS = 180
-"""Rows of the sky's table that ridges and trees can reach, up to 0.12 in the sine of elevation."""
+"""Number of rows of the sky's texture that ridges and trees can cover, up to a sine of elevation of 0.12."""
 _RIDGE_TONES = np.array([0.36, 0.47, 0.62]), np.array([0.22, 0.32, 0.36])
-"""Linear RGB of the far and the near ridge."""
+"""Colours (linear RGB) of the far and the near ridge of hills."""
 _SKY_BAND = 12
-"""Number of rows of the sky's table that are computed at once: few enough to stay in a core's cache. It divides
+"""Number of rows of the sky's texture that are computed at once, which fit into a core's cache; a divisor of
 :data:`_RIDGE_ROWS`."""
 
 
 def _sky_directions() -> tuple[np.ndarray, np.ndarray]:
-    """Sine of elevation [row, 1] and azimuth [1, column] rad of the sky's table."""
+    """Returns sine of elevation [row, 1] and azimuth [1, column] rad of the texels of the sky's texture."""
     return np.linspace(0.0, 1.0, SKY_ROWS)[:, None] ** 2, np.linspace(-np.pi, np.pi, SKY_COLUMNS)[None]
 
 
 def _clear_sky() -> np.ndarray:
-    """Blue of a sky without clouds [row, 1, 3]: it is the same in all directions."""
+    """Returns the colour [row, 1, 3] (linear RGB) of a sky without clouds, which does not depend on azimuth."""
     height, _ = _sky_directions()
     horizon = np.exp(-5.5 * height)[..., None]
     return (1.0 - horizon) * np.array([0.13, 0.30, 0.78]) + horizon * np.array([0.52, 0.68, 0.92])
@@ -270,10 +280,11 @@ def _clear_sky() -> np.ndarray:
 
 @functools.lru_cache(maxsize=1)  # cameras of one robot see the same sun
 def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, float, float]) -> np.ndarray:
-    """Radiance of the sky by sqrt(sine of elevation) and azimuth: [SKY_ROWS, SKY_COLUMNS, 3] float32.
+    """Returns the radiance of the sky [SKY_ROWS, SKY_COLUMNS, 3] float32, by square root of the sine of elevation and
+    by azimuth.
 
-    Clear blue with thin clouds, a halo around the sun (unit vector towards it) that reddens when the sun is low, and
-    hills in the haze.
+    The sky is blue with thin clouds, a halo around the sun that is redder for a low sun, and hills in the haze.
+    ``sun``: unit vector towards the sun; ``colour_of_sun``: linear RGB.
     """
     table = np.empty((SKY_ROWS, SKY_COLUMNS, 3), np.float32)
     layers = _sky_layers()
@@ -284,7 +295,8 @@ def sky_texture(sun: tuple[float, float, float], colour_of_sun: tuple[float, flo
 
 
 def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of_sun: np.ndarray) -> np.ndarray:
-    """Some rows of the sky's table [row, SKY_COLUMNS, 3]; they lie within or beyond :data:`_RIDGE_ROWS`."""
+    """Returns some ``rows`` of the sky's texture [row, SKY_COLUMNS, 3], which are all below or all above
+    :data:`_RIDGE_ROWS`."""
     height, azimuth = _sky_directions()
     height = height[rows]
     colour = _clear_sky()[rows]
@@ -303,7 +315,10 @@ def _sky_rows(rows: slice, layers: disk_cache.Arrays, sun: np.ndarray, colour_of
 
 
 def sample_noise(x: np.ndarray, y: np.ndarray, octaves: slice = slice(None)) -> np.ndarray:
-    """Noise of period 1 at some positions, with bilinear interpolation [..., 4]; or some of its octaves."""
+    """Returns the noise texture [..., 4], of period 1, interpolated bilinearly at positions (x, y) [...].
+
+    ``octaves``: the octaves (last index) to return.
+    """
     table = np.ascontiguousarray(noise_texture()[..., octaves]).reshape(TEXTURE_SIZE**2, -1)
     fx = (x % 1.0) * TEXTURE_SIZE
     fy = (y % 1.0) * TEXTURE_SIZE
@@ -330,7 +345,10 @@ def _mix(a: np.ndarray, b: np.ndarray, t: np.ndarray) -> np.ndarray:
 
 @functools.cache
 def tone_curve() -> np.ndarray:
-    """8-bit sRGB of sqrt(linear) in 0..4, 4096 entries: the filmic curve of Narkowicz (2015), then IEC 61966-2-1."""
+    """Returns the tone curve [4096]: 8-bit sRGB by the square root of exposed radiance from 0 to 4.
+
+    It is the filmic curve of Narkowicz (2015), followed by the sRGB encoding of IEC 61966-2-1.
+    """
     x = (np.arange(4096) / 1024.0) ** 2
     film = np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0)
     srgb = np.where(film <= 0.0031308, 12.92 * film, 1.055 * film ** (1.0 / 2.4) - 0.055)

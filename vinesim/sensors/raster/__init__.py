@@ -1,1 +1,1 @@
-"""Rasterisers: which primitive each pixel of a camera sees."""
+"""Rasterisers, which find the visible primitive in each pixel of a camera, and lens distortion."""

@@ -1,5 +1,4 @@
-"""Camera rasterisation on the CPU, or by the renderer of the scene: keys, depth, labels and primitive of every
-pixel."""
+"""Camera rasteriser: primitive, depth and label of every pixel, by CPU kernels or by another renderer of the scene."""
 
 from __future__ import annotations
 
@@ -13,6 +12,7 @@ import warp as wp
 
 from vinesim.core import frames
 from vinesim.core.thread_pool import ThreadPool
+from vinesim.core.warp_arrays import struct_fields
 from vinesim.kernels.raster import camera_raster, camera_raster_plants
 from vinesim.kernels.raster import primitives as shapes
 from vinesim.kernels.raster.pinhole import EMPTY_KEY, NEAR_DEPTH, Pinhole
@@ -30,15 +30,16 @@ from vinesim.sensors.raster.primitive_arrays import (
 )
 
 MAX_DEPTH = 500.0
-"""Nothing is drawn beyond this depth [m]."""
+"""Depth [m] beyond which primitives are not drawn."""
 BANDS_PER_THREAD = 2
-"""Average number of bands of a picture for each thread. A thread that has finished its band takes the next one."""
+"""Average number of bands of rows of a picture for each thread. A thread that has finished a band takes the next one.
+"""
 _KERNELS = (
     (camera_raster_plants.raster_cones, (CONE,)),
     (camera_raster_plants.raster_spheroids, (SPHEROID,)),
     (camera_raster.raster_triangles, (TRIANGLE,)),
     (camera_raster.raster_solids, (BOX, ELLIPSOID, CYLINDER)),
-    (camera_raster_plants.raster_leaves, (LEAF,)),  # last, since this test costs most: most leaves are hidden by then
+    (camera_raster_plants.raster_leaves, (LEAF,)),  # last, because leaves cost most, and most are then already hidden
 )
 _KERNEL_OF_KIND = np.array(
     [next(i for i, (_, kinds) in enumerate(_KERNELS) if kind in kinds) for kind in range(TRIANGLE + 1)]
@@ -47,7 +48,7 @@ _KERNEL_OF_KIND = np.array(
 
 
 def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
-    """Kernel struct of a camera with intrinsics ``info`` whose optical frame has the ``pose`` [7]."""
+    """Returns the kernel struct of a camera with intrinsics ``info`` whose optical frame has the ``pose`` [7]."""
     if not (info.fx > 0.0 and info.fy > 0.0 and info.width > 0 and info.height > 0):
         raise ValueError(
             f"camera {info.frame_id!r} has fx {info.fx}, fy {info.fy}, {info.width} x {info.height}; give positive ones"
@@ -76,13 +77,14 @@ def pinhole(info: CameraInfo, pose: np.ndarray) -> Pinhole:
 
 
 def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
-    """Up to ``count`` lenses that together draw the rows of one picture; each draws an even number of rows."""
+    """Returns up to ``count`` copies of ``lens``, each for a band of an even number of rows, that together cover its
+    rows."""
     rows = [2 * round(0.5 * lens.height * i / count) for i in range(count)] + [lens.height]
     bands = []
     for first, end in itertools.pairwise(rows):
         if first < end:
             band = Pinhole()
-            for name in Pinhole.vars:
+            for name in struct_fields(Pinhole):
                 setattr(band, name, getattr(lens, name))
             band.first_row = first
             band.end_row = end
@@ -91,7 +93,7 @@ def row_bands(lens: Pinhole, count: int) -> list[Pinhole]:
 
 
 def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
-    """Intrinsics of the same view with ``samples`` times as many pixels along each side."""
+    """Returns the intrinsics of a picture with ``samples`` times as many pixels along each side and an equal view."""
     return dataclasses.replace(
         info,
         width=info.width * samples,
@@ -104,11 +106,11 @@ def supersampled(info: CameraInfo, samples: int) -> CameraInfo:
 
 
 class CameraRasterizer:
-    """Finds the nearest primitive of every pixel, and holds the buffers of one camera."""
+    """Finds the nearest primitive in every pixel of one camera, and holds the buffers of its picture."""
 
     def __init__(self, width: int, height: int, device: str = "cpu", workers: ThreadPool | None = None) -> None:
-        """``workers`` draw bands of rows at the same time. The result is the same to the bit for every number of
-        workers."""
+        """``width``, ``height``: of the picture [px]; ``workers``: threads that draw bands of rows in parallel, without
+        effect on the result."""
         count = width * height
         self.workers = workers or ThreadPool(1)
         self.width = width
@@ -128,9 +130,10 @@ class CameraRasterizer:
         farthest: float = MAX_DEPTH,
         beside: Sequence[Callable[[], None]] = (),
     ) -> None:
-        """Fill keys, primitive numbers (-1 sky, -2 ground), depth [m] and labels.
+        """Compute primitive (-1 the sky, -2 the ground), depth [m] and label of every pixel.
 
-        ``beside`` is other work for the same threads; it is done when this returns.
+        ``nearest``, ``farthest``: range of depth [m]; depths beyond it become -inf and inf. ``beside``: other functions
+        for the same threads, which have returned when this method returns.
         """
         if primitives.rasterizer is not None:
             primitives.rasterizer.rasterize(primitives, lens, None, self.keys)
@@ -147,12 +150,12 @@ class CameraRasterizer:
         self.workers.share([*beside, *(functools.partial(draw_band, band) for band in self.bands(lens))])
 
     def bands(self, lens: Pinhole) -> list[Pinhole]:
-        """The bands of rows that :attr:`workers` take one after the other."""
+        """Returns the bands of rows of ``lens`` into which the work of a picture is divided for :attr:`workers`."""
         return row_bands(lens, BANDS_PER_THREAD * self.workers.size if self.workers.size > 1 else 1)
 
     def _resolve(self, primitives: PosedPrimitives, lens: Pinhole, nearest: float, farthest: float) -> None:
-        """Convert the keys of the rows of ``lens`` to primitive numbers, depth and labels."""
-        run = self.width if self.device == "cpu" else 1  # a thread takes a row: structs are passed once a thread
+        """Convert the keys in the rows of ``lens`` to primitive, depth and label."""
+        run = self.width if self.device == "cpu" else 1  # on a CPU one thread takes a row, to pass structs less often
         wp.launch(
             camera_raster.resolve_keys,
             self.width * (lens.end_row - lens.first_row) // run,
@@ -172,7 +175,7 @@ class CameraRasterizer:
         )
 
     def cluster_distances(self, primitives: PosedPrimitives, lens: Pinhole) -> np.ndarray:
-        """[cluster] m Least distance of each cluster from the eye; :data:`shapes.FAR` if no pixel can see it."""
+        """Returns [cluster] m the least distance of each cluster from the camera, or FAR for clusters out of view."""
         distance = wp.empty(len(primitives.cluster_first), dtype=float, device=self.device)
         wp.launch(
             camera_raster.cull_clusters,
@@ -184,7 +187,10 @@ class CameraRasterizer:
         return distance.numpy()
 
     def coverage(self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray) -> np.ndarray:
-        """Pixels [height, width] that would see some clusters [k] if the scene had no others. Only keys are drawn."""
+        """Returns [height, width] which pixels would show the ``clusters`` [k] if the scene contained no others.
+
+        This overwrites the keys, but neither depth nor labels.
+        """
         if primitives.rasterizer is None:
             self._rasterize(primitives, lens, clusters)
         else:
@@ -192,8 +198,8 @@ class CameraRasterizer:
         return self.keys.numpy().reshape(self.height, self.width) < int(EMPTY_KEY)
 
     def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
-        """Fill the keys of the rows of ``lens`` with the nearest primitive of some clusters [k]. Fastest if the
-        clusters are sorted from near to far."""
+        """Compute the keys in the rows of ``lens`` from the clusters ``seen`` [k], which should be sorted from near to
+        far for speed."""
         assert self._keys is not None, "these kernels draw on a CPU only"
         rows = slice(lens.first_row * self.width, lens.end_row * self.width)
         self._keys[rows].fill(int(EMPTY_KEY))  # numpy fills this memory five times as fast as Warp

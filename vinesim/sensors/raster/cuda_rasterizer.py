@@ -1,4 +1,4 @@
-"""The rasteriser on a GPU: the memory of its lists of pieces, and the number of threads that draw them."""
+"""The rasteriser on a CUDA GPU: launches of its two kernels, and memory of the lists of tiles."""
 
 from __future__ import annotations
 
@@ -13,14 +13,16 @@ _LISTS = int(cuda_raster.TILE_LISTS)
 
 
 class CudaRasterizer:
-    """Fills the keys of pictures of any size. The host does not wait for the GPU.
+    """Rasteriser on a CUDA GPU: lists tiles of primitives, then draws them into the keys of a picture of any size.
+
+    The host does not wait for the GPU.
 
     Args:
-        groups: number of pieces of each list that are drawn at the same time.
-        lanes: number of threads that draw one piece together.
-        listers: number of threads that list the pieces of one cluster.
-        block: number of threads in a CUDA block that draws pieces.
-        room: number of pieces for which each list has room. Further pieces are drawn too, but slowly.
+        groups: number of tiles of each list that are drawn at the same time.
+        lanes: number of threads that draw one tile together.
+        listers: number of threads that list the tiles of one cluster.
+        block: number of threads in a CUDA block that draws tiles.
+        room: capacity of each list in tiles. Tiles beyond it are drawn when they are listed, which is slow.
     """
 
     def __init__(
@@ -45,7 +47,8 @@ class CudaRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """Find the nearest primitive of every pixel among all clusters, or among some [k]."""
+        """Write the nearest primitive of every pixel to ``keys`` [pixel], of all clusters or only of ``clusters``
+        [k]."""
         if len(self._all) != len(primitives.cluster_first):
             self._all = wp.array(np.arange(len(primitives.cluster_first), dtype=np.int32), device=self.device)
         which = self._all if clusters is None else wp.array(np.asarray(clusters, np.int32), device=self.device)

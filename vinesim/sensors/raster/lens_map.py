@@ -1,4 +1,4 @@
-"""Pictures through a lens with distortion: drawn by a pinhole camera that sees at least as much, then resampled."""
+"""Lens distortion: pictures are rendered by a pinhole camera whose view contains the distorted one, then resampled."""
 
 from __future__ import annotations
 
@@ -12,24 +12,27 @@ from vinesim.scene.camera_geometry import pixel_rays
 from vinesim.scene.values import CameraInfo
 
 MAX_GROWTH = 4.0
-"""Largest number of pixels of the pinhole picture for each pixel of the distorted picture."""
+"""Largest ratio of the numbers of pixels of the pinhole picture and of the distorted picture."""
 
 
 class LensError(ValueError):
-    """No picture can be drawn with these coefficients of distortion. The text is one line."""
+    """Error: no picture can be rendered with given coefficients of distortion. The message is one line."""
 
 
 class LensMap:
-    """The pinhole that is drawn for a camera, and the map from its pictures to the camera's. Pictures of a camera
-    without distortion are not changed."""
+    """The pinhole camera that is rendered in place of a distorted camera, and the map from its pictures to distorted
+    ones.
+
+    Without distortion, pictures are not changed.
+    """
 
     def __init__(self, info: CameraInfo) -> None:
         self.pinhole = info
-        """Intrinsics of the pinhole that is drawn."""
+        """Intrinsics of the pinhole camera that is rendered."""
         self._columns = self._rows = np.zeros((0, 0), np.float32)
-        """[height, width] Place in the pinhole's picture from which each pixel is taken."""
+        """[height, width] Column and row [px] of the pinhole's picture at which each distorted pixel is sampled."""
         self._nearest = np.zeros((0, 0), np.intp)
-        """[height, width] Pixel of the pinhole's picture that is nearest to this place, counted row by row."""
+        """[height, width] Flat index of the pixel in the pinhole's picture that is nearest to the sampling point."""
         if not info.distortion:
             return
         if len(info.distortion) not in camera_geometry.MODELS:
@@ -59,19 +62,22 @@ class LensMap:
         self._nearest = np.rint(self._rows).astype(np.intp) * width + np.rint(self._columns).astype(np.intp)
 
     def nearest(self, drawn: np.ndarray) -> np.ndarray:
-        """The camera's picture from the pinhole's ``drawn`` [height, width]: each pixel takes the nearest value."""
+        """Returns the distorted picture from the pinhole's picture ``drawn`` [height, width], with nearest-pixel
+        sampling."""
         return drawn if not self._nearest.size else drawn.reshape(-1)[self._nearest]
 
     def smooth(self, drawn: np.ndarray) -> np.ndarray:
-        """As :meth:`nearest` for colours [height, width, 3] uint8, with linear interpolation between pixels."""
+        """Returns the distorted picture from the pinhole's colours ``drawn`` [height, width, 3] uint8, with bilinear
+        interpolation."""
         if not self._nearest.size:
             return drawn
-        import cv2  # imported here, since most cameras do not need it
+        import cv2  # imported here, because most cameras do not need it
 
         return cv2.remap(drawn, self._columns, self._rows, cv2.INTER_LINEAR)
 
 
 @functools.lru_cache(maxsize=16)
 def lens_map(info: CameraInfo) -> LensMap:
-    """The map of a camera, made once. :class:`LensError` if its distortion cannot be drawn."""
+    """Returns the lens map of a camera, which is computed once; :class:`LensError` if its distortion cannot be
+    rendered."""
     return LensMap(info)

@@ -31,19 +31,20 @@ KINDS = {
     "cylinder": CYLINDER,
     "triangle": TRIANGLE,
 }
-"""Number of each kind of primitive, by name."""
+"""Numbers that stand for the kinds of primitives in kernels, by name."""
 
 
 class PosedPrimitives(Protocol):
-    """Primitives posed in the world (:class:`vinesim.sensors.primitives.scene_primitives.Primitives`)."""
+    """Interface of the primitives of a scene in world poses, for rasterisers; implemented by
+    :class:`vinesim.sensors.primitives.scene_primitives.Primitives`."""
 
     device: str
     shapes: primitives.Shapes
     clusters: primitives.Clusters
     ball: wp.array
-    """[cluster] vec4, bounding sphere: centre and radius [m]. The radius is negative if the cluster is hidden."""
+    """[cluster] vec4, bounding sphere: centre and radius [m]. The radius of a hidden cluster is negative."""
     labels: wp.array
-    """[primitive] int32, as of :func:`vinesim.scene.ids.label`."""
+    """[primitive] int32, label as defined by :func:`vinesim.scene.ids.label`."""
     cluster_first: np.ndarray
     """[cluster] int32, index of the cluster's first primitive."""
     cluster_size: np.ndarray
@@ -55,19 +56,20 @@ class PosedPrimitives(Protocol):
 
     @property
     def rasterizer(self) -> PrimitiveRasterizer | None:
-        """The rasteriser that fills the keys of cameras; None for the kernels of
+        """The rasteriser for cameras of this scene; None: the CPU kernels of
         :mod:`vinesim.kernels.raster.camera_raster`."""
         ...
 
 
 class PrimitiveRasterizer(Protocol):
-    """Fills keys: depth [um] in the upper 32 bits, number of the primitive in the lower 32 bits."""
+    """Interface of a rasteriser, which computes a key for each pixel: depth [um] in the upper 32 bits, index of the
+    primitive in the lower 32 bits."""
 
     def rasterize(
         self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """Write the nearest primitive of every pixel to ``keys`` [pixel] int64.
+        """Write the key of the nearest primitive of every pixel to ``keys`` [pixel] int64.
 
-        ``clusters`` [k]: only these are drawn; all unless given.
+        ``clusters``: [k] clusters to draw; None: all clusters.
         """
         ...

@@ -1,4 +1,4 @@
-"""Renderers by name: Warp on a CPU, Warp on CUDA, Taichi. All find the same primitive in every pixel."""
+"""Renderers by name: Warp on a CPU, Warp on CUDA, Taichi. All of them find the same primitive in every pixel."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ RENDERERS = ("warp", "taichi", "taichi-gpu")
 
 
 class RendererUnavailable(ValueError):
-    """The renderer is unknown or cannot run here; the text gives the remedy."""
+    """Error: a renderer is unknown or cannot run on this machine. The message contains the remedy."""
 
     exit_code = 3
 
 
 def check_renderer(renderer: str, device: str = "cpu") -> str:
-    """Return the name of a renderer that is known, installed and draws on ``device``; :class:`RendererUnavailable` in
-    words if not."""
+    """Returns ``renderer`` if it is known, installed and can draw on ``device``; raises :class:`RendererUnavailable`
+    otherwise."""
     if renderer not in RENDERERS:
         raise RendererUnavailable(f"renderer {renderer!r}: give one of {', '.join(RENDERERS)}")
     if renderer != "warp" and importlib.util.find_spec("taichi") is None:
@@ -33,7 +33,8 @@ def check_renderer(renderer: str, device: str = "cpu") -> str:
 
 
 def create_rasterizer(renderer: str, device: str) -> PrimitiveRasterizer | None:
-    """The rasteriser of a renderer, by name, for primitives on ``device``; None for Warp's own on a CPU."""
+    """Returns the rasteriser of the renderer with this name, for primitives on ``device``; None for Warp on a CPU,
+    whose kernels ``CameraRasterizer`` launches."""
     if check_renderer(renderer, device) != "warp":
         from vinesim.sensors.raster.taichi_rasterizer import TaichiRasterizer
 

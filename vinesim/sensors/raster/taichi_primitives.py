@@ -1,13 +1,14 @@
-"""Primitives in Taichi: for each kind, functions that place it in the optical frame, bound it, and meet it with a ray.
+"""Primitives in Taichi: for each kind, functions that transform it to the optical frame, bound it and intersect rays.
 
-``place`` transforms a primitive into the optical frame, ``outline`` bounds its picture by a box and two strips
-``low <= x - slope y <= high``, ``hit`` meets it with the ray of a pixel. The arrays are those of
-:mod:`vinesim.kernels.raster.primitives`. No postponed annotations: Taichi needs real ones.
+Functions ``place_*`` transform a primitive into the optical frame, ``*_outline`` bound its picture by a box and two
+strips ``low <= x - slope y <= high``, ``hit_*`` intersect it with the ray of a pixel. The arrays are those of
+:mod:`vinesim.kernels.raster.primitives`. This module must not import ``annotations`` from ``__future__``, because
+Taichi evaluates annotations.
 """
 
 import os
 
-os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output belongs to the command
+os.environ.setdefault("ENABLE_TAICHI_HEADER_PRINT", "0")  # standard output is for the command's results
 
 import taichi as ti
 from taichi.math import clamp, cross, dot, length, vec2, vec3, vec4
@@ -23,14 +24,14 @@ TEXELS = float(leaf_surface.OUTLINE_TEXELS)
 
 mat3 = ti.types.matrix(3, 3, ti.f32)
 Placed = ti.types.struct(a=vec4, b=vec4, c=vec4, d=vec4)
-"""A primitive in the optical frame. Boxes and ellipsoids keep two axes in b and c, each with a half size as fourth
-component."""
+"""A primitive in the optical frame, as four vectors. For boxes and ellipsoids, b and c are two axes, each with a half
+size as fourth component."""
 Lens = ti.types.struct(
     eye=vec3, rotation=mat3, focal=vec2, centre=vec2, size=vec2, max_depth=ti.f32, near_radius=ti.f32
 )
 Bound = ti.types.struct(box=vec4, rising=vec3, falling=vec3, depth=ti.f32)
-"""Bounds of a primitive in the picture. ``box``: lowest and highest x, lowest and highest y [pixel]. ``rising``,
-``falling``: strips (slope, low, high). ``depth``: no point of the primitive is nearer [m]."""
+"""Bounds of a primitive in the picture. ``box``: lowest and highest x, lowest and highest y [px]. ``rising``,
+``falling``: strips (slope, low, high). ``depth``: lower bound of the depth of the primitive's points [m]."""
 EMPTY_BOUNDS = vec4(UNBOUND, -UNBOUND, UNBOUND, -UNBOUND)
 UNBOUNDED_STRIP = vec3(0.0, -UNBOUND, UNBOUND)
 
@@ -40,8 +41,8 @@ UNBOUNDED_STRIP = vec3(0.0, -UNBOUND, UNBOUND)
 
 @ti.func
 def tangents(x, z, r):
-    """Both tangents (x / z) from the origin to a circle. Beyond +-90 degrees they are unbounded, with the right
-    sign."""
+    """Returns x / z of both tangents from the origin to a circle of radius ``r`` around (x, z) [m]; very large numbers
+    of the right sign for tangents beyond +-90 degrees."""
     out = vec2(-UNBOUND, UNBOUND)
     free = x * x + z * z - r * r
     if free > 0.0:
@@ -56,7 +57,8 @@ def tangents(x, z, r):
 
 @ti.func
 def ball(lens, p, r):
-    """Box around the picture of a sphere."""
+    """Returns the box [px] around the picture of a sphere of radius ``r`` [m] around ``p`` [m], in the optical
+    frame."""
     h = tangents(p[0], p[2], r) * lens.focal[0] + lens.centre[0]
     v = tangents(p[1], p[2], r) * lens.focal[1]
     return vec4(h[0], h[1], v[0] + lens.centre[1], v[1] + lens.centre[1])
@@ -109,7 +111,7 @@ def cone_outline(s, hull: ti.template(), lens):
     box = EMPTY_BOUNDS
     strip = UNBOUNDED_STRIP
     if ti.max(a[2], b[2]) > -r:
-        # what comes closer than NEAR_DEPTH may be cut there if its axis stays clear of all that is so close and in view
+        # if the cone stays clear of the part of the view nearer than NEAR_DEPTH, its axis may be cut at NEAR_DEPTH
         axis = b - a
         cut = NEAR_DEPTH - r
         start = a
@@ -193,7 +195,8 @@ def triangle_outline(s, hull: ti.template(), lens):
 
 @ti.func
 def hit_ball(centre, r, d):
-    """First hit of a ray from the origin with a sphere that does not contain the origin."""
+    """Returns the first hit of a ray from the origin with a sphere that does not contain the origin, in lengths of
+    ``d``."""
     dd = dot(d, d)
     along = dot(d, centre) / dd
     miss = centre - d * along
@@ -239,7 +242,10 @@ def hit_box(s, outlines: ti.template(), d, smooth):
 
 @ti.func
 def hit_cone(s, outlines: ti.template(), d, smooth):
-    """Hit with the hull of two spheres, measured from the foot of the perpendicular onto the axis' middle."""
+    """Returns the hit with a cone with rounded ends (the convex hull of two spheres), in lengths of ``d``.
+
+    The equations are solved from the ray's point nearest to the middle of the axis, for precision.
+    """
     a = s.a.xyz
     b = s.b.xyz
     ra = s.a[3]
@@ -270,7 +276,7 @@ def hit_cone(s, outlines: ti.template(), d, smooth):
             if y > 0.0 and y < d2:
                 best = t + shift
                 side = True
-        elif k2 < 0.0:  # steeper than the slope: either root may be the first hit
+        elif k2 < 0.0:  # the ray is steeper than the cone's slope: either root may be the first hit
             for sign in ti.static((1.0, -1.0)):
                 t = (sign * root - k1) / k2
                 y = m1 - ra * slope + t * m2
@@ -350,7 +356,8 @@ def on_blade(outlines: ti.template(), number, u, v, smooth):
 
 @ti.func
 def hit_leaf(s, outlines: ti.template(), ray, smooth):
-    """Hit with two half surfaces w = a u^2 + b v^2 + c |u| in the leaf's own frame and unit, hinged at u = 0."""
+    """Returns the hit with a leaf: two half surfaces w = a u^2 + b v^2 + c |u|, in the leaf's own frame and unit, that
+    meet at u = 0."""
     rib = s.b.xyz
     up = s.c.xyz
     bend = s.d
@@ -381,7 +388,7 @@ def hit_leaf(s, outlines: ti.template(), ray, smooth):
     return best
 
 
-# ------------------------------------------------------------------------------------------------- places
+# ---------------------------------------------------------------------------- transforms to the optical frame
 
 
 @ti.func
@@ -396,7 +403,7 @@ def arrow(lens, v):
 
 @ti.func
 def place_blade(lens, a, b, c, d):
-    """Place leaves and spheroids, which have one point; the other vectors are directions."""
+    """Transform a leaf or spheroid to the optical frame: ``a`` is a point, the other vectors are directions."""
     return Placed(a=point(lens, a), b=arrow(lens, b), c=arrow(lens, c), d=d)
 
 
@@ -423,5 +430,5 @@ KERNEL_FUNCTIONS = {
     BOX: (place_box, box_outline, hit_box),
     ELLIPSOID: (place_box, ellipsoid_outline, hit_ellipsoid),
     CYLINDER: (place_points, cylinder_outline, hit_cylinder),
-    LEAF: (place_blade, leaf_outline, hit_leaf),  # last, since this test costs most: most leaves are hidden by then
+    LEAF: (place_blade, leaf_outline, hit_leaf),  # last, because leaves cost most, and most are then already hidden
 }

@@ -1,11 +1,11 @@
 """The camera rasteriser in Taichi: for all cores of a CPU, and for GPUs that Warp cannot use (Vulkan, Metal).
 
-It reads the arrays of :mod:`vinesim.kernels.raster.primitives` and finds the same primitive in every pixel. A GPU here
-may have no 64-bit atomics; there depth and number of the nearest primitive are found one after the other, in two
-passes.
+It reads the arrays of :mod:`vinesim.kernels.raster.primitives` and finds the same primitive in every pixel as Warp's
+rasteriser. Some of these GPUs lack 64-bit atomics, so on a GPU depth and index of the nearest primitive are found in
+two passes.
 
-Only this module and :mod:`vinesim.sensors.raster.taichi_primitives` know Taichi. No postponed annotations: Taichi needs
-real ones.
+Only this module and :mod:`vinesim.sensors.raster.taichi_primitives` import Taichi. They must not import ``annotations``
+from ``__future__``, because Taichi evaluates annotations.
 """
 
 import contextlib
@@ -27,22 +27,25 @@ EMPTY_KEY = int(pinhole.EMPTY_KEY)
 SMOOTH_SIZE = float(pinhole.SMOOTH_SIZE)
 _NO_PRIMITIVE = 2**31 - 1
 _INEXACT = 2**30
-"""Added to primitive numbers that were found a micrometre too deep: the compiler may round differently in the two
-passes."""
+"""Number added to the index of a primitive that the second pass found a micrometre deeper than the first pass, because
+the compiler may round differently in the two passes."""
 _CORES = (64, 1)
 _GPU = (24, 32)
-"""On a GPU: number of threads that share the primitives of a cluster, and of threads that share the rows of a
-primitive. On a CPU (``_CORES``) Taichi gives 512 iterations at once to a core, idle ones included. So a core gets 8
-clusters, few enough that no core gets all near ones."""
+"""Numbers of GPU threads that share the primitives of a cluster, and that share the rows of a primitive.
+
+``_CORES`` has these numbers for a CPU, where Taichi assigns 512 iterations at a time to a core, including iterations
+without work. So a core gets 8 clusters, few enough that no core gets all near ones."""
 KEY, DEPTH, NUMBER = range(3)
-"""What a pass draws: depth and number at once; depth alone; the number of the primitive at that depth."""
+"""Codes of a pass's result: keys (depth and index together); depths alone; the index of the primitive at known depth.
+"""
 
 Table = ti.types.ndarray(dtype=vec4, ndim=1)
 
 
 @ti.func
 def lens_of(view: ti.template()):
-    """Unpack the camera from one array: passing a struct of vectors costs Taichi a millisecond in every launch."""
+    """Returns the camera's struct from one array, because passing a struct of vectors costs Taichi a millisecond a
+    launch."""
     return Lens(
         eye=vec3(view[0], view[1], view[2]),
         rotation=mat3(view[3], view[4], view[5], view[6], view[7], view[8], view[9], view[10], view[11]),
@@ -56,7 +59,7 @@ def lens_of(view: ti.template()):
 
 @functools.cache
 def _draw_kernel(kind: int, phase: int):
-    """The kernel that draws clusters of one kind.
+    """Returns the Taichi kernel that draws clusters of primitives of one ``kind``; ``phase``: KEY, DEPTH or NUMBER.
 
     One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
     """
@@ -124,11 +127,11 @@ def _draw_kernel(kind: int, phase: int):
 
 
 class TaichiRasterizer:
-    """Fills the keys of pictures as Warp's rasteriser does: on all cores of the CPU, or on a Vulkan or Metal GPU."""
+    """Computes the keys of pictures like Warp's rasteriser, on all cores of the CPU, or on a Vulkan or Metal GPU."""
 
     def __init__(self, gpu: bool = False) -> None:
-        """Raises RuntimeError if there is no such GPU. A process has Taichi rasterisers of one kind only, CPU or
-        GPU."""
+        """``gpu``: use a Vulkan or Metal GPU; RuntimeError if there is none. All Taichi rasterisers of a process must
+        use the same kind of device, CPU or GPU."""
         _start(gpu)
         self._gpu = gpu
         self._of: tuple[object, int] = (None, -1)
@@ -139,7 +142,8 @@ class TaichiRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """Find the nearest primitive of every pixel among all clusters, or among some [k]."""
+        """Write the nearest primitive of every pixel to ``keys`` [pixel], of all clusters or only of ``clusters``
+        [k]."""
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
         mine = {number: which[kind == number] for number in KERNEL_FUNCTIONS}
@@ -159,7 +163,10 @@ class TaichiRasterizer:
     def _rasterize_on_gpu(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
-        """Draw on a GPU: first depths, then numbers. Arrays of primitives are copied there again only after motion."""
+        """Draw clusters ``mine`` (by kind) on a GPU in two passes: first depths, then indices of primitives.
+
+        Arrays of primitives are copied to the GPU only after motion.
+        """
         if self._of != (primitives, primitives.pose_version):
             s = primitives.shapes
             self._of = (primitives, primitives.pose_version)
@@ -185,7 +192,7 @@ class TaichiRasterizer:
 
 @functools.cache
 def _start(gpu: bool) -> None:
-    """Start Taichi, once in a process. Its greeting is kept from standard output, which belongs to the command."""
+    """Start Taichi, once in a process, without its greeting on standard output, which is for the command's results."""
     with contextlib.redirect_stdout(io.StringIO()), _floating_point_kept():
         if gpu:
             ti.init(arch=[ti.metal, ti.vulkan], enable_fallback=False, log_level=ti.ERROR)
@@ -196,10 +203,10 @@ def _start(gpu: bool) -> None:
 
 @contextlib.contextmanager
 def _floating_point_kept() -> Iterator[None]:
-    """Leave the floating-point environment of this thread as it was.
+    """Context manager that restores the floating-point environment of this thread.
 
-    Taichi switches denormal numbers off for all later computations of this thread. Physics in the same process would
-    then differ in some bits from physics without a camera.
+    Taichi disables denormal numbers for all later computations of the thread, so that physics in the same process would
+    differ in some bits from physics without a camera.
     """
     # fenv_t: 32 bytes on x86-64, 8 on AArch64
     libm = ctypes.CDLL(None)
@@ -212,13 +219,13 @@ def _floating_point_kept() -> Iterator[None]:
 
 
 def _pinhole_values(lens: pinhole.Pinhole) -> np.ndarray:
-    """The array that :func:`lens_of` unpacks."""
+    """Returns the camera as an array of numbers, for :func:`lens_of`."""
     others = lens.fx, lens.fy, lens.cx, lens.cy, lens.width, lens.height, lens.max_depth, lens.near_radius
     return np.concatenate([np.array(lens.eye), np.array(lens.rotation).ravel(), others]).astype(np.float32)
 
 
 def _visible_clusters(primitives: PosedPrimitives, lens: pinhole.Pinhole) -> np.ndarray:
-    """Clusters that a pixel may see, near ones first [k]."""
+    """Returns the clusters [k] that may be in the camera's view, sorted from near to far."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]
     p = (ball[:, :3] - np.array(lens.eye)) @ np.array(lens.rotation).reshape(3, 3).T
