@@ -11,6 +11,7 @@ from vinesim.contact.row_response import RowResponse
 from vinesim.core import frames
 from vinesim.kernels.contact import structs
 from vinesim.kernels.contact.islands import MOST_SIDES
+from vinesim.kernels.graph import KernelGraph
 from vinesim.plants.articulation_solver import ArticulationSolver
 from vinesim.plants.device_buffers import DeviceBuffers
 from vinesim.scene.builder import RodMaterial, assemble
@@ -105,7 +106,9 @@ def test_responses_are_those_of_bodies_wherever_kernels_find_them(interleave: in
     bodies = np.sort(
         np.concatenate([rng.choice(np.flatnonzero(model.body_tree == tree), 3, replace=False) for tree in range(5)])
     )
-    response = RowResponse(plants, len(bodies))
+    counters = np.zeros(structs.COUNTERS, np.int32)
+    counters[structs.GROUPS] = 5
+    response = RowResponse(plants, len(bodies), counters)
     sides = np.arange(len(bodies))
     response.body[: len(bodies)], response.body_slot[:], response.other_slot[:] = bodies, sides, -1
     response.tree_end[: len(bodies)] = 3 * (sides // 3) + 3
@@ -115,7 +118,7 @@ def test_responses_are_those_of_bodies_wherever_kernels_find_them(interleave: in
     response.groups.tree[:5] = 3 * np.arange(5)
     width = 16
     response.groups.response[:5] = 3 * 6 * width * np.arange(5)
-    response.launch(5)
+    KernelGraph(response.launch)()
     found = response.numbers[: 5 * 3 * 6 * width].reshape(5, 3, 6, width)
     expected = plants.impulse_response(bodies)
     for tree in range(5):
