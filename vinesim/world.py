@@ -338,7 +338,7 @@ class Physics:
         self.plants.put_to_sleep(resting)
         self.contact_solver.update_tree_bounds(resting)
         self.elastic_supports.place(resting)
-        self.wires.let_go(resting)
+        self.wires.release(resting)
         self.remotely_posed = np.union1d(self.remotely_posed, trees).astype(np.int32)
         self._body_q = None
 

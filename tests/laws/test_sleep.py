@@ -185,7 +185,7 @@ def test_what_was_clear_of_sleepers_and_hardly_moved_need_not_be_compared_again(
         anchor += np.float32(0.01) * velocity
         for physics, tied in zip(worlds, ties, strict=True):
             physics.plants.tie_anchor[tied] = anchor
-        worlds[1].contact_solver.detection.compare_anew()
+        worlds[1].contact_solver.detection.forget_clearances()
         for physics in worlds:
             physics.step()
         most = max(most, len(worlds[0].plants.awake))

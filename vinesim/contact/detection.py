@@ -111,7 +111,7 @@ class ContactDetection:
         self._listed = None
         self.counters[structs.SEARCHING_TREES] = 0
         self._find_reached_trees(len(trees))
-        self.compare_anew()
+        self.forget_clearances()
 
     def _list(self, trees: np.ndarray) -> None:
         """Write ``trees`` [k] and their blocks into the lists that the kernels read."""
@@ -120,7 +120,7 @@ class ContactDetection:
         self.counters[structs.AWAKE_TREES] = len(trees)
         self.counters[structs.CHANGED_BLOCKS] = len(blocks)
 
-    def compare_anew(self) -> None:
+    def forget_clearances(self) -> None:
         """Make the next step compare all capsules of awake trees with those of sleeping trees.
 
         Otherwise, capsules that moved less than their last known clearance are skipped.
@@ -198,7 +198,7 @@ class ContactDetection:
         count = len(awake)
         sleep = among_plants and len(awake) < len(self._is_reached)
         self.counters[structs.PAIRED_TREES] = count if among_plants else 0
-        # a tree that falls asleep calls compare_anew()
+        # a tree that falls asleep calls forget_clearances()
         self.counters[structs.SEARCHING_TREES] = count if sleep else 0
         self._find_reached_trees(count)
         if not sleep:

@@ -192,11 +192,7 @@ class ResidentContacts:
         """Returns a table [tree, column] of zeros that is stored column by column, so that the entries of consecutive
         trees are adjacent in memory.
         """
-        flat = self._zeros(dtype, self._trees * columns)
-        strides = (flat.strides[0], flat.strides[0] * self._trees)
-        table = wp.array(ptr=flat.ptr, shape=(self._trees, columns), strides=strides, dtype=dtype, device=self._device)
-        table._flat = flat  # keeps the memory
-        return table
+        return self._zeros(dtype, columns, self._trees).transpose()
 
     def _allocate(self) -> None:
         trees = self._trees

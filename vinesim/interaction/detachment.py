@@ -125,9 +125,9 @@ class DetachmentMonitor:
             self._detach_overloaded()
         if any(blade.closing for blade in self.blades):
             self._cut_with_blades()
-        told = tuple(sorted(self._detachments, key=lambda parting: parting.body))
+        taken = tuple(sorted(self._detachments, key=lambda parting: parting.body))
         self._detachments = []
-        return told
+        return taken
 
     def _detach_overloaded(self) -> None:
         """Detach bunches whose peduncles were overloaded for ``detachment_duration``, on trees that this client
@@ -313,7 +313,7 @@ class DetachmentMonitor:
 
         The bunch is not listed in this client's detachments.
         """
-        self._pick(bunch, "told", "", np.zeros(6))
+        self._pick(bunch, "remote", "", np.zeros(6))
         self._detachments.pop()
         self.rigid.place_bunch(bunch, pose, velocity)
 

@@ -183,9 +183,9 @@ class Model(StructOfArrays):
 
     def is_on_arm(self) -> np.ndarray:
         """Whether the root of each tree sits on a piece of arm that can twist [tree] bool."""
-        return np.append(self.arm_gives(), False)[self.tree_piece]
+        return np.append(self.arm_is_elastic(), False)[self.tree_piece]
 
-    def arm_gives(self) -> np.ndarray:
+    def arm_is_elastic(self) -> np.ndarray:
         """Whether each piece is a piece of arm that shoots can twist [fixed] bool."""
         return (self.fixed_organ == int(Organ.ARM)) & (self.fixed_shear_modulus > 0.0)
 

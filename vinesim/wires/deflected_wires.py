@@ -59,7 +59,7 @@ SAME_PLACE = 0.05
 """[m] Distance up to which contacts of the same pair of shapes in two successive steps are the same contact. TUNED:
 shorter than any box, longer than any sliding distance in a step."""
 ROOM = 32
-MOST_PRESSES = 512
+MAX_PRESSES = 512
 """Largest number of pressing contacts that are stored for wires, of plants and rigid bodies together. ``ROOM``: initial
 capacity for contacts with wires in one solve."""
 NO_TREE = int(np.iinfo(np.int32).min)
@@ -87,7 +87,7 @@ class DeflectedWires:
             kernels.WireGeoms, count, start=self.start, axis=axis, offset=self.offset, count=np.zeros(2, np.int32)
         )
         self.presses, self._found = (
-            SharedArrays.zeros(kernels.WirePresses, MOST_PRESSES, count=np.zeros(1, np.int32)) for _ in range(2)
+            SharedArrays.zeros(kernels.WirePresses, MAX_PRESSES, count=np.zeros(1, np.int32)) for _ in range(2)
         )
         self._numbers = _numbers(dt)
         self._load = share(supports.load, wp.vec3d)
@@ -131,7 +131,7 @@ class DeflectedWires:
         self._deflect()
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
-    def let_go(self, trees: np.ndarray) -> None:
+    def release(self, trees: np.ndarray) -> None:
         """Remove the presses of sleeping trees [k] that were moved to another pose. These trees press on no wire until
         they wake."""
         self.presses.tree[np.isin(self.presses.tree, trees)] = NO_TREE

@@ -260,7 +260,7 @@ def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
 def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
     """Returns the nodes of arms: the roots of trees that stand on elastic arms, sorted by arm and along each arm."""
     model = plants.model
-    pieces = np.flatnonzero(model.arm_gives())
+    pieces = np.flatnonzero(model.arm_is_elastic())
     tree = np.flatnonzero(model.is_on_arm())
     body = model.tree_first[tree]
     here = np.searchsorted(pieces, model.tree_piece[tree])

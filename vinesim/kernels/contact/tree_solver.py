@@ -299,7 +299,7 @@ def copy_rows(
 
 
 @wp.func
-def search_on(
+def step_or_follow(
     sweeps: int,
     newton_end: int,
     gradient: wp.float64,
@@ -361,7 +361,7 @@ def solve_tree(
     gradient = wp.float64(0.0)
     busy = bool(True)
     while busy and sweeps < max_sweeps:
-        gradient = search_on(sweeps, newton_end, gradient, lane, lanes, count, system_out, search_out)
+        gradient = step_or_follow(sweeps, newton_end, gradient, lane, lanes, count, system_out, search_out)
         if sweeps >= newton_end:
             copy_rows(lane, lanes, 3 * count, system_out.impulse, search_out.before)
         busy = sweep_contacts(lane, lanes, count, tolerance, system_out)
