@@ -1,4 +1,4 @@
-"""Flags of Warp's CPU compiler for modules whose loops over lanes must be vectorised."""
+"""Flags of Warp's CPU compiler for modules in which LLVM must vectorise loops over the lanes of SIMD vectors."""
 
 import warp as wp
 

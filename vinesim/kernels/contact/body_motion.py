@@ -19,15 +19,17 @@ def to_single(v: wp.vec3d):
 
 @wp.func
 def velocity_at(pose: wp.transform, velocity: wp.spatial_vector, point: wp.vec3d):
-    """Returns the world velocity [m/s] of a body's material at ``point`` [m]. ``velocity`` (linear, angular): velocity
-    of the body's origin."""
+    """Returns the velocity [m/s] of the material point of a body that is at ``point`` [m], both in the world.
+
+    ``pose``, ``velocity`` (linear, angular): pose and velocity of the body's origin.
+    """
     lever = point - to_double(wp.transform_get_translation(pose))
     return to_double(wp.spatial_top(velocity)) + wp.cross(to_double(wp.spatial_bottom(velocity)), lever)
 
 
 @wp.func
 def rotate_by_small_angle(angle: wp.vec3d, rotation: wp.mat33d):
-    """Returns a rotation turned by a small angle [rad], to second order."""
+    """Returns ``rotation`` turned by the rotation vector ``angle`` [rad], exact to second order in the angle."""
     columns = wp.transpose(rotation)
     x = columns[0] + wp.cross(angle, columns[0] + wp.float64(0.5) * wp.cross(angle, columns[0]))
     y = columns[1] + wp.cross(angle, columns[1] + wp.float64(0.5) * wp.cross(angle, columns[1]))

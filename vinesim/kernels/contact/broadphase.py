@@ -225,11 +225,11 @@ def take_free_velocities(
     # out
     rigid_out: RigidBodies,
 ):
-    """One thread per degree of freedom. Copy its free velocity in this step, and compute the correction of the last
-    step.
+    """One thread per degree of freedom of MuJoCo. Write its free velocity: the velocity at the end of the step if no
+    plant touches a rigid body.
 
-    The correction is the amount by which plants changed the velocity in the last step. qvel, qacc: [dof] MuJoCo's
-    arrays. A sleeping body has an outdated acceleration, and no velocity.
+    Also write the correction, which is the amount by which plants changed the velocity in the last step. qvel, qacc:
+    [dof] MuJoCo's arrays. While a body sleeps, its free velocity is 0, because MuJoCo does not update its acceleration.
     """
     dof = wp.tid()
     rigid_out.correction_before[dof] = rigid_out.correction[dof]

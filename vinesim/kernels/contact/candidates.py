@@ -25,7 +25,9 @@ class Candidate:
 
 @wp.func
 def is_smooth(normal: wp.vec3d, end_normal: wp.vec3d):
-    """Returns whether a contact stays on the same side of the other shape in the step."""
+    """Returns whether the normal of a contact turns so little in the step that the contact stays on the same side of
+    the other shape.
+    """
     return wp.dot(normal, end_normal) > MIN_NORMAL_COSINE
 
 
@@ -41,7 +43,9 @@ def curvature_gap(distance: wp.float64, end_distance: wp.float64, approach: wp.f
 
 @wp.func
 def store_candidate(row: int, slot: int, feature: int, other: int, candidate: Candidate, candidates_out: Candidates):
-    """Write a candidate to the slot ``slot`` of the row ``row``, unless the row has no such slot."""
+    """Write a candidate contact to the entry ``row``, ``slot`` of the table of candidates [awake tree, slot], unless
+    the table has no such slot.
+    """
     if slot < candidates_out.feature.shape[1]:
         candidates_out.feature[row, slot] = feature
         candidates_out.other[row, slot] = other

@@ -18,10 +18,11 @@ wp.set_module_options({"enable_backward": False})
 def follow_conjugate_direction(
     island: int, first: int, last: int, gradient_before: wp.float64, islands: Islands, system_out: IslandSystem
 ):
-    """Continue in the conjugate direction after a sweep. Returns the square of the gradient [N^2 s^2].
+    """Move the impulses of an island along the conjugate direction after a Gauss-Seidel sweep. Returns the square of
+    the gradient, which is the change of the impulses by the sweep [N^2 s^2].
 
-    ``first``, ``last``: rows of the island. ``gradient_before``: return value after the previous sweep; 0 for the
-    first. If the gradient grows, the search starts again. The next sweep projects the impulses back into their friction
+    ``first``, ``last``: rows of the island. ``gradient_before``: return value after the previous sweep; 0 for the first
+    sweep. If the gradient grows, the search starts again. The next sweep projects the impulses back into their friction
     cones.
     """
     zero = wp.float64(0.0)

@@ -54,8 +54,11 @@ def solve_rigid_rows(
     jacobian: wp.array2d(dtype=wp.vec3d),
     response: wp.array2d(dtype=wp.vec3d),
 ):
-    """Solve L^T D L x = j for the three rows j of a contact, within the degrees of freedom from ``first`` to ``end`` of
-    one kinematic tree. ``entry``: entries of L. ``inverse``: inverse of D."""
+    """Solve L^T D L x = j for the three rows j of a contact in the rigid Jacobian.
+
+    L^T D L is MuJoCo's factored mass matrix. Only the degrees of freedom from ``first`` to ``end`` of one kinematic
+    tree are used. ``entry``: entries of L. ``inverse``: inverse of D.
+    """
     ...
 
 
@@ -71,7 +74,9 @@ def respond_rigidly(
     # out
     rows_out: Rows,
 ):
-    """One thread per contact. Compute M^-1 j for its three rows j, for one kinematic tree of MuJoCo."""
+    """One thread per contact. Compute the velocity changes M^-1 j^T of the touched rigid body's kinematic tree by unit
+    impulses along the contact's three rows j.
+    """
     c = wp.tid()
     if c >= counters[CONTACTS]:
         return
@@ -145,9 +150,15 @@ def add_entries(
     at: int,
     pitch: int,
 ):
-    """Add to the Delassus matrix the velocities along the rows of a side by unit impulses along the rows of a group of
-    ``count`` sides, listed from ``start`` on. ``number``: index of the first value in the response of the side's body
-    to these impulses, which has rows of ``width``. ``at``: index of the matrix entry of the side's first row."""
+    """Add to the Delassus matrix the velocities along the three rows of one contact side, by unit impulses along the
+    rows of a group of sides.
+
+    A *side* is one body of a contact (:mod:`vinesim.kernels.contact.row_response`). jacobian: [row, 12]. response:
+    velocities of bodies by unit impulses of each group; those of the body of ``side`` begin at index ``number`` and
+    have ``width`` columns. sides: list of sides, in which the group has ``count`` sides from ``start`` on. place:
+    [contact] index in the list of all islands' contacts; ``first_place`` is the index of the block's first contact.
+    delassus: entries of the matrix; the rows of ``side`` begin at ``at`` and are ``pitch`` apart.
+    """
     ...
 
 

@@ -120,7 +120,7 @@ def ellipsoid_distance(size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def round_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
-    """Returns :func:`primitive_distance` for a plane, sphere or capsule."""
+    """Returns the result of :func:`primitive_distance` for a plane, sphere or capsule."""
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     q = wp.vec3d(p[0], p[1], p[2] - wp.clamp(p[2], -size[1], size[1]))
@@ -154,8 +154,9 @@ def primitive_distance(kind: int, size: wp.vec3d, p: wp.vec3d):
 
 @wp.func
 def distance_of(is_round: bool, kind: int, size: wp.vec3d, p: wp.vec3d):
-    """Returns :func:`primitive_distance`. ``is_round``: ``kind`` is known to be a plane, sphere or capsule, so that
-    less code is compiled."""
+    """Returns the result of :func:`primitive_distance`. ``is_round``: whether ``kind`` is known to be a plane, sphere
+    or capsule, so that less code is compiled.
+    """
     found = wp.vec4d()
     if is_round:
         found = round_distance(kind, size, p)
@@ -199,8 +200,9 @@ def closest_to_axis(a: wp.vec3d, along: wp.vec3d):
 
 @wp.func
 def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Returns :func:`closest_on_segment` for any kind of primitive, by bisection; for the side of a cylinder by a
-    formula."""
+    """Returns the result of :func:`closest_on_segment` for any kind of primitive, by bisection; for the side of a
+    cylinder by a formula.
+    """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
     half = wp.float64(0.5)
@@ -250,7 +252,7 @@ def closest_by_bisection(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
 
 @wp.func
 def closest_to_round(kind: int, size: wp.vec3d, a: wp.vec3d, b: wp.vec3d):
-    """Returns :func:`closest_on_segment` for a plane, sphere or capsule."""
+    """Returns the result of :func:`closest_on_segment` for a plane, sphere or capsule."""
     t = wp.float64(0.0)
     if kind == PLANE:
         t = closest_to_plane(a, b)
@@ -299,7 +301,8 @@ def segment_primitive_distance(
 def is_outside_box(half: wp.vec3d, a: wp.vec3d, b: wp.vec3d, reach: wp.float64):
     """Returns whether the segment a b is farther than ``reach`` [m] beyond one side of a box, in the box's frame.
 
-    ``half`` [m]: half edges. If so, a shape inside the box is also farther away than ``reach``.
+    ``half`` [m]: half edges of the box. If the result is true, any shape inside the box is also farther than ``reach``
+    from the segment.
     """
     outside = bool(False)
     for i in range(3):
@@ -315,8 +318,11 @@ def has_flat_or_straight_side(kind: int):
 
 @wp.func
 def on_same_face(closest: wp.vec4d, other: wp.vec4d, tolerance: wp.float64):
-    """Returns whether a point lies along the same face as the closest point, to within ``tolerance`` [m]. Both
-    arguments: normal (entries 0 to 2) and distance (3)."""
+    """Returns whether another point of a segment is near the same face of a primitive as the closest point, to within
+    ``tolerance`` [m].
+
+    ``closest``, ``other``: outward normal (entries 0 to 2) and distance (3) [m] at the closest and at the other point.
+    """
     cosine = closest[0] * other[0] + closest[1] * other[1] + closest[2] * other[2]
     return cosine > MIN_COPLANAR_COSINE and other[3] < closest[3] + tolerance
 

@@ -87,9 +87,8 @@ def count_unfinished(
     # out
     counters_out: wp.array(dtype=wp.int32),
 ):
-    """One thread in all.
-
-    Count the islands whose solve took ``most_sweeps`` sweeps. Their impulses may be outside the tolerance.
+    """One thread in all. Count the islands of contacts whose solve took ``most_sweeps`` sweeps, so that their impulses
+    may be outside the tolerance.
     """
     unfinished = int(0)
     for island in range(counters_out[ISLANDS]):

@@ -148,11 +148,13 @@ def clip(ends: wp.vec2d, gap_a: wp.float64, gap_b: wp.float64):
 
 @wp.func
 def interval_along_hull(hulls: Hulls, hull: int, a: wp.vec3d, b: wp.vec3d, closest: vec5d, tolerance: wp.float64):
-    """Returns the parameters (0 to 1) of both ends of the part of a segment along a face or an edge of a hull. The two
-    are equal if the segment crosses the face or edge.
+    """Returns the interval of the segment a b that runs along a face or an edge of a convex hull, as the parameters (0
+    to 1) of its ends.
 
-    ``closest``: result of :func:`segment_hull_distance`. ``tolerance`` [m]: largest distance of the ends from the hull,
-    minus that of the closest point.
+    Both parameters are that of the closest point if no face or edge is nearly parallel to the segment, or if the
+    interval is shorter than twice ``tolerance``: one contact point is then enough. ``a``, ``b`` [m]: ends of the
+    segment in the hull's frame. ``closest``: result of :func:`segment_hull_distance`. ``tolerance`` [m]: along a face,
+    the interval contains the points that are at most this much farther from the face than the closest point is.
     """
     t = closest[4]
     along = b - a

@@ -23,7 +23,11 @@ EIGHT = "typedef double Eight __attribute__((vector_size(64), aligned(8)));"
 
 @wp.struct
 class IslandSystem:
-    """Data of the solver for all islands, by place in the list of islands or by row of the padded blocks."""
+    """Dense systems of all islands of contacts.
+
+    Dimensions: [place] index in ``Islands.contact``, the list of contacts sorted by island; [row] row of the padded
+    blocks; [entry] index into matrices that are stored one after the other; [place of dof] index in ``Islands.dof``.
+    """
 
     surface: wp.array(dtype=Surface)
     """[place] Contact properties of the pair of materials."""
@@ -48,15 +52,16 @@ class IslandSystem:
     rigid_force: wp.array(dtype=wp.float64)
     """[dof of MuJoCo] Generalised force of all contacts on rigid bodies, N or N m; 0 for bodies without contact."""
     pressed: wp.array(dtype=wp.int32)
-    """[place] Closed contacts of each block, by their index in the block, stored from the block's first place on."""
+    """[place] Closed contacts of each block (contacts with a positive normal impulse), by their index in the block. The
+    list of a block begins at the block's first place.
+    """
     matrix: wp.array(dtype=wp.float64)
-    """[entry] Linear systems of a Newton step, for one block of an island after the other.
-
-    Right-hand sides come first.
+    """[entry] Linear systems of a Newton step, one for each block of an island. A block's system begins with its
+    right-hand sides.
     """
     solution: wp.array(dtype=wp.vec3d)
-    """[entry] Solutions of these systems, contact by contact: impulses for w = 0, then their change with each entry of
-    w.
+    """[entry] Solutions of the linear systems in ``matrix``, contact by contact: impulses for w = 0, then their change
+    with each entry of w.
     """
     rigid_matrix: wp.array2d(dtype=wp.float64)
     """[place of dof, 1 + dof of the island] System for w that remains after elimination; right-hand side first."""
@@ -142,7 +147,7 @@ def block_pitch(block: int, islands: Islands):
 
 @wp.func
 def contact_row(place: int, block: int, islands: Islands):
-    """Returns the first of the three rows of a contact."""
+    """Returns the first of the three rows of the contact at ``place`` in the list of islands' contacts."""
     return islands.row_start[block] + 3 * (place - islands.block_start[block])
 
 
@@ -154,7 +159,9 @@ def island_dofs(island: int, islands: Islands):
 
 @wp.func
 def rigid_entry(place: int, island: int, islands: Islands):
-    """Returns the first entry of a contact's rigid Jacobian."""
+    """Returns the index of the first entry of a contact's rigid Jacobian. ``place``: index in the list of islands'
+    contacts.
+    """
     return islands.rigid_start[island] + (place - islands.start[island]) * island_dofs(island, islands)
 
 
@@ -209,8 +216,9 @@ def gather_rigid_rows(
     rows: Rows,
     system_out: IslandSystem,
 ):
-    """Gather the rigid Jacobian J_r and the response G^T of a contact. Both are zero unless its other side is a rigid
-    body that can move."""
+    """Copy the rigid Jacobian J_r and the response G^T of contact ``c`` into the system of its island. Both are zero
+    unless the contact's other side is a rigid body that can move.
+    """
     moves = bool(False)
     if contacts.other[c] >= 0:
         moves = geoms.dof[contacts.other[c]] >= 0
@@ -237,7 +245,8 @@ def gather_contact(
     rows: Rows,
     system_out: IslandSystem,
 ):
-    """Gather the values of a contact and compute its response to its own impulses.
+    """Copy the values of contact ``c`` into the system of its island, and compute the contact's Gauss-Seidel step sizes
+    from its response to its own impulses.
 
     Call :func:`gather_rigid_rows` for the contact before.
     """
@@ -285,7 +294,9 @@ def update_rigid_velocity(island: int, islands: Islands, system_out: IslandSyste
 def gather_island(
     island: int, geoms: Geoms, contacts: Contacts, islands: Islands, rows: Rows, system_out: IslandSystem
 ):
-    """Gather all contacts of an island, starting from the impulses in ``rows``."""
+    """Copy the values of all contacts of an island into the island's dense system. The impulses in ``rows`` are the
+    start of the solve.
+    """
     for block in range(islands.first_block[island], islands.first_block[island + 1]):
         for place in range(islands.block_start[block], islands.block_start[block + 1]):
             c = islands.contact[place]

@@ -127,7 +127,9 @@ def slot_of(body: int, count: int, sorted_bodies: wp.array(dtype=wp.int32)):
 
 @wp.func
 def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
-    """Find the first slot, and the slot after the last, of the touched bodies of each tree."""
+    """Find the range of each tree in the sorted list of touched plant bodies: the index of its first body, and the
+    index after its last body.
+    """
     for slot in range(count):
         touched_out.last_contact[slot] = -1
         touched_out.tree_start[slot] = slot
@@ -142,7 +144,11 @@ def bound_trees(count: int, bodies: PlantBodies, touched_out: TouchedBodies):
 
 @wp.func
 def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int, label_out: wp.array(dtype=wp.int32)):
-    """Join contact ``c`` with the island of the contact that was linked last at ``place``, and store ``c`` there."""
+    """Join contact ``c`` with the island of the contact in ``last_contact_out[place]``, if there is one, and write
+    ``c`` to that entry.
+
+    ``place``: index of a tree, or of a set of coupled rigid bodies. ``label_out``: union-find structure [contact].
+    """
     if last_contact_out[place] >= 0:
         one = island_root(label_out, c)
         two = island_root(label_out, last_contact_out[place])
@@ -152,7 +158,7 @@ def link_contacts(c: int, last_contact_out: wp.array(dtype=wp.int32), place: int
 
 @wp.func
 def flatten_labels(contact_count: int, label_out: wp.array(dtype=wp.int32)):
-    """Set every contact's label to the first contact of its set."""
+    """Set every contact's label to the first contact of its island or block."""
     for c in range(contact_count):
         label_out[c] = island_root(label_out, c)
 
@@ -247,7 +253,9 @@ def padded(size: int):
 
 @wp.func
 def list_side(slot: int, side: int, touched: TouchedBodies, groups_out: SideGroups):
-    """List a side of a contact together with the other sides on its tree. A side without a ``slot`` is not listed."""
+    """Add ``side`` (one body of a contact) to the list of the sides on its tree. A negative ``slot`` (the body is not a
+    plant's) adds nothing.
+    """
     if slot >= 0:
         tree = touched.tree_start[slot]
         groups_out.side[groups_out.listed[tree]] = side
@@ -262,7 +270,9 @@ def group_sides(
     islands: Islands,
     groups_out: SideGroups,
 ):
-    """List the sides of all contacts by tree, divide the sides of each tree into groups, and place their responses."""
+    """List the sides (bodies) of all contacts by tree, divide the sides of each tree into groups, and assign memory to
+    the response of each group.
+    """
     for slot in range(counters_out[BODIES]):
         groups_out.listed[slot] = 0
     for c in range(counters_out[CONTACTS]):

@@ -41,7 +41,11 @@ def first_tangent(n: wp.vec3d):
 def write_plant_row(
     row: int, column: int, sign: wp.float64, axis: wp.vec3d, lever: wp.vec3d, jacobian_out: wp.array2d(dtype=wp.float64)
 ):
-    """Write the six entries of one plant body in a row of the Jacobian."""
+    """Write the six entries of one plant body in row ``row`` of the contact Jacobian, from column ``column`` on.
+
+    ``axis``: unit vector along the row; ``lever`` [m]: from the body's origin to the contact point; ``sign``: 1 for the
+    contact's first body, -1 for the other plant body.
+    """
     moment = wp.cross(lever, axis)
     for k in range(3):
         jacobian_out[row, column + k] = sign * axis[k]
@@ -274,7 +278,7 @@ def write_contact_rows(
 
 @wp.func
 def row_vector(row: int, column: int, jacobian: wp.array2d(dtype=wp.float64)):
-    """Returns three entries of a row, in single precision."""
+    """Returns the entries ``column`` to ``column`` + 2 of a row of the Jacobian, in single precision."""
     return wp.vec3(
         wp.float32(jacobian[row, column]), wp.float32(jacobian[row, column + 1]), wp.float32(jacobian[row, column + 2])
     )

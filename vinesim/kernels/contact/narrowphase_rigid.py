@@ -258,8 +258,10 @@ def contact_ends(
     b: wp.vec3d,
     nearest: vec5d,
 ):
-    """Returns the parameters (0 to 1) of both ends of the part of the segment a b along a face of a geom. The two are
-    equal if no part lies along a face.
+    """Returns the parameters (0 to 1) of both ends of the part of the segment a b along a face of a geom. The two
+    parameters are equal if no part of the segment is along a face.
+
+    ``nearest``: result of :func:`segment_geom_distance`.
     """
     ends = wp.vec2d(nearest[4], nearest[4])
     to_local = wp.transpose(rotation)
@@ -295,7 +297,7 @@ def is_tied(capsule: int, geom: int, capsules: Capsules, is_cut: wp.array(dtype=
 
 @wp.func
 def clear_slots(row: int, count: int, candidates_out: Candidates):
-    """Mark the unused slots of a row as empty."""
+    """Mark the slots from ``count`` on as empty in a row of the table of candidates [awake tree, slot]."""
     slots = candidates_out.feature.shape[1]
     for k in range(wp.min(count, slots), slots):
         candidates_out.feature[row, k] = -1
@@ -320,8 +322,8 @@ def add_pairs(
     geom_states: GeomStates,
     candidates_out: Candidates,
 ):
-    """Add the contacts of pairs of a capsule and a geom, whose boxes overlap, to a row that already has ``count``
-    contacts.
+    """Find the contacts of a tree's pairs of a capsule and a geom with overlapping boxes. Write them to the tree's row
+    in the table of candidates, after the ``count`` contacts that the row already has.
 
     The pairs are listed ``pitch`` apart, from ``first`` on, sorted by capsule. Returns the number of contacts, and
     whether one contact is an impact. One call handles all pairs of a tree, because every call copies all structs.
@@ -458,7 +460,9 @@ def find_contacts_of_tree(
     candidates_out: Candidates,
 ):
     """Find the contacts of the tree ``trees.awake[row]`` with rigid geoms, and write them to row ``row`` of the
-    candidates. End the passing of bunches through the tree that no longer overlap it.
+    candidates.
+
+    A picked bunch that was passing through the tree collides with the tree again once the two no longer overlap.
     """
     tree = trees.awake[row]
     near_count = list_near_geoms(

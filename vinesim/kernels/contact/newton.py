@@ -250,7 +250,9 @@ def subtract_products(
     entry: int,
     count: int,
 ):
-    """Subtract the products of ``response`` with ``count`` vectors from ``count`` numbers."""
+    """Subtract from ``count`` numbers, which begin at index ``at``, the inner products of ``response`` with ``count``
+    vectors, which begin at index ``entry``.
+    """
     ...
 
 

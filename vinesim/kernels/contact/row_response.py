@@ -34,7 +34,9 @@ EIGHT = """
 
 @wp.struct
 class ResponseScratch:
-    """Working memory for the groups that are computed at the same time [row of scratch, body of the tree]."""
+    """Working memory of the impulse response [row of scratch, body of the tree]. Each row serves one group of contact
+    sides at a time.
+    """
 
     is_on_path: wp.array(dtype=wp.bool)
     """Whether the body or one of its descendants is in contact."""
@@ -58,7 +60,11 @@ def clear_numbers(values: wp.array(dtype=float), at: int, count: int):
     }
 """)
 def add_side(side: int, number: int, jacobian: wp.array2d(dtype=wp.float64), values: wp.array(dtype=float), at: int):
-    """Add unit impulses along the rows of a side to its body, in the columns of the side's index in the group."""
+    """Add unit impulses along the three rows of a contact side to the working memory of the side's body.
+
+    ``number``: index of the side in its group, which selects the three columns. ``values``: working memory; the body's
+    part begins at index ``at``.
+    """
     ...
 
 
@@ -102,10 +108,12 @@ def carry_inward(
     lever: wp.vec3,
     root: wp.mat33,
 ):
-    """Propagate the impulses at a body to its parent, whose memory begins at ``to``. The part that turns the joint
-    stays in the body's memory.
+    """Propagate the impulses at a body through its joint to the body's parent. The part that turns the joint stays in
+    the body's working memory.
 
-    Without a parent (``to`` < 0) the impulses move the body; ``root`` is its inverse mass.
+    ``values``: working memory; the body's part begins at index ``at``, the parent's at ``to``. ``width``: number of
+    columns. D, DJ, DH: factors of the joint (:mod:`vinesim.kernels.plants`); lever: [m] from parent to body. Without a
+    parent (``to`` < 0) the impulses move the body; ``root`` is its inverse mass [1/kg].
     """
     ...
 
@@ -138,7 +146,11 @@ def carry_inward(
 def carry_outward(
     values: wp.array(dtype=float), at: int, from_parent: int, width: int, DJ: wp.mat33, DH: wp.mat33, lever: wp.vec3
 ):
-    """Compute the velocities of a body from the impulses that turn its joint and from the velocities of its parent."""
+    """Compute the velocities of a body from the impulses that turn its joint and from the velocities of its parent.
+
+    ``values``: working memory; the body's part begins at index ``at``, the parent's at ``from_parent`` (negative: no
+    parent). ``width``: number of columns. DJ, DH: factors of the joint; lever: [m] from parent to body.
+    """
     ...
 
 
@@ -147,7 +159,9 @@ def carry_outward(
         for (int i = 0; i < width; ++i) response.data[to + width * k + i] = values.data[at + 32 * k + i];
 """)
 def keep_velocities(values: wp.array(dtype=float), at: int, width: int, response: wp.array(dtype=float), to: int):
-    """Copy the velocities of a body."""
+    """Copy the velocities of a body from the working memory (index ``at``) to the response (index ``to``). ``width``:
+    number of columns.
+    """
     ...
 
 
@@ -208,7 +222,8 @@ def respond_to_groups(
     scratch_out: ResponseScratch,
     response_out: wp.array(dtype=float),
 ):
-    """Compute, for each group, the velocities of its tree's touched bodies by unit impulses along the sides' rows.
+    """Compute, for each group of contact sides, the velocities of the touched bodies of the group's tree by unit
+    impulses along the sides' rows.
 
     There are ``scratch_rows`` threads. Thread i takes the groups i, i + scratch_rows, i + 2 scratch_rows ...
 

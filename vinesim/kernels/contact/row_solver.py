@@ -38,7 +38,9 @@ def _on_gpu(code: str, elsewhere: str = "0") -> str:
 
 @wp.func_native(_on_gpu("return __shfl_sync(ALL, value, source, lanes);"))
 def from_lane(value: wp.float64, source: int, lanes: int) -> wp.float64:
-    """Returns the value of thread ``source`` among the ``lanes`` threads of the same tree."""
+    """Returns the number that thread ``source`` holds in ``value``. The ``lanes`` threads that solve one tree have the
+    indices 0 to ``lanes`` - 1.
+    """
     ...
 
 
@@ -58,7 +60,7 @@ def any_of_warp(value: bool) -> bool:
 
 @wp.func_native(_on_gpu("return __reduce_max_sync(ALL, value);"))
 def most_of_warp(value: int) -> int:
-    """Returns the largest value of the warp's threads. The compiler knows that it is the same for all."""
+    """Returns the largest value of the warp's threads. The compiler knows that all threads get the same result."""
     ...
 
 
@@ -86,7 +88,8 @@ def largest_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
 
 @wp.func
 def of_contact(c: int, value: wp.float64, lanes: int):
-    """Returns the values of the three rows of a contact."""
+    """Returns the numbers that the three threads of contact ``c`` hold in ``value``, one for each row of the contact.
+    """
     return wp.vec3d(
         from_lane(value, 3 * c, lanes), from_lane(value, 3 * c + 1, lanes), from_lane(value, 3 * c + 2, lanes)
     )
@@ -107,10 +110,11 @@ def follow_direction(
     gradient_before: wp.float64,
     lanes: int,
 ):
-    """Move a thread's impulse on in the conjugate direction after a sweep that changed it by ``change``, if its tree
-    follows that direction. Returns the impulse, the direction, and the square of the tree's change.
+    """Add a step along the conjugate direction to a thread's impulse, after a sweep that changed the impulse by
+    ``change``. Only trees that follow the direction (``follows``) take the step.
 
-    See :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
+    Returns the impulse, the direction, and the square of the change of all impulses of the tree. See
+    :func:`vinesim.kernels.contact.tree_solver.follow_conjugate_direction`.
     """
     if not any_of_warp(follows):
         return x, direction, gradient_before
@@ -155,7 +159,10 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
     Column = wp.types.vector(length=rows, dtype=wp.float32)
 
     def func(function: Callable[..., Any]) -> Any:
-        """Register a Warp function under a name of its own, because another solver has functions of the same names."""
+        """Returns ``function`` as an inlined Warp function with the number of rows in its name.
+
+        Warp needs different names, because each call of :func:`row_solver` makes functions of the same names.
+        """
         return wp.func(function, name=f"{function.__name__}_{rows}", inline=True)
 
     @func
@@ -169,7 +176,9 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
 
     @func
     def row_velocity(x: wp.float64, outside: wp.float64, column: Column):
-        """Returns ``outside`` [m/s] plus the velocity along a thread's row by the impulses of all rows."""
+        """Returns the velocity [m/s] along a thread's row: ``outside`` (the velocity without impulses) plus the
+        velocity by the impulses ``x`` of all rows.
+        """
         v = outside
         for j in range(wp.static(rows)):
             v = v + wp.float64(column[j]) * from_lane(x, j, lanes)
@@ -177,7 +186,9 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
 
     @func
     def moved_velocity(moves: bool, x: wp.float64, v: wp.float64, outside: wp.float64, column: Column):
-        """Returns the velocity [m/s] along a thread's row: ``v`` if no impulse of its tree has changed."""
+        """Returns the velocity [m/s] along a thread's row: the present velocity ``v`` if no impulse of the thread's
+        tree has changed (``moves`` false), else the result of ``row_velocity``.
+        """
         if not any_of_warp(moves):
             return v
         return wp.where(moves, row_velocity(x, outside, column), v)
@@ -195,7 +206,7 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
         lanes: int,
         most: int,
     ) -> wp.float64:
-        """Solve a linear system of at most ``most`` rows. Returns the entry of this thread.
+        """Solve a linear system of at most ``most`` rows. Returns this thread's entry of the solution.
 
         The thread's row of the system is ``own`` times its column of the symmetric matrix plus ``others`` times its
         partner's column, in the given columns, plus ``added`` in the columns of its own contact. ``right`` is its
@@ -254,8 +265,9 @@ def row_solver(rows: int, lanes: int) -> Any:  # noqa: PLR0915 (it holds eight f
 
     @func
     def sweep_rows(x: wp.float64, v: wp.float64, lane: int, turns: int, steps: Steps, surface: Surface, column: Column):
-        """One sweep over the contacts, which take their turns one after the other. Returns the impulse and the velocity
-        along the row of a thread, the size of the change of its contact's impulse, and the normal impulse [N s].
+        """Take one Gauss-Seidel sweep over the contacts, one contact after the other. Returns the impulse and the
+        velocity along the row of a thread, the size of the change of its contact's impulse, and the normal impulse [N
+        s].
 
         Each thread computes for its own contact, and uses the result at that contact's turn. turns: number of contacts
         of the thread's tree; 0 if its impulses do not change any more.

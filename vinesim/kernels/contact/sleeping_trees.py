@@ -77,9 +77,10 @@ def compare_with_sleeping_tree(
     capsule_states: CapsuleStates,
     clearances_out: Clearances,
 ):
-    """Returns whether the due capsules of a tree will be in contact with another tree.
+    """Returns whether the due capsules of a tree will be in contact with another tree. A capsule is *due* if it may
+    touch a sleeping tree before the step ends.
 
-    Stores their clearance from it.
+    Also stores how far each due capsule may move before it must be compared with the other tree again (its clearance).
     """
     reached = bool(False)
     for s in range(capsules.tree_start[tree], capsules.tree_start[tree + 1]):

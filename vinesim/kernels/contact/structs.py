@@ -15,35 +15,37 @@ wp.set_module_options({"enable_backward": False})
 AWAKE_TREES = wp.constant(0)
 CONTACTS = wp.constant(1)
 OVERFLOW = wp.constant(2)
-"""Contacts that were found beyond the number that one tree can have at once."""
+"""Index in ``counters``: number of contacts that were found beyond the number that one tree can have at once."""
 IMPACTED_TREES = wp.constant(3)
-"""Trees with a contact that closes faster than the impact speed."""
+"""Index in ``counters``: number of trees with a contact that closes faster than the impact speed."""
 BODIES = wp.constant(4)
-"""Plant bodies in contact."""
+"""Index in ``counters``: number of plant bodies in contact."""
 SORT_AXIS = wp.constant(5)
-"""World axis (0, 1, 2) along which the boxes of trees are sorted."""
+"""Index in ``counters``: world axis (0, 1, 2) along which the boxes of trees are sorted."""
 ISLANDS = wp.constant(6)
 BLOCKS = wp.constant(8)
 MATRIX_ENTRIES = wp.constant(9)
-"""Entries of the matrices of all blocks, or of the Newton matrices of all islands, whichever is larger."""
+"""Index in ``counters``: number of entries of the matrices of all blocks, or of the Newton matrices of all islands,
+whichever is larger.
+"""
 SKIPPED_GEOMS = wp.constant(7)
-"""Static geoms near a tree that were left out because the tree's list was full."""
+"""Index in ``counters``: number of static geoms near a tree that were left out because the tree's list was full."""
 GROUPS = wp.constant(10)
-"""Groups of contact sides; see :class:`SideGroups`."""
+"""Index in ``counters``: number of groups of contact sides; see :class:`SideGroups`."""
 RESPONSE_NUMBERS = wp.constant(11)
-"""Values in the responses to all groups."""
+"""Index in ``counters``: number of values in the responses to all groups of contact sides."""
 HAVE_ROOM = wp.constant(12)
-"""1 if there are contacts and the arrays have room for all of them, else 0."""
+"""Index in ``counters``: 1 if there are contacts and the arrays have room for all of them, else 0."""
 UNFINISHED = wp.constant(13)
-"""Islands whose solve ended at the largest number of sweeps."""
+"""Index in ``counters``: number of islands whose solve ended at the largest number of sweeps."""
 NEAR_ASLEEP = wp.constant(14)
-"""Sleeping trees that actors are near to."""
+"""Index in ``counters``: number of sleeping trees that actors are near to."""
 CHANGED_BLOCKS = wp.constant(15)
-"""Blocks of tree boxes that contain an awake tree."""
+"""Index in ``counters``: number of blocks of tree boxes that contain an awake tree."""
 SEARCHING_TREES = wp.constant(16)
-"""Awake trees that are compared with sleeping trees."""
+"""Index in ``counters``: number of awake trees that are compared with sleeping trees."""
 PAIRED_TREES = wp.constant(17)
-"""Awake trees that are compared with each other."""
+"""Index in ``counters``: number of awake trees that are compared with each other."""
 COUNTERS = 18
 
 AABB_BLOCK = wp.constant(32)
@@ -85,9 +87,9 @@ class Trees:
     is_awake: wp.array(dtype=wp.bool)
     """[tree] Whether the tree is awake."""
     is_fine: wp.array(dtype=wp.bool)
-    """[tree] whether the clusters of its bunches are free to move."""
+    """[tree] Whether the berry clusters of the tree's bunches are free to move."""
     is_remote: wp.array(dtype=wp.bool)
-    """[tree] whether another client owns its state."""
+    """[tree] Whether another client owns the tree's state."""
     bunch_attached: wp.array(dtype=wp.bool)
     """[bunch] Whether the bunch still hangs on its tree."""
 
@@ -382,7 +384,9 @@ class Contacts:
     wire_stiffness: wp.array(dtype=wp.float64)
     """[N/m] Stiffness of the wire on the contact's other side; 0 for a rigid wire or another shape."""
     wire_shift: wp.array(dtype=wp.float64)
-    """[m] Gap to the unloaded wire minus the gap to the wire's geom."""
+    """[m] Gap to the position that a touched wire would have without this contact's force, minus the gap to the wire's
+    geom.
+    """
     point: wp.array(dtype=wp.vec3d)
     axes: wp.array(dtype=wp.mat33d)
     """[contact] Rows: normal, first tangent, second tangent."""
@@ -396,24 +400,27 @@ class Contacts:
 
 @wp.struct
 class TouchedBodies:
-    """Plant bodies in contact [slot], sorted, each listed once. The bodies of one tree are adjacent in the list."""
+    """Plant bodies in contact, sorted, each listed once. The bodies of one tree are adjacent. [slot]: index in this
+    list.
+    """
 
     body: wp.array(dtype=wp.int32)
     tree_start: wp.array(dtype=wp.int32)
-    """[slot] First slot of the slot's tree."""
+    """[slot] First slot of the tree to which the body in this slot belongs."""
     tree_end: wp.array(dtype=wp.int32)
-    """[slot] Slot after the last slot of the slot's tree."""
+    """[slot] Slot after the last slot of the tree to which the body in this slot belongs."""
     last_contact: wp.array(dtype=wp.int32)
     """[slot] Scratch, for the first slot of a tree: the contact of this tree that was linked last."""
 
 
 @wp.struct
 class SideGroups:
-    """Sides of contacts on plants, in groups of at most ten sides on one tree; see
-    :mod:`vinesim.kernels.contact.row_response`."""
+    """Sides of contacts on plants, in groups of at most ten sides on one tree. A side is one body of a contact; see
+    :mod:`vinesim.kernels.contact.row_response`. [slot]: index in :class:`TouchedBodies`.
+    """
 
     side: wp.array(dtype=wp.int32)
-    """[place] 2 * contact, plus 1 for the side of the other plant body.
+    """[k] List of the sides: 2 * contact, plus 1 for the contact's other plant body.
 
     Sorted by trees, then as in ``Islands.contact``.
     """
@@ -427,9 +434,11 @@ class SideGroups:
     Its dimensions: touched body of the tree, component (linear and angular velocity), column.
     """
     first: wp.array(dtype=wp.int32)
-    """[slot] First group of the tree whose touched bodies begin at this slot."""
+    """[slot] First group of a tree. Only the slot of the tree's first touched body is used."""
     listed: wp.array(dtype=wp.int32)
-    """[slot] Scratch: index at which the next side of that tree is listed."""
+    """[slot] Scratch: index in ``side`` at which the next side of a tree is listed. Only the slot of the tree's first
+    touched body is used.
+    """
 
 
 @wp.struct
@@ -458,7 +467,7 @@ class Islands:
     system_start: wp.array(dtype=wp.int32)
     """[island + 1] Index in ``IslandSystem`` of the first entry of the island's Newton matrices."""
     contact: wp.array(dtype=wp.int32)
-    """[place] Contacts, sorted by island and then by block."""
+    """[place] Indices of the contacts, sorted by island and then by block."""
     label: wp.array(dtype=wp.int32)
     """[contact] Scratch: the first contact of the contact's island."""
     block_label: wp.array(dtype=wp.int32)
@@ -466,7 +475,7 @@ class Islands:
     first_dof: wp.array(dtype=wp.int32)
     """[island + 1] Index in ``dof`` of the island's first degree of freedom."""
     dof: wp.array(dtype=wp.int32)
-    """[place] Degrees of freedom of the rigid bodies, sorted by island."""
+    """[k] Degrees of freedom of the rigid bodies in contact, sorted by island."""
     rigid_last_contact: wp.array(dtype=wp.int32)
     """[label of rigid bodies] Scratch: the contact with the rigid bodies of this label that was linked last."""
     sweeps: wp.array(dtype=wp.int32)

@@ -120,8 +120,9 @@ def respond_at_contacts(
 
 @wp.func
 def carry_to_parent(k: int, factors: Factors, force: wp.mat33, moment: wp.mat33):
-    """Returns the impulses (force, moment) on the parent due to impulses on body k, minus the parts that turn the
-    joint; one column for each impulse."""
+    """Returns the impulses (force, moment about the parent's origin) on the parent by impulses on body k. The part of
+    the impulses that turns the joint is not transmitted. Each matrix has one column for each impulse.
+    """
     lever = factors.lever[k]
     DH = factors.DH[k]
     DJ = factors.DJ[k]
@@ -144,10 +145,10 @@ def common_body_response(
     force: wp.mat33,
     moment: wp.mat33,
 ):
-    """Returns the velocity changes along the rows of contact ``other`` by the impulses ``force``, ``moment`` on body
-    ``at``, which may be on another branch of the tree.
+    """Returns the velocity changes [3, 3] along the rows of contact ``other`` by three impulses ``force``, ``moment``
+    on body ``at``, which may be on another branch of the tree than the contact.
 
-    ``body``: body of contact ``other``.
+    ``body``: body of contact ``other``. Each column of ``force``, ``moment`` and the result belongs to one impulse.
     """
     force_other = row_columns(other, 0, jacobian)
     moment_other = row_columns(other, 3, jacobian)

@@ -298,9 +298,10 @@ def solve_small_trees(
     tree_contacts_out: TreeContacts,
     system_out: TreeSystem,
 ):
-    """``lanes`` GPU threads per tree, in full warps. Solve for the tree's impulses.
+    """``lanes`` GPU threads per tree, in full warps. Solve for the impulses of the tree's contacts.
 
-    Trees with more rows are skipped; see :func:`vinesim.kernels.contact.row_solver.row_solver`.
+    Trees that have more contact rows than ``lanes`` threads can hold are skipped; see
+    :func:`vinesim.kernels.contact.row_solver.row_solver`.
     """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
@@ -332,10 +333,11 @@ def solve_busy_trees(
     dense_out: TreeSystem,
     search_out: TreeSearch,
 ):
-    """``lanes`` threads per busy tree. Solve for its impulses. Each of ``groups`` groups of threads processes one tree
-    after the other.
+    """``lanes`` threads per busy tree. Solve for the impulses of the tree's contacts. Each of ``groups`` groups of
+    threads processes one tree after the other.
 
-    dense_out: scratch, the system of each group's tree in contiguous memory.
+    A tree is *busy* if it needs more threads or sweeps than most trees. dense_out: scratch, the system of each group's
+    tree in contiguous memory.
     """
     group = wp.tid() // lanes
     lane = wp.tid() % lanes

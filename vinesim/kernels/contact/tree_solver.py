@@ -44,7 +44,7 @@ class TreeSystem:
     matrix: wp.array2d(dtype=float)
     """[row, row] Delassus matrix, 1/kg."""
     free: wp.array(dtype=wp.float64)
-    """[row] m/s without impulses, bias included."""
+    """[row] Velocity along the row without impulses, bias included, m/s."""
     surface: wp.array(dtype=Surface)
     """[contact] Contact properties of the pair of materials."""
     impulse: wp.array(dtype=wp.float64)
@@ -60,11 +60,11 @@ class TreeSearch:
     factor: wp.array2d(dtype=wp.float64)
     """[row, row + 1] Linear system of a Newton step; the last column is the right-hand side."""
     first: wp.array(dtype=wp.float64)
-    """[row] impulses before the first Newton step."""
+    """[row] Impulses before the first Newton step, N s."""
     before: wp.array(dtype=wp.float64)
-    """[row] impulses before the last sweep."""
+    """[row] Impulses before the last sweep, N s."""
     direction: wp.array(dtype=wp.float64)
-    """[row] direction of search."""
+    """[row] Direction of search, N s."""
 
 
 @wp.func_native("""
@@ -86,7 +86,7 @@ def synchronize_lanes(lanes: int):
 
 @wp.func
 def update_velocities(lane: int, lanes: int, size: int, system_out: TreeSystem):
-    """Compute the velocities along all rows again from the impulses."""
+    """Compute the velocities along all contact rows of a tree from the impulses."""
     for row in range(lane, size, lanes):
         value = system_out.free[row]
         for j in range(size):  # the matrix is symmetric: along its row, threads in step read one stretch
@@ -148,7 +148,9 @@ def list_pressing(count: int, system: TreeSystem):
 
 @wp.func
 def row_of(listed: wp.int64, i: int):
-    """Returns the contact row of row ``i`` of the linear system, which contains the rows of listed contacts only."""
+    """Returns the contact row of row ``i`` of the linear system, which contains only the rows of the contacts in
+    ``listed`` (indices of four bits each).
+    """
     return 3 * int((listed >> wp.int64(4 * (i // 3))) & wp.int64(15)) + i % 3
 
 
@@ -262,7 +264,8 @@ def project_into_cones(lane: int, lanes: int, count: int, system_out: TreeSystem
 def follow_conjugate_direction(
     gradient_before: wp.float64, lane: int, lanes: int, size: int, system_out: TreeSystem, search_out: TreeSearch
 ):
-    """Continue in the conjugate direction after a sweep. Returns the square of the gradient [N^2 s^2].
+    """Move the impulses of a tree along the conjugate direction after a Gauss-Seidel sweep. Returns the square of the
+    gradient, which is the change of the impulses by the sweep [N^2 s^2].
 
     See :func:`vinesim.kernels.contact.conjugate_gradient.follow_conjugate_direction`.
     """
@@ -326,7 +329,7 @@ def step_or_follow(
 def sweep_contacts(lane: int, lanes: int, count: int, tolerance: wp.float64, system_out: TreeSystem):
     """Take one Gauss-Seidel step of each contact of a tree.
 
-    Returns whether it changed more than ``tolerance`` of the largest impulse.
+    Returns whether an impulse changed by more than ``tolerance`` times the largest impulse.
     """
     change = wp.float64(0.0)
     largest = wp.float64(MIN_IMPULSE_SCALE)

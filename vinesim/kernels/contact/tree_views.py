@@ -168,7 +168,9 @@ def part_of_system(s: TreeSystem, first: int):
 
 @wp.func
 def part_of_search(s: TreeSearch, first: int):
-    """Returns views of the search from row ``first`` on, for arrays in which each tree's rows are contiguous."""
+    """Returns views of the scratch of a search from row ``first`` on, for arrays in which each tree's rows are
+    contiguous.
+    """
     return TreeSearch(
         part_table(s.factor, first),
         part_double(s.first, first),
