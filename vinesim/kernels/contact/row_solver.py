@@ -88,8 +88,7 @@ def largest_of_lanes(value: wp.float64, lanes: int) -> wp.float64:
 
 @wp.func
 def of_contact(c: int, value: wp.float64, lanes: int):
-    """Returns the numbers that the three threads of contact ``c`` hold in ``value``, one for each row of the contact.
-    """
+    """Returns the numbers that the three threads of contact ``c`` hold in ``value``, one for each row of the contact."""
     return wp.vec3d(
         from_lane(value, 3 * c, lanes), from_lane(value, 3 * c + 1, lanes), from_lane(value, 3 * c + 2, lanes)
     )

@@ -124,9 +124,8 @@ def sorted_rays(
 
 @wp.struct
 class Echoes:
-    """Echoes of one laser shot, each as (signal, range [m], brightness, index of the ray that contributes most).
-
-    An echo with signal 0 does not exist.
+    """Echoes of one laser shot, each as (signal, range [m], brightness, index of the ray that contributes most). An
+    echo with signal 0 does not exist.
     """
 
     strongest: wp.vec4

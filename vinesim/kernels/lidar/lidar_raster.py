@@ -195,7 +195,7 @@ class AngularBound:
     """Half of the range of azimuths [rad]; pi for a full turn."""
     low: float
     high: float
-    """Tangents of the lowest and the highest elevation."""
+    """Tangent of the highest elevation; ``low`` is the tangent of the lowest."""
 
 
 @wp.func
@@ -287,7 +287,7 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread tests one cluster against the fired rays.
+    """One thread tests one cluster of primitives against the fired rays.
 
     ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] least distance to the head [m], or
     FAR if no ray can hit the cluster.
@@ -373,7 +373,8 @@ def raster_clusters(  # noqa: PLR0915 - one loop over all kinds of primitives ke
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th primitive of one cluster into every ``slices``-th row of the lidar's rays.
+    """One thread draws every ``lanes``-th primitive of one cluster of primitives into every ``slices``-th row of the
+    lidar's rays.
 
     lower, upper: [primitive, 3] bounding boxes [m]; visible: clusters in view; keys: [column * row] nearest hit, as in
     :mod:`vinesim.kernels.raster.pinhole` but with the range [um] in the upper 32 bits. The function is long so that

@@ -41,11 +41,11 @@ def load_bodies(
 
     Nothing happens if a body cannot be loaded: its tree was not in the last prediction (is_stepped [tree]), or it is
     not among the first tree_moving [tree] bodies of its tree. place_in_tree: [body] index in the tree, from 0 on. body,
-    wrench: [k] bodies and their wrenches (N, N m); a body may occur several times. loaded_out: [k] loaded bodies; it
-    holds the bodies of the last call and is replaced by those of this call.
-    body_wrench_out: [body] N, N m sums. touched_out: [j] each tree once; touched_count_out: [1] number of touched
-    trees. last_contact_out: [tree] number of the step with the last contact. tree_euler_steps_out: [tree] raised where
-    contact begins.
+    wrench: [k] bodies and their wrenches (N, N m); a body may occur several times. loaded_out: [k] loaded bodies; the
+    array holds the bodies of the last call and is overwritten with the bodies of this call. body_wrench_out: [body] N,
+    N m sums. touched_out: [j] each tree once; touched_count_out: [1] number of touched trees. last_contact_out: [tree]
+    number of the step with the last contact. tree_euler_steps_out: [tree] number of steps with phi = 1 still to be
+    taken; set to at least ``ONSET_STEPS`` where contact begins.
     """
     given = int(numbers_out[GIVEN])
     numbers_out[REFUSED] = wp.int64(0)

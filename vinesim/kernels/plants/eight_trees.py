@@ -73,19 +73,19 @@ Floats = wp.array(dtype=float)
 
 @wp.func_native("a.data += at; a.strides[0] = sizeof(*a.data); return a;")
 def record(a: wp.array(dtype=float), at: int) -> wp.array(dtype=float):
-    """Returns a view of the array from number ``at`` on."""
+    """Returns a view of the array ``a`` that begins at index ``at``."""
     ...
 
 
 @wp.func_native("const float* const p = a.data + i; return wp::vec3(p[0], p[8], p[16]);")
 def vec3_at(a: wp.array(dtype=float), i: int) -> wp.vec3:
-    """Returns a vector of one lane; its first number is at i."""
+    """Returns a vector of one lane (one of eight trees stored side by side); its first number is at index i."""
     ...
 
 
 @wp.func_native("const float* const p = a.data + i; return wp::quat(p[0], p[8], p[16], p[24]);")
 def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
-    """Returns a rotation of one lane."""
+    """Returns a rotation of one lane (one of eight trees stored side by side); its first number is at index i."""
     ...
 
 
@@ -93,7 +93,7 @@ def quat_at(a: wp.array(dtype=float), i: int) -> wp.quat:
     "const float* const p = a.data + i; wp::vec_t<6, float> v; for (int c = 0; c < 6; ++c) v[c] = p[8 * c]; return v;"
 )
 def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
-    """Returns a spatial vector of one lane."""
+    """Returns a spatial vector of one lane (one of eight trees stored side by side); its first number is at index i."""
     ...
 
 
@@ -101,7 +101,7 @@ def spatial_at(a: wp.array(dtype=float), i: int) -> wp.spatial_vector:
     "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[24], p[32], p[40], p[48], p[56], p[64]);"
 )
 def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
-    """Returns a matrix of one lane."""
+    """Returns a matrix of one lane (one of eight trees stored side by side); its first number is at index i."""
     ...
 
 
@@ -109,7 +109,9 @@ def mat33_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
     "const float* const p = a.data + i; return wp::mat33(p[0], p[8], p[16], p[8], p[24], p[32], p[16], p[32], p[40]);"
 )
 def symmetric_at(a: wp.array(dtype=float), i: int) -> wp.mat33:
-    """Returns a symmetric matrix of one lane, of which the upper triangle is stored."""
+    """Returns a symmetric matrix of one lane (one of eight trees stored side by side). Only the upper triangle is
+    stored, from index i on.
+    """
     ...
 
 
@@ -121,21 +123,21 @@ def upper_triangle(m: wp.mat33):
 
 @wp.func
 def put_vec3(a_out: Floats, i: int, v: wp.vec3):
-    """Write a vector of one lane."""
+    """Write a vector of one lane (one of eight trees stored side by side), from index i on."""
     for c in range(3):
         a_out[i + 8 * c] = v[c]
 
 
 @wp.func
 def put_quat(a_out: Floats, i: int, q: wp.quat):
-    """Write a rotation of one lane."""
+    """Write a rotation of one lane (one of eight trees stored side by side), from index i on."""
     for c in range(4):
         a_out[i + 8 * c] = q[c]
 
 
 @wp.func
 def put_spatial(a_out: Floats, i: int, v: wp.spatial_vector):
-    """Write a spatial vector of one lane."""
+    """Write a spatial vector of one lane (one of eight trees stored side by side), from index i on."""
     for c in range(6):
         a_out[i + 8 * c] = v[c]
 
@@ -158,7 +160,11 @@ def load_tree(
     forces: AppliedForces,
     records_out: Floats,
 ):
-    """Copy all inputs of one tree into its lane. Record 0 is the frame that roots are attached to."""
+    """Copy all inputs of one tree into its lane of the records. Record 0 describes the frame that roots are attached
+    to.
+
+    ``lane``: index of the tree among the eight trees that are predicted together.
+    """
     pose = model.tree_pose[tree]
     put_vec3(records_out, POSE + lane, wp.transform_get_translation(pose))
     put_quat(records_out, POSE + 24 + lane, wp.transform_get_rotation(pose))
@@ -207,7 +213,10 @@ def store_tree(
     factors_out: Factors,
     prediction_out: Prediction,
 ):
-    """Copy one tree's results out of its lane."""
+    """Copy one tree's results out of its lane of the records.
+
+    ``lane``: index of the tree among the eight trees that are predicted together.
+    """
     first = model.tree_first[tree]
     for i in range(model.tree_moving[tree]):
         k = first + i

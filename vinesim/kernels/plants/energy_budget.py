@@ -74,10 +74,10 @@ Otherwise one step in :data:`CHECK_PERIOD` is checked. TUNED
 NO_BUDGET = 0
 CLOSELY = 1
 NOW_AND_THEN = 2
-"""The ways in which the energy of a tree is watched.
+"""Value of ``tree_budget``: the tree's energy is checked once in :data:`CHECK_PERIOD` launches. When its energy has
+risen, every step is checked until :data:`CLOSE_STEPS` steps have passed without a rise.
 
-NO_BUDGET: not at all. CLOSELY: the budget is kept in every step. NOW_AND_THEN: energy is checked periodically; when it
-has risen, the tree is watched closely until :data:`CLOSE_STEPS` steps have passed without a rise.
+With ``NO_BUDGET`` the energy is never checked. With ``CLOSELY`` the budget is kept in every step.
 """
 
 CHECK_PERIOD = wp.constant(8)
@@ -298,7 +298,10 @@ def filter_rates(
 
 @wp.func
 def is_due(rate: float, close: bool, tree: int, budget_out: EnergyBudget):
-    """Returns whether this step of a tree is to be checked. Counts the step."""
+    """Returns whether this step of a tree is to be checked, and counts the step.
+
+    ``rate`` [rad/s]: largest joint rate of the tree. ``close``: whether the tree is watched closely.
+    """
     watch = budget_out.watch[tree] - 1
     due = watch >= 0 or (close and rate > CHECK_RATE)
     if watch <= -CHECK_PERIOD:
@@ -319,10 +322,10 @@ def lead_back(
     joints_out: JointState,
     bodies_out: BodyState,
 ):
-    """Set the rates of a tree to 0, and halve the rotations of its joints in the step until its energy is at most
-    ``goal`` [J].
+    """Set the joint rates of a tree to 0, and move its joints back towards their rotations at the start of the step
+    (``start_q``), half of the remaining way at a time, until the potential energy is at most ``goal`` [J].
 
-    Returns the energy.
+    Returns the result of :func:`tree_energy` in the new pose.
     """
     first = model.tree_first[tree]
     energy = wp.vec4(0.0, wp.float32(NO_LIMIT), 0.0, 0.0)

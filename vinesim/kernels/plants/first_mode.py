@@ -47,7 +47,9 @@ def compliance(stiffness: wp.vec3, torque: wp.vec3):
 
 @wp.func
 def place_relaxed(model: ArticulationModel, k: int, scratch_out: Scratch):
-    """Compute the axes of body k in its tree (in ``J``) and the lever to it (``tension``), with all springs relaxed."""
+    """Compute the axes of body k in the frame of its tree (stored in ``scratch_out.J``) and the lever to the body
+    (stored in ``scratch_out.tension``), with all springs relaxed.
+    """
     parent = model.body_parent[k]
     axes = wp.quat_to_matrix(model.body_rest[k])
     lever = wp.vec3()
@@ -157,7 +159,7 @@ def begin_substep(
     """One thread in all. Set the number of trees and of floating roots that take part in the next substep.
 
     levels: [substep, 2] numbers of trees and of floating roots. level_count: [1] number of substeps. level_out: [1]
-    index of the next substep, which returns to 0 after the last.
+    index of the next substep; 0 again after the last substep.
     """
     level = level_out[0]
     tree_count_out[0] = levels[level, 0]

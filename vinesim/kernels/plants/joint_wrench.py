@@ -1,4 +1,6 @@
-"""Wrench that a joint carries, computed from the motion of the subtree beyond the joint."""
+"""Wrench that the parent exerts on a body through the body's joint, computed from the motion of the subtree beyond the
+joint.
+"""
 
 import warp as wp
 
@@ -25,13 +27,13 @@ def joint_wrench(
     # out
     wrench_out: wp.array(dtype=wp.spatial_vector),
 ):
-    """One thread per joint. Sum the wrench that the joint must carry so that the subtree beyond it moves as it did in
-    the last step.
+    """One thread per joint. Compute the wrench that the parent exerted on a body through the joint in the last step.
 
-    Newton-Euler of the subtree (Featherstone 2008, section 5.3). joint_bodies: [thread] body beyond the joint.
-    bodies: motion at the start of the step. body_acceleration: [body] m/s^2, rad/s^2 over the step. If the step was
-    divided into tree_steps [tree] substeps, both belong to the last substep. wrench_out: [thread] N, and N m about the
-    body's origin, world axes; zero for bodies that have been cut off.
+    It is the wrench with which the subtree beyond the joint moves as it did in the step: Newton-Euler (Featherstone
+    2008, section 5.3). joint_bodies: [thread] body beyond the joint. bodies: motion at the start of the step.
+    body_acceleration: [body] m/s^2, rad/s^2 over the step. If the step was divided into tree_steps [tree] substeps,
+    both describe the last substep. wrench_out: [thread] force on the body [N], and moment on the body about the body's
+    origin [N m], world axes; zero for bodies that have been cut off.
     """
     slot = wp.tid()
     if slot >= count[0]:

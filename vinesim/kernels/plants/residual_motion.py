@@ -1,4 +1,4 @@
-"""Residual motion: the speed of a tree that is coming to rest, and its distance from its rest pose.
+"""Residual motion: the speed of a tree that is coming to rest, and its distance from its equilibrium pose (rest pose).
 
 The displacement to the rest pose is computed by one step of the articulated-body algorithm that starts at zero
 velocity, has no damping, and is so long that inertia is negligible compared with springs. The step solves (M + (T/2)^2
@@ -59,8 +59,11 @@ def largest_displacement(linear: wp.vec3, angular: wp.vec3, arm: wp.vec3, so_far
 
 @wp.func
 def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: Scratch):
-    """Subtract a point mass ``mass`` at ``point`` of body k, across ``axis``, from the implicit inertia. In this form
-    the tie's stiffness is reduced because its wire deflects.
+    """Subtract a point mass ``mass`` at ``point`` of body k, for motion across ``axis``, from the body's implicit
+    inertia.
+
+    A tie (spring to a wire) acts on the implicit inertia like an added mass, so this subtraction reduces the stiffness
+    of the tie, because its wire deflects.
     """
     across = mass * (wp.identity(n=3, dtype=float) - wp.outer(axis, axis))
     arm = wp.skew(point)

@@ -45,7 +45,7 @@ def cull_clusters(
     # out
     distance_out: wp.array(dtype=wp.float32),
 ):
-    """One thread tests one cluster against the view.
+    """One thread tests one cluster of primitives against the view.
 
     ball: [cluster] centre and radius of a bounding sphere [m]; distance: [cluster] least distance to the camera [m], or
     FAR if the cluster is out of view.
@@ -111,7 +111,7 @@ def raster_solids(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th box, ellipsoid or cylinder of one visible cluster.
+    """One thread draws every ``lanes``-th box, ellipsoid or cylinder of one visible cluster of primitives.
 
     visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
@@ -175,7 +175,7 @@ def raster_triangles(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th triangle of one visible cluster.
+    """One thread draws every ``lanes``-th triangle of one visible cluster of triangles.
 
     visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.

@@ -50,7 +50,7 @@ def raster_spheroids(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th spheroid of one visible cluster.
+    """One thread draws every ``lanes``-th spheroid (berry) of one visible cluster of spheroids.
 
     visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
@@ -174,7 +174,7 @@ def raster_cones(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th cone of one visible cluster.
+    """One thread draws every ``lanes``-th cone of one visible cluster of cones.
 
     visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.
@@ -323,7 +323,7 @@ def raster_leaves(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th leaf of one visible cluster.
+    """One thread draws every ``lanes``-th leaf of one visible cluster of leaves.
 
     visible: clusters in view; lanes: number of threads that share one cluster; keys: [pixel] nearest hit, see
     :mod:`vinesim.kernels.raster.pinhole`.

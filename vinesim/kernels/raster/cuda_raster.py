@@ -276,8 +276,8 @@ def list_tiles(
     pieces_out: wp.array2d(dtype=wp.vec4i),
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread lists the tiles of every ``lanes``-th primitive of a cluster, and draws tiles for which the list is
-    full.
+    """One thread lists the tiles (rectangles of pixels) of every ``lanes``-th primitive of a cluster of primitives. If
+    the list is full, the thread draws the tile itself.
 
     ball: [cluster] centre and radius [m]; which: clusters to draw; count: [list] number of tiles; pieces: [list, slot]
     tiles, see :func:`draw_tile`; keys: [pixel].

@@ -36,7 +36,9 @@ TRIANGLE = wp.constant(6)
 FAR = wp.constant(1.0e30)
 TINY = wp.constant(1.0e-20)
 HIDDEN_HEIGHT = wp.constant(-1.0e6)
-"""Height [m] at which removed primitives are placed, so that no ray of the ray caster hits them."""
+"""World coordinate z [m] of the bounding boxes of removed primitives: so far below the ground that no ray of the ray
+caster hits them.
+"""
 
 
 @wp.struct
@@ -132,11 +134,11 @@ def leaf_extent(hull: wp.array2d(dtype=wp.vec2), number: int) -> wp.vec3:
 
 @wp.func
 def leaf_bulge(hull: wp.array2d(dtype=wp.vec2), number: int, bend: wp.vec4) -> wp.vec2:
-    """Returns how far a leaf blade rises above, and falls below, the convex hull of its eight points over the corners
-    of its outline's octagon [leaf units].
+    """Returns the largest distances of a leaf blade above and below a polyhedron [leaf units].
 
-    A quadratic deviates from its linear interpolation by at most its curvature times (range / 2)^2. Each half of a
-    blade is a quadratic; corners 3 and 7 are at the midrib or near it. ``bend``: curvatures a, b, c, and age.
+    The polyhedron is the convex hull of the eight points of the blade over the corners of its outline's octagon. A
+    quadratic deviates from its linear interpolation by at most its curvature times (range / 2)^2. Each half of a blade
+    is a quadratic; corners 3 and 7 are at the midrib or near it. ``bend``: curvatures a, b, c, and age.
     """
     extent = leaf_extent(hull, number)
     wide = 0.5 * extent[0]
@@ -206,7 +208,7 @@ def hit_leaf(
 
 @wp.func
 def within_leaf_rectangle(sign: float, extent: wp.vec3, o: wp.vec3, d: wp.vec3, t: float) -> float:
-    """Returns ``t`` if the ray o + t d is there within one half of a leaf's bounding rectangle, else :data:`FAR`.
+    """Returns ``t`` if the point o + t d of a ray is within one half of a leaf's bounding rectangle, else :data:`FAR`.
 
     ``sign``: side of the midrib, 1 or -1; ``extent``: largest |u|, lowest and highest v [leaf units].
     """

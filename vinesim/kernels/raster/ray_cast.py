@@ -14,7 +14,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Hierarchies:
-    """Ids of two Warp BVHs: of plants (primitives 0 to ``first_rigid`` - 1) and of rigid links (the following ones)."""
+    """Ids of two Warp BVHs: of plants (primitives 0 to ``first_rigid`` - 1) and of rigid links (all later primitives)."""
 
     plants: wp.uint64
     rigid: wp.uint64

@@ -36,9 +36,10 @@ class PosedPrimitive:
 
 @wp.func
 def pose_leaf(local: Shapes, i: int, pose: wp.transform) -> PosedPrimitive:
-    """Returns leaf ``i``, given in the frame of its body, transformed by the body's ``pose``, with its bounding box.
+    """Returns leaf ``i`` transformed by ``pose`` from the frame of its body into the world, with its bounding box.
 
-    The box contains the octagon around the leaf's outline, raised by the leaf's curvatures.
+    An octagon in the leaf's plane contains the outline of the blade. The box contains two copies of this octagon,
+    shifted along the leaf's normal to the lowest and to the highest point of the curved blade.
     """
     q = wp.transform_get_rotation(pose)
     s = PosedPrimitive()
@@ -121,7 +122,8 @@ def pose_clusters(
     upper_out: wp.array(dtype=wp.vec3),
     ball_out: wp.array(dtype=wp.vec4),
 ):
-    """One thread transforms the primitives of one cluster from their bodies' frames into the world, and bounds them.
+    """One thread transforms the primitives of one cluster of primitives from their bodies' frames into the world, and
+    computes their bounds.
 
     local: [primitive] in the frame of its body; carrier: [primitive] row of the body in ``poses``; dirty: clusters
     whose bodies moved; lower, upper: [primitive] bounding box [m]; ball: [cluster] centre and radius of the bounding

@@ -6,7 +6,9 @@ wp.set_module_options({"enable_backward": False})
 
 VELOCITY = wp.constant(1)
 EFFORT = wp.constant(2)
-"""Codes of the velocity and effort interfaces, as in ``CommandInterface``; all other joints follow a position."""
+"""Code of the effort interface of a joint, as in ``CommandInterface``. ``VELOCITY`` is the code of the velocity
+interface. A joint with any other code follows a position.
+"""
 MIN_INERTIA = wp.constant(wp.float64(1e-9))
 """Least inertia [kg m^2 or kg] by which the code divides."""
 

@@ -30,7 +30,9 @@ WHITE_POINT = wp.constant(3.0)
 """Exposed radiance (relative, linear) that the tone curve maps to nearly white; larger radiance is clipped to it."""
 MIN_METERED_LUMINANCE = wp.constant(0.02)
 MAX_METERED_LUMINANCE = wp.constant(2.0)
-"""Limits of luminance for the exposure meter: it clips darker pixels to the minimum, brighter ones to the maximum."""
+"""Largest luminance for the exposure meter: brighter pixels count as this bright. Pixels darker than
+``MIN_METERED_LUMINANCE`` count as that bright.
+"""
 
 
 @wp.struct

@@ -114,8 +114,8 @@ def blade_light(
 ) -> wp.vec3:
     """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on a leaf or on grass.
 
-    The function follows ``leaf_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's. It
-    is long because one body without calls keeps eight points in SIMD lanes.
+    The formulas are those of ``leaf_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's.
+    The function is long because one body without calls keeps eight points in SIMD lanes.
     """
     i = points.primitive[slot]
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
@@ -215,7 +215,8 @@ def ground_light(
 ) -> wp.vec3:
     """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on the ground.
 
-    The function follows ``ground_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's.
+    The formulas are those of ``ground_surface`` and ``shade_surface``; ``back`` turns the optical frame into the
+    world's.
     """
     ray = point_ray(lens, back, points.u[slot], points.v[slot])
     z = -lens.eye[2] / ray[2]
@@ -285,7 +286,8 @@ def berry_light(
 ) -> wp.vec3:
     """Returns the radiance (linear RGB) of point ``slot`` of :class:`Points`, which is on a berry.
 
-    The function follows ``berry_surface`` and ``shade_surface``; ``back`` turns the optical frame into the world's.
+    The formulas are those of ``berry_surface`` and ``shade_surface``; ``back`` turns the optical frame into the
+    world's.
     """
     number = points.primitive[slot]
     ray = point_ray(lens, back, points.u[slot], points.v[slot])

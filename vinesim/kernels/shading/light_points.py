@@ -278,7 +278,7 @@ def light_others(
     # out
     radiance_out: wp.array(dtype=wp.vec3),
 ):
-    """One thread shades the points of one list that are in the class of all other surfaces, one by one.
+    """One thread shades, one by one, the points of one list that are neither sky, ground, leaf, grass nor berry.
 
     first_list: list of thread 0; radiance: [pixel] linear RGB.
     """
@@ -312,7 +312,7 @@ def point_kernel(module: str, name: str, kind: int, light_point: wp.Function) ->
         # out
         radiance_out: wp.array(dtype=wp.vec3),
     ):
-        """One thread shades the points of one class in one list.
+        """One thread shades the points of one class of surface in one list, eight at a time.
 
         first_list: list of thread 0; radiance: [pixel] linear RGB.
         """

@@ -361,7 +361,8 @@ def raster_shadow_map(
     # out
     depth_out: wp.array(dtype=wp.float32),
 ):
-    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster into a shadow map.
+    """One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster of primitives into a
+    shadow map.
 
     ball: [cluster] centre and radius [m]; which: clusters to draw; smallest: least radius [texel] of canes that are
     drawn; window: first and last + 1 column, first and last + 1 row to draw; depth: [side * side] least distance [m]

@@ -87,9 +87,10 @@ class SupportedBodies:
 
 @wp.struct
 class SupportedSprings:
-    """Anchors of ties and rest angles of root joints, written by the kernels of supports.
+    """Anchors of ties (springs from shoots to wires) and rest poses of the springs of root joints, written by the
+    kernels of supports.
 
-    Those kernels only read ``span`` and ``stiffness``.
+    The kernels of supports only read ``span`` and ``stiffness``.
     """
 
     span: wp.array(dtype=wp.vec2i)  # [body] first tie of the body, and the one after the last
@@ -160,7 +161,8 @@ def turn_rest(
     bodies: SupportedBodies,
     springs_out: SupportedSprings,
 ):
-    """Turn the rest angle of the root joint at node ``i`` with the twist of its arm, by ``deflection`` [rad].
+    """Rotate the rest pose of the root joint's spring at node ``i`` of an arm with the twist of the arm, ``deflection``
+    [rad].
 
     ``velocity`` [rad/s]: rate of the twist; ``share``: see ``SupportState.share``.
     """
@@ -189,12 +191,13 @@ def balance_supports(
     is_moved_out: wp.array(dtype=wp.bool),
     moved_count_out: wp.array(dtype=wp.int32),
 ):
-    """One thread solves the static balance of one support with the trees on it, by tridiagonal elimination.
+    """One thread solves the static balance of one support (wire or arm) with the trees on it, by tridiagonal
+    elimination.
 
     count: [1] number of supports; supports: [thread] index of the support; is_placed: [tree] sleeping trees that were
-    placed since the last step; state, springs: results at this support's nodes; is_moved: [tree] set for sleeping trees
-    whose support has moved further than ``wake_distance`` since they fell asleep; moved_count: [1] number of such
-    trees.
+    moved to another pose since the last step; state, springs: results at this support's nodes; is_moved: [tree] set for
+    sleeping trees whose support has moved further than ``wake_distance`` since they fell asleep; moved_count: [1]
+    number of such trees.
     """
     if wp.tid() >= count[0]:
         return
@@ -259,8 +262,9 @@ def balance_supports(
 
 @wp.func
 def pull_of_node(i: int, nodes: SupportNodes, bodies: SupportedBodies, springs: SupportedSprings):
-    """Returns the stiffness k [N/m] of the tie at node ``i`` of a wire, and its force k s [N]; see
-    :func:`pull_of_tie`."""
+    """Returns the stiffness k [N/m] of the tie at node ``i`` of a wire, and its force k s [N]. s is the displacement of
+    the tied point of the shoot across the wire; see :func:`pull_of_tie`.
+    """
     stiffness = wp.float64(springs.stiffness[springs.span[nodes.body[i]][0] + nodes.number[i]])
     stiffness, moved, _ = pull_of_tie(i, stiffness, nodes, bodies)
     return stiffness, moved

@@ -123,8 +123,9 @@ def deflection_between(piece: int, x: wp.float64, wires: Wires, nodes: SupportNo
 
 @wp.func
 def last_press(i: int, same_place: wp.float64, contacts: WireContacts, presses: WirePresses):
-    """Returns the index of the last step's press of contact ``i``: the nearest press with the contact's key; -1 if
-    there is none within ``same_place`` [m]."""
+    """Returns the index of the last step's press (force on a wire) of contact ``i``: the nearest press with the
+    contact's key; -1 if no such press is within ``same_place`` [m].
+    """
     best = int(-1)
     nearest = same_place
     for j in range(presses.count[0]):
@@ -291,7 +292,7 @@ def add_presses(
 
 @wp.func
 def copy_press(j: int, k: int, presses: WirePresses, presses_out: WirePresses):
-    """Copy press ``j`` of the list ``presses`` to place ``k`` of the list ``presses_out``."""
+    """Copy press ``j`` (a force on a wire) of the list ``presses`` to index ``k`` of the list ``presses_out``."""
     presses_out.piece[k] = presses.piece[j]
     presses_out.key[k] = presses.key[j]
     presses_out.tree[k] = presses.tree[j]
@@ -313,9 +314,10 @@ def load_nodes(
     loads_out: wp.array(dtype=wp.vec3d),
     is_loaded_out: wp.array(dtype=wp.bool),
 ):
-    """Add press ``j`` to the loads [N] of the two nodes next to it, by the lever rule, times ``sign``.
+    """Distribute press ``j`` (a force on a wire), times ``sign``, to the loads [N] of the two nodes next to it by the
+    lever rule.
 
-    With ``sign`` 0 the loads of these nodes are cleared instead.
+    With ``sign`` 0 the loads of these nodes are set to zero instead.
     """
     piece = presses.piece[j]
     support = wires.support[piece]
@@ -332,7 +334,8 @@ def load_nodes(
 
 @wp.func
 def rod_through(piece: int, first: int, numbers: WireNumbers, wires: Wires, presses: WirePresses, geoms_out: WireGeoms):
-    """Place the straight geom of a wire through the points that presses displaced.
+    """Compute the displacement of the straight geom of a wire so that the geom passes through the points that presses
+    (forces) displaced.
 
     If these points are near each other, the geom moves by their mean displacement. ``first``: index of the wire's first
     press.
@@ -382,12 +385,13 @@ def deflect_wires(
     is_loaded_out: wp.array(dtype=wp.bool),
     geoms_out: WireGeoms,
 ):
-    """The only thread replaces the list of presses, keeping presses of sleeping trees, and updates loads and wire
-    geoms.
+    """The only thread updates the list of presses (forces on wires), the loads on the wires' nodes and the positions of
+    the wires' geoms at the end of a step.
 
-    rigid_asleep: [kinematic tree of MuJoCo] not negative while the tree sleeps; found: presses of this step, whose
-    count is cleared; presses: list of the last step, replaced by that of this step; loads: [node] N; is_loaded:
-    [support].
+    Presses of sleeping trees stay in the list. The geom of a wire without presses moves towards its undeflected
+    position step by step. rigid_asleep: [kinematic tree of MuJoCo] not negative while the tree sleeps; found: presses
+    of this step, whose count is set to 0; presses: list of the last step, overwritten with the list of this step;
+    loads: [node] N; is_loaded: [support].
     """
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
