@@ -239,7 +239,7 @@ class RigidArrays:
         return persistent_names(self.listed)
 
     def update(self, rigid: RigidWorld, remote_actors: set[str]) -> np.ndarray:
-        """Write the geoms again after the same world has renumbered them.
+        """Write the arrays again after the rigid world has renumbered its geoms without a recompilation.
 
         Returns the new index [geom] of each previously listed geom; -1 if it is no longer listed.
         """
@@ -258,8 +258,8 @@ class RigidArrays:
 
     @functools.cached_property
     def take_free_velocities(self) -> KernelLaunch:
-        """Launch that reads for each dof its free velocity in this step, and the velocity change that plants caused in
-        the last step.
+        """Launch of the kernel that computes for each degree of freedom the velocity at the end of the step if no plant
+        touches a rigid body, and the velocity change that plants caused in the last step.
         """
         return KernelLaunch(
             broadphase.take_free_velocities, self._free_velocities, [self.bodies.struct], threads=self.world.nv

@@ -60,7 +60,9 @@ class ContactSolver:
         self.skipped_geoms = 0
         """Number of static geoms left out since the start because too many of them were near one tree."""
         self.near_trees = np.zeros(0, np.int32)
-        """[k] Trees whose bounding box overlaps that of a robot or a moving box. These trees must not fall asleep."""
+        """[k] Trees whose bounding box overlaps the bounding box of a robot, a person or a moving object. These trees
+        must not fall asleep.
+        """
         self.remote_actors: set[str] = set()
         """Robots and people that another client controls. That client computes their contacts. In this world they touch
         only remote trees, so that each contact is solved by one client only.
@@ -185,7 +187,7 @@ class ContactSolver:
 
     @property
     def rigid_force(self) -> np.ndarray | None:
-        """[dof] Generalised force (N or N m) of the same contacts on the rigid world. None without contact."""
+        """[dof] Generalised force (N or N m) of the contacts with plants on the rigid world. None without contact."""
         return self.impulses.rigid_force
 
     @property
@@ -257,7 +259,7 @@ class ContactSolver:
         return nearest_body(self.capsules, self.model, self.plants.state, trees, points, max_distance)
 
     def update_tree_bounds(self, trees: np.ndarray) -> None:
-        """Update the bounding boxes of the sleeping trees ``trees`` [k] after their bodies were moved."""
+        """Compute the bounding boxes of the sleeping trees ``trees`` [k] again, after their bodies were moved."""
         self.detection.update_tree_bounds(trees)
 
     def ignore_overlaps(self, bunch: int, low: np.ndarray, high: np.ndarray) -> None:

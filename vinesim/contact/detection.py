@@ -67,7 +67,7 @@ class ContactDetection:
         self._blocks = np.zeros(blocks, np.int32)
         self._block_boxes = SharedArrays.zeros(structs.Aabbs, blocks)
         self._listed: np.ndarray | None = None
-        """Awake trees that the kernels' lists hold. None after the lists were filled with other trees."""
+        """[k] Trees in the kernels' lists of awake trees. None after other trees were written to these lists."""
         self.slots = np.arange(parameters.max_contacts_per_tree)
         self._room = 0
 
@@ -106,7 +106,9 @@ class ContactDetection:
     # ------------------------------------------------------------------ broadphase
 
     def update_tree_bounds(self, trees: np.ndarray) -> None:
-        """Update the bounding boxes of ``trees`` [k] and of their blocks to the present poses of the bodies."""
+        """Compute the bounding boxes of ``trees`` [k], and of the blocks of trees that contain them, from the present
+        poses of the bodies.
+        """
         self._list(trees)
         self._listed = None
         self.counters[structs.SEARCHING_TREES] = 0
@@ -114,7 +116,7 @@ class ContactDetection:
         self.forget_clearances()
 
     def _list(self, trees: np.ndarray) -> None:
-        """Write ``trees`` [k] and their blocks into the lists that the kernels read."""
+        """Write ``trees`` [k], and the blocks of trees that contain them, into the lists that the kernels read."""
         blocks = np.unique(trees // AABB_BLOCK)
         self.arrays.trees.awake[: len(trees)], self._blocks[: len(blocks)] = trees, blocks
         self.counters[structs.AWAKE_TREES] = len(trees)
@@ -123,7 +125,8 @@ class ContactDetection:
     def forget_clearances(self) -> None:
         """Make the next step compare all capsules of awake trees with those of sleeping trees.
 
-        Otherwise, capsules that moved less than their last known clearance are skipped.
+        Otherwise, a capsule is skipped until it has moved by its clearance, the distance that it could move without
+        touching a sleeping tree when it was last compared.
         """
         self._clearances.distance[:] = -1.0
 
@@ -185,7 +188,8 @@ class ContactDetection:
         self._passing[near, room.argmax(1)] = bunch
 
     def find_reached_trees(self, awake: np.ndarray, among_plants: bool) -> np.ndarray:
-        """Update the boxes of the awake trees [k] to their predicted motion, and find the sleeping trees they touch.
+        """Compute the boxes of the awake trees [k] over their predicted motion, and find the sleeping trees that the
+        awake trees touch.
 
         Returns the sleeping trees [j] that the awake trees touch now or will touch before the step ends; no trees
         unless plants can touch each other (``among_plants``).

@@ -100,17 +100,17 @@ class ImpulseSolver:
         # the end of that range. _most_contacts: the largest number of contacts in one solve. _columns: length of their
         # rows.
         self._memory: dict[str, np.ndarray] = {}
-        """Name -> memory that :meth:`_kept` reuses."""
+        """Arrays that :meth:`_kept` reuses, by name."""
         self._wrench = np.zeros((2 * n, 6))
         self.bodies = np.zeros(0, np.int32)
         """[n] Indices of the plant bodies in contact, sorted.
 
-        A view that the next solve changes, like the next two arrays.
+        ``bodies``, ``wrenches`` and ``rigid_force`` are views that the next solve overwrites.
         """
         self.wrenches = np.zeros((0, 6))
         """[n, 6] Force (N) and torque (N m) of the contacts on each of ``bodies``, at the body's origin, world axes."""
         self.rigid_force: np.ndarray | None = None
-        """[dof] Generalised force (N or N m) of the same contacts on the rigid world. None without contact."""
+        """[dof] Generalised force (N or N m) of the contacts with plants on the rigid world. None without contact."""
         self._padded_rows = 0
         """Number of rows of all blocks in the last solve, including the rows that pad the blocks."""
         self.unfinished = 0
@@ -194,7 +194,7 @@ class ImpulseSolver:
         return int(self.islands.sweeps[: self.island_count].max(initial=0))
 
     def clear(self) -> None:
-        """Set the results of a step without contacts."""
+        """Set the results to those of a step without contacts."""
         self.bodies = self.touched.body[:0]
         self.wrenches = self._wrench[:0]
         self.rigid_force = None

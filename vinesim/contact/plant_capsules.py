@@ -1,4 +1,4 @@
-"""Collision capsules of plants: one for each piece of wood, a few spheres for each bunch, one for each cluster."""
+"""Collision capsules of plants: one for each piece of wood, a few spheres for each bunch, one for each berry cluster."""
 
 from __future__ import annotations
 
@@ -30,7 +30,8 @@ class PlantCapsules:
     level: np.ndarray
     """[capsule] Level of detail at which the capsule exists.
 
-    0: always; 1: while its tree is coarse; 2: while its tree is fine (see ``State.tree_fine``).
+    0: always; 1: while the tree's berry clusters are locked to their bunches (coarse); 2: while the clusters move
+    (fine, see ``State.tree_fine``).
     """
     start: np.ndarray
     """[capsule, 3] Start of the axis, m, in the body's frame. Equal to ``end`` for a sphere."""
@@ -43,9 +44,11 @@ class PlantCapsules:
 
 
 def plant_capsules(model: Model) -> PlantCapsules:
-    """Returns a capsule for each piece of wood, a few spheres for each bunch, and a capsule or sphere for each cluster.
+    """Returns a capsule for each piece of wood, a few spheres for each bunch, and a capsule or sphere for each berry
+    cluster.
 
-    The spheres collide for bunches without clusters. For bunches with clusters, they collide while the tree is coarse.
+    The spheres collide for bunches without clusters. For bunches with clusters, they collide while the clusters are
+    locked (the tree is coarse).
     """
     parts: list[tuple[int, int, int, float, float, float]] = []  # body, bunch, level, start and end along x, radius
     of_body = {int(b): i for i, b in enumerate(model.bunch_body)}

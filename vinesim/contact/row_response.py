@@ -16,15 +16,15 @@ from vinesim.plants.articulation_solver import ArticulationSolver
 NUMBERS_PER_CONTACT = 256
 """Initial capacity for response values, per contact. It grows when more are needed."""
 ROWS_ON_A_GPU = 256
-"""Number of GPU threads, each of which computes one group at a time."""
+"""Number of GPU threads. Each thread computes the response to one group of contact sides at a time."""
 
 
 class RowResponse:
     """Response of the plants to unit impulses along the rows of contacts, up to a fixed number of contacts.
 
     The contact kernels fill ``jacobian`` [row, 12], the lists ``body`` and ``tree_end`` [slot] of the plant bodies in
-    contact, ``body_slot`` and ``other_slot`` [contact], and ``groups`` of sides. The device that holds the plants can
-    read all of these.
+    contact (slot: index in these lists), ``body_slot`` and ``other_slot`` [contact], and ``groups`` of contact sides.
+    The device that holds the plants can read all of these arrays.
     """
 
     def __init__(self, plants: ArticulationSolver, contacts: int, counters: np.ndarray) -> None:
@@ -41,7 +41,9 @@ class RowResponse:
         for name, data in lists.items():
             setattr(self._there, name, buffers.reach(data, wp.int32, name))
         self.numbers = np.zeros(0, np.float32)
-        """Response of each group; see :class:`vinesim.kernels.contact.structs.SideGroups`."""
+        """Values of the responses to all groups of contact sides; see
+        :class:`vinesim.kernels.contact.structs.SideGroups`.
+        """
         self.make_room(NUMBERS_PER_CONTACT * contacts)
 
     def make_room(self, numbers: int) -> bool:

@@ -200,8 +200,9 @@ class ArticulationSolver:
         """[tree] phi that the last ``predict()`` of each tree used."""
         self.awake_list = np.zeros(trees, np.int32)
         self.awake_count = np.zeros(1, np.int32)
-        """[1] Number n of awake trees; the first n entries of ``awake_list`` [tree] are these trees. Kernels are bound
-        to both arrays."""
+        """[1] Number n of awake trees. The first n entries of ``awake_list`` [tree] are the indices of these trees.
+        Kernels are bound to both arrays.
+        """
         self.tree_rate = np.zeros(trees, np.float32)
         """[tree] sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed b [m/s] of a floating root
         in the last step. If it is NaN or above ``fault_rate``, the tree was stopped."""
@@ -224,9 +225,13 @@ class ArticulationSolver:
         self.body_com = model.body_com.copy()
         self.body_inertia = model.body_inertia.copy()
         self.body_drag = model.body_drag.copy()
-        """The arrays from ``body_mass`` to ``body_drag`` are mass, centre of mass, inertia and drag of the bodies as
-        they are now, in the model's units. The body of a bunch has the values of the whole compound while its tree is
-        coarse, and those of the bunch's head while the tree is fine. The body of a picked bunch is a stub."""
+        """[body] m^2: drag area of each body as it is now.
+
+        The arrays from ``body_mass`` to ``body_drag`` are mass, centre of mass, inertia and drag of the bodies as they
+        are now, in the model's units. The body of a bunch has the values of the whole bunch while its tree is coarse
+        (the berry clusters are locked to it), and the values of the bunch's head while the tree is fine. The body of a
+        picked bunch is a stub.
+        """
         self.body_product = np.zeros((bodies, 3), np.float32)
         """[body, 3] kg m^2: entries yz, zx, xy of the inertia in the body's axes. The inertia of a compound is not
         diagonal."""
@@ -240,8 +245,10 @@ class ArticulationSolver:
         """[body, 6] N s, N m s: scratch for the impulses of a plastic impact."""
         self.joint_xd_free = np.zeros((bodies, 3), np.float32)
         self.joint_qd_free = np.zeros((bodies, 3), np.float32)
-        """[body, 3] rad/s: predicted rates of joints. ``joint_xd_free`` [body, 3] m/s: predicted velocities of floating
-        roots."""
+        """[body, 3] rad/s: predicted rates of joints at the end of the step without contacts.
+
+        ``joint_xd_free`` [body, 3] m/s: predicted velocities of floating roots.
+        """
         self._place_in_tree = (np.arange(bodies) - model.tree_first[model.body_tree]).astype(np.int32)
         # the trees as the kernels use them: a cut-off body has no parent and no lever
         self._parent = model.body_parent.copy()
@@ -570,8 +577,11 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 for ``contact_onset_duration`` on trees that are about to be touched; ``integrate()`` does so for
-        trees that are touched."""
+        """Use phi = 1 on trees for ``contact_onset_duration``.
+
+        Call it for trees that are about to be touched. For trees that are already touched, ``integrate()`` does the
+        same.
+        """
         self._euler_steps[trees] = np.maximum(self._euler_steps[trees], self.onset_steps)
 
     def forward_kinematics(self, trees: np.ndarray | int | None = None) -> None:
@@ -586,7 +596,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def list_subset(self, trees: np.ndarray) -> None:
-        """Set the list of trees [k] for kernels that work on a subset of the trees."""
+        """Write ``trees`` [k] to the list from which the kernels for a subset of the trees read their trees."""
         self._subset[: len(trees)] = trees
         self._counts[_SUBSET] = len(trees)
 
@@ -603,17 +613,21 @@ class ArticulationSolver:
 
     @property
     def tie_anchor(self) -> np.ndarray:
-        """[tie, 3] m, in the world: the fixed end of each tie; callers may move it. See :meth:`add_tie`."""
+        """[tie, 3] m, in the world: the fixed end of each tie (a spring and damper on a point of a body). Callers may
+        move it. See :meth:`add_tie`.
+        """
         return self.ties.anchor
 
     @property
     def tie_stiffness(self) -> np.ndarray:
-        """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
+        """[tie] N/m: stiffness of each tie (a spring and damper on a point of a body). A tie of zero stiffness does
+        nothing.
+        """
         return self.ties.stiffness
 
     @property
     def tie_damping(self) -> np.ndarray:
-        """[tie] N s/m damping."""
+        """[tie] N s/m: damping of each tie (a spring and damper on a point of a body)."""
         return self.ties.damping
 
     @property
@@ -642,11 +656,11 @@ class ArticulationSolver:
         self._find_falling(self.bodies_of(self.model.body_tree[[body]]))
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
-        """Returns the wrench [n, 6] that each body's joint carried in the last step: force [N] and moment [N m] from
-        the parent on the body, about the body's origin, world axes.
+        """Returns the wrench [n, 6] that the parent of each of the ``bodies`` [n] exerted on the body through its joint
+        in the last step: force [N], and moment [N m] about the body's origin, world axes.
 
-        The result is valid only for bodies of trees that were awake in the last step. At rest a joint carries the
-        weight of the bodies beyond it.
+        The result is valid only for bodies of trees that were awake in the last step. If the tree does not move, the
+        force is upwards and equals the weight of the body and its descendants.
         """
         return self.launches.joint_wrench(bodies)
 
@@ -669,7 +683,9 @@ def spans(first: np.ndarray, count: np.ndarray) -> np.ndarray:
 
 
 class BerryClusters:
-    """Locks and unlocks the clusters of the bunches of one solver; see :meth:`ArticulationSolver.refine`."""
+    """Locks the berry clusters of bunches to their bunch, and unlocks them, in the trees of one solver; see
+    :meth:`ArticulationSolver.refine`.
+    """
 
     def __init__(self, solver: ArticulationSolver) -> None:
         self._solver: ArticulationSolver = weakref.proxy(solver)  # no cycle of references
@@ -679,7 +695,9 @@ class BerryClusters:
         order = np.argsort(tree, kind="stable")
         self.bunches = clustered[order]
         self._bunch_tree = tree[order]
-        """[k] Tree of each entry of ``bunches`` [k], the list of bunches that have clusters, sorted by tree."""
+        """[k] Tree of each entry of ``bunches``. ``bunches`` [k] lists the bunches that have berry clusters, sorted by
+        tree.
+        """
         self.head_mass = model.bunch_head_mass.copy()
         self.head_inertia = model.bunch_head_inertia.copy()
         """[bunch, 3] kg m^2: moments of inertia of each bunch's head, the part of the bunch that belongs to no cluster.
@@ -689,8 +707,10 @@ class BerryClusters:
         self.unlock(self.bunches[fine])
 
     def clustered_trees(self, trees: np.ndarray | int, *, fine: bool) -> np.ndarray:
-        """Returns the trees among ``trees`` that have clusters and are fine (``fine`` true) or coarse (``fine`` false)
-        [k], sorted."""
+        """Returns the trees [k] among ``trees`` that have berry clusters and are in the given level of detail, sorted.
+
+        ``fine``: true for trees in which the clusters move, false for trees in which they are locked (coarse).
+        """
         model = self._solver.model
         trees = np.unique(checked_trees(trees, len(self._solver.state.tree_fine)))
         return trees[(self._solver.state.tree_fine[trees] == fine) & (model.tree_core[trees] < model.tree_size[trees])]
@@ -990,16 +1010,16 @@ MIN_CAPACITY = 16
 
 @dataclasses.dataclass(frozen=True)
 class JointWrenches:
-    """Wrenches that joints carried in the last step."""
+    """Wrenches that the parents of some bodies exerted on the bodies through their joints in the last step."""
 
     places: np.ndarray
-    """[joint] int32: place in the kernels' arrays of the body of each joint. The caller writes it."""
+    """[joint] int32: index in the kernels' arrays of the body beyond each joint. The caller writes it."""
     count: np.ndarray
     """[1] int32: number of joints. The caller writes it."""
     carried: np.ndarray
-    """[joint, 6] N, N m: wrench that each joint carried."""
+    """[joint, 6] Force [N] of the parent on the body, and moment [N m] about the body's origin, world axes."""
     launch: KernelLaunch
-    """Fills :attr:`carried`."""
+    """Kernel launch that computes :attr:`carried`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -1502,7 +1522,9 @@ class KernelLaunches:
         )
 
     def joint_wrench(self, bodies: np.ndarray) -> np.ndarray:
-        """Returns the wrench [n, 6] N, N m that the joint of each of the ``bodies`` [n] carried in the last step."""
+        """Returns the wrench [n, 6] that the parent of each of the ``bodies`` [n] exerted on the body through its joint
+        in the last step: force [N], and moment [N m] about the body's origin, world axes.
+        """
         if len(bodies) > len(self._joint_wrenches.places):
             self._make_room_for_joints(2 * len(bodies))
         wrenches = self._joint_wrenches
@@ -1517,7 +1539,9 @@ class KernelLaunches:
         self._carry = self.graph(self._joint_wrenches.launch)
 
     def joint_wrenches(self, capacity: int) -> JointWrenches:
-        """Returns the arrays and the launch that compute the wrenches of up to ``capacity`` joints in the last step."""
+        """Returns the arrays and the launch that compute the joint wrenches of up to ``capacity`` bodies in the last
+        step.
+        """
         buffers = self.buffers
         places = buffers.pinned(np.zeros(capacity, np.int32))
         count = buffers.pinned(np.zeros(1, np.int32))
@@ -1546,7 +1570,7 @@ class KernelLaunches:
 
 
 Levels = tuple[int, ...]
-"""Entry i is the number of entries of a list that take at least i + 1 substeps."""
+"""Entry i is the number of trees (or floating roots) in a list that take at least i + 1 substeps."""
 
 
 class StepRunner:
@@ -1603,7 +1627,9 @@ class StepRunner:
         """The trees of :attr:`stepped` whose step is to be divided into substeps [k], sorted."""
         self._whole = 0
         self._kind = (False, False)
-        """Whether the integrations of this step keep energy budgets, and whether there are floating roots."""
+        """Key of the launches of this step in :attr:`Step.integrate`: whether energy budgets are kept, and whether
+        there are floating roots.
+        """
         self._room = 0
         """Length of the longest list of an integration."""
         self._levels: Levels = ()

@@ -33,11 +33,15 @@ class ContactLoads:
         then: Sequence[KernelLaunch],
     ) -> None:
         """Args:
-        body_tree, place_in_tree: [body] tree of each body, and the body's index within that tree.
-        is_stepped, tree_moving: [tree] whether a tree was in the last prediction, and how many of its bodies move.
+        body_tree: [body] tree of each body.
+        place_in_tree: [body] index of each body within its tree.
+        is_stepped: [tree] whether the tree was in the last prediction.
+        tree_moving: [tree] number of bodies of the tree that move.
         body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
-        touched, touched_count: [tree] list of the touched trees, [1] number of its entries.
+        touched: [tree] list of the touched trees.
+        touched_count: [1] number of entries of ``touched``.
         euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
+        onset: number of steps with phi = 1 at the beginning of a contact.
         then: launches that follow the sum; they apply the summed wrenches to the touched trees.
         """
         self._then = then

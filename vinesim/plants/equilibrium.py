@@ -1,4 +1,4 @@
-"""Equilibrium of single trees: measures how far trees are from equilibrium, and moves trees into it."""
+"""Equilibrium of single trees: computes how far trees are from equilibrium, and moves trees into it."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ _INPUTS = ("joint_x", "joint_xd", "joint_q", "joint_qd", "body_load", "body_wren
 
 
 class EquilibriumFinder:
-    """Measures how far trees are from equilibrium, between steps; see :mod:`vinesim.kernels.plants.residual_motion`."""
+    """Computes how far trees are from their equilibrium poses, between steps; see
+    :mod:`vinesim.kernels.plants.residual_motion`.
+    """
 
     def __init__(self, plants: ArticulationSolver) -> None:
         self._plants = plants
@@ -76,9 +78,12 @@ class EquilibriumFinder:
         self._measure = launches.graph(measure)
 
     def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns for each of the ``trees`` [k]: speed [k] m/s of the fastest point; distance [k] m from its rest
-        position of the point that is furthest from it; whether :meth:`move_to_rest` can move the tree [k] bool. Call it
-        after ``integrate()``."""
+        """Computes how fast trees [k] move and how far they are from their equilibrium (rest) poses. Call it after
+        ``integrate()``.
+
+        Returns three arrays [k]: speed of the tree's fastest point [m/s]; largest distance of a point of the tree from
+        its rest position [m]; whether :meth:`move_to_rest` can move the tree.
+        """
         plants = self._plants
         plants.list_subset(trees)
         plants.launches.upload_changed()

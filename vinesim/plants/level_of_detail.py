@@ -24,8 +24,10 @@ class LevelOfDetail:
         self.rest_rate = p.detail_rate
         self.fine_steps = p.steps(p.detail_duration)
         self.rest_steps = p.steps(p.detail_rest_duration)
-        """Number of successive steps for which the clusters of a tree must have been at rest before the tree is
-        coarsened. ``fine_steps`` is the number of steps for which a tree stays fine after the last actor has left."""
+        """Number of successive steps for which the clusters of a tree must have been slow before the tree is coarsened.
+
+        ``fine_steps`` is the number of steps for which a tree stays fine after the last actor has left.
+        """
         model = plants.model
         trees = len(model.tree_first)
         self._clustered = np.flatnonzero(model.bunch_clusters > 0)
@@ -39,8 +41,10 @@ class LevelOfDetail:
         self._attached = -1
         self._worth = np.zeros(trees, bool)
         self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
-        """Trees of the last call of :meth:`_rate`, the bodies of all their clusters, and for each tree the index of its
-        first cluster in this list."""
+        """``_rated_trees`` [k]: trees of the last call of :meth:`_rate`.
+        ``_clusters`` [n]: bodies of all berry clusters of ``_rated_trees``, tree by tree.
+        ``_first_cluster`` [k]: index in ``_clusters`` of the first cluster of each of ``_rated_trees``.
+        """
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:
         """Watch ``points`` [n, 3] m until the next call: trees with a bunch within ``radius`` [m] of a point are
@@ -54,8 +58,11 @@ class LevelOfDetail:
         return self.plants.state.tree_fine.nonzero()[0]
 
     def update(self, near: np.ndarray) -> np.ndarray:
-        """Refine and coarsen trees; call it before ``predict()``. ``near`` [k]: awake trees whose bounding box an
-        actor's overlaps. Returns the trees [k] that were coarsened."""
+        """Refine trees (let their berry clusters move) that an actor is near to or watches, and coarsen trees (lock the
+        clusters) that are left alone. Call it before ``predict()``.
+
+        ``near`` [k]: awake trees whose bounding box overlaps an actor's. Returns the trees [k] that were coarsened.
+        """
         coarsened = near[:0]
         if len(self._clustered) == 0:
             return coarsened
@@ -84,7 +91,7 @@ class LevelOfDetail:
         return coarsened
 
     def _left_alone(self, wanted: np.ndarray) -> np.ndarray:
-        """Returns the fine trees [k] that are not in ``wanted``."""
+        """Returns the trees [k] with moving berry clusters that are not in ``wanted``."""
         fine = self.fine_trees
         if len(fine) == 0:
             return fine

@@ -21,12 +21,15 @@ from vinesim.plants.equilibrium import EquilibriumFinder
 from vinesim.scene.physics_parameters import PhysicsParameters
 
 CHECK_PERIOD = 0.05
-"""[s] Period at which trees are measured and put to sleep. All trees are measured in the same step, because a
-measurement costs as much as the prediction of a step. TUNED."""
+"""[s] Period at which trees are tested for rest and put to sleep. All trees are tested in the same step, because the
+computation of residual motion costs as much as the prediction of a step. TUNED.
+"""
 
 CONTACT_SHARE = 0.05
-"""[1] Share of ``sleep_distance`` within which a tree in contact, or a cut-off part, must be of its rest pose to fall
-asleep. It is small because these are not moved to their rest pose. TUNED: 0.01 mm, a thousandth of a travel of 1 cm."""
+"""[1] Largest distance from its rest pose at which a tree in contact, or a cut-off part, falls asleep, as a share of
+``sleep_distance``. It is small because such trees are not moved to their rest pose. TUNED: 0.01 mm, a thousandth of a
+travel of 1 cm.
+"""
 
 STILL_DURATION = 5.0
 """[s] Duration after which a tree in contact, or a cut-off part, counts as at rest if none of its bodies has moved by
@@ -48,7 +51,7 @@ class SleepMonitor:
         self.distance = parameters.sleep_distance
         self._equilibrium = EquilibriumFinder(plants)
         self.patience = parameters.steps(parameters.sleep_duration)
-        """Number of steps for which the joints of a tree must have been slow before the tree is measured."""
+        """Number of steps for which the joints of a tree must have been slow before the tree is tested for rest."""
         self._check_steps = parameters.steps(CHECK_PERIOD)
         trees = len(plants.model.tree_first)
         self.quiet_steps = np.zeros(trees, np.int32)
@@ -61,7 +64,10 @@ class SleepMonitor:
         """[body, 3] m Positions of bodies at the tick in ``_seen_tick``."""
         self._limit = np.zeros(1, np.float32)
         self._longest = np.zeros(1, np.int32)
-        """[1] Largest entry of :attr:`quiet_steps` of an awake tree. ``_limit`` [1] is :attr:`rate`."""
+        """[1] Largest entry of :attr:`quiet_steps` of an awake tree.
+
+        ``_limit`` [1] rad/s: copy of :attr:`rate` for the kernel.
+        """
         self._count_quiet_steps = KernelGraph(
             KernelLaunch(
                 count_quiet_steps,
@@ -125,7 +131,12 @@ class SleepMonitor:
         contact_pairs: np.ndarray = _NO_PAIRS,
         is_coupled: np.ndarray | None = None,
     ) -> np.ndarray:
-        """Measure the trees that have been slow for long enough; see :meth:`update`."""
+        """Test the awake trees whose joints have been slow for long enough, and put those at rest to sleep.
+
+        A tree is at rest if its largest speed and its largest distance from its rest pose are below the limits
+        (:meth:`EquilibriumFinder.residual_motion`). Arguments: see :meth:`update`. Returns the trees [k] that have been
+        put to sleep.
+        """
         plants = self.plants
         awake = self.plants.awake
         slow = awake[self.quiet_steps[awake] >= self.patience]
@@ -167,7 +178,7 @@ class SleepMonitor:
             self._seen_tick[late] = now
 
     def _forget(self, trees: np.ndarray) -> None:
-        """Restart the counts of slow steps and the stored positions of trees."""
+        """Set the counts of slow steps of trees [k] to zero, and delete their stored positions."""
         self.quiet_steps[trees] = 0
         self._is_at_rest[trees] = False
         self._seen_tick[trees] = -1

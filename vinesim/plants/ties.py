@@ -49,8 +49,9 @@ class TieTable:
         self.axis = np.zeros_like(self.anchor)
         """[tie, 3] Unit vector along the wire that the tie is bound to; 0 for a tie that is not bound to a wire."""
         self.softening = np.zeros(len(self.anchor), np.float32)
-        """[tie] N/m: stiffness of the tie minus stiffness of tie and wire in series, across the wire, when all awake
-        trees on the wire move together. Only the sleep of trees uses it."""
+        """[tie] N/m: stiffness across the wire of the tie alone, minus that of tie and wire in series when all awake
+        trees on the wire move together. Only the sleep of trees uses it.
+        """
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
         """[tie] N/m stiffness; a tie of zero stiffness does nothing."""
         self.damping = np.append(model.tie_damping, np.zeros(room, np.float32))
@@ -134,8 +135,9 @@ class TieTable:
 
 
 class RootRests:
-    """Rotations by which the arms of cordons turn the rest poses of the root springs of trees; see
-    :mod:`vinesim.wires.elastic_supports`."""
+    """Rotations of the rest poses of the root springs of trees, by the twist of the cordon arms on which the trees
+    stand; see :mod:`vinesim.wires.elastic_supports`.
+    """
 
     def __init__(self, model: Model) -> None:
         trees = len(model.tree_first)

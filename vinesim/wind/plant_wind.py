@@ -53,7 +53,7 @@ class WindOnPlants:
         self._steps = 0
 
     def update(self, wind: Wind | None, time: float, observers: Observers | None = None) -> None:
-        """Apply ``wind`` (None: calm air) at world ``time`` [s] before a step.
+        """Set the air velocity at each tree for ``wind`` (None: calm air) at world ``time`` [s]. Call it before a step.
 
         Without ``observers`` wind is simulated on all awake trees. A wind given in the first step has full strength at
         once. A wind that begins or ends later fades in or out.
@@ -91,8 +91,9 @@ class WindOnPlants:
         return WindState(self._wind, self._time, self._strength, self.plants.tree_air.copy(), drawn)
 
     def _follow(self, wind: Wind | None) -> None:
-        """Change the strength of the present wind by one step towards ``wind``. The present wind ends before another
-        wind begins."""
+        """Fade the present wind in or out by one step, towards the strength that ``wind`` requires. The present wind
+        fades out before another wind begins.
+        """
         step = self.parameters.dt / FADE_DURATION
         if wind is self._wind:
             self._strength = min(self._strength + step, 1.0)
@@ -114,7 +115,7 @@ class WindOnPlants:
         return self._strength * self._share[trees, None] * velocity
 
     def _calm(self, trees: np.ndarray) -> None:
-        """While a wind fades out, reduce the air velocity of ``trees`` [tree] bool, and wake these trees."""
+        """Reduce the air velocity of ``trees`` [tree] bool while a wind fades out, and wake these trees."""
         felt = np.flatnonzero(trees & (self.plants.tree_air != 0.0).any(1))
         if len(felt):
             self.plants.wake(felt)

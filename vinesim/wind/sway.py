@@ -42,7 +42,7 @@ _MIN_DISTANCE = 1.0
 
 
 class Sway:
-    """Moves the trees in snapshots according to the wind.
+    """Computes the poses in which trees are drawn in wind, in snapshots of the world.
 
     A ``Sway`` stores the poses that it computed last, so the snapshots must be passed in order of time.
     """

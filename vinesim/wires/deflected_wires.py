@@ -60,10 +60,14 @@ SAME_PLACE = 0.05
 shorter than any box, longer than any sliding distance in a step."""
 ROOM = 32
 MAX_PRESSES = 512
-"""Largest number of pressing contacts that are stored for wires, of plants and rigid bodies together. ``ROOM``: initial
-capacity for contacts with wires in one solve."""
+"""Largest number of presses (forces of contacts on wires) that are stored, of plants and rigid bodies together.
+
+``ROOM``: initial capacity for contacts with wires in one solve.
+"""
 NO_TREE = int(np.iinfo(np.int32).min)
-"""Tree number of presses that end with the step, because their shape was removed or moved elsewhere."""
+"""Value of a press's tree if the press (force on a wire) ends with the step, because the pressing shape was removed or
+moved elsewhere.
+"""
 
 
 class DeflectedWires:
@@ -119,11 +123,12 @@ class DeflectedWires:
         return KernelGraph(find), KernelGraph(add)
 
     def end_step(self, rigid_asleep: np.ndarray) -> None:
-        """Move the geoms of wires with the contacts, return wires without contacts to their undeflected positions, and
-        set the contact forces on the elastic supports.
+        """Update the positions of the wires' geoms at the end of a step, and pass the contact forces on wires to the
+        elastic supports.
 
-        ``rigid_asleep``: [kinematic tree] MuJoCo's ``tree_asleep``, which is negative while the kinematic tree is
-        awake.
+        The geom of a wire with contacts is displaced as the contacts deflect the wire. The displacement of a wire
+        without contacts decays over the following steps. ``rigid_asleep``: [kinematic tree] MuJoCo's ``tree_asleep``,
+        which is negative while the kinematic tree is awake.
         """
         if not (self._found.count[0] or self.presses.count[0] or self._geoms.count[0]):
             return
@@ -132,14 +137,17 @@ class DeflectedWires:
         self._supports.set_loaded(self._geoms.loaded[: self._geoms.count[1]])
 
     def release(self, trees: np.ndarray) -> None:
-        """Remove the presses of sleeping trees [k] that were moved to another pose. These trees press on no wire until
-        they wake."""
+        """Remove the presses (stored forces on wires) of sleeping trees [k] that were moved to another pose. These
+        trees press on no wire until they wake.
+        """
         self.presses.tree[np.isin(self.presses.tree, trees)] = NO_TREE
 
     def renumber_rigid(self, numbers: Callable[[int], tuple[int, int]], trees: int) -> None:
-        """Update the keys and trees of presses after the rigid world was recompiled. ``numbers`` maps the old key of a
-        pair of shapes to the new key and the new tree, which is :data:`NO_TREE` if the shape was removed. ``trees``:
-        new number of kinematic trees."""
+        """Write new keys and trees to the stored forces on wires (presses) after the rigid world was recompiled.
+
+        ``numbers`` maps the old key of a pair of shapes to the new key and the new tree, which is :data:`NO_TREE` if
+        the shape was removed. ``trees``: new number of kinematic trees.
+        """
         presses = self.presses
         for k in np.flatnonzero(presses.tree[: presses.count[0]] < 0).tolist():
             presses.key[k], presses.tree[k] = numbers(int(presses.key[k]))

@@ -67,14 +67,14 @@ class ElasticSupports:
         self._active_count = np.zeros(1, np.int32)
         self._moved_count = np.zeros(1, np.int32)
         self.is_coupled = np.zeros(trees, np.bool_)
-        """[tree] Whether the tree shares a support with another awake tree."""
+        """[tree] Whether the tree shares a support (a wire or an arm) with another awake tree."""
         self._is_placed = np.zeros(trees, np.bool_)
         self._awake = _NO_TREES
         self._placed = _NO_TREES
         self._is_listed = False
         self._loaded = self._unloaded = _NO_SUPPORTS
         self.load = np.zeros((len(self._tree), 3))
-        """[node, 3] N Forces on nodes of wires, without the forces of ties."""
+        """[node, 3] N: forces of contacts on the nodes of wires. The forces of ties are not included."""
         first_tie = np.searchsorted(model.tie_body, model.tie_body[wires["tie"]])
         stiffness, last_stiffness = _springs_in_series(nodes["compliance"], nodes["whole"], nodes["is_arm"], first)
         self._bind(
@@ -163,7 +163,7 @@ class ElasticSupports:
         """Arguments of :func:`kernels.wire_spring`, except the loads."""
 
     def set_loaded(self, supports: np.ndarray) -> None:
-        """Set the supports [k] on which :attr:`load` acts until the next call."""
+        """Set the supports (wires or arms) [k] on which :attr:`load` acts until the next call."""
         if not np.array_equal(supports, self._loaded):
             self._unloaded = self._loaded
             self._loaded = supports.copy()
@@ -171,7 +171,7 @@ class ElasticSupports:
 
     @property
     def active(self) -> np.ndarray:
-        """The supports [k] that the last :meth:`update` computed."""
+        """The supports (wires or arms) [k] that the last :meth:`update` computed."""
         return self._active[: self._active_count[0]]
 
     def moved_pieces(self) -> np.ndarray:
@@ -183,12 +183,15 @@ class ElasticSupports:
         return pieces[pieces >= 0]
 
     def place(self, trees: np.ndarray) -> None:
-        """Mark sleeping trees [k] as moved to another pose, so that the next :meth:`update` computes their supports."""
+        """Mark sleeping trees [k] as moved to another pose, so that the next :meth:`update` computes the wires and arms
+        that hold them.
+        """
         self._placed = np.union1d(self._placed, trees).astype(np.int32)
 
     def update(self) -> None:
-        """Move the supports into equilibrium with the forces of their trees, and wake the trees that this moves. Poses
-        and velocities of awake trees must be up to date."""
+        """Compute the deflection of wires and arms in equilibrium with the forces of their trees, and wake sleeping
+        trees that it moves. Poses and velocities of awake trees must be up to date.
+        """
         plants = self._plants
         awake = self._plants.awake
         if awake is not self._awake:
@@ -213,8 +216,9 @@ class ElasticSupports:
             plants.wake(moved)
 
     def _list_supports(self) -> None:
-        """List the supports of the trees that are awake or marked by :meth:`place`, and find the awake trees that share
-        a support."""
+        """List the supports (wires and arms) of the trees that are awake or marked by :meth:`place`, and find the awake
+        trees that share a support.
+        """
         trees = np.concatenate([self._awake, self._placed])
         count = self._tree_start[trees + 1] - self._tree_start[trees]
         support = self._tree_supports[spans(self._tree_start[trees], count)]
@@ -230,8 +234,9 @@ class ElasticSupports:
 
 
 def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Returns the nodes of wires: the ties that are bound to wires under tension, sorted by wire and along each
-    wire."""
+    """Returns the nodes of wires as arrays by name. A node is a tie of a shoot to a wire under tension. Nodes are
+    sorted by wire and along each wire.
+    """
     model = plants.model
     tied = plants.ties.on_wire
     piece = model.tie_wire[tied]
@@ -258,7 +263,9 @@ def _wire_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
 
 
 def _arm_nodes(plants: ArticulationSolver) -> dict[str, np.ndarray]:
-    """Returns the nodes of arms: the roots of trees that stand on elastic arms, sorted by arm and along each arm."""
+    """Returns the nodes of arms as arrays by name. A node is the root of a tree that stands on an elastic arm. Nodes
+    are sorted by arm and along each arm.
+    """
     model = plants.model
     pieces = np.flatnonzero(model.arm_is_elastic())
     tree = np.flatnonzero(model.is_on_arm())
@@ -319,10 +326,13 @@ def _tip_response(plants: ArticulationSolver, tree: np.ndarray, axis: np.ndarray
 def _springs_in_series(
     compliance: np.ndarray, whole: np.ndarray, is_free: np.ndarray, first: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the stiffness [node] of the part of a support before each node, and the stiffness [support] of the part
-    after its last node, which is 0 for a free end. ``compliance`` [node]: compliance from the support's start to the
-    node. ``whole`` [node]: compliance of the node's whole support. ``is_free`` [node]: whether the end of the node's
-    support is free. ``first`` [support]: first node of each support."""
+    """Returns the stiffness [node] of the part of a support (wire or arm) between each node and the node before, and
+    the stiffness [support] of the part after its last node, which is 0 for a free end.
+
+    ``compliance`` [node]: compliance from the support's start to the node. ``whole`` [node]: compliance of the node's
+    whole support. ``is_free`` [node]: whether the end of the node's support is free. ``first`` [support]: first node of
+    each support.
+    """
     before = np.append(0.0, compliance[:-1])[: len(compliance)]
     before[first] = 0.0
     last = np.append(first[1:], len(compliance))[: len(first)] - 1

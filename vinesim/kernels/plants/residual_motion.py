@@ -62,8 +62,8 @@ def soften_tie(k: int, point: wp.vec3, axis: wp.vec3, mass: float, scratch_out: 
     """Subtract a point mass ``mass`` at ``point`` of body k, for motion across ``axis``, from the body's implicit
     inertia.
 
-    A tie (spring to a wire) acts on the implicit inertia like an added mass, so this subtraction reduces the stiffness
-    of the tie, because its wire deflects.
+    A tie (spring to a wire) adds a mass to the implicit inertia. The subtraction makes the tie as soft as tie and
+    deflecting wire in series.
     """
     across = mass * (wp.identity(n=3, dtype=float) - wp.outer(axis, axis))
     arm = wp.skew(point)
