@@ -228,8 +228,8 @@ class Physics:
             self._kinematics_current = True
 
     def wake(self, trees: np.ndarray) -> None:
-        """Wake trees [k] and compute their poses. Call it between steps, after writing joint rotations of these trees
-        into :attr:`state`.
+        """Wake trees [k] and compute the poses of their bodies. Call it between steps, after writing joint rotations of
+        these trees into :attr:`state`.
 
         Raises :class:`ValueError` if there is no such tree.
         """
@@ -256,8 +256,9 @@ class Physics:
         )
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """Returns all rigid bodies and dormant bunches that have a shape. The same tuple is returned until a body or
-        bunch is added or removed."""
+        """Returns all rigid bodies and dormant bunches that have a visible shape. The same tuple is returned until a
+        body or bunch is added or removed.
+        """
         rigid = self.rigid.visuals()
         dormant = self.dormant_bunches.visuals()
         if self._visuals[0] is not rigid or self._visuals[1] is not dormant:
@@ -265,7 +266,7 @@ class Physics:
         return self._visuals[2]
 
     def visual_q(self) -> np.ndarray:
-        """Returns the world poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of the bodies and bunches of :meth:`visuals`."""
         rigid = self.rigid.visual_q()
         return np.concatenate([rigid, self.dormant_bunches.visual_q()]) if len(self.dormant_bunches) else rigid
 
@@ -327,10 +328,10 @@ class Physics:
         self._body_q = None
 
     def apply_remote_rest(self, trees: list[int], joint_q: list[np.ndarray]) -> None:
-        """Put trees into the rest pose that the client that owns them has sent. No tree wakes.
+        """Put trees to sleep in the rest poses that the clients that own the trees have sent. No tree wakes.
 
-        ``joint_q`` has the joint rotations [body of the tree, 4] of each tree. If a tree is named several times, its
-        last pose counts.
+        ``trees`` [k]: indices of the trees. ``joint_q`` [k]: joint rotations [body of the tree, 4] of each tree. If a
+        tree is named several times, its last pose counts.
         """
         for tree, rotations in zip(trees, joint_q, strict=True):
             self.state.joint_q[self.model.bodies_of(tree)] = frames.normalize(np.asarray(rotations, np.float32))

@@ -1,4 +1,4 @@
-"""Collision capsules of plants: one for each piece of wood, a few spheres for each bunch, one for each berry cluster."""
+"""Collision capsules of plants: one for each piece of wood, a few for each bunch, one for each berry cluster."""
 
 from __future__ import annotations
 

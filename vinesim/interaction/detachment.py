@@ -77,7 +77,9 @@ class DetachmentMonitor:
         self.contact_solver = contact_solver
         self.blades: list[Blade] = []
         self.hand_contacts: tuple[Contact, ...] = ()
-        """Hands that hold plants, as contacts. They are used to find the actor who pulled off a bunch."""
+        """Forces of hands that hold plants, as contacts. They are used to find the actor who pulled off a bunch. The
+        caller writes them.
+        """
         model = plants.model
         self._overloaded_steps = np.zeros(len(model.bunch_body), np.int32)
         self._bunch_of = model.bunch_of_body()

@@ -20,7 +20,9 @@ from vinesim.scene.values import RigidVisual
 
 
 class DormantBunches:
-    """Picked bunches without bodies. Each has a pose in the frame of its support."""
+    """Picked bunches without bodies. Each bunch has a pose in the frame of its support (ground, box or link of a
+    robot).
+    """
 
     def __init__(
         self, plants: ArticulationSolver, rigid: RigidWorld, contact_solver: ContactSolver, supports: SupportTracker
@@ -36,8 +38,10 @@ class DormantBunches:
         """World pose [7] of each bunch, which is used while the bunch's support does not exist."""
         self._visuals: tuple[RigidVisual, ...] | None = ()
         self._groups: list[tuple[str, np.ndarray, np.ndarray, np.ndarray]] = []
-        """For each support: its name, rows [k] of :meth:`visuals` of the bunches on it, their poses [k, 7] in its
-        frame, and their world poses [k, 7] while it does not exist."""
+        """One entry for each support (ground, box or link of a robot) with dormant bunches on it: name of the support;
+        rows [k] of these bunches in :meth:`visuals`; their poses [k, 7] in the support's frame; their world poses [k,
+        7], for the time in which the support does not exist.
+        """
         capsules = contact_solver.capsules
         of_bunches = np.flatnonzero(
             (plants.model.body_organ[capsules.body] == int(Organ.BUNCH)) & (capsules.level != 2)
@@ -109,7 +113,7 @@ class DormantBunches:
         return [visuals[i].index for i in np.argsort(distance, kind="stable")[:most].tolist() if distance[i] < radius]
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """Returns all dormant bunches, as in :meth:`RigidWorld.visuals`."""
+        """Returns the visible shapes of all dormant bunches, as in :meth:`RigidWorld.visuals`."""
         if self._visuals is None:
             order = sorted(self._bunches)
             self._visuals = tuple(RigidVisual(f"bunch/{i}", Organ.BUNCH, i, self._bunches[i].shapes) for i in order)
@@ -121,7 +125,7 @@ class DormantBunches:
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
-        """Returns the world poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of the dormant bunches, in the order of :meth:`visuals`."""
         pose = np.zeros((len(self.visuals()), 7))
         for support, rows, relative, place in self._groups:
             frame = self.supports.support_state(support)

@@ -146,8 +146,10 @@ class GraspManager:
             self.rigid.grasp(*key, *rigid[1:])
 
     def _pull(self, human: HumanBody, hand: HandBody, grasp: _PlantGrasp) -> None:
-        """Set the anchor of the spring. Its distance from the grasped point is limited, so that the spring's force does
-        not exceed the hand's force."""
+        """Set the world end (anchor) of the spring that pulls a held plant to the hand's controller.
+
+        The anchor is so near to the grasped point that the spring's force does not exceed the hand's largest force.
+        """
         at = self._grasped_point(grasp)
         velocity = human.controller_velocity(hand, self.rigid.dt)
         pull = human.controller_pose(hand)[:3] + hand.damping / hand.stiffness * velocity - at

@@ -55,14 +55,20 @@ class SupportTracker:
         self._anchor_pose = np.zeros((0, 7))
         """[object, 7] Anchor pose in the support's frame, around which the object may move within its band."""
         self._still_steps = self._slow_steps = np.zeros(0, np.int64)
-        """[object] ``_still_steps``: number of successive steps for which the object has been within its band.
-        ``_slow_steps``: number for which it has been slower than ``support_move_speed``."""
+        """[object] Number of successive steps for which the object has been slower than ``support_move_speed``.
+
+        ``_still_steps`` [object]: number of successive steps for which the object has been within its band (the
+        permitted displacement from its anchor pose).
+        """
         self._row_of_object: dict[int, int] = {}
         self._touching_pairs = _NO_PAIRS
         """[k, 2] Pairs of an object's row and the MuJoCo body in contact with the object in the last step."""
         self._bands_before = self._bands_on_ground = np.zeros((0, 2))
-        """[object, 2] m, rad. ``_bands_before``: bands in the last step. ``_bands_on_ground``: bands of objects that
-        rest on the ground."""
+        """[object, 2] m, rad: band of each object if it is on the ground (permitted displacement and rotation from the
+        anchor pose).
+
+        ``_bands_before`` [object, 2]: band of each object in the last step.
+        """
         self._touched: list[tuple[int, str]] | None = None
         self._all_sleep = False
         """Whether all objects slept after the last step."""
@@ -274,7 +280,7 @@ class SupportTracker:
     # ------------------------------------------------------------------ inside
 
     def _update_tables(self) -> None:
-        """Rebuild the tables if MuJoCo's model has changed."""
+        """Build the tables of objects and bodies again if MuJoCo's model has changed."""
         if self._generation != self.rigid.generation:
             self._rebuild_tables()
 
@@ -302,7 +308,9 @@ class SupportTracker:
         return relative
 
     def _band_sizes(self) -> np.ndarray:
-        """[object, 2] m, rad, band of each object on its present support."""
+        """Returns the band [object, 2] m, rad of each object on its present support: the displacement and rotation from
+        its anchor pose within which the object is still.
+        """
         if not self._support.any():
             return self._bands_on_ground
         on = self._row_of_body[self._support]
@@ -355,7 +363,9 @@ class SupportTracker:
         return np.where(keep, self._support, np.where(found == _NONE, 0, found))[rows]
 
     def _rebuild_tables(self) -> None:
-        """Build the tables for MuJoCo's present model. Objects keep their supports, which are matched by name."""
+        """Build the tables of objects and bodies for MuJoCo's present model. Objects keep their supports, which are
+        matched by name.
+        """
         rigid = self.rigid
         m = rigid.mj_model
         rigid.update_kinematics()

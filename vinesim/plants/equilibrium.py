@@ -78,7 +78,7 @@ class EquilibriumFinder:
         self._measure = launches.graph(measure)
 
     def residual_motion(self, trees: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Computes how fast trees [k] move and how far they are from their equilibrium (rest) poses. Call it after
+        """Compute how fast trees [k] move and how far they are from their equilibrium (rest) poses. Call it after
         ``integrate()``.
 
         Returns three arrays [k]: speed of the tree's fastest point [m/s]; largest distance of a point of the tree from

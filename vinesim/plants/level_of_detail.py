@@ -41,9 +41,10 @@ class LevelOfDetail:
         self._attached = -1
         self._worth = np.zeros(trees, bool)
         self._rated_trees = self._clusters = self._first_cluster = np.zeros(0, np.int64)
-        """``_rated_trees`` [k]: trees of the last call of :meth:`_rate`.
-        ``_clusters`` [n]: bodies of all berry clusters of ``_rated_trees``, tree by tree.
-        ``_first_cluster`` [k]: index in ``_clusters`` of the first cluster of each of ``_rated_trees``.
+        """[k] Index in ``_clusters`` of the first berry cluster of each tree in ``_rated_trees``.
+
+        ``_rated_trees`` [k]: trees of the last call of :meth:`_rate`. ``_clusters`` [n]: bodies of all berry clusters
+        of ``_rated_trees``, tree by tree.
         """
 
     def set_focus(self, points: np.ndarray, radius: float) -> None:

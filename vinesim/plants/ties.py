@@ -49,8 +49,8 @@ class TieTable:
         self.axis = np.zeros_like(self.anchor)
         """[tie, 3] Unit vector along the wire that the tie is bound to; 0 for a tie that is not bound to a wire."""
         self.softening = np.zeros(len(self.anchor), np.float32)
-        """[tie] N/m: stiffness across the wire of the tie alone, minus that of tie and wire in series when all awake
-        trees on the wire move together. Only the sleep of trees uses it.
+        """[tie] N/m: stiffness of the tie alone, minus the stiffness of tie and wire in series when all awake trees on
+        the wire move together; both across the wire. Only the sleep of trees uses it.
         """
         self.stiffness = np.append(model.tie_stiffness, np.zeros(room, np.float32))
         """[tie] N/m stiffness; a tie of zero stiffness does nothing."""

@@ -36,8 +36,9 @@ class RigidGeoms:
     size: np.ndarray
     """[geom, 3] size as in MuJoCo's ``geom_size``; for a mesh, half edges of its bounding box."""
     half: np.ndarray
-    """[geom, 3] m, half edges of the bounding box in the geom's axes; for a plane, :data:`PLANE_HALF_SIZE` twice and
-    height 0."""
+    """[geom, 3] m, half edges of the bounding box in the geom's axes. A plane has :data:`PLANE_HALF_SIZE` along x and
+    y, and 0 along z.
+    """
     center: np.ndarray
     """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
     radius: np.ndarray
@@ -49,7 +50,8 @@ class RigidGeoms:
     dof: np.ndarray
     """[geom] last degree of freedom that moves the geom (-1: none); ``dof_parentid`` gives its ancestors."""
     root: np.ndarray
-    """[geom] root body of the geom's kinematic tree; MuJoCo's ``cvel`` and ``cdof`` refer to its centre of mass."""
+    """[geom] root body of the geom's kinematic tree. MuJoCo's ``cvel`` and ``cdof`` refer to the tree's centre of mass.
+    """
     actor: tuple[str, ...]
     link: tuple[str, ...]
 

@@ -37,8 +37,9 @@ class EffectiveMass:
         return change
 
     def island_labels(self, d: mujoco.MjData) -> np.ndarray:
-        """Returns a label [MuJoCo kinematic tree] of each tree's island: a force on a tree can move only trees with an
-        equal label within this step."""
+        """Returns a label [MuJoCo kinematic tree] of each tree's island. A force on a tree can move only trees with the
+        same label within this step.
+        """
         m = self._world
         if d.nefc == 0:
             return self._each

@@ -41,7 +41,7 @@ BODY_ARRAYS = (
     "body_contype",
     "body_conaffinity",
 )
-"""Names of the arrays of ``MjModel`` with constants that MuJoCo derives for a body from its mass and shapes."""
+"""Names of the arrays of ``MjModel`` with constants of a body that MuJoCo derives from the body's mass and shapes."""
 GEOM_ARRAYS = (
     "geom_type",
     "geom_contype",

@@ -350,7 +350,7 @@ class HumanBody:
             hand.apply_control(m, d, at[i], error, motion)
 
     def measure(self, d: mujoco.MjData) -> None:
-        """After a step: set the prescribed poses of the kinematic parts, and read the forces of the hands."""
+        """After a step: set the kinematic parts to their prescribed poses, and store the forces of the hands."""
         self._last_poses = self._poses
         if self.is_remote:
             force = d.qfrc_constraint[self.part_dofs[:, :3]]
@@ -419,9 +419,13 @@ class HandBody:
         self.closed = False
         """Whether the hand is commanded to grasp objects near it."""
         self.has_shears = self.is_squeezed = False
-        """Whether the hand has shears, and whether it is closed around shears or an object; both only affect looks."""
+        """Whether the hand is closed around shears or an object. ``has_shears``: whether the hand has shears. Both only
+        affect the drawn hand.
+        """
         self.busy = False
-        """Whether a remote person's hand is busy. A busy hand does not collide: its own client computes its forces."""
+        """Whether a remote person's hand is busy: its own client reports that it pushes a robot or holds an object. A
+        busy hand does not collide in this world.
+        """
         self.steps_since_contact = self.contact_steps
         self.force = np.zeros(3)
         """[3] N, force of the hand on its surroundings in the last step, world axes."""
@@ -512,7 +516,7 @@ class HandBody:
         error: tuple[np.ndarray, np.ndarray],
         motion: tuple[np.ndarray, np.ndarray],
     ) -> None:
-        """Set the velocity of a free hand: the velocity of its controller, plus a motion towards the controller."""
+        """Set the velocity of a free hand: the velocity of its controller, plus a velocity towards the controller."""
         p = self.parameters
         dt = self.parameters.dt
         offset, angle = error
@@ -546,7 +550,7 @@ class HandBody:
         d.qvel[self.dofs] = 0.0
 
     def measure(self, d: mujoco.MjData) -> None:
-        """After a step: read the force of the hand on what it touches or holds."""
+        """After a step: store the force that the hand exerts on what it touches or holds."""
         if not self.on_plant:
             reaction = d.qfrc_constraint[self.dofs] + d.qfrc_applied[self.dofs]
             self.force = -reaction[:3]

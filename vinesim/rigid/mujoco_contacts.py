@@ -102,8 +102,11 @@ def let_links_collide(parsed: mujoco.MjSpec, given: RobotSpec, code: int) -> Non
 
 
 def disabled_pairs(urdf: str) -> list[tuple[str, str]]:
-    """Returns the pairs of links in the ``disable_collisions`` elements of a URDF, into which loading has copied the
-    elements of the SRDF."""
+    """Returns the pairs of link names between which the robot's description disables collisions.
+
+    The pairs are the elements ``disable_collisions`` of the URDF. Loading a robot copies these elements from the SRDF
+    into the URDF.
+    """
     root = ElementTree.fromstring(urdf)
     return [(pair.get("link1", ""), pair.get("link2", "")) for pair in root.findall("disable_collisions")]
 

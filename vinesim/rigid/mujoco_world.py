@@ -46,7 +46,9 @@ class CompiledWorld:
     mj_model: mujoco.MjModel
     names: WorldNames
     bunches: dict[int, tuple[int, FreeBunch]]
-    """Free bunches that already have bodies in the world, each with its slot."""
+    """Free bunches that already have bodies in the world: index of the body in the pool for free bunches, and shapes,
+    by number of the bunch.
+    """
     hulls: SharedArrays
     """Convex hulls of all meshes, see :func:`vinesim.rigid.collision_geoms.hull_arrays`."""
     removed: tuple[RobotBody | HumanBody, ...] = ()
@@ -197,11 +199,13 @@ class MujocoWorld:
         return np.array([*self.mj_data.xpos[body].tolist(), x, y, z, w])  # Python floats take half the time
 
     def visuals(self) -> tuple[RigidVisual, ...]:
-        """Returns all rigid bodies with visible shapes; the same tuple object until one is added or removed."""
+        """Returns the visible rigid bodies, each with its shapes. The same tuple object is returned until a body is
+        added or removed.
+        """
         return self._visuals
 
     def visual_q(self) -> np.ndarray:
-        """Returns the world poses [visual, 7] of :meth:`visuals`."""
+        """Returns the world poses [visual, 7] of the visible rigid bodies, in the order of :meth:`visuals`."""
         self.update_kinematics()
         d = self.mj_data
         body = self._visual_body
@@ -354,7 +358,7 @@ def list_visuals(
     humans: Mapping[str, HumanBody],
     bunches: Mapping[int, tuple[FreeBunch, int]],
 ) -> tuple[tuple[RigidVisual, ...], np.ndarray]:
-    """Returns all rigid bodies with visible shapes, and the MuJoCo body of each [visual].
+    """Returns all rigid bodies with visible shapes (``RigidVisual``), and the MuJoCo body [visual] of each.
 
     The MuJoCo body is 0 for arms and fingers of people, whose poses :class:`PostureSolver` computes. ``bunches``:
     shapes and MuJoCo body of every free bunch.
@@ -413,7 +417,9 @@ class LinkSensors:
         self._row: dict[tuple[str, str], int] = {}
         """Row of a sensor, by robot and link."""
         self._body = self._root = np.zeros(0, int)
-        """[sensor] Index of the MuJoCo body of the link, and of the root of its robot."""
+        """[sensor] MuJoCo index of the root body of the sensor's robot. ``_body`` [sensor]: MuJoCo index of the
+        sensor's link.
+        """
         self._wrench = np.zeros((0, 6))
         """[sensor, 6] N m, N, moment about ``_com`` and force that the parent link exerts on the link, world axes."""
         self._com = np.zeros((0, 3))
@@ -440,7 +446,9 @@ class LinkSensors:
         self._root = m.body_rootid[self._body]
 
     def measure(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """At the end of a step: measure while MuJoCo's poses are still those of the start of the step."""
+        """Store the measurements of all sensors. Call it at the end of a step, while MuJoCo's poses are still those of
+        the start of the step.
+        """
         body = self._body
         if not len(body):
             return

@@ -8,8 +8,9 @@ import mujoco
 import numpy as np
 
 AWAKE_COUNTER = -1 - mujoco.mjMINAWAKE
-"""Value of MuJoCo's ``tree_asleep`` [steps] for a tree that was just woken; MuJoCo counts up to -1, then the tree may
-sleep."""
+"""Value of MuJoCo's ``tree_asleep`` for a kinematic tree that was just woken. MuJoCo adds 1 in each step; at -1 the
+tree may sleep.
+"""
 
 
 def wake_body(m: mujoco.MjModel, d: mujoco.MjData, body: int) -> None:

@@ -168,7 +168,9 @@ class RigidWorld(MujocoWorld):
         return self.human(name).part_poses[_HIPS, :3] if name in self._humans else self.base_state(name)[0][:3]
 
     def penetrations(self) -> list[tuple[str, str, float]]:
-        """Returns the pairs of actors or objects that overlapped at the start of the last step, with the depth [m]."""
+        """Returns the pairs of actors or objects that overlapped at the start of the last step, each with the depth of
+        the overlap [m].
+        """
         m = self.mj_model
         d = self.mj_data
         found = []
@@ -399,11 +401,11 @@ class RigidWorld(MujocoWorld):
     def follow_remote(
         self, name: str, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> None:
-        """Let the servos pull the copy of a remote robot to the received state; the copy stays dynamic, so that a vine
-        can hold it back.
+        """Let the servos pull the copy of a remote robot to the state that its client has sent. The copy stays dynamic,
+        so that a vine can hold it back.
 
-        ``base_q``: [7] pose of the base; ``base_qd``: [6] its velocity, world axes; ``position``, ``velocity``:
-        [joint].
+        ``base_q``: [7] pose of the base; ``base_qd``: [6] velocity of the base, world axes; ``position``, ``velocity``:
+        [joint] rad or m, rad/s or m/s.
         """
         self._check_joints(name, position=position, velocity=velocity)
         _check_finite(name, "base pose", base_q, 7)
@@ -420,11 +422,11 @@ class RigidWorld(MujocoWorld):
         wrench[:3], wrench[3:] = force, moment
 
     def set_remote_wrenches(self, name: str, wrenches: dict[str, np.ndarray]) -> None:
-        """Apply the wrenches [6], by link, of remote people on a robot until the next call.
+        """Set the wrenches that remote people exert on a robot. They act until the next call.
 
-        A wrench is a force [N] and a moment about the link's centre of mass [N m], world axes.
-        :meth:`joint_measurements` counts wrenches as contacts. Raises :class:`RobotError` if a link does not exist or a
-        wrench is not finite.
+        ``wrenches``: wrench [6] by name of the link: a force [N] and a moment [N m] about the link's centre of mass,
+        world axes. The contact efforts of :meth:`joint_measurements` include them. Raises :class:`RobotError` if a link
+        does not exist or a number is not finite.
         """
         robot = self.robot(name)
         for link, wrench in wrenches.items():
@@ -663,7 +665,8 @@ class RigidWorld(MujocoWorld):
         self._end_passing()
 
     def _end_passing(self) -> None:
-        """Enable collisions with fixed pieces for bunches that passed through one and no longer overlap any.
+        """Enable collisions with fixed pieces for the bunches that passed through a fixed piece since they were picked
+        and no longer overlap any.
 
         MuJoCo's poses must be current.
         """

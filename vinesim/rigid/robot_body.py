@@ -100,7 +100,9 @@ class RobotBody:
         """Links with a sensor, see :meth:`RigidWorld.add_link_sensor`."""
         self._controls_of: mujoco.MjData | None = None
         self.remote_wrenches: dict[str, np.ndarray] = {}
-        """Wrenches [6] of remote people by link; see :meth:`RigidWorld.set_remote_wrenches`."""
+        """Wrenches [6] that remote people exert on the robot, by name of the link; see
+        :meth:`RigidWorld.set_remote_wrenches`.
+        """
 
     @property
     def base_slip(self) -> float:
@@ -247,8 +249,9 @@ class RobotBody:
     def follow_remote(
         self, d: mujoco.MjData, base_q: np.ndarray, base_qd: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> None:
-        """Let the servos pull the copy of a remote robot to its received state; see
-        :meth:`RigidWorld.follow_remote`."""
+        """Let the servos pull the copy of a remote robot to the state that its client has sent; see
+        :meth:`RigidWorld.follow_remote`.
+        """
         self.command(position, velocity)
         # MuJoCo treats a servo that is at its effort limit at the start of the step as explicit; a light joint that
         # catches up would then overshoot its target
@@ -293,7 +296,9 @@ class RobotBody:
         self.control[:] = given + self.stiffness * q + self.damping_at_end * v
 
     def set_remote_wrenches(self, d: mujoco.MjData, wrenches: dict[str, np.ndarray]) -> None:
-        """Set the wrenches [6] of remote people by link; :class:`RobotError` if a link does not exist."""
+        """Set the wrenches [6] (force [N], moment [N m]) that remote people exert on the robot, by name of the link.
+        Raises :class:`RobotError` if a link does not exist.
+        """
         if unknown := sorted(wrenches.keys() - self.bodies.keys()):
             raise RobotError(f"robot {self.spec.name!r} is pushed at {unknown[0]!r}, which is not one of its links")
         for link in self.remote_wrenches.keys() - wrenches.keys():

@@ -26,7 +26,9 @@ in a step; a bottom of the visible thickness would push it out below."""
 CRATE_COLOR = (0.75, 0.15, 0.12, 1.0)
 
 FIRST_FIXED_GEOM = 1
-"""MuJoCo's geom number of the first fixed piece. The ground has number 0; the other pieces follow the first."""
+"""MuJoCo's number of the geom of the first fixed piece (piece of a pole, wire, trunk or arm). The geoms of the other
+pieces follow; the ground has number 0.
+"""
 
 GROUND, FIXED, BOX, CRATE_FLOOR, FREE_BUNCH, REMOTE_HAND = (1 << bit for bit in range(6))
 """Collision bits. Free bunches collide with the thick bed of a crate, all other bodies with its thin floor. Robots do

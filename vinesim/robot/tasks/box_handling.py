@@ -18,7 +18,9 @@ from vinesim.robot.tasks.task import Task, TaskFailed
 from vinesim.world import Physics
 
 LIFT_HEIGHT = 0.15
-"""[m] Height above the ground at which boxes are carried. GUESSED"""
+"""[m] Position of a lift's joint while the robot carries a box with it: about the height of the box's underside above
+the ground. GUESSED
+"""
 MIN_CLAMP_FORCE = 100.0
 """[N] Contact force on each paddle from which on the paddles have clamped something. GUESSED"""
 CLAMP_TIME = 1.5

@@ -27,8 +27,9 @@ from vinesim.robot.tasks.task import TaskFailed
 from vinesim.world import Physics
 
 RELEASE_HEIGHT = 0.004
-"""[m] Height above the ground at which a box is released. It is so small because the box then stands on the ground
-even if the clamp sags."""
+"""[m] Height of a box's underside above the ground at which the robot's clamp releases the box. It is so small because
+the box then stands on the ground even if the clamp sags.
+"""
 PLACEMENT_TOLERANCE = 0.05
 """[m] Largest permitted distance between the empty box and the place where the full box stood. GUESSED"""
 
