@@ -26,10 +26,10 @@ KEPT_SIZE = 64 << 20
 """Free memory that stays at the end of the heap [bytes]. It is the largest amount that glibc would choose itself."""
 
 TRIM_PERIOD = 60.0
-"""Period at which free pages are returned to the system [s]."""
+"""Period at which free pages are given back to the operating system [s]."""
 _TRIM_THRESHOLD = -1
 _MMAP_THRESHOLD = -3
-"""Parameter numbers of mallopt(3), from glibc's malloc.h."""
+"""Number of the parameter M_MMAP_THRESHOLD of mallopt(3), from glibc's malloc.h; ``_TRIM_THRESHOLD`` likewise."""
 
 
 @functools.cache
@@ -42,15 +42,16 @@ def _glibc() -> ctypes.CDLL | None:
 
 
 def keep_large_blocks_apart() -> None:
-    """Return blocks of at least :data:`BLOCK_SIZE` to the system as soon as they are freed. Call it before large tables
-    are allocated."""
+    """Set the allocator to give blocks of at least :data:`BLOCK_SIZE` back to the operating system as soon as they are
+    freed. Call it before large tables are allocated.
+    """
     if (library := _glibc()) is not None:
         library.mallopt(_MMAP_THRESHOLD, BLOCK_SIZE)
         library.mallopt(_TRIM_THRESHOLD, KEPT_SIZE)
 
 
 def trim_regularly(period: float = TRIM_PERIOD) -> None:
-    """Start a thread that returns free pages of the heap to the system every ``period`` [s]."""
+    """Start a thread that gives free pages of the heap back to the operating system every ``period`` [s]."""
     if (library := _glibc()) is not None:
         threading.Thread(target=_trim_for_ever, args=(library, period), name="heap trimmer", daemon=True).start()
 
@@ -62,7 +63,8 @@ def _trim_for_ever(library: ctypes.CDLL, period: float) -> None:
 
 
 def release_free_memory() -> None:
-    """Collect garbage, including objects frozen by ``gc.freeze``, and return free pages of the heap to the system.
+    """Collect garbage, including objects frozen by ``gc.freeze``, and give free pages of the heap back to the operating
+    system.
 
     This takes up to a second, so call it only after the world was built or rebuilt.
     """

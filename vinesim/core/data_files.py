@@ -10,7 +10,7 @@ class DataFileNotFound(FileNotFoundError):
 
 
 def data_dir() -> pathlib.Path:
-    """Returns the folder ``data``: inside the installed package, or next to it in a checkout."""
+    """Returns the folder ``data`` of vinesim: inside the installed package, or next to the package in a checkout."""
     package = pathlib.Path(__file__).resolve().parent.parent
     return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
 

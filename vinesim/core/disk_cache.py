@@ -31,7 +31,7 @@ from vinesim.core.progress import ProgressLine
 log = logging.getLogger(__name__)
 
 MAX_SIZE = 1 << 30
-"""Largest total size of the entries [bytes]; beyond it the least recently used entries are deleted."""
+"""Largest total size of the entries [bytes]. When it is exceeded, the least recently used entries are deleted."""
 LOCK_TIMEOUT = 120.0
 """Longest time to wait for another process that is computing an entry [s]; this process then computes the entry too."""
 _LEFTOVER_AGE = 3600.0
@@ -146,7 +146,7 @@ def _read(path: pathlib.Path) -> Arrays | None:
 
 
 def _write(path: pathlib.Path, arrays: Arrays) -> None:
-    """Write a file under another name, then rename it: readers find the whole file or none."""
+    """Write the arrays to a temporary file, then rename it to ``path``, so that readers find the whole file or none."""
     if sum(array.nbytes for array in arrays.values()) > MAX_SIZE:
         return
     draft = path.with_name(f"{path.stem}.{os.getpid()}-{threading.get_ident()}.tmp")
@@ -166,7 +166,9 @@ def _write(path: pathlib.Path, arrays: Arrays) -> None:
 
 
 def _prune(place: pathlib.Path) -> None:
-    """Delete files left by killed processes, then the least recently used entries until :data:`MAX_SIZE` is met."""
+    """Delete files left by killed processes, then the least recently used entries until the total size is at most
+    :data:`MAX_SIZE`.
+    """
     now = time.time()
     entries = []
     for file in place.iterdir():

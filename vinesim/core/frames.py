@@ -29,7 +29,8 @@ _W_LAST = np.array([1, 2, 3, 0])
 
 
 _MANY = 512
-"""Array size [elements] above which computing component by component is faster."""
+"""Number of array elements above which functions of this module compute component by component, which is then faster.
+"""
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:

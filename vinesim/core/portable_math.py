@@ -1,9 +1,9 @@
-"""Mathematical functions that give the same bits on every CPU.
+"""Mathematical functions that return the same bits on every CPU.
 
 On CPUs with AVX-512, NumPy computes these functions with vector instructions, which round differently. A vineyard
-generated there would have another digest than on other CPUs, and the server would refuse its clients. Here each number
-is computed by the C library, as NumPy does on other CPUs. NumPy's sines, cosines, square roots and products agree on
-all CPUs. The C library itself rounds differently on CPUs without FMA (x86 of 2012 and before).
+generated on such a CPU would have another digest than on other CPUs, and the server would refuse its clients. In this
+module each number is computed by the C library, as NumPy does on other CPUs. NumPy's sines, cosines, square roots and
+products agree on all CPUs. The C library itself rounds differently on CPUs without FMA (x86 of 2012 and before).
 """
 
 from __future__ import annotations

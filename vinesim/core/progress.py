@@ -14,10 +14,10 @@ PERIOD = 1.0
 """Least time between two texts of a :class:`ProgressLine` [s]."""
 
 LINE_PERIOD = 5.0
-"""Least time between two lines in an output where a line cannot be updated, such as a log file [s]."""
+"""Least time [s] between two lines in an output in which a line cannot be overwritten, such as a log file."""
 
 _ERASE = "\r\x1b[K"
-"""Terminal control sequence: return to the beginning of the line and erase the line."""
+"""Terminal control sequence that moves the cursor to the beginning of the line and erases the line."""
 
 
 class ProgressLine:

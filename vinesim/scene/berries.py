@@ -54,7 +54,9 @@ PROTOTYPE_BERRIES = (50, 64, 80, 97, 116, 140)
 MIN_BERRIES = 40
 MAX_BERRIES = PROTOTYPE_BERRIES[-1]
 _SHAPES = ((0.75, 0), (0.45, 1), (0.22, 2))
-"""Taper and number of wings of the three prototypes of each count: conical, shouldered, cylindrical with two wings."""
+"""Taper and number of wings of the three prototypes (packed model bunches) of each count of berries: conical,
+shouldered, cylindrical with two wings.
+"""
 _ITERATIONS = 400
 _SPREAD = 0.07
 """Standard deviation of a berry's radius, as a fraction of the radius."""
@@ -145,8 +147,9 @@ def _packed() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _prototype(count: np.ndarray | int, seed: np.ndarray | int) -> np.ndarray:
-    """Returns the index of a bunch's prototype: the one with the next larger count, in the shape that the seed
-    selects."""
+    """Returns the index of the prototype (packed model bunch) of a bunch: the prototype with the next larger count of
+    berries, in the shape that the seed selects.
+    """
     if np.min(count) < 1 or np.max(count) > MAX_BERRIES:
         raise ValueError(f"a bunch has 1 to {MAX_BERRIES} berries, not {np.min(count)} to {np.max(count)}")
     return np.searchsorted(PROTOTYPE_BERRIES, count) * len(_SHAPES) + np.asarray(seed, np.int64) % len(_SHAPES)

@@ -101,16 +101,20 @@ def measured_points(frame: CameraFrame, step: int = 1) -> np.ndarray:
 
 
 MODELS = {5: "plumb_bob", 8: "rational_polynomial"}
-"""Names of the models by their number of coefficients."""
+"""Names of the models of lens distortion (as in sensor_msgs/CameraInfo), by their number of coefficients."""
 NONE = (0.0, 0.0, 0.0, 0.0, 0.0)
 """Coefficients of a lens without distortion."""
 _STEPS = 20
 _TOLERANCE = 1e-9
-"""Tolerance of Newton's method for points in the plane at depth 1, in which a pixel is about 1e-3 wide."""
+"""[1] Tolerance of Newton's method in :func:`undistort`, for points in the plane at depth 1, in which a pixel is about
+1e-3 wide.
+"""
 
 
 def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns the radial factor of the distortion and its derivative with respect to r2."""
+    """Returns the radial factor of the lens distortion and its derivative with respect to ``r2``, the squared distance
+    of a point from the optical axis in the plane at depth 1.
+    """
     k1, k2, _, _, k3, k4, k5, k6 = np.pad(coefficients, (0, 8 - len(coefficients)))
     above = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
     below = 1.0 + r2 * (k4 + r2 * (k5 + r2 * k6))
@@ -120,7 +124,9 @@ def _polynomials(r2: np.ndarray, coefficients: tuple[float, ...]) -> tuple[np.nd
 
 
 def distort(points: np.ndarray, coefficients: tuple[float, ...]) -> np.ndarray:
-    """Returns the distorted positions [..., 2] of points [..., 2] in the plane at depth 1."""
+    """Returns the positions [..., 2] that a lens with these distortion coefficients gives to points [..., 2] in the
+    plane at depth 1.
+    """
     x = points[..., 0]
     y = points[..., 1]
     r2 = x * x + y * y

@@ -69,7 +69,7 @@ def parse_object_name(name: str) -> int | None:
 
 
 LABEL_STRIDE = 1 << 20
-"""Factor of the organ in a label of label images, which is ``organ * LABEL_STRIDE + index``, one int32."""
+"""Factor of the organ in a pixel of a label image. The pixel is one int32, ``organ * LABEL_STRIDE + index``."""
 
 
 def label(organ: Organ, index: int) -> int:

@@ -69,7 +69,9 @@ QUANTITIES = {
 _ContactFile = msgspec.defstruct(
     "_ContactFile", [(name, dict[str, Number], {}) for name in QUANTITIES], frozen=True, forbid_unknown_fields=True
 )
-"""Structure of the file: one table for each quantity, with numbers by pair, such as ``bark-steel``, in either order."""
+"""Structure of a file in ``data/materials``: one table for each quantity, with numbers by pair of materials, such as
+``bark-steel``, in either order.
+"""
 
 
 def materials_of_organs(organs: np.ndarray) -> np.ndarray:

@@ -16,13 +16,15 @@ from vinesim.core.data_files import find_data_file
 from vinesim.core.toml_loader import DataError, load_toml
 
 AXIS_LENGTH = 0.05
-"""[1] Largest relative difference between the length of a specimen's axis and its measured length."""
+"""[1] Largest relative difference between the length of the axis (points along a measured cane) of a specimen and its
+measured length.
+"""
 Grade = Literal["READ", "DERIVED", "GUESSED", "FITTED"]
 """Origin of a number: a publication, a derivation from one, a guess, or a fit to a measured plant."""
 
 
 class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One sourced number."""
+    """One number with its unit, its grade (see :data:`Grade`) and its source."""
 
     value: float
     unit: str
@@ -31,7 +33,7 @@ class Number(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sourced range between two numbers."""
+    """A range between two numbers, with its unit, its grade (see :data:`Grade`) and its source."""
 
     value: tuple[float, float]
     unit: str
@@ -44,7 +46,7 @@ class Range(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Colour(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sourced linear RGB reflectance."""
+    """A linear RGB reflectance, with its unit, its grade (see :data:`Grade`) and its source."""
 
     value: tuple[float, float, float]
     unit: str

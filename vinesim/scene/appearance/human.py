@@ -62,7 +62,7 @@ class HumanFile(Table, frozen=True):
     height: float
     paints: dict[str, Paint]
     outfits: dict[str, dict[str, Point]]
-    """For each outfit: colour [sRGB, 0 to 1] of each paint, by name."""
+    """Colour [sRGB, 0 to 1] of each paint by the paint's name, for each outfit by the outfit's name."""
     parts: dict[str, tuple[ShapeSpec, ...]]
     limbs: Limbs
     fingers: dict[str, Finger]

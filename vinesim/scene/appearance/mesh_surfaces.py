@@ -1,4 +1,4 @@
-"""Meshes for sensors: simplified, with smooth normals, from a file or from received triangles."""
+"""Meshes for sensors: simplified, with smooth normals, from a file or from triangles received over the network."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ def smooth_surface(vertices: np.ndarray, faces: np.ndarray, scale: tuple[float, 
 
 
 def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
-    """Returns the mesh of :func:`read_surface` for received triangles with ``corners`` [face, 3, 3] m.
+    """Returns the mesh of :func:`read_surface` for triangles that were received over the network, with ``corners``
+    [face, 3, 3] m.
 
     Raises :class:`TrianglesError` if the triangles cannot be simplified or too many of them meet at one point.
     """

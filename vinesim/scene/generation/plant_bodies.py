@@ -1,4 +1,6 @@
-"""Bodies of all shoots in one table [shoot, slot]: poses as drawn, masses, inertias, springs."""
+"""Bodies of all shoots in one table [shoot, slot]: poses as drawn, masses, inertias, springs. A slot is a column of the
+table, see :mod:`~vinesim.scene.generation.shoot_slots`.
+"""
 
 from __future__ import annotations
 
@@ -33,12 +35,14 @@ from vinesim.scene.spec import Scene
 
 @dataclasses.dataclass
 class Bodies:
-    """Table of bodies [shoot, slot] from which the model is built; poses are in the world, as drawn."""
+    """Table of bodies [shoot, slot] from which the model is built. A slot is a column of the table: a segment, a bunch
+    or a berry cluster. Poses are in the world, as drawn.
+    """
 
     present: np.ndarray
     """[shoot, slot] bool: the shoot has this body."""
     parent: np.ndarray
-    """[shoot, slot] slot of the parent, -1 for the root."""
+    """[shoot, slot] Slot (column of the table) of the parent body, -1 for the root."""
     organ: np.ndarray
     """[shoot, slot] :class:`Organ`."""
     origin: np.ndarray
@@ -52,13 +56,15 @@ class Bodies:
     mass: np.ndarray
     """[shoot, slot] kg, mass of the body."""
     com: np.ndarray
-    """[shoot, slot, 3] m, in the body's frame."""
+    """[shoot, slot, 3] m, centre of mass in the body's frame."""
     inertia: np.ndarray
     """[shoot, slot, 3] kg m^2, principal moments of inertia about the centre of mass."""
     stiffness: np.ndarray
     """[shoot, slot, 3] N m/rad, stiffness of the body's joint."""
     half: np.ndarray
-    """[shoot, slot, 3] N m/rad, spring of the half of a segment beyond its middle."""
+    """[shoot, slot, 3] N m/rad, stiffness of the spring that represents the outer half of a segment (from its middle to
+    its tip).
+    """
     damping: np.ndarray
     """[shoot, slot, 3] N m s/rad, damping of the body's joint."""
     drag: np.ndarray
@@ -136,15 +142,18 @@ def _allocate(count: int) -> Bodies:
 
 
 def _chain_parents(first: np.ndarray, chain: np.ndarray) -> np.ndarray:
-    """Returns the parent slots [shoot, segment] of a rod that grows on slot ``first`` [shoot].
+    """Returns the parent slots [shoot, segment] of the segments of a rod that grows on the body in slot ``first``
+    [shoot]. A slot is a column of the table of bodies.
 
-    ``chain`` [segment - 1] are the rod's own slots.
+    ``chain`` [segment - 1]: slots of all segments of the rod except the last one.
     """
     return np.concatenate([first[:, None], np.broadcast_to(chain, (len(first), len(chain)))], 1)
 
 
 def _fill_bunch(parameters: VineParameters, shoots: Shoots, bodies: Bodies, k: int) -> None:
-    """Fill the slots of the bunch at the end of peduncle ``k`` and of its clusters."""
+    """Fill the columns (slots) of the table of bodies for the bunch at the end of peduncle ``k`` and for its berry
+    clusters.
+    """
     bunch = peduncle_slots(k).stop - 1
     clusters = cluster_slots(k)
     bodies.present[:, clusters] = False
@@ -196,7 +205,8 @@ def _fill_rod(
     up: np.ndarray,
     parent: np.ndarray,
 ) -> None:
-    """Fill the slots of one rod of every shoot, which is either a root or grows on the tip of its parent.
+    """Fill the columns (slots) of the table of bodies for one rod of every shoot, which is either a root or grows on
+    the tip of its parent.
 
     Args:
         bodies: the table.

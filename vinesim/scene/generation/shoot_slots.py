@@ -29,12 +29,14 @@ SLOT_COUNT = CORE_SLOTS + MAX_BUNCHES * MAX_CLUSTERS
 
 
 def peduncle_slots(which: int) -> slice:
-    """Returns the slots of one peduncle, followed by the slot of its bunch."""
+    """Returns the slots (columns of the table of bodies) of the segments of peduncle ``which`` (0 or 1), followed by
+    the slot of its bunch.
+    """
     first = AXIS_SEGMENTS + LATERAL_SEGMENTS + which * (PEDUNCLE_SEGMENTS + 1)
     return slice(first, first + PEDUNCLE_SEGMENTS + 1)
 
 
 def cluster_slots(which: int) -> slice:
-    """Returns the slots of one bunch's berry clusters."""
+    """Returns the slots (columns of the table of bodies) of the berry clusters of bunch ``which`` (0 or 1)."""
     first = CORE_SLOTS + which * MAX_CLUSTERS
     return slice(first, first + MAX_CLUSTERS)

@@ -27,38 +27,42 @@ class Shoots:
 
     vine: np.ndarray
     piece: np.ndarray
-    """[shoot] index of the piece of an arm on which the shoot grows, counted over all arms"""
+    """[shoot] Index of the piece of an arm on which the shoot grows, counted over all arms."""
     up: np.ndarray
     """[shoot, 3] direction that the bodies' z axes lean to."""
     points: np.ndarray
     """[shoot, AXIS_SEGMENTS + 1, 3] m, points along the main axis."""
     length: np.ndarray
     base: np.ndarray
-    """[shoot] radius at the base [m]"""
+    """[shoot] m, radius at the base of the main axis."""
     has_lateral: np.ndarray
-    """[shoot] bool: has a side shoot"""
+    """[shoot] bool, whether the shoot has a lateral (side shoot)."""
     lateral_at: np.ndarray
-    """[shoot] segment of the main axis whose tip carries the lateral"""
+    """[shoot] Index of the segment of the main axis whose tip carries the lateral (side shoot)."""
     lateral_points: np.ndarray
     """[shoot, LATERAL_SEGMENTS + 1, 3] m, points along the lateral."""
     has_bunch: np.ndarray
-    """[shoot, MAX_BUNCHES] bool: the shoot has this bunch."""
+    """[shoot, MAX_BUNCHES] bool, whether the shoot has this bunch."""
     bunch_at: np.ndarray
-    """[shoot, MAX_BUNCHES] segment of the main axis whose tip carries the peduncle"""
+    """[shoot, MAX_BUNCHES] Index of the segment of the main axis whose tip carries the bunch's peduncle."""
     peduncle: np.ndarray
-    """[shoot, MAX_BUNCHES, PEDUNCLE_SEGMENTS + 1, 3] m, the last point is the bunch's origin"""
+    """[shoot, MAX_BUNCHES, PEDUNCLE_SEGMENTS + 1, 3] m, points along the peduncle. The last point is the bunch's
+    origin.
+    """
     bunch_axis: np.ndarray
-    """[shoot, MAX_BUNCHES, 3] direction of the bunch's axis"""
+    """[shoot, MAX_BUNCHES, 3] Direction of the bunch's axis."""
     bunch_up: np.ndarray
-    """[shoot, MAX_BUNCHES, 3] direction that the bunch's z axis leans to"""
+    """[shoot, MAX_BUNCHES, 3] Direction that the bunch's z axis leans to."""
     fruit: dict[str, np.ndarray]
-    """[shoot, MAX_BUNCHES] mass, count, length, radius, seed, variety, pull, thick"""
+    """Properties of the bunches by name, each an array [shoot, MAX_BUNCHES]: mass, count, length, radius, seed,
+    variety, pull, thick.
+    """
     nodes: np.ndarray
-    """[shoot] number of nodes of the main axis"""
+    """[shoot] Number of nodes of the main axis."""
     leaf_normal: np.ndarray
-    """[8, shoot, MAX_NODES + LATERAL_NODES] standard normal numbers"""
+    """[8, shoot, MAX_NODES + LATERAL_NODES] Standard normal random numbers from which the leaves are generated."""
     leaf_uniform: np.ndarray
-    """[4, shoot, MAX_NODES + LATERAL_NODES] uniform numbers"""
+    """[4, shoot, MAX_NODES + LATERAL_NODES] Uniform random numbers from which the leaves are generated."""
 
 
 def sample_shoots(scene: Scene, parameters: VineParameters, structure: FixedStructure) -> Shoots:

@@ -99,7 +99,9 @@ def _assemble_model(
     leaf: dict[str, np.ndarray],
     ties: dict[str, np.ndarray],
 ) -> Model:
-    """Build the model: drop masked slots, number the rest, and turn world poses into poses relative to parents."""
+    """Build the model from the tables [shoot, slot]: remove slots that a shoot does not use, number the remaining
+    bodies, and convert world poses to poses relative to parents.
+    """
     size = bodies.present.sum(1)
     first = np.cumsum(size) - size
     number = first[:, None] + np.cumsum(bodies.present, 1) - 1

@@ -71,7 +71,9 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
 
 
 def _bearer(path: pathlib.Path, table: np.ndarray, start: np.ndarray, way: np.ndarray, i: int) -> int:
-    """Returns the index of the earlier cylinder on whose surface or axis cylinder ``i`` starts."""
+    """Returns the index of the parent of cylinder ``i``: the earlier cylinder on whose surface or axis cylinder ``i``
+    starts.
+    """
     share = np.clip(((start[i] - start[:i]) * way[:i]).sum(1) / (way[:i] ** 2).sum(1), 0.0, 1.0)
     off = np.linalg.norm(start[:i] + share[:, None] * way[:i] - start[i], axis=1) - table[:i, 0]
     nearest = int(np.argmin(off))

@@ -32,7 +32,7 @@ class _Entity:
 
 
 def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
-    """Returns the skeleton of the plant in an MTG file.
+    """Returns the skeleton of the plant in a file of a multiscale tree graph (MTG).
 
     Args:
         path: the file.
@@ -140,7 +140,9 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
 
 
 def _steps(place: str, code: str) -> list[tuple[str, int]]:
-    """Returns operators and indices of one code. For ``^<E2+U1`` these are ``^``, ``<2`` and ``+1``."""
+    """Returns the operators and indices of one topology code of an MTG file. For ``^<E2+U1`` these are ``^``, ``<2``
+    and ``+1``.
+    """
     found = []
     at = 0
     while at < len(code):
@@ -159,7 +161,9 @@ def _steps(place: str, code: str) -> list[tuple[str, int]]:
 
 
 def _features(place: str, cells: list[str], columns: dict[int, str]) -> dict[str, float]:
-    """Returns the features of one line that this reader uses, by name."""
+    """Returns the features of one line of the file, by name: coordinates, thickness, and mass of a hanging bunch. All
+    other features are ignored.
+    """
     values = {}
     for i, name in columns.items():
         if i < len(cells) and cells[i].strip() and (name in ("xx", "yy", "zz", _BUNCH) or name in _DIAMETERS):

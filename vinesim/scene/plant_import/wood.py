@@ -30,7 +30,9 @@ _OFFSETS = {
     "tie_body": "body",
     "leaf_body": "body",
 }
-"""Fields of a model that contain indices, with the axis that each indexes. Negative values mean none."""
+"""Fields of :class:`Model` that contain indices, each with the name of the axis into which it indexes. A negative index
+means none.
+"""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

@@ -57,7 +57,9 @@ class TreeUpdate:
     """Authority sequence number, u16 with wraparound; every touch increments it."""
     time: float
     resting: bool
-    """Whether the tree is at rest. Such a record is the last one for the tree and is sent reliably."""
+    """Whether the tree is at rest (slow and near its equilibrium). Such an update is the last one for the tree and is
+    sent reliably.
+    """
     touched: bool
     """Whether the owner of the tree, or an object of the owner, is in contact with the tree."""
     joint_q: np.ndarray
@@ -77,12 +79,12 @@ class ObjectUpdate:
     """State of one moving box or free bunch, as sent over the network."""
 
     object: int
-    """:func:`vinesim.scene.ids.object_id`"""
+    """Id of the object, see :func:`vinesim.scene.ids.object_id`."""
     owner: str
     ownership: int
     authority: int
     time: float
     pose: np.ndarray
-    """[7] pose in the world"""
+    """[7] Pose of the object in the world."""
     velocity: np.ndarray
-    """[6] m/s and rad/s, of its origin, world axes."""
+    """[6] m/s, rad/s: linear velocity of the object's origin, then angular velocity, world axes."""

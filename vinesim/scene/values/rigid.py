@@ -56,7 +56,7 @@ class RigidBox:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class RigidVisual:
-    """One visible rigid body: name, organ, index and shapes."""
+    """One visible rigid body for pictures, scans and the web page: name, organ, index and shapes."""
 
     name: str
     """Full name, ``actor/link`` or ``box/3``."""

@@ -80,7 +80,7 @@ class ControllerKind(enum.StrEnum):
 
 
 FORWARD_KINDS = (ControllerKind.FORWARD_POSITION, ControllerKind.FORWARD_VELOCITY, ControllerKind.FORWARD_EFFORT)
-"""Kinds of controllers that pass on one value for each joint."""
+"""Kinds of controllers that send the command for each joint unchanged to its drive."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

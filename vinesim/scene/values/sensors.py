@@ -15,10 +15,10 @@ MIN_BERRY_PIXELS = 4
 """Smallest number of visible pixels of a berry that counts as visible."""
 
 Box = tuple[int, int, int, int]
-"""First column, first row, last column, last row (inclusive)."""
+"""Rectangle of pixels: first column, first row, last column, last row (inclusive)."""
 MIN_CAMERA_SIZE = 16
 MAX_CAMERA_SIZE = 4096
-"""Smallest and largest width and height of a camera's picture [px]."""
+"""Largest width and height of a camera's picture [px]. ``MIN_CAMERA_SIZE``: smallest width and height [px]."""
 
 
 class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -65,7 +65,7 @@ class SensorFrame(Protocol):
 
     @property
     def time(self) -> float:
-        """[s]"""
+        """Simulated time of the measurement [s]."""
         ...
 
     @property
@@ -75,7 +75,7 @@ class SensorFrame(Protocol):
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
-        """Returns the arrays that are equal to the bit in two lockstep runs."""
+        """Returns the arrays that are equal to the bit in two runs with lockstep (:class:`SensorMode`)."""
         ...
 
 
@@ -118,8 +118,9 @@ class SensorPacing:
 
 
 class CameraOutput(enum.Flag):
-    """Parts of a :class:`CameraFrame`. A camera renders only the requested parts. Other sensors render completely if
-    any part is requested."""
+    """Parts of a :class:`CameraFrame`. A camera renders only the requested parts. Sensors that are not cameras render
+    completely if any part is requested.
+    """
 
     RGB = enum.auto()
     DEPTH = enum.auto()
@@ -227,7 +228,7 @@ class CameraFrame:
 
     @property
     def outputs(self) -> CameraOutput:
-        """The parts that were made."""
+        """Parts of the picture that this frame contains."""
         made = CameraOutput.NONE if self.bunches is None else CameraOutput.BUNCHES
         for output, array in (
             (CameraOutput.RGB, self.rgb),
@@ -306,7 +307,7 @@ class LidarScan:
 
     @property
     def organs(self) -> np.ndarray:
-        """[point] :class:`~vinesim.scene.ids.Organ` that each point is on."""
+        """[point] :class:`~vinesim.scene.ids.Organ` of the object that each point is on."""
         return self.labels // LABEL_STRIDE
 
 
@@ -331,7 +332,7 @@ class MultispectralFrame:
     name: str
     info: CameraInfo
     pose: np.ndarray
-    """[7] optical frame in the world when the picture was taken."""
+    """[7] Pose of the optical frame in the world when the picture was taken."""
     bands: tuple[Band, ...]
     """Bands, sorted by wavelength."""
     reflectance: np.ndarray

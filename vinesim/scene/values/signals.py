@@ -85,7 +85,9 @@ class Intention:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HandGestures:
-    """Gestures of a person's hands (CANOPIES D6.4, section 3.4): names of finger poses, empty for other poses."""
+    """Gestures of a person's hands (CANOPIES D6.4, section 3.4). A gesture is the name of a finger pose; empty for a
+    pose without a name.
+    """
 
     person: str
     left: str

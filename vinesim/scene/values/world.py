@@ -49,11 +49,13 @@ class Snapshot:
     bunch_attached: np.ndarray
     """[bunch] bool, whether the bunch hangs on its plant."""
     visuals: tuple[RigidVisual, ...]
-    """Rigid bodies; the same tuple object as long as no actor joins or leaves."""
+    """Visible rigid bodies with their shapes. The same tuple object as long as no body is added or removed."""
     visual_q: np.ndarray
-    """[link, 7] m, 1, poses of ``visuals``."""
+    """[visual, 7] m, 1: world poses of the bodies in ``visuals``."""
     moved_trees: np.ndarray
-    """[k] Indices of the trees that are awake; all other trees stand still."""
+    """[k] Indices of the trees whose pose may have changed: trees that are awake, and sleeping trees whose rest pose
+    another client has sent.
+    """
     wind: WindState | None = None
     """The wind; None in calm air. In wind ``body_q`` does not contain the sway of trees on which wind is not simulated;
     see :mod:`vinesim.wind.sway`."""
