@@ -273,24 +273,28 @@ class Physics:
     # ------------------------------------------------------------------ actors
 
     def add_robot(self, spec: RobotSpec) -> None:
-        """See :meth:`RigidWorld.add_robot`."""
+        """Add a robot to the vineyard; see :meth:`RigidWorld.add_robot`."""
         self.rigid.add_robot(spec)
 
     def remove_robot(self, name: str) -> None:
-        """See :meth:`RigidWorld.remove_robot`. The robot's blades are removed as well."""
+        """Remove a robot and its blades; see :meth:`RigidWorld.remove_robot`."""
         self.rigid.remove_robot(name)
         self._remove_blades_of(name)
 
     def add_human(self, spec: HumanSpec, *, is_remote: bool = False) -> None:
-        """See :meth:`RigidWorld.add_human`. A remote person is controlled by another client, and touches only trees
-        whose state that client sends."""
+        """Add a person to the vineyard; see :meth:`RigidWorld.add_human`.
+
+        ``is_remote``: another client controls the person. A remote person touches only trees whose state that client
+        sends.
+        """
         self.rigid.add_human(spec, is_remote=is_remote)
         if is_remote:
             self.contact_solver.remote_actors.add(spec.name)
 
     def remove_human(self, name: str) -> None:
-        """See :meth:`RigidWorld.remove_human`. The person's hands release all objects and plants; the person's blades
-        are removed as well."""
+        """Remove a person and the person's blades; see :meth:`RigidWorld.remove_human`. The hands release all objects
+        and plants.
+        """
         self.rigid.remove_human(name)
         self._remove_blades_of(name)
         self.grasp_manager.remove_ties_of(name)

@@ -188,7 +188,7 @@ class ArticulationSolver:
         return self._dt
 
     def _allocate(self, phi: float) -> None:
-        """Allocate the arrays that the solver has in addition to those of model and state."""
+        """Allocate the solver's own arrays. Other arrays belong to the model and the state."""
         model = self.model
         state = self.state
         trees = len(self.model.tree_first)
@@ -472,8 +472,7 @@ class ArticulationSolver:
     # ------------------------------------------------------------------ one step
 
     def predict(self, trees: np.ndarray | None = None) -> None:
-        """Update ``body_q`` and ``body_qd`` to the start of the step, and compute the motion over the step without
-        contacts.
+        """Compute ``body_q`` and ``body_qd`` at the start of the step, and the motion over the step without contacts.
 
         ``trees`` [k]: predict only these trees, which were woken or given another phi after all trees were predicted.
         """
@@ -605,8 +604,9 @@ class ArticulationSolver:
         self._loads.require_stepped(np.asarray(bodies))
 
     def blend_towards(self, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float) -> None:
-        """Move one tree towards the state that another client has sent: joint rotations by the share ``blend`` (0 to 1)
-        of the way to ``joint_q`` [k, 4]; joint rates are set to ``joint_qd`` [k, 3]."""
+        """Change the joint state of one tree towards the state that another client has sent: joint rotations by the
+        share ``blend`` (0 to 1) of the way to ``joint_q`` [k, 4]; joint rates are set to ``joint_qd`` [k, 3].
+        """
         blend_towards(self, tree, joint_q, joint_qd, blend)
 
     # ------------------------------------------------------------------ ties, wrenches, damping
@@ -727,7 +727,7 @@ class BerryClusters:
         return self.bunches[spans(start, end - start)]
 
     def refine(self, trees: np.ndarray | int) -> None:
-        """See :meth:`ArticulationSolver.refine`."""
+        """Unlock the berry clusters of trees; see :meth:`ArticulationSolver.refine`."""
         solver = self._solver
         trees = self.clustered_trees(trees, fine=False)
         if len(trees) == 0:
@@ -739,7 +739,7 @@ class BerryClusters:
         solver.forward_kinematics(trees)
 
     def coarsen(self, trees: np.ndarray | int) -> None:
-        """See :meth:`ArticulationSolver.coarsen`."""
+        """Lock the berry clusters of trees to their bunches; see :meth:`ArticulationSolver.coarsen`."""
         solver = self._solver
         trees = self.clustered_trees(trees, fine=True)
         if len(trees) == 0:
@@ -790,7 +790,7 @@ class BerryClusters:
         state.joint_xd[roots] = solver.joint_xd_free[roots]
 
     def set_mass(self, body: int, mass: float) -> None:
-        """See :meth:`ArticulationSolver.set_mass`."""
+        """Set the mass [kg] of one body; see :meth:`ArticulationSolver.set_mass`."""
         solver = self._solver
         model = self._solver.model
         bunches = self.bunches[model.bunch_body[self.bunches] == body]
@@ -910,7 +910,9 @@ class BerryClusters:
 def blend_towards(
     plants: ArticulationSolver, tree: int, joint_q: np.ndarray, joint_qd: np.ndarray, blend: float
 ) -> None:
-    """See :meth:`vinesim.plants.articulation_solver.ArticulationSolver.blend_towards`."""
+    """Change the joint state of one tree towards the state that another client has sent; see
+    :meth:`vinesim.plants.articulation_solver.ArticulationSolver.blend_towards`.
+    """
     state = plants.state
     bodies = plants.model.bodies_of(tree)
     there = np.asarray(joint_q, np.float32)
@@ -1299,8 +1301,9 @@ class KernelLaunches:
     def _integrate(
         self, parameters: Any, count: int, trees: str, root_count: int, roots: str
     ) -> dict[tuple[bool, bool], list[KernelLaunch]]:
-        """Returns the launches of an integration. Key: whether energy budgets are kept, whether there are floating
-        roots."""
+        """Returns the launches of an integration for each combination of two conditions, which are the key: whether
+        energy budgets are kept, and whether there are floating roots.
+        """
         fill = self.fill
         s = structs
         model, forces, joints, prediction = (
@@ -1414,8 +1417,8 @@ class KernelLaunches:
     def keeps_budgets(self, steps: int = 1) -> bool:
         """Returns whether the next ``steps`` steps keep energy budgets. Call it once before their integrations.
 
-        On a GPU, and with more than one step, all steps keep budgets. Otherwise one step of :data:`BUDGET_PERIOD` does,
-        and so do the steps until the next one if a tree is watched closely after it.
+        On a GPU, and with more than one step, all steps keep budgets. Otherwise one step in :data:`BUDGET_PERIOD` keeps
+        budgets. If a tree is watched closely after that step, all steps up to the next such step keep budgets, too.
         """
         self._budget_phase = (self._budget_phase + 1) % BUDGET_PERIOD if steps == 1 else 0
         if self._budget_phase == 0 or self.buffers.device.is_cuda:

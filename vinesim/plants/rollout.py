@@ -338,7 +338,9 @@ class Rollout:
         return [(i, start, min(self._slots, self.ticks - start)) for i, start in enumerate(starts)]
 
     def _replay(self, segment: int, count: int) -> None:
-        """Run one segment again from its checkpoint."""
+        """Run the ticks of one segment again from the state at its checkpoint, because the backward pass needs their
+        values.
+        """
         for name, value in self._checkpoints[segment].items():
             _fill(self._stacks[name][0], value)
         counter = self._stacks[_COUNTER]

@@ -35,7 +35,8 @@ STILL_DURATION = 5.0
 """[s] Duration after which a tree in contact, or a cut-off part, counts as at rest if none of its bodies has moved by
 more than :data:`CONTACT_SHARE` of ``sleep_distance``. This rule is needed because the tangent stiffness does not
 contain the supporting contacts, so the distance from rest may be overestimated. A tree that creeps with a time constant
-of five times this duration falls asleep 0.05 mm from its rest. TUNED."""
+of five times this duration falls asleep 0.05 mm from its rest pose. TUNED.
+"""
 
 _NO_PAIRS = np.zeros((0, 2), np.int32)
 

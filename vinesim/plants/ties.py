@@ -21,7 +21,7 @@ damps its rotation. GUESSED: a damping ratio of 0.1 for a swing of 1.5 s."""
 
 
 class TieLimitError(ValueError):
-    """Raised if too many bodies are held, or one body in too many places."""
+    """Raised if hands would hold too many plant bodies, or one body in too many places."""
 
 
 class TieTable:

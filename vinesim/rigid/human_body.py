@@ -187,7 +187,7 @@ class HumanBody:
         return self._poses[: len(BODY_PARTS)]
 
     def controller_pose(self, hand: HandBody) -> np.ndarray:
-        """Pose [7] of a hand's controller."""
+        """Returns the pose [7] of a hand's controller."""
         return self._poses[len(BODY_PARTS) + self.hands.index(hand)]
 
     def controller_velocity(self, hand: HandBody, dt: float) -> np.ndarray:

@@ -158,7 +158,7 @@ class SpeculativeContacts:
         self._has_margins = False
 
     def find_crates(self, m: mujoco.MjModel, numbers: Iterable[int]) -> None:
-        """Look up the bodies and geoms of the boxes with these ``numbers`` in a recompiled world."""
+        """Look up the bodies and geoms of the crates (boxes) with these ``numbers`` in a recompiled world."""
         self._bodies = bodies = np.array(sorted(m.body(f"box/{number}").id for number in numbers), int)
         self._dof = m.body_dofadr[bodies][:, None] + np.arange(6)
         self._geoms = np.flatnonzero(np.isin(m.geom_bodyid, bodies))
@@ -227,7 +227,9 @@ WIRE_MASS = 0.02
 """Effective mass [kg] of a piece of wire between posts, at the point of largest motion. DERIVED: a third of 2 m of
 steel wire, 2.8 mm thick, weighs 0.03 kg."""
 MARGIN_LEVELS = (0.005, 0.02, 0.05, 0.1)
-"""Margins [m] of contacts with wires, of which the smallest is used that exceeds the motion of the fastest body."""
+"""Margins [m] that contacts with wires can have. The smallest margin that exceeds the motion of the fastest body in a
+step is used.
+"""
 # MuJoCo's mjMINIMP, mjMAXIMP
 _LEAST_IMPEDANCE = 1e-4
 _MOST_IMPEDANCE = 0.9999
@@ -313,8 +315,9 @@ class SoftWires:
             m.body_margin[0] = max(self._body_margin, level)
 
     def soften(self, m: mujoco.MjModel, d: mujoco.MjData) -> None:
-        """After MuJoCo has made the constraints: set the stiffness of contacts with wires to that of the wires'
-        springs."""
+        """After MuJoCo has made the constraints: set the stiffness of each contact with a wire to the stiffness of the
+        wire's spring.
+        """
         self._at = self._at[:0]
         if d.ncon == 0:
             return

@@ -471,7 +471,7 @@ class RigidWorld(MujocoWorld):
         return self.mj_data.M[self.robot(name).inertia_index]
 
     def base_state(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Pose [7] and velocity [6] (world axes) of the base link."""
+        """Returns the pose [7] and the velocity [6] (world axes) of the base link."""
         robot = self.robot(name)
         d = self.mj_data
         x, y, yaw = d.qpos[robot.base_q].tolist()

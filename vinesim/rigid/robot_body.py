@@ -36,7 +36,7 @@ CONTACT_IMPEDANCE = (0.95, 0.99)
 """Smallest and largest impedance of a link's contacts (MuJoCo's ``solimp``). TUNED: with MuJoCo's 0.9 and 0.95 an arm
 that pushes against its own torso at full effort penetrates by 3 mm, with these by less than 1 mm."""
 COPY_EFFORT_SHARE = 0.999
-"""Largest fraction of its effort limit that a servo of a remote robot's copy uses."""
+"""Largest effort of a servo in the local copy of a remote robot, as a fraction of the servo's effort limit."""
 _PLANAR = ("x", "y", "yaw")
 
 

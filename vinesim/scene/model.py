@@ -90,8 +90,9 @@ class Model(StructOfArrays):
     bunch_clusters: np.ndarray = array("bunch", unit="1", dtype=np.int32)
     """Number of clusters, from ``bunch_cluster`` on."""
     bunch_head_mass: np.ndarray = array("bunch", unit="kg")
-    """Mass of the head of the rachis, the part of the compound outside the clusters. The compound is the head and the
-    clusters at ``joint_settled``."""
+    """Mass of the bunch's head, which is the part of the bunch that belongs to no berry cluster. The head and the
+    clusters at ``joint_settled`` form the compound.
+    """
     bunch_head_com: np.ndarray = array("bunch", 3, unit="m")
     bunch_head_inertia: np.ndarray = array("bunch", 3, unit="kg m^2")
 

@@ -88,8 +88,9 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     detail_rate: Positive = 0.05
     """[rad/s] The clusters of a tree count as at rest while all turn slower than this against their parents. TUNED."""
     detail_rest_duration: Positive = 0.25
-    """[s] Time at rest after which clusters are locked again. DERIVED: longer than a swing is slow at its turning
-    point."""
+    """[s] Time for which the berry clusters of a tree must be at rest before they are locked to their bunches again.
+    DERIVED: longer than a swing is slow at its turning point.
+    """
 
     # ------------------------------------------------------------------ detachment
     detachment_duration: Positive = 0.03
@@ -121,8 +122,9 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     solver_sweeps: Count = 100
     """Largest number of Gauss-Seidel sweeps; with warm start and Newton steps, two to five are usual. TUNED."""
     solver_newton_steps: Annotated[int, msgspec.Meta(ge=0)] = 6
-    """Number of first sweeps of an island that are each followed by a Newton step. Of the later sweeps one in ten is.
-    TUNED."""
+    """Number of first sweeps of an island that are each followed by a Newton step. Of the later sweeps, one in ten is
+    followed by a Newton step. TUNED.
+    """
     solver_newton_contacts: Annotated[int, msgspec.Meta(ge=0)] = 16
     """Islands in which plants couple more contacts than this take no Newton step, whose cost grows with the cube of the
     number of contacts."""
@@ -156,7 +158,9 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[m or rad] Offset of a robot's base from its target at which the tracks give full effort; beyond it they slip.
     TUNED."""
     remote_base_slip: Positive = 0.05
-    """[m or rad] As ``base_slip``, for the copy of a remote robot. TUNED."""
+    """[m or rad] Offset of the base of a remote robot's copy from its target at which the tracks give full effort.
+    TUNED.
+    """
     base_damping_time: Positive = 0.05
     """[s] Damping of the base's servos divided by their stiffness. TUNED."""
 

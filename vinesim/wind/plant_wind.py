@@ -83,7 +83,7 @@ class WindOnPlants:
 
     @property
     def state(self) -> WindState | None:
-        """The wind for sensors, None in calm air."""
+        """The wind at this instant, for snapshots from which sensors compute the sway of trees; None in calm air."""
         if self._wind is None:
             return None
         fade = np.clip(2.0 - 2.0 * self.phase, 0.0, 1.0)

@@ -291,8 +291,11 @@ class _Response:
         return good & (distance < _CONVERGED)
 
     def _residual_turn(self, trees: np.ndarray, velocity: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-        """Returns the remaining rotation [body, 3] rad of each joint, in its own axes, under the drag of a wind
-        ``velocity``."""
+        """Returns the rotation [body, 3] rad by which each joint is away from its equilibrium under the drag of a wind
+        ``velocity``, in the joint's own axes.
+
+        ``extra``: pressure v |v| that is added to the pressure of this wind [m^2/s^2].
+        """
         pressure = self._pressure(velocity)
         self._load(pressure if extra is None else pressure + extra)
         self._finder.residual_motion(trees)

@@ -228,7 +228,7 @@ class WireContacts:
         self._find()
 
     def add_presses(self, force: np.ndarray, velocity: np.ndarray) -> None:
-        """Store the results of the solve.
+        """Store the contacts that press on wires, with the forces and velocities that the contact solve has found.
 
         Args:
             force: [contact] N, normal force; 0 for contacts that are near but do not press.

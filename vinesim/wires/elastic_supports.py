@@ -20,9 +20,10 @@ from vinesim.plants.equilibrium import EquilibriumFinder
 from vinesim.scene.physics_parameters import PhysicsParameters
 
 WAKE_SHARE = 0.25
-"""[1] Displacement by a wire or arm at which a sleeping tree wakes, as a share of ``sleep_distance``. For a wire it is
-the displacement of a tie, for an arm the displacement of the point of the tree that moves most. TUNED: twenty shoots
-that sleep on a wire hold it with 2 N until then."""
+"""[1] Displacement of a sleeping tree by a wire or arm at which the tree wakes, as a share of ``sleep_distance``. For a
+wire it is the displacement of a tie, for an arm the displacement of the point of the tree that moves most. TUNED:
+twenty shoots that sleep on a wire hold it with 2 N until they wake.
+"""
 
 LEAST_SHARE = 5e-4
 """[1] Smallest compliance between adjacent nodes, and between a node and an end of its support, as a share of the
@@ -54,8 +55,9 @@ class ElasticSupports:
         trees = len(model.tree_first)
         self._tree_start = np.searchsorted(self._tree[by_tree], np.arange(trees + 1)).astype(np.int32)
         self.deflection = np.zeros((len(self._tree), 3))
-        """[node, 3] For nodes of wires the displacement [m] from their rest position; for nodes of arms the twist,
-        [rad, 0, 0]. Wires come first. The nodes of each support are in order from its start to its end."""
+        """[node, 3] For nodes of wires the displacement [m] from their position on the straight wire; for nodes of arms
+        the twist, [rad, 0, 0]. Wires come first. The nodes of each support are in order from its start to its end.
+        """
         self.count = len(first)
         """Number of supports."""
         piece = nodes["support"][first]

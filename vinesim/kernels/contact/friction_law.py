@@ -108,7 +108,7 @@ def relaxed(x: wp.vec3d, residual: wp.vec3d, steps: Steps, surface: Surface):
 
 @wp.func
 def size_of_change(change: wp.vec3d):
-    """Returns the size [N s] of a change of impulse that is used to judge convergence."""
+    """Returns the size [N s] of a change of a contact's impulse, by which convergence is judged."""
     return wp.max(wp.abs(change[0]), wp.abs(change[1]) + wp.abs(change[2]))
 
 

@@ -138,7 +138,9 @@ def write_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """Write the three rows of contact ``c``. Its candidate is in the slot ``slot`` of the row ``tree_row``."""
+    """Write the three rows of contact ``c``. ``tree_row``, ``slot``: index of the contact's candidate in the table of
+    candidates [awake tree, slot].
+    """
     g = contacts_out.other[c]
     n = candidates.normal[tree_row, slot]
     x = candidates.point[tree_row, slot]

@@ -96,7 +96,9 @@ def of_contact(c: int, value: wp.float64, lanes: int):
 
 @wp.func
 def component(part: int, of: wp.vec3d):
-    """Returns an entry of a vector, without an index that would move the vector to memory."""
+    """Returns entry ``part`` (0 to 2) of the vector ``of``. The code compares instead of indexing, because an index
+    would move the vector from registers to memory.
+    """
     return wp.where(part == 0, of[0], wp.where(part == 1, of[1], of[2]))
 
 

@@ -124,7 +124,9 @@ class Capsules:
     bunch: wp.array(dtype=wp.int32)
     """[capsule] Index of the bunch that the capsule belongs to; -1 for wood."""
     level: wp.array(dtype=wp.int32)
-    """[capsule] Level of detail of the tree at which the capsule exists: 0 always, 1 only coarse, 2 only fine."""
+    """[capsule] Level of detail of the tree at which the capsule exists. 0: always; 1: only while the berry clusters
+    are locked to their bunches (coarse); 2: only while the clusters move (fine).
+    """
     local_start: wp.array(dtype=wp.vec3)
     """[capsule] Start of the axis, m, in the body's frame."""
     local_end: wp.array(dtype=wp.vec3)
@@ -191,7 +193,7 @@ class Geoms:
     root: wp.array(dtype=wp.int32)
     """[geom] Root body of the geom's kinematic tree.
 
-    MuJoCo expresses ``cvel`` and ``cdof`` about its centre of mass.
+    MuJoCo's ``cvel`` and ``cdof`` refer to the centre of mass of this tree.
     """
     dof: wp.array(dtype=wp.int32)
     """[geom] Last degree of freedom that moves the geom; -1 for none."""
@@ -277,7 +279,7 @@ class Actors:
     may_sleep: wp.array(dtype=wp.bool)
     """[actor] Whether MuJoCo may put the actor to sleep.
 
-    Boxes and free bunches wake plants only while they are awake.
+    This is true for boxes and free bunches. They wake plants only while they are awake themselves.
     """
 
 
@@ -510,7 +512,7 @@ class WarmStart:
     """Values from which the next step's solve starts [contact of the last step]."""
 
     count: wp.array(dtype=wp.int32)
-    """[1] Number of contacts."""
+    """[1] Number of contacts of the last step."""
     feature: wp.array(dtype=wp.int32)
     """[contact] As in :class:`Contacts`; -1 if the contact carried no force."""
     other: wp.array(dtype=wp.int32)

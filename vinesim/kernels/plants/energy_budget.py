@@ -356,9 +356,10 @@ def take_energy(
     scratch_out: Scratch,
     prediction_out: Prediction,
 ):
-    """Remove a tree's energy above ``goal`` [J], or above ``pose_goal`` [J] if its potential energy exceeds that.
+    """Remove a tree's energy above ``goal`` [J], or above ``pose_goal`` [J] if its potential energy exceeds
+    ``pose_goal``.
 
-    Returns its kinetic and potential energy.
+    Returns the tree's remaining kinetic and potential energy [J].
     """
     filter_rates(p, FILTER * dt * dt, model, joints_out, tree, bodies_out, factors_out, scratch_out, prediction_out)
     first = model.tree_first[tree]

@@ -1,4 +1,6 @@
-"""Integration: joints move to the end of the step. Faulty trees keep their state from the start of the step."""
+"""Integration: computes the state of joints at the end of the step. Faulty trees keep their state from the start of the
+step.
+"""
 
 import warp as wp
 

@@ -95,8 +95,9 @@ def applied_terms(
     stiffness: wp.vec3,
     damping: wp.vec3,
 ):
-    """Returns the implicit inertia J, H, M of body k, its bias and its tension: the sums of its own terms, those of
-    drag, and those of its ties."""
+    """Returns the implicit inertia J, H, M of body k, its bias and its tension. Each is a sum of the terms of the body
+    itself, of air drag, and of the body's ties.
+    """
     mass = model.body_mass[k]
     local_com = model.body_com[k]
     local_inertia = model.body_inertia[k]

@@ -1,6 +1,6 @@
-"""Energy of trees: kinetic energy, and that of springs, ties and weight.
+"""Energy of trees: kinetic energy, and potential energy of weight, springs and ties (springs to wires or hands).
 
-Also detects changes of state and of forces.
+Also checksums by which changes of state and of forces are detected.
 """
 
 import warp as wp
@@ -38,8 +38,9 @@ def body_energy(
     """Returns kinetic and potential energy of one body, the sum of the absolute values of their terms [J], and a
     checksum.
 
-    The checksum is computed from the anchors of the body's ties. The potential energy is that of its weight, its
-    joint's spring and its ties. pose: [m] relative to ``origin`` [m], world axes.
+    The potential energy is the sum of the energies of the body's weight, its joint's spring and its ties (springs to
+    wires or hands). The checksum is computed from the anchors of the ties. pose: [m] relative to ``origin`` [m], world
+    axes.
     """
     com = model.body_com[k]
     mass = model.body_mass[k]

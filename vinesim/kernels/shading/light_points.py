@@ -77,7 +77,7 @@ class ShadowMaps:
     near: ShadowMap
     far: ShadowMap
     depth: wp.array(dtype=wp.float32)
-    """Depths [m] of the near map's texels, followed by those of the far map's."""
+    """Depths [m] of the near map's texels, followed by the depths of the far map's texels."""
 
 
 @wp.func

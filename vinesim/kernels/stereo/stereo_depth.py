@@ -86,9 +86,9 @@ class WindowStatistics:
     total: float
     """Sum of the disparities [px]."""
     across: float
-    """Sum of disparities of the right column minus those of the left one [px]."""
+    """Sum of disparities of the right column minus the sum of the left column [px]."""
     down: float
-    """Sum of disparities of the lowest row minus those of the uppermost one [px]."""
+    """Sum of disparities of the lowest row minus the sum of the uppermost row [px]."""
     brightness: float
     """Mean grey level, 0 to 255."""
     darkest: float
@@ -221,7 +221,7 @@ def seen_by_second(
 
 @wp.func
 def second_row(lens: Pinhole, second: Pinhole, y: int) -> int:
-    """Returns the row of the second imager that corresponds to row ``y`` of the picture."""
+    """Returns the row of the stereo camera's second imager (image sensor) that corresponds to row ``y`` of the picture."""
     row = int(wp.round((float(y) - lens.cy) / lens.fy * second.fy + second.cy))
     return wp.clamp(row, 0, second.height - 1)
 

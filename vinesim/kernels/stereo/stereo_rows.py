@@ -28,7 +28,9 @@ _NOTHING = wp.constant(1.0e9)
 
 @wp.struct
 class ImagerPixels:
-    """Mapping from the first imager's columns and rows to columns and rows of the picture."""
+    """Mapping from the columns and rows of a stereo camera's first imager (image sensor) to columns and rows of the
+    picture.
+    """
 
     first_column: wp.array(dtype=wp.int32)
     """[imager's columns + 1] First column of the picture within each column of the imager."""

@@ -44,7 +44,7 @@ def received_surface(corners: np.ndarray, scale: tuple[float, ...]) -> Mesh:
 
 
 def read_surface(file: str, scale: tuple[float, ...]) -> Mesh:
-    """Returns the mesh of :func:`smooth_surface` for the mesh in ``file``."""
+    """Returns the mesh in ``file``, simplified and with smooth normals; see :func:`smooth_surface`."""
     import trimesh
 
     mesh = cast("trimesh.Trimesh", trimesh.load(file, force="mesh", process=True))

@@ -115,7 +115,9 @@ class JointSample:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointReference:
-    """References of a robot's controllers for its joints in one step, in the order of joint arrays."""
+    """Positions and velocities that a robot's controllers command to its joints in one step, in the order of joint
+    arrays.
+    """
 
     position: np.ndarray
     """[joint] rad or m, joint positions."""

@@ -52,7 +52,7 @@ class PictureMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
     """Width and height [px] with the same angle of view; by default those in the sensor's data file."""
 
     def fault(self) -> tuple[str, str] | None:
-        """See :meth:`RenderedMount.fault`."""
+        """Returns the name of an invalid field and how to correct it; None if all values are valid."""
         if self.size is not None and not all(MIN_CAMERA_SIZE <= n <= MAX_CAMERA_SIZE for n in self.size):
             bounds = f"give width and height from {MIN_CAMERA_SIZE} to {MAX_CAMERA_SIZE} px"
             return f"the size {list(self.size)}", bounds
@@ -223,7 +223,7 @@ class CameraFrame:
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
-        """See :attr:`SensorFrame.measured`."""
+        """Returns the measured arrays; see :attr:`SensorFrame.measured`."""
         return self.rgb, self.depth, self.labels
 
     @property
@@ -302,7 +302,7 @@ class LidarScan:
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
-        """See :attr:`SensorFrame.measured`."""
+        """Returns the measured arrays; see :attr:`SensorFrame.measured`."""
         return self.xyz, self.intensity, self.labels
 
     @property
@@ -343,7 +343,7 @@ class MultispectralFrame:
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
-        """See :attr:`SensorFrame.measured`."""
+        """Returns the measured arrays; see :attr:`SensorFrame.measured`."""
         return (self.reflectance,)
 
     @property

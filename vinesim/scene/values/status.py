@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ComponentStatus:
-    """Name and state of one part of a client (such as ``simulation``, ``network`` or ``sensors``), with its statistics."""
+    """Name and state of one part of a client (``simulation``, ``network``, ``sensors``, ...), with its statistics."""
 
     name: str
     level: Literal["ok", "warning", "error"] = "ok"
