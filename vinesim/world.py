@@ -221,8 +221,9 @@ class Physics:
         return tuple(sorted({*self.contact_solver.touched_trees, *held}))
 
     def update_kinematics(self) -> None:
-        """Compute the body poses ``state.body_q`` at the end of the last step. A step leaves them as they were at its
-        start."""
+        """Compute the body poses ``state.body_q`` at the end of the last step. Without this call, ``state.body_q``
+        contains the poses at the start of the last step.
+        """
         if not self._kinematics_current:
             self.plants.forward_kinematics()
             self._kinematics_current = True

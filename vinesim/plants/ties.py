@@ -144,7 +144,7 @@ class RootRests:
         self.turn = np.zeros((trees, 3), np.float32)
         """[tree, 3] rad: rotation of each tree's rest pose, in joint axes."""
         self.rate = np.zeros((trees, 3), np.float32)
-        """[tree, 3] rad/s: rate of this rotation, in joint axes."""
+        """[tree, 3] rad/s: rate of the rotation in ``turn``, in joint axes."""
         self.softening = np.zeros((trees, 3), np.float32)
         """[tree, 3] (N m/rad)^(1/2), in joint axes. The outer product of this vector with itself is the stiffness of
         the root spring minus the stiffness of spring and arm in series, when all awake trees on the arm move together.

@@ -49,7 +49,9 @@ STILL_SPEED = 0.05
 
 
 class YieldingParts:
-    """Decides which body parts [k] of one remote person are light, and which pass through other bodies."""
+    """Decides which body parts [k] of one remote person have a small mass (are *light*), and which pass through other
+    bodies.
+    """
 
     def __init__(self, count: int) -> None:
         self.is_passing = np.zeros(count, bool)
@@ -74,7 +76,7 @@ class YieldingParts:
         force: np.ndarray,
         released: np.ndarray,
     ) -> None:
-        """Update which parts are light, and which pass through other bodies.
+        """Decide for this step which parts have the small mass of a light part, and which pass through other bodies.
 
         Args:
             m: MuJoCo's model.

@@ -332,7 +332,7 @@ class MujocoWorld:
         return bunch_body
 
     def _show_lamps(self, robot: RobotBody) -> None:
-        """Update the visible shapes of a robot after its indicator lights changed."""
+        """Set the visible shapes of a robot again after its indicator lights changed."""
         prefix = robot.spec.name + "/"
         shown = robot.shown_shapes
         self._visuals = tuple(

@@ -84,7 +84,7 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ level of detail of bunches
     detail_duration: Positive = 1.0
-    """[s] Clusters of a bunch keep moving for this time after the last actor has left. TUNED."""
+    """[s] Time for which the berry clusters of a bunch keep moving after the last actor has left. TUNED."""
     detail_rate: Positive = 0.05
     """[rad/s] The clusters of a tree count as at rest while all turn slower than this against their parents. TUNED."""
     detail_rest_duration: Positive = 0.25

@@ -380,8 +380,8 @@ class Contacts:
     """[contact] Index of ``other_body`` in the list of bodies in contact; -1 if the other side is a geom."""
     gap: wp.array(dtype=wp.float64)
     surface: wp.array(dtype=Surface)
-    """[contact] Contact properties of the two materials, with the friction of a geom that has its own and a wire's
-    spring.
+    """[contact] Contact properties of the two materials. They include the friction coefficient of a geom that has its
+    own coefficient, and the spring of a wire.
     """
     wire_stiffness: wp.array(dtype=wp.float64)
     """[N/m] Stiffness of the wire on the contact's other side; 0 for a rigid wire or another shape."""

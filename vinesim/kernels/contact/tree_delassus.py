@@ -185,10 +185,10 @@ def write_delassus(
     # out
     system_out: TreeSystem,
 ):
-    """One thread per slot of a tree. Write the slot's contact into the tree's system, and the entries of the Delassus
-    matrix for its impulses.
+    """One thread per contact slot of a tree. Write the contact in this slot into the tree's system, and the entries of
+    the Delassus matrix for the contact's impulses.
 
-    The entries are velocity changes along the rows of all contacts up to the slot's own. The slot's impulses are
+    The entries are velocity changes along the rows of all contacts up to this one. The contact's impulses are
     propagated inward. When they reach a body with another contact, the entry follows from the response of that contact,
     because the matrix is symmetric.
     """

@@ -112,7 +112,7 @@ def write_tree_rows(
     contacts_out: Contacts,
     rows_out: Rows,
 ):
-    """One thread per slot of a tree. Write the rows of its contact."""
+    """One thread per contact slot of a tree. Write the three rows of the contact in this slot."""
     tree, c = tree_and_entry(wp.tid(), slots)
     if tree < trees and c < tree_contacts.count[wp.min(tree, trees - 1)]:
         contacts = view_contacts(contacts_out, tree, trees)

@@ -295,7 +295,7 @@ def follow_conjugate_direction(
 def copy_rows(
     lane: int, lanes: int, size: int, source: wp.array(dtype=wp.float64), target_out: wp.array(dtype=wp.float64)
 ):
-    """Copy the rows of one tree."""
+    """Copy the values of all contact rows of one tree."""
     for row in range(lane, size, lanes):
         target_out[row] = source[row]
     synchronize_lanes(lanes)
