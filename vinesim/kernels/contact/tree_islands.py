@@ -300,8 +300,7 @@ def solve_small_trees(
 ):
     """``lanes`` GPU threads per tree, in full warps. Solve for the impulses of the tree's contacts.
 
-    Trees that have more contact rows than ``lanes`` threads can hold are skipped; see
-    :func:`vinesim.kernels.contact.row_solver.row_solver`.
+    Trees with more than 15 contact rows are skipped; see :data:`vinesim.kernels.contact.row_solver.solve_few_rows`.
     """
     tree = wp.tid() // lanes
     lane = wp.tid() % lanes
