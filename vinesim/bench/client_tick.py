@@ -275,7 +275,12 @@ def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) ->
 
 
 def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: float | None) -> Iterator[Measurement]:
-    """Yields the median and the 99th percentile of the whole tick and of its parts, in processor and wall time."""
+    """Yields the rows of one measurement: median and 99th percentile of the whole tick and of each part, in processor
+    time and in wall time.
+
+    ``text``: description of the case. ``tick_budget``, ``step_budget``: budgets of the processor time of the whole tick
+    and of its physics step [ms]; None: no budget.
+    """
     budgets = {"whole tick": tick_budget, "step": step_budget}
     for kind, values in (("CPU", times.cpu), ("wall", times.wall)):
         for name, column in zip((*PARTS, "whole tick"), 1e3 * values.T, strict=True):
@@ -285,7 +290,8 @@ def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: f
 
 
 def _row(case: str, value: float, budget: float | None = None) -> Measurement:
-    """Returns one row, with its budget if it has one."""
+    """Returns a row with a time ``value`` [ms]. ``case``: description; ``budget``: largest accepted value [ms], None:
+    none."""
     if budget is None:
         return Measurement("tick", case, value, "ms/tick")
     return Measurement("tick", case, value, "ms/tick", "budget", budget, budget / value)

@@ -163,8 +163,11 @@ class Problem:
         return thetas[:, self.names.index("release")]
 
     def _base_velocity(self, last: int) -> np.ndarray | None:
-        """Returns the velocity of the base up to the tick after the ``last`` one [tick, 3] m/s; None if the base
-        rests."""
+        """Returns the velocity of the shaken base at ticks 0 to ``last`` + 1: [tick, 3] m/s; None if the base is not
+        shaken.
+
+        ``last``: last tick at which the simulated motion is compared with the track.
+        """
         if self.shaking is None:
             return None
         return self.shaking.velocity(self.track.time[0] + self.candidates.dt * np.arange(last + 2))

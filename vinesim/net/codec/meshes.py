@@ -15,7 +15,7 @@ from vinesim.scene.triangles import MAX_BYTES, is_digest
 MESH_PART = 19
 MESH_REQUEST = 20
 MESH_WANTED = 21
-"""Numbers of the kinds of messages, the fourth byte of each message."""
+"""Numbers of the kinds of messages in this module. The fourth byte of a message is the number of its kind."""
 
 MAX_PART = 64_000
 """Largest size of the part of a mesh in one message [B]."""

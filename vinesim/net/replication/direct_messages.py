@@ -69,10 +69,11 @@ REACH = 1.2
 Half the length of a long link, and the way of a running person until the pose arrives. GUESSED."""
 
 COUPLING_MAX_AGE = 0.2
-"""Time for which couplings are applied after their arrival, unless newer ones arrive [s].
+"""Time for which couplings (virtual springs) are applied after their arrival, unless newer ones arrive [s].
 
 Couplings are springs, so old ones are stable, too. Over a link with a delay of 100 +- 40 ms and a loss of 4 %, messages
-arrive up to 0.15 s apart. With a value of 0.1 s the bunch jumped."""
+arrive up to 0.15 s apart. With a value of 0.1 s the bunch jumped.
+"""
 
 ARM_REACH = 2.5
 """Largest distance on the ground of a coupling's anchor from the base of its actor [m]: a long arm. GUESSED."""
@@ -314,7 +315,8 @@ class WrenchSync(ForceSync):
 
 
 class CouplingSync(ForceSync):
-    """Sends couplings of the own actor's contacts with trees, and receives those of other actors to the same trees."""
+    """Sends couplings (virtual springs) of the own actor's contacts with trees, and receives couplings of other
+    actors."""
 
     kind = COUPLINGS
 
@@ -384,10 +386,10 @@ class CouplingSync(ForceSync):
         return sent
 
     def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
-        """Returns the own couplings by the peer that shall receive them.
+        """Returns the own couplings (virtual springs), by name of the peer that shall receive them.
 
-        This is the owner of the tree. Couplings to an own tree go to each peer whose couplings to it are valid at own
-        time ``now`` [s].
+        The receiver of a coupling is the owner of its tree. A coupling to a tree of the own actor is sent to each peer
+        whose couplings to the tree are valid at own time ``now`` [s].
         """
         found: dict[str, list[Coupling]] = {}
         for coupling in couplings:

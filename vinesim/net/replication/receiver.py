@@ -237,7 +237,8 @@ class Receiver:
         return self.early.put(sender, key, payload, peers.may_join)
 
     def _receive_trees(self, trees: TreeStates, sender: str, step: _Step) -> None:
-        """Accept or drop each state in a batch of trees, by its claim and its distance."""
+        """Accept or drop each state in a batch of trees, by the claim in it and by the distance of the tree from this
+        actor."""
         state = self._state
         check_tree_states(trees, state.model)
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
@@ -252,7 +253,8 @@ class Receiver:
                 state.counters.dropped += 1
 
     def _receive_objects(self, objects: ObjectStates, cell: Cell, sender: str, step: _Step) -> None:
-        """Accept or drop each state in a batch of boxes and bunches, by its claim and its distance."""
+        """Accept or drop each state in a batch of boxes and bunches, by the claim in it and by the distance of the
+        object from this actor."""
         state = self._state
         updates = objects.updates(sender)
         for update in updates:

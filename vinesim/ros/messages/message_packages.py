@@ -493,5 +493,6 @@ def install(packages: list[str]) -> None:
 
 
 def _digest(content: bytes) -> str:
-    """Returns the SHA-256 digest of a file as a wheel's RECORD contains it."""
+    """Returns the SHA-256 digest of a file's ``content``, in the encoding of a wheel's file ``RECORD``: URL-safe base64
+    without padding."""
     return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()
