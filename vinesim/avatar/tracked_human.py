@@ -54,7 +54,8 @@ class TrackedHuman:
         clock: Callable[[], float] | None = None,
         gestures: Gestures | None = None,
     ) -> None:
-        """Stands at ``root`` [7] until the first input. ``clock`` [s] measures the intervals between inputs.
+        """``root`` [7]: pose at which the person stands until the first input. ``height``: of the person [m].
+        ``clock``: function that returns a time [s], by which the intervals between inputs are measured.
 
         Without a ``clock`` the intervals are counted in steps of ``dt``.
         """

@@ -296,7 +296,7 @@ class Replay:
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
-        """Prepare a replay.
+        """Begin a replay of a recording to a network.
 
         Args:
             recording: the recording.

@@ -107,7 +107,7 @@ class SimulationControl:
         return {}
 
     def _play(self, request: SimulationRequest) -> None:
-        """Play, pause, or begin to step."""
+        """Let the simulation run, pause it, or begin to simulate the requested number of steps."""
         client = self._client
         is_step = request.action is SimulationAction.STEP
         if client.world_time.is_shared:
