@@ -53,7 +53,7 @@ TRUTH_PERIOD = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """Properties of a client that is measured, and budgets of its median times [ms]."""
+    """One measured kind of client: its properties, and budgets of its median times [ms]."""
 
     scene: str
     robots: int = 1
@@ -188,8 +188,8 @@ class PushingClient:
 
 
 class _Demand:
-    """Stands in for a worker process of the client whose topics all have subscribers. It takes the messages that are
-    written."""
+    """Object in place of a worker process of the client, as if all topics had subscribers. It takes the messages that
+    the client writes."""
 
     is_ready = True
     pid = 0
@@ -256,7 +256,7 @@ def _subscribe_to_all(
 
 
 def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) -> Iterator[Measurement]:
-    """Yields the rows of one case."""
+    """Yields the measurements of one kind of client: ticks that are paced in real time, and ticks back to back."""
     with contextlib.ExitStack() as stack:
         pushing = PushingClient(
             scene,

@@ -27,8 +27,8 @@ from vinesim.world import Physics
 
 CANE_COUNTS = (64, 256)
 STEPS_PER_ROUND = (20, 5)
-"""Number of steps of a turn, for each number of canes: about 50 ms of MuJoCo, since every turn begins with cold
-caches."""
+"""Number of steps that a simulator makes before the other one continues, for each number of canes. They take MuJoCo
+about 50 ms, because each turn begins with cold caches."""
 LIFTED_CANES = 12
 HELD_CANES = (14, 20, 26, 32)
 """Indices of the canes whose bunch a gripper holds."""
@@ -64,10 +64,11 @@ def contact_measurements() -> Iterator[Measurement]:
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
-    """One gripper and the vine it holds, compared with MuJoCo; then the shipped block with one ``robot`` and with ten.
+    """Measure steps of one gripper and the vine that it holds, compared with MuJoCo; then whole steps of a shipped
+    vineyard with one ``robot`` and with ten.
 
-    The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
-    on the headland. All swing their joints.
+    The first robot faces a row, with its arms among the vines (positions ``raised`` [joint] of the drives). All other
+    robots drive in circles on the headland. All robots swing their joints.
     """
     yield from _compare_with_mujoco(
         "1 hand, 1 held vine", "tick", scenes.cane_row(1), [scenes.gripper("hand", scenes.bunch_center(0))], 100
@@ -79,7 +80,8 @@ def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurem
 
 
 def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
-    """Yields the times of whole steps, and of their stages summed over MuJoCo, vinesim's own code and the rest."""
+    """Yields the times of whole steps with ``count`` robots, and the times of their stages, summed for MuJoCo, for
+    vinesim's own code and for the rest."""
     physics = Physics(model)
     for i in range(count):
         position = [4.0 * i, -6.0, 0.0] if i else [*ROBOT_POSITION, 0.0]

@@ -27,9 +27,9 @@ from vinesim.tune.start import start_values
 from vinesim.tune.tuning import STEP_PHASE
 
 AS_GOOD = 1.0
-"""A peer has finished when its loss, half a chi square, exceeds the loss of vinesim's minimum by less than this."""
+"""Difference from the loss (half a chi square) of vinesim's minimum below which another method's fit is finished."""
 MOST_SECONDS = 30.0
-"""Processor time after which a peer with restarts gives up [s]."""
+"""Processor time after which a method that restarts from several points gives up [s]."""
 STEIN_SEGMENTS = 3
 """Number of rigid bodies of the chain of springs on which Stein particles are computed."""
 STEIN_PARTICLES = 20

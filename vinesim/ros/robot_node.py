@@ -54,7 +54,8 @@ EXACT_ODOMETRY = "exact_odometry"
 ODOM_FRAME_ID = "odom_frame_id"
 """Name of the parameter with the frame id of odometry."""
 LOOK_PERIOD = 1.0
-"""Wall time between two checks for another robot under the same names, and for commands of another type [s]."""
+"""Wall time between two checks for another robot with the same topics, and for commands with a wrong message type
+[s]."""
 STAMPED_REMEDY = " (teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)"
 """Hint that is added to the warning about a base command of the wrong message type."""
 UNKNOWN = "_NODE_NAME_UNKNOWN_"

@@ -13,7 +13,8 @@ from vinesim.tune.problem import SOFT, Evaluation, Problem
 Z90 = 1.6448536269514722
 """Number of standard deviations from the mean of a normal distribution to either end of its 90 % interval."""
 DECIDED = 3.0
-"""The data determine a direction if their information (1 / variance) is at least this multiple of the prior's [1]."""
+"""Ratio of the data's information (1 / variance) along a direction to the prior's from which the data determine the
+direction [1]."""
 _CORRELATED = 3.0
 
 
@@ -29,7 +30,7 @@ class Ridge:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Posterior:
-    """A normal distribution of all parameters around the best ones."""
+    """A normal distribution of all parameters of a fit around the best parameters."""
 
     names: tuple[str, ...]
     mean: np.ndarray

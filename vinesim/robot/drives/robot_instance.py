@@ -1,5 +1,4 @@
-"""A robot in the rigid world: base class of robots that this client or another client controls, and the latter's
-copy."""
+"""A robot in the rigid world: the base class of all robots, and the copy of a robot that another client controls."""
 
 from __future__ import annotations
 
@@ -21,7 +20,8 @@ _NO_POSES = np.zeros((0, 7))
 
 
 class RobotInstance:
-    """A robot in the rigid world; base class of local and remote robots."""
+    """A robot in the rigid world. Base class of robots that this client controls and of copies of other clients'
+    robots."""
 
     def __init__(
         self,
