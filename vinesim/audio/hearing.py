@@ -1,4 +1,4 @@
-"""Which actors hear which, and how loudness falls with distance."""
+"""Rules of hearing: which actors hear which other actors, and how loudness falls with distance."""
 
 from __future__ import annotations
 

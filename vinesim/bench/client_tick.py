@@ -212,7 +212,7 @@ class _Demand:
         self.process = types.SimpleNamespace(pid=os.getpid())
 
     def current(self) -> _Demand:
-        """This object, which takes the place of the current run of a worker process."""
+        """Returns this object, in place of the present run of a worker process."""
         return self
 
     def send(self, kind: str, value: Any = None) -> None:

@@ -43,7 +43,8 @@ class WorldTime:
         self._clock = 0.0  # server's time at the last step
 
     def follow(self, simulated: float, clock: float) -> None:
-        """Follow the server's ``clock`` [s] at the step that starts at ``simulated`` time [s]; call it every step."""
+        """Adapt the offset to the time of the server's ``clock`` [s] at the step that starts at ``simulated`` time [s].
+        Call this in every step."""
         away = clock - simulated - self.offset
         passed = clock - self._clock
         self._clock = clock

@@ -35,8 +35,8 @@ SUBSCRIPTION_COUNT_PERIOD = 0.1
 
 
 class Node:
-    """A ROS 2 node under ``namespace``. Several nodes may exist in one process, each with its own ROS context unless it
-    shares that of another node (``beside``). A node is a context manager, which calls :meth:`close` at its end.
+    """A ROS 2 node under ``namespace``. Several nodes may exist in one process. Each has its own ROS context, or shares
+    the context of another node (``beside``). A node is a context manager, which calls :meth:`close` at its end.
 
     Raises :class:`middleware.RosUnavailableError`, :class:`message_packages.InterfacesError`, or :class:`ValueError`
     for a name that ROS does not allow. Their messages have one line.

@@ -199,7 +199,7 @@ class RobotNode(Node):
             self._warn_of_types()
 
     def _locate_subscribers(self) -> None:
-        """Update for each topic that is published in every step whether all its subscribers are on this machine.
+        """Find out, for each topic that is published in every step, whether all its subscribers are on this machine.
 
         The first four bytes of a Fast DDS identifier are the vendor and the machine, two bytes each.
         """
@@ -303,7 +303,7 @@ class RobotNode(Node):
         self._send(self._sound.pending(time, pcm))
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
-        """Publish the states of the client's ``components`` and that of this node. Call this about once a second."""
+        """Publish the states of the client's ``components`` and of this node. Call this about once a second."""
         own = {"refused_commands": self.refused_commands}
         prefix = self._node.get_fully_qualified_name()
         trouble = [f"{topic} is published as {', '.join(types)}" for topic, types in self._foreign_types.items()]

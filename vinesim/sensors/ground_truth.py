@@ -1,8 +1,8 @@
 """Ground truth of pictures: visible bunches, their occlusion, boxes and cut points, and optical flow.
 
 The ground truth is computed from the primitives, not from the picture, so noise and range limits of a camera do not
-affect it. Ids are equal on all clients: bunch indices are those of the model, berry indices those of
-:func:`vinesim.scene.berries.lay_out_berries`.
+affect it. Ids are equal on all clients: bunches have their indices in the model, and berries their indices in the
+result of :func:`vinesim.scene.berries.lay_out_berries`.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ FREQUENCIES_PER_BIN = 4
 RELATIVE_STEP = 0.03
 """[1] Relative spacing of the trial frequencies of a shaken oscillator."""
 SUBSTEPS = 8
-"""Number of parts of a sample interval in each of which the acceleration of a base is taken as constant."""
+"""Number of equal parts of a sample interval. The acceleration of a shaken base is taken as constant in each part."""
 STANDS_OUT = 0.1
 """Fraction of a track's whole range by which a sample must differ from the first samples to count as motion, not noise
 [1].

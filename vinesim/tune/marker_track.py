@@ -22,7 +22,7 @@ sunny side by 20 degrees.
 """
 LEAST_SATURATION = 0.5
 """Smallest saturation with which a pixel belongs to a marker [1]: distance of the pixel's chromaticity from grey,
-divided by that of the marker's colour. A pixel that the marker covers by half has 0.5."""
+divided by the distance of the marker's colour from grey. A pixel that the marker covers by half has 0.5."""
 DARKEST = 60
 """Smallest sum of red, green and blue (at most 765) with which a pixel may belong to a marker [1]; darker pixels have
 no reliable hue."""

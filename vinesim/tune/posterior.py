@@ -36,7 +36,8 @@ class Posterior:
     mean: np.ndarray
     covariance: np.ndarray
     physical: int
-    """Number of parameters of the plant, which come first; the others belong to the experiment."""
+    """Number of parameters that describe the plant. These are the first ones; the remaining parameters describe the
+    experiment."""
     ridges: tuple[Ridge, ...]
     correlation_time: float
     """Correlation time of the residuals in samples, 1 if they are independent. Its square root widens the intervals."""

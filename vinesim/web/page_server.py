@@ -280,7 +280,9 @@ class PageServer:
     async def _read(
         self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
     ) -> None:
-        """Handle the messages of a page. ``flight``: ticks of the states that the page has not drawn yet."""
+        """Read the messages of a page until it disconnects, and pass them to the world. ``page``: number of the page.
+        ``flight``: ticks of the states that were sent and that the page has not drawn yet. ``fresh``: set when the page
+        can take a state."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 if self.refused == 0:

@@ -142,7 +142,7 @@ class VoiceSocket:
             await socket.close()
 
     def _take(self, page: PageVoice, kind: WSMsgType, data: bytes | str) -> bool:
-        """Handle a message of a page. Returns whether the message is valid."""
+        """Store the page's sound formats, or pass on its frame of sound. Returns whether the message is valid."""
         if kind is WSMsgType.TEXT:
             try:
                 ears = _ears.decode(data)

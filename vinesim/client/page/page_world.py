@@ -39,10 +39,10 @@ GRASS = 25.0
 MAX_PRIMITIVES = 400_000
 """Largest number of primitives of plants and ground in a page at a time: 32 MB."""
 LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BERRY): 1.0}
-"""Distance up to which a page loads a primitive, by material, relative to that of berries: about the distance up to
-which the page draws it. GUESSED."""
+"""Distance up to which a page loads primitives of a material, relative to the distance for berries: about the distance
+up to which the page draws them. GUESSED."""
 ELSE_LOADED = 2.0
-"""Distance up to which a page loads leaves and wood, relative to that of berries. GUESSED."""
+"""Distance up to which a page loads leaves and wood, relative to the distance for berries. GUESSED."""
 AMONG_VINES = 1.08
 """Ratio of a page's exposure to the usual daylight exposure. Automatic exposure of cameras among vines yields 1.06 to
 1.12 in the pictures of docs/web.md."""
@@ -63,7 +63,7 @@ class Replay(Protocol):
         ...
 
     def take(self, command: ReplayCommand) -> None:
-        """Handle a command of a page; called in the server's thread."""
+        """Execute a command of a page: play, pause or seek. Called in the server's thread."""
         ...
 
 
@@ -294,7 +294,8 @@ class PageWorld:
         return self._rigid
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Returns the tick of the newest state, and the message with it; None if it is not newer than tick ``since``.
+        """Returns the newest state as a message, with its tick before it; None if the state is not newer than tick
+        ``since``.
 
         The message contains the poses of the bodies of trees that moved after tick ``since``, the poses of all rigid
         bodies, and which bunches are picked.

@@ -154,7 +154,7 @@ class ReplayBus:
 
     @property
     def time(self) -> float:
-        """Network time [s]."""
+        """Network time up to which the recording has been played [s]."""
         return self._playhead.time
 
     @property

@@ -79,7 +79,7 @@ class Listener(Protocol):
     def decodes_opus(self) -> bool: ...
 
     def hear(self, step: SoundStep) -> None:
-        """Take the sound of one step. It is called in the client's loop and must return at once."""
+        """Receive the sound of one step. The client's loop calls this method, which must return at once."""
         ...
 
 

@@ -479,7 +479,7 @@ TASKS = ("pick", "exchange", "meet")
 
 
 class UnknownTask(ValueError):
-    """There is no task of that name; the message lists the tasks."""
+    """Error: no task has the given name. The message lists all tasks."""
 
 
 def validate_task_name(job: str | None) -> str | None:

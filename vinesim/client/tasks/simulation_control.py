@@ -85,7 +85,8 @@ class SimulationControl:
                 self._answer(request, **result)
 
     def _do(self, request: SimulationRequest) -> dict[str, Any]:
-        """Execute a request that needs no steps. Returns values for the answer in addition to time and pause."""
+        """Execute a request that needs no steps. Returns the values of its answer, except the time and whether the
+        simulation is paused."""
         editor = self._editor
         arguments = request.entity or EntityArguments("")
         match request.action:

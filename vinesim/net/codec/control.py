@@ -62,7 +62,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     urdf: str = ""
     """The URDF as text."""
     sidecar: str = ""
-    """What a URDF cannot express, as JSON: see :func:`vinesim.robot.description.sidecar.encode_sidecar`."""
+    """Properties of the robot that a URDF cannot express, as JSON: see
+    :func:`vinesim.robot.description.sidecar.encode_sidecar`."""
     scene: str = ""
     """Name of the actor's scene."""
     digest: str = ""
@@ -90,7 +91,7 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     digest: str = ""
     """``Model.digest()`` of the world's scene."""
     spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE
-    """Who hears spectators in this world."""
+    """Actors that hear spectators in this world."""
     protocol: int = PROTOCOL
 
 

@@ -1,4 +1,4 @@
-"""Wire formats of forces on objects that another client simulates: wrenches, and virtual couplings.
+"""Wire formats of forces on objects that another client simulates: wrenches and couplings.
 
 A wrench is the force and moment of a person's hands on one link of a robot. A coupling is the force of an actor on one
 body of a tree that another actor owns, sent as a spring.

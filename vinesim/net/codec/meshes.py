@@ -47,7 +47,7 @@ class MeshWanted(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     """Position in the mesh of the part that the actor shall send next [B]. Equal to the size of the
     mesh if the server has all parts."""
     refused: str = ""
-    """Why the server does not take the mesh now; empty if it takes it."""
+    """Reason why the server does not accept the mesh now; empty if it accepts the mesh."""
 
 
 def encode_part(part: MeshPart) -> bytes:

@@ -20,10 +20,10 @@ TREE_VELOCITY_DECAY = 0.080
 TUNED on a bunch that is pushed: from 60 to 120 ms the errors differ by 4 %."""
 
 POSITION_ERROR = 0.005
-"""Position error of the copies of an object above which its state is published [m]."""
+"""Position error of an object's copies, which other clients move, above which the object's state is published [m]."""
 
 ANGLE_ERROR = float(np.radians(1.0))
-"""Angle error of the copies of an object above which its state is published [rad]."""
+"""Angle error of an object's copies, which other clients move, above which the object's state is published [rad]."""
 
 HEARTBEAT_PERIOD = 1.0
 """Longest time between two published states of an object that is awake [s]."""
@@ -117,9 +117,9 @@ def needs_update(
 ) -> np.ndarray:
     """Returns which of ``k`` objects need to be published: [k] bool.
 
-    An object needs it if its copies are wrong by more than ``tolerance`` times 5 mm or 1 degree, or if its last state
-    was sent a :data:`HEARTBEAT_PERIOD` ago. ``position_error`` [k] m, ``angle_error`` [k] rad: errors of the copies.
-    ``silence`` [k] s: time since the last state.
+    The state of an object needs to be published if its copies on other clients are wrong by more than ``tolerance``
+    times 5 mm or 1 degree, or if its last state was sent a :data:`HEARTBEAT_PERIOD` ago. ``position_error`` [k] m,
+    ``angle_error`` [k] rad: errors of the copies. ``silence`` [k] s: time since the last state.
     """
     wrong = (position_error > tolerance * POSITION_ERROR) | (angle_error > tolerance * ANGLE_ERROR)
     return wrong | (silence >= HEARTBEAT_PERIOD - 1e-9)

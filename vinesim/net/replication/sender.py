@@ -44,9 +44,9 @@ class LocalStep:
     :meth:`vinesim.net.replication.replicator.Replicator.send`."""
 
     now: float
-    """Own time [s]."""
+    """Own time of the step [s]: a time of this client's clock."""
     time: float
-    """Network time [s]."""
+    """Network time of the step [s]: the time of the world, as this client estimates it."""
     touched: set[int]
     moving: set[int]
     grabbed: set[int]

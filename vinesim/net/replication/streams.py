@@ -1,5 +1,5 @@
-"""Streams of states of moving objects: last published states, errors of the copies, and messages that correct the
-copies.
+"""Streams of states of moving objects. A stream stores the last published states, computes the errors of the copies on
+other clients, and encodes the messages that correct the copies.
 
 :class:`TreeStream` is for trees, which stay in one cell. :class:`ObjectStream` is for boxes and free bunches, which
 move between cells. Sender and receiver store the same quantised states and extrapolate them in the same way
@@ -87,7 +87,8 @@ class TreeStream:
         self._roots = [cut(tree) for tree in active]
 
     def prediction_error(self, layer: int, silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the errors of the copies of the ``k`` trees that were last read: positions [k] m, angles [k] rad.
+        """Returns the errors of the copies, on other clients, of the ``k`` trees that were last read: positions [k] m,
+        angles [k] rad.
 
         The copies are those of peers that receive no layer after ``layer``. ``silence`` [k]: time since the last state
         that these peers received [s].
@@ -197,7 +198,8 @@ class ObjectStream:
         return [self._cell[object_id] for object_id in active]
 
     def prediction_error(self, active: tuple[int, ...], silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the errors of the copies of the ``k`` objects that were last read: positions [k] m, angles [k] rad.
+        """Returns the errors of the copies, on other clients, of the ``k`` objects that were last read: positions [k]
+        m, angles [k] rad.
 
         ``silence`` [k]: time since the last published state [s].
         """

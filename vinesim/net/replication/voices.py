@@ -33,8 +33,8 @@ MAX_AGE = 2.0
 """Largest difference between the time of a frame and the present; other frames are refused [s]."""
 
 BURST = 25.0
-"""Number of frames of one speaker that may arrive at once in addition to those of the elapsed time: half a second of
-sound, which a slow link may have delayed."""
+"""Number of frames by which one speaker may exceed its usual rate at once: half a second of sound, which a slow link
+may have delayed."""
 
 
 ROBOT_MOUTH = np.array([0.0, 0.0, 1.2])
@@ -164,7 +164,7 @@ class VoiceSync(MessageSync):
             self._sources[name] = _Source(self._bus.subscribe(key, KEEP_LAST_64), now)
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a frame of another actor at own time ``now`` and network ``time`` [s].
+        """Store a frame of another actor that arrived at own time ``now`` and network ``time`` [s].
 
         Raises :class:`MessageError` if the frame is invalid, or its time is too far from the present.
         """

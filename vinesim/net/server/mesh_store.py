@@ -95,8 +95,8 @@ class MeshStore:
         return MeshPart(digest, size, offset, kept.payload[offset : offset + MAX_PART])
 
     def offer(self, actor: Actor, part: MeshPart) -> MeshWanted:
-        """Take a part of a mesh that an actor offers. Returns the reply, which names the part that the actor shall send
-        next."""
+        """Store a part of a mesh that an actor offers. Returns the reply, which names the part that the actor shall
+        send next."""
         with self._lock:
             kept = self._kept.get(part.digest)
             if kept is not None:

@@ -346,8 +346,8 @@ class Sunlight:
     def update(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
-        """Update the light, and return the fine and the coarse shadow map for a camera at ``eye`` [3] m that looks
-        along ``forward`` [3]."""
+        """Compute light and shadows again where they are no longer valid at ``time`` [s], for a camera at ``eye`` [3] m
+        that looks along ``forward`` [3]. Returns the fine and the coarse shadow map."""
         self._update_light(time)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)

@@ -13,8 +13,8 @@ _LISTS = int(cuda_raster.TILE_LISTS)
 
 
 class CudaRasterizer:
-    """Rasteriser on a CUDA GPU: it lists the tiles of the picture that each primitive may cover, then draws these
-    tiles. The result is a key for each pixel: depth and primitive as one integer.
+    """Rasteriser on a CUDA GPU. It lists tiles (small rectangles of the picture that cover each primitive), then draws
+    the tiles. The result is a key for each pixel: depth and primitive as one integer.
 
     The host does not wait for the GPU.
 
