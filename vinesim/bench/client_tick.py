@@ -84,7 +84,7 @@ CASES = (
 
 @dataclasses.dataclass(frozen=True)
 class TickTimes:
-    """Times of ticks [s]."""
+    """Processor and wall times of measured ticks and of their parts [s]."""
 
     cpu: np.ndarray
     """Processor time of the thread in each part, and in the whole tick [tick, part + 1] s."""

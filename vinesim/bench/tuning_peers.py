@@ -58,7 +58,8 @@ class PlainProblem:
         return np.array([problem.loss(theta, y, self.noise) for theta, y in zip(thetas, x, strict=True)])
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Returns the residuals of one candidate, priors included, for scipy."""
+        """Returns the residuals for the parameters ``theta`` [8], including those of the priors, in one array for
+        scipy."""
         problem = self.problem
         x, _ = problem.samples(theta[None], problem.row(theta)[None])
         off = (x[0] - problem.observed)[problem.seen] / self.noise

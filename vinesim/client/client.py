@@ -174,7 +174,8 @@ class Client:
         """Functions that are called after :meth:`reset`, so that parts with references to the physics or a robot take
         the new objects."""
         self.earlier_faults: collections.Counter[str] = collections.Counter()
-        """Number of faults of the physics and of couplings before the last reset, by kind of fault."""
+        """Number of faults before the last reset, by kind of fault. Refused couplings (virtual springs of other
+        clients' actors) are counted, too."""
         # Each returns the fault counts of a part that serves this client, such as its page.
         self.other_faults: list[Callable[[], dict[str, int]]] = []
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement

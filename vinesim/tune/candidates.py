@@ -208,8 +208,8 @@ class Candidates:
         plants.launches.changed = True
 
     def _sags(self, candidates: np.ndarray) -> np.ndarray:
-        """Returns the rotation of joints by weight [n, body, 3] rad, for candidates [n, 7] of a specimen with an
-        axis."""
+        """Returns the rotation of each joint from its slack shape by the specimen's weight [n, body, 3] rad, for
+        candidates [n, 7] of a specimen with an axis."""
         assert self._sag is not None
         return self._sag * np.exp(candidates[:, 2] - candidates[:, 0])[:, None, None]
 

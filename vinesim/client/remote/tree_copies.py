@@ -52,7 +52,7 @@ class TreeCopies:
 
     @property
     def trees(self) -> KeysView[int]:
-        """Indices of the copied trees."""
+        """Indices of the trees of which this client moves copies."""
         return self._copies.keys()
 
     def apply(

@@ -256,7 +256,8 @@ class Counters:
     retained: Traffic = dataclasses.field(default_factory=Traffic)
     """Retained records. They are sent even if no peer is near, because the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
-    """Wrenches of people's hands on robots of other clients, and couplings of two actors to one tree."""
+    """Wrenches of people's hands on robots of other clients, and couplings (virtual springs) of two actors to one
+    tree."""
     voice: Traffic = dataclasses.field(default_factory=Traffic)
     """Frames of sound: voices, and loudspeakers of robots."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
@@ -272,7 +273,8 @@ class Counters:
     """Number of messages and steps in which wrenches were reduced to what hands can exert."""
 
     couplings_refused: int = 0
-    """Number of refused couplings of peers: neither side owns the tree, or the peer's arms do not reach it."""
+    """Number of refused couplings (virtual springs that peers send for their contacts with trees): neither side owns
+    the tree, or the peer's arms do not reach it."""
 
     foreign: int = 0
     """Number of messages and replies that the bus dropped because their key contains the name of an actor and they come

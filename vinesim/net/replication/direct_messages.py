@@ -424,7 +424,8 @@ def make_syncs(
     hand_force: float = HAND_FORCE,
     link_centre: LinkCentre = lambda _: None,
 ) -> tuple[MessageSync, ...]:
-    """Make the syncs of all direct messages of the actor ``name`` except voices, and subscribe to their keys.
+    """Make the senders and receivers (:class:`MessageSync`) of all direct messages of the actor ``name`` except voices,
+    and subscribe to their keys.
 
     ``owner(object_id)``: name of the actor that owns an object, or None. ``hand_force``, ``link_centre``: see
     :class:`WrenchSync`.

@@ -1,9 +1,9 @@
 """Network time of one client: its estimate of the world's time, from the server's replies to pings.
 
-Pings measure the offset between two real-time clocks, that of the client and that of the server. This offset stays
-constant whatever the world's real-time factor is. Each reply also contains a time of the server's clock, the time of
-the world at that moment, and the real-time factor. The present time of the world follows from these. Own time runs at
-the real-time factor and is slewed towards the time of the world.
+Pings measure the offset between the real-time clocks of client and server. This offset does not depend on the world's
+real-time factor. Each reply also contains a time of the server's clock, the time of the world at that moment, and the
+real-time factor. The present time of the world follows from these. Own time runs at the real-time factor and is slewed
+towards the time of the world.
 
 Key: the query ``clock/<actor>``, which also reports how fast the actor's client can follow (:mod:`vinesim.net.pace`).
 """
