@@ -261,7 +261,7 @@ def with_group(vinebot: RobotDescription, **change) -> str:
                 series_damping=None,
                 home=None,
             ),
-            "no drive moves",
+            "no driven joint",
         ),
         (lambda robot: with_group(robot, stiffness=(1e300,) * 9), "stiffness"),
         (lambda robot: with_group(robot, damping=(-1.0,) * 9), "damping"),

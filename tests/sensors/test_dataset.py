@@ -479,8 +479,8 @@ def test_a_picture_and_its_truth(tmp_path: pathlib.Path) -> None:
         ({"size": "640*480"}, UsageError, "WxH"),
         ({"at": "1,2"}, UsageError, "X,Y,Z"),
         ({"at": "1,2,nan"}, UsageError, "X,Y,Z"),
-        ({"look": "0.4,1.2,1.3"}, UsageError, "where the camera stands"),
-        ({"at": "1,2,-0.1"}, UsageError, "in the ground"),
+        ({"look": "0.4,1.2,1.3"}, UsageError, "the position of the camera"),
+        ({"at": "1,2,-0.1"}, UsageError, "below the ground"),
         ({"at": "0,0,1"}, UsageError, "inside"),
         ({"robots": ["vinebot"]}, UsageError, "give NAME@X,Y,YAW"),
         ({"robots": ["vinebot@1"]}, UsageError, "--robot is at '1'; give X,Y,YAW"),
@@ -533,5 +533,5 @@ def test_a_camera_of_absurd_resolution_is_refused(tmp_path: pathlib.Path) -> Non
 def test_a_camera_without_range_is_refused(tmp_path: pathlib.Path) -> None:
     text = (pathlib.Path(dataset.__file__).parents[3] / "data/cameras/d435.toml").read_text()
     (tmp_path / "blind.toml").write_text(text.replace("nearest = { value = 0.158", "nearest = { value = 10.0"))
-    with pytest.raises(SensorError, match="no range"):
+    with pytest.raises(SensorError, match="an empty range"):
         _render(tmp_path / "shot", camera=str(tmp_path / "blind.toml"))

@@ -343,7 +343,7 @@ def test_flow_of_a_moved_plant_is_its_motion_alone(grove) -> None:
             model, (sensor_scenes.thing(sensor_scenes.shape("sphere", 0.1)),), np.array([[0, 0, 9.0, 0, 0, 0, 1]])
         )
     )
-    with pytest.raises(ValueError, match="came or went"):
+    with pytest.raises(ValueError, match="added or removed"):
         ground_truth.optical_flow(one, ground_truth.render_buffers(primitives, NEAR, pose))
 
 
