@@ -27,7 +27,7 @@ _OPUS_20_MS = frozenset((1, 5, 9, 13, 15, 19, 23, 27, 31))
 
 
 class Codec(enum.IntEnum):
-    """How the sound of a frame is coded; the number crosses the network."""
+    """Coding of the sound in a frame. Frames on the network contain the number."""
 
     OPUS = 1
     PCM16 = 2

@@ -1,4 +1,4 @@
-"""Which actors hear which, and how loudness falls with distance."""
+"""Rules of hearing: which actors hear which other actors, and how loudness falls with distance."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ import enum
 
 
 REFERENCE = 1.0
-"""[m] Up to this distance a sound is as loud as it was recorded."""
+"""[m] Distance up to which a sound is as loud as it was recorded."""
 
 REACH = 25.0
-"""[m] Beyond this distance nothing is heard, and no voice crosses the network. GUESSED."""
+"""[m] Distance beyond which nothing is heard, and no voice crosses the network. GUESSED."""
 
 FADE = 5.0
-"""[m] Loudness fades to zero over this last distance before :data:`REACH`, so no sound begins abruptly. GUESSED."""
+"""[m] Length of the distance before :data:`REACH` over which loudness fades to zero, so that no sound begins abruptly.
+GUESSED."""
 
 
 def gain(distance: float) -> float:

@@ -29,7 +29,7 @@ CAPACITY = 2.0
 """[s] Length of the ring buffer; frames stamped further in the future are dropped."""
 
 MAX_SPEAKERS = 64
-"""Largest number of voices at a time; beyond it the voice that was silent longest is forgotten."""
+"""Largest number of voices at a time. If there are more, the voice that was silent longest is forgotten."""
 
 _RING = round(CAPACITY * SAMPLE_RATE)
 
@@ -96,7 +96,7 @@ class Microphone:
         return self.lost + self.late + self.undecoded
 
     def hear(self, frame: HeardFrame) -> None:
-        """Mix a frame that has arrived."""
+        """Add the sound of a frame that has arrived to the recording."""
         voice = self._voices.pop(frame.speaker, None)
         step = 1 if voice is None else (frame.number - voice.number) % 65536
         if voice is not None and not 0 < step < 32768:  # the frame was received twice or out of order
@@ -132,7 +132,8 @@ class Microphone:
         self._voices[frame.speaker] = _Voice(frame.number, start + len(samples), frame.gain, samples, decoder)
 
     def sound(self, source: str, frequency: float, gain: float, now: float) -> None:
-        """Mix a tone of ``frequency`` [Hz] up to network time ``now`` [s], from where this source was mixed before.
+        """Add a tone of ``frequency`` [Hz] to the recording, up to network time ``now`` [s]. It continues the tone of
+        this ``source`` that was added before.
 
         The amplitude changes linearly from its previous value to ``gain``. Frequency 0 ends the tone.
         """

@@ -43,7 +43,7 @@ _Bend = Annotated[float, msgspec.Meta(ge=0.0, le=1.0)]
 
 
 class GestureError(DataError):
-    """A file of gestures that cannot be used."""
+    """Error: a file of gestures cannot be used."""
 
 
 class _Buttons(msgspec.Struct, forbid_unknown_fields=True):

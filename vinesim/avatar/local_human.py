@@ -85,8 +85,8 @@ class LocalHuman:
         return HumanUpdate(self.name, now, pose, velocity, self.intention)
 
     def between_blades(self) -> tuple[str, ...]:
-        """What the shears in the left and in the right hand would cut now, as in :meth:`Shears.between`; "" without
-        shears."""
+        """Returns what the shears in the left and in the right hand would cut now, see :meth:`Shears.between`; "" for a
+        hand without shears."""
         return tuple(
             shears.between() if getattr(self.pose, f"{side}_shears") else ""
             for shears, side in zip(self._shears, SIDES, strict=True)

@@ -123,7 +123,8 @@ class ScriptedHuman:
         yield
 
     def withdraw(self, side: str, way: float = 1.0) -> Iterator[None]:
-        """Move a hand towards its rest pose by the share ``way`` of the distance; 1 moves it all the way."""
+        """Move a hand back towards the pose in which it hangs down, by the share ``way`` of the distance (1: all the
+        way)."""
         start = self._hands[side].copy()
         goal = self._rest[side]
         for tick in range(

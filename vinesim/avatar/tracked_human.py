@@ -17,8 +17,8 @@ from vinesim.scene.values import HumanPose
 MAX_PERIOD = 0.1
 """Longest time over which motion between two inputs is interpolated [s]. GUESSED."""
 MAX_MOTION = 0.5
-"""A head that moves further than this between two inputs counts as teleported and is not interpolated [m]. The physics
-has the same rule (``PhysicsParameters.teleport_distance``)."""
+"""Distance that a head may move between two inputs [m]. Beyond it the head counts as teleported, and its motion is not
+interpolated. The physics has an equal rule (``PhysicsParameters.teleport_distance``)."""
 _SMOOTHING = 0.2
 """Weight of the newest interval in the running mean of the time between inputs [1]."""
 
@@ -54,7 +54,8 @@ class TrackedHuman:
         clock: Callable[[], float] | None = None,
         gestures: Gestures | None = None,
     ) -> None:
-        """Stands at ``root`` [7] until the first input. ``clock`` [s] measures the intervals between inputs.
+        """``root`` [7]: pose at which the person stands until the first input. ``height``: of the person [m].
+        ``clock``: function that returns a time [s], by which the intervals between inputs are measured.
 
         Without a ``clock`` the intervals are counted in steps of ``dt``.
         """

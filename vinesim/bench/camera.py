@@ -58,7 +58,8 @@ def triangle_mesh(primitives: Primitives) -> tuple[np.ndarray, np.ndarray]:
     first = 0
 
     def add(points: np.ndarray, triangles: np.ndarray) -> None:
-        """Add ``points`` [thing, vertex, 3]; ``triangles`` [k, 3] holds indices into the vertices of each thing."""
+        """Add copies of one mesh. ``points``: vertices of each copy [copy, vertex, 3] m; ``triangles`` [k, 3]: indices
+        of a copy's vertices."""
         nonlocal first
         count, each = points.shape[:2]
         vertices.append(points.reshape(-1, 3))
@@ -115,7 +116,7 @@ def embree_scene(vertices: np.ndarray, faces: np.ndarray) -> Any:
 
 
 def camera() -> Iterator[Measurement]:
-    """Measure the rasteriser and whole pictures; the peer is Open3D if it is installed."""
+    """Measure processor times of the rasteriser and of whole pictures, compared with Open3D if it is installed."""
     _, primitives = demo_scene()
     spec = CameraSpec.load("pinhole")
     info = spec.info("optical")

@@ -53,7 +53,7 @@ TRUTH_PERIOD = 0.1
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """Properties of a client that is measured, and budgets of its median times [ms]."""
+    """One measured kind of client: its properties, and budgets of its median times [ms]."""
 
     scene: str
     robots: int = 1
@@ -84,7 +84,7 @@ CASES = (
 
 @dataclasses.dataclass(frozen=True)
 class TickTimes:
-    """Times of ticks [s]."""
+    """Processor and wall times of measured ticks and of their parts [s]."""
 
     cpu: np.ndarray
     """Processor time of the thread in each part, and in the whole tick [tick, part + 1] s."""
@@ -188,8 +188,8 @@ class PushingClient:
 
 
 class _Demand:
-    """Stands in for a worker process of the client whose topics all have subscribers. It takes the messages that are
-    written."""
+    """Object in place of a worker process of the client, as if all topics had subscribers. It takes the messages that
+    the client writes."""
 
     is_ready = True
     pid = 0
@@ -212,7 +212,7 @@ class _Demand:
         self.process = types.SimpleNamespace(pid=os.getpid())
 
     def current(self) -> _Demand:
-        """This object, which takes the place of the current run of a worker process."""
+        """Returns this object, in place of the present run of a worker process."""
         return self
 
     def send(self, kind: str, value: Any = None) -> None:
@@ -256,7 +256,7 @@ def _subscribe_to_all(
 
 
 def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) -> Iterator[Measurement]:
-    """Yields the rows of one case."""
+    """Yields the measurements of one kind of client: ticks that are paced in real time, and ticks back to back."""
     with contextlib.ExitStack() as stack:
         pushing = PushingClient(
             scene,
@@ -275,7 +275,12 @@ def _measure(case: Case, scene: Scene, model: Model, robot: RobotDescription) ->
 
 
 def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: float | None) -> Iterator[Measurement]:
-    """Yields the median and the 99th percentile of the whole tick and of its parts, in processor and wall time."""
+    """Yields the rows of one measurement: median and 99th percentile of the whole tick and of each part, in processor
+    time and in wall time.
+
+    ``text``: description of the case. ``tick_budget``, ``step_budget``: budgets of the processor time of the whole tick
+    and of its physics step [ms]; None: no budget.
+    """
     budgets = {"whole tick": tick_budget, "step": step_budget}
     for kind, values in (("CPU", times.cpu), ("wall", times.wall)):
         for name, column in zip((*PARTS, "whole tick"), 1e3 * values.T, strict=True):
@@ -285,7 +290,8 @@ def _rows(text: str, times: TickTimes, tick_budget: float | None, step_budget: f
 
 
 def _row(case: str, value: float, budget: float | None = None) -> Measurement:
-    """Returns one row, with its budget if it has one."""
+    """Returns a row with a time ``value`` [ms]. ``case``: description; ``budget``: largest accepted value [ms], None:
+    none."""
     if budget is None:
         return Measurement("tick", case, value, "ms/tick")
     return Measurement("tick", case, value, "ms/tick", "budget", budget, budget / value)

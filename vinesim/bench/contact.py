@@ -1,7 +1,7 @@
-"""Time of contacts, compared with MuJoCo: the same canes, grippers and bar in both, in one process, in turns.
+"""Time of contacts, compared with MuJoCo. Both simulate equal canes, grippers and a bar, in one process, in turns.
 
-The module also measures a whole step of a vineyard of ten thousand bunches, of which twenty trees are awake, with one
-robot and with ten, by stages.
+The module also measures whole steps of a vineyard with ten thousand bunches and twenty awake trees, by stages, with one
+robot and with ten.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ from vinesim.world import Physics
 
 CANE_COUNTS = (64, 256)
 STEPS_PER_ROUND = (20, 5)
-"""Number of steps of a turn, for each number of canes: about 50 ms of MuJoCo, since every turn begins with cold
-caches."""
+"""Number of steps that a simulator makes before the other one continues, for each number of canes. They take MuJoCo
+about 50 ms, because each turn begins with cold caches."""
 LIFTED_CANES = 12
 HELD_CANES = (14, 20, 26, 32)
 """Indices of the canes whose bunch a gripper holds."""
 COMBS = ((2, 10, 50), (4, 32, 12), (8, 64, 5))
-"""Cases of two combs: number of bars, number of canes between them, steps of a turn. All contacts form one island;
-their number is bars times canes."""
+"""Cases with two combs: number of bars, number of canes between the bars, and number of steps that a simulator makes
+before the other one continues. All contacts form one island; their number is bars times canes."""
 SETTLE_STEPS = 150
 """Number of steps before the measurement, in which the grippers close, and bar and grippers lift."""
 SCENE = "tendone"
@@ -47,8 +47,8 @@ WARM_UP_STEPS = 100
 
 
 def contact_measurements() -> Iterator[Measurement]:
-    """Measure awake canes with bunches, of which a bar lifts twelve and four grippers hold one bunch each; then canes
-    between combs."""
+    """Measure steps of awake canes with bunches: a bar lifts twelve canes, and four grippers hold one bunch each. Then
+    measure steps of canes between two combs."""
     robots = [
         scenes.bar("bar", 0, LIFTED_CANES),
         *(scenes.gripper(f"hand{i}", scenes.bunch_center(i)) for i in HELD_CANES),
@@ -64,10 +64,11 @@ def contact_measurements() -> Iterator[Measurement]:
 
 
 def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurement]:
-    """One gripper and the vine it holds, compared with MuJoCo; then the shipped block with one ``robot`` and with ten.
+    """Measure steps of one gripper and the vine that it holds, compared with MuJoCo; then whole steps of a shipped
+    vineyard with one ``robot`` and with ten.
 
-    The first stands facing a row, its arms among the vines (drives at ``raised`` [joint]); the others drive in circles
-    on the headland. All swing their joints.
+    The first robot faces a row, with its arms among the vines (positions ``raised`` [joint] of the drives). All other
+    robots drive in circles on the headland. All robots swing their joints.
     """
     yield from _compare_with_mujoco(
         "1 hand, 1 held vine", "tick", scenes.cane_row(1), [scenes.gripper("hand", scenes.bunch_center(0))], 100
@@ -79,7 +80,8 @@ def step_measurements(robot: RobotSpec, raised: np.ndarray) -> Iterator[Measurem
 
 
 def _measure_vineyard(model: Model, robot: RobotSpec, raised: np.ndarray, count: int) -> Iterator[Measurement]:
-    """Yields the times of whole steps, and of their stages summed over MuJoCo, vinesim's own code and the rest."""
+    """Yields the times of whole steps with ``count`` robots, and the times of their stages, summed for MuJoCo, for
+    vinesim's own code and for the rest."""
     physics = Physics(model)
     for i in range(count):
         position = [4.0 * i, -6.0, 0.0] if i else [*ROBOT_POSITION, 0.0]
@@ -148,7 +150,7 @@ def _one_core() -> Iterator[None]:
 def _compare_with_mujoco(
     case: str, bench: str, model: Model, robots: list[RobotSpec], steps: int
 ) -> Iterator[Measurement]:
-    """Step the same scene here and in MuJoCo, in turns of ``steps`` steps, and compare processor times.
+    """Step a scene in vinesim and in MuJoCo, in turns of ``steps`` steps, and compare processor times.
 
     Contacts are counted after all turns: counting takes longer than a step.
     """

@@ -195,8 +195,8 @@ class GoalSender:
         return self.history[-1][1][[self.names.index(name) for name in joints]]
 
     def until(self, done: Callable[[], object], what: str) -> None:
-        """Process messages until ``done()`` is true. Raises RuntimeError after :data:`TIMEOUT`, with ``what`` was
-        awaited."""
+        """Process messages until ``done()`` is true. Raises RuntimeError after :data:`TIMEOUT`. ``what``: text for the
+        error that names the awaited event."""
         end = time.monotonic() + TIMEOUT
         while not done():
             rclpy.spin_once(self.node, timeout_sec=0.1)

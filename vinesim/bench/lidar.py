@@ -1,7 +1,7 @@
 """``vinesim bench lidar``: rays of one revolution compared with Open3D's ray caster (Embree), with plants at rest and
 moving.
 
-The scene and the method are the same as in ``vinesim bench camera``.
+Scene and method are those of :mod:`vinesim.bench.camera`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def _grid(spec: LidarSpec) -> LidarRasterizer:
 
 
 def lidar() -> Iterator[Measurement]:
-    """Measure distances and primitives of all rays, the whole scan, and rays while twenty trees move."""
+    """Measure processor times of all rays of a revolution, of a whole scan, and of rays while twenty trees move."""
     model, primitives = demo_scene()
     spec = LidarSpec.load("vlp16")
     head = _grid(spec)

@@ -32,7 +32,7 @@ GENERATE = (
 
 @dataclasses.dataclass(frozen=True)
 class Row:
-    """Figures that are measured together, in one run of programs."""
+    """A row of the benchmark ``live``: figures that are measured together, in one run of programs."""
 
     about: str
     seconds: float

@@ -1,4 +1,5 @@
-"""Median time of a step of plants without contacts, compared with MuJoCo on the same scene, in one process, in turns.
+"""Median time of a step of plants without contacts, compared with MuJoCo on the same scene. Both run in one process, in
+turns.
 
 The scene: canes of 16 bodies (1 m, 8 mm, 5 GPa, 800 kg/m^3), each with a bunch of 0.5 kg on its tip.
 """

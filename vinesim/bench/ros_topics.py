@@ -42,7 +42,7 @@ TOPICS = (
 )
 """Topics that vinebot publishes in every step."""
 JOINTS = 21
-"""Number of joints in a message of the stock publisher, the same as of vinebot."""
+"""Number of joints in a message of the stock publisher, equal to that of vinebot."""
 WINDOW = 20.0
 """Duration of the measurement before the third process is stopped, and again afterwards [s]."""
 SETTLING = 3.0
@@ -94,8 +94,8 @@ def load_arrivals(path: pathlib.Path) -> dict[str, Arrivals]:
 def delay_ms(messages: Arrivals, clock: Arrivals, memory: int = 100) -> np.ndarray:
     """Returns the delay of each message from the time at which it was due until it arrived [message] ms.
 
-    A message is due at its stamp. The offset between stamps and wall time is that of the fastest of the last ``memory``
-    messages of ``clock``, which counts as undelayed.
+    A message is due at its stamp. The offset between stamps and wall time follows from the fastest of the last
+    ``memory`` messages of ``clock``, which counts as undelayed.
     """
     offsets = (clock.arrival - clock.stamp).astype(float)
     padded = np.r_[np.full(memory - 1, np.inf), offsets]

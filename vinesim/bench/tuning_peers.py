@@ -27,9 +27,9 @@ from vinesim.tune.start import start_values
 from vinesim.tune.tuning import STEP_PHASE
 
 AS_GOOD = 1.0
-"""A peer has finished when its loss, half a chi square, exceeds the loss of vinesim's minimum by less than this."""
+"""Difference from the loss (half a chi square) of vinesim's minimum below which another method's fit is finished."""
 MOST_SECONDS = 30.0
-"""Processor time after which a peer with restarts gives up [s]."""
+"""Processor time after which a method that restarts from several points gives up [s]."""
 STEIN_SEGMENTS = 3
 """Number of rigid bodies of the chain of springs on which Stein particles are computed."""
 STEIN_PARTICLES = 20
@@ -58,7 +58,8 @@ class PlainProblem:
         return np.array([problem.loss(theta, y, self.noise) for theta, y in zip(thetas, x, strict=True)])
 
     def residuals(self, theta: np.ndarray) -> np.ndarray:
-        """Returns the residuals of one candidate, priors included, for scipy."""
+        """Returns the residuals for the parameters ``theta`` [8], including those of the priors, in one array for
+        scipy."""
         problem = self.problem
         x, _ = problem.samples(theta[None], problem.row(theta)[None])
         off = (x[0] - problem.observed)[problem.seen] / self.noise

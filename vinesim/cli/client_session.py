@@ -109,7 +109,7 @@ class ClientSession:
         self._stack.callback(client.leave)
 
     def trace(self, client: Client, bunch: int) -> Trace:
-        """Record the force on a bunch and its displacement from now on."""
+        """Start to record the force on a bunch and the displacement of the bunch."""
         client.trace = start_trace(client, self.model, bunch)
         return client.trace
 

@@ -80,7 +80,7 @@ def run(options: ClientOptions) -> int:
 def pull_repeatedly(
     human: ScriptedHuman, point: Callable[[], np.ndarray], indicate: Callable[[str], None] = lambda _: None
 ) -> Iterator[None]:
-    """Script for a person: hold the thing at a point [3] m in the world, pull at it, let it go; without end.
+    """Script for a person: hold the object at a point [3] m in the world, pull at it, let it go, and begin again.
 
     ``indicate`` is called with what the person is about to do.
     """

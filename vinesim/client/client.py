@@ -73,14 +73,15 @@ CLOCK_POLL_PERIOD = 0.005
 
 
 class Exchange(NamedTuple):
-    """Functions of a client that make and apply one kind of the messages that actors send each other directly."""
+    """Two functions of a client for one kind of direct messages between actors: one makes the messages, one applies
+    them."""
 
     say: Callable[[str], Any]
-    """Returns the message of the named local actor to other actors in this step: the value for
-    :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`."""
+    """Function that returns, by name of an actor of this client, the actor's message to other actors in this step: the
+    value for :meth:`vinesim.net.replication.direct_messages.MessageSync.publish`."""
     apply: Callable[[Mapping[str, Any]], None]
-    """Applies, before a step, the messages from other actors that are valid now: for each local actor, by name, the
-    value of :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
+    """Function that applies, before a step, the valid messages from other actors. Its argument contains, by name of
+    each actor of this client, the value of :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
 
 
 class Client:
@@ -135,7 +136,8 @@ class Client:
         self.meshes = MeshExchange()
         """Sends the meshes of local robots to other clients, and receives the meshes of remote robots."""
         self.step_time: Callable[[], float] | None = None
-        """Returns the world's time at the present step [s]. None if the steps do not follow the server's clock."""
+        """Function that returns the world's time at the present step [s]. None if the steps do not follow the server's
+        clock."""
         self.replicators: dict[str, Replicator] = {}
         """Network replication of each local actor, by name; the first is :attr:`replicator`."""
         self.objects = ObjectSync(self.physics, self.replicators, self._is_present)
@@ -166,28 +168,32 @@ class Client:
         """Functions that are called at the end of a tick and wake the processes that take the tick's results. They come
         last because a woken process may get this core immediately."""
         self.script = ""
-        """Command line option that lets the robots act by themselves, or "". Services do not reset a client that has
-        such an option."""
+        """Command line option that lets the robots act by themselves, or "". ROS services refuse to reset a client that
+        has such an option."""
         self.after_reset: list[Callable[[], None]] = []
         """Functions that are called after :meth:`reset`, so that parts with references to the physics or a robot take
         the new objects."""
         self.earlier_faults: collections.Counter[str] = collections.Counter()
-        """Number of faults of the physics and of couplings before the last reset, by kind of fault."""
+        """Number of faults before the last reset, by kind of fault. Refused couplings (virtual springs of other
+        clients' actors) are counted, too."""
         # Each returns the fault counts of a part that serves this client, such as its page.
         self.other_faults: list[Callable[[], dict[str, int]]] = []
         self.frame_score: Callable[[], float] = lambda: 0.0 if self.trace is None else self.trace.displacement
-        """Returns a score of how much there is to see now. The picture with the highest score is kept."""
+        """Function that returns how useful a picture would be now. The picture taken at the highest value is kept."""
         self.trace: Trace | None = None
         """Record of the force on one bunch and of its displacement. None: nothing is recorded."""
         self.interest_audit = InterestAudit()
         self.world_time = WorldTime(self.physics.dt)
         """Time of the world, in which ROS messages are stamped."""
         self.pace_text: Callable[[], str] = lambda: ""
-        """Returns a text for people: how fast time passes and what limits it (:func:`vinesim.net.pace.describe`)."""
+        """Function that returns a text for people: how fast time passes and what limits it
+        (:func:`vinesim.net.pace.describe`)."""
         self.holds: list[Callable[[], str]] = []
-        """Each returns the reason why the next step has to wait, such as "sensors", or "" if the step may begin."""
+        """Functions that return the reason why the next step has to wait, such as "sensors", or "" if the step may
+        begin."""
         self.pace_limits: list[Callable[[], Limit]] = []
-        """Each returns the largest real-time factor that a part that serves this client can follow."""
+        """Functions that return the largest real-time factor with which a part of this client, such as its sensors, can
+        keep up."""
         self.clock = clock
         self.sound = SoundExchange(self)
         self.tree_copies = TreeCopies(self.physics, self.objects)
@@ -307,8 +313,11 @@ class Client:
         )
 
     def follow_steps(self, step_time: Callable[[], float] | None) -> None:
-        """Set the function ``step_time`` that returns the world's time of a step [s], with which results of the step
-        are stamped, sent and shown. None: the results get the time at which the step is computed."""
+        """Set the function that returns the world's time of a step [s].
+
+        The results of the step are stamped, sent and shown with this time. None: they get the time at which the step is
+        computed.
+        """
         self.step_time = step_time
         for replicator in self.replicators.values():
             replicator.step_time = step_time
@@ -396,7 +405,8 @@ class Client:
         self.objects.receive(inbox)
 
     def control(self) -> None:
-        """Run the callbacks of :attr:`pre_step`, then the drives of robots and the poses of humans."""
+        """Call the functions of :attr:`pre_step`, then pass the set-points of robots and the poses of humans to the
+        physics."""
         for callback in self.pre_step:
             callback(self.physics.time)
         for robot in self.robots.values():
@@ -405,7 +415,7 @@ class Client:
             human.control(self.physics.time)
 
     def sense(self) -> None:
-        """Record the traced bunch, then run the callbacks of :attr:`post_step`."""
+        """Record the traced bunch, then call the functions of :attr:`post_step`."""
         if self.trace is not None:
             self.physics.update_kinematics()
             body = self.trace.body
@@ -455,7 +465,8 @@ class Client:
         self.interest_audit.update(self, touching)
 
     def leave(self) -> None:
-        """Publish the objects that rest on local robots with poses in the world frame, as the robots disappear.
+        """Publish world poses of the objects that rest on this client's robots, because the robots are about to
+        disappear.
 
         Call it before the buses close.
         """
@@ -516,7 +527,7 @@ class Client:
         return any(replicator.is_present(name) for replicator in self.replicators.values())
 
     def _is_owned_remotely(self, number: int) -> bool:
-        """Returns whether an actor of another client owns an object or tree."""
+        """Returns whether an actor of another client owns the object with the id ``number``, which may be a tree."""
         owners = {replicator.owner(number) for replicator in self.replicators.values()} - {None}
         return bool(owners) and not owners & self.replicators.keys()
 
@@ -541,11 +552,12 @@ class Client:
                 log.debug("a wrench on an unknown link: %s", error)
 
     def _say_couplings(self, name: str) -> list[Coupling]:
-        """Returns couplings for the contacts of a local actor with trees that other clients also move or touch."""
+        """Returns the couplings (virtual springs) that stand for the contacts of a local actor with trees that other
+        clients also move or touch."""
         return self.couplings.of_actor(name, self.tree_copies.trees | self.couplings.trees)
 
     def _apply_couplings(self, received: Mapping[str, dict[str, tuple[Coupling, ...]]]) -> None:
-        """Hold trees by the couplings of remote actors."""
+        """Apply the couplings (virtual springs) that actors of other clients have sent to the trees that they touch."""
         couplings: dict[str, tuple[Coupling, ...]] = {}
         for by_actor in received.values():
             for actor, theirs in by_actor.items():
@@ -554,11 +566,12 @@ class Client:
 
 
 class InterestAudit:
-    """Counts the bytes with states of touched plants that are sent while no remote actor is near. It must stay 0."""
+    """Counts the bytes with states of touched plants that are sent while no remote actor is near. The count must stay
+    0."""
 
     MARGIN = 3.0
-    """An actor counts as far if its distance from this client's actor exceeds the interest radius by more than this
-    [m]: a tree is not a point."""
+    """Distance beyond the interest radius from which a remote actor counts as far [m]. It is not 0, because a tree is
+    not a point."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -568,8 +581,11 @@ class InterestAudit:
         self._seen = 0
 
     def update(self, client: Client, touching: bool) -> None:
-        """Count one tick. Remote actors count at the positions in their messages: their copies appear later, and
-        spectators have no copy."""
+        """Count one tick. ``touching``: whether this client touched plants in it.
+
+        Positions of remote actors are those in their messages, because their copies appear later, and spectators have
+        no copy.
+        """
         replicators = client.replicators.values()
         sent = sum(replicator.counters.environment.bytes_out for replicator in replicators)
         if touching or sent != self._seen:

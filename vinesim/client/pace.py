@@ -13,12 +13,12 @@ from vinesim.net.replication.replicator import Replicator
 HEADROOM = 0.9
 """Share of a core's time that steps may take. The rest is for work that occurs rarely."""
 WINDOW = 0.5
-"""Length of a span of real time over which work is measured [s]; the last two spans count."""
+"""Length of a span of real time over which the work of steps is measured [s]. The last two spans count."""
 HELD_SHARE = 0.1
-"""If steps are held back for more than this share of the time [1], the client reports its present speed as its
-limit."""
+"""Share of the time [1] for which due steps are held back, by sensors or ROS, above which a client reports its present
+speed as its limit."""
 REPORT_PERIOD = 0.05
-"""Real time between two reports to the clock of a client without a server, :class:`OwnPace` [s]."""
+"""Real time between two reports of speed to :class:`OwnPace`, the clock of a client without a server [s]."""
 
 
 class StepClock(Protocol):
@@ -47,7 +47,7 @@ class StepClock(Protocol):
 
 
 class RealTime:
-    """Real time, or a fixed multiple of it."""
+    """A clock that shows real time, or a fixed multiple of it."""
 
     cause = ""
 
@@ -127,7 +127,7 @@ class Limit(NamedTuple):
 
 
 class _Span:
-    """How a loop spent one span of real time."""
+    """Steps, idle time and held time of a loop in one span of real time."""
 
     def __init__(self, begun: float) -> None:
         self.begun = begun
@@ -147,7 +147,7 @@ class PaceMeter:
 
     def __init__(self, dt: float) -> None:
         self.limits: list[Callable[[], Limit]] = []
-        """Each returns the limit of another part of the client."""
+        """Functions that return the limits of further parts of the client, such as its sensors."""
         self._dt = dt
         self._spans: deque[_Span] = deque(maxlen=2)
         self._span: _Span | None = None

@@ -26,7 +26,7 @@ WAITING_MAX_LAG = 1.0
 
 @dataclasses.dataclass(frozen=True)
 class TickLog:
-    """A record of steps, for statistics of any part of a run."""
+    """Begin and duration of each step of a loop, for statistics of any part of a run."""
 
     begins: np.ndarray
     """Time at which each step began, by ``time.monotonic`` of this machine [step] s."""
@@ -38,10 +38,10 @@ class TickLog:
     """Real time from one deadline to the next [step] s: longer than ``dt`` if the world is slower than real time."""
 
     def between(self, since: float, until: float) -> dict[str, float]:
-        """Returns rate, percentiles of the work, overruns and real-time factor of the steps that began in a span of
-        time [s].
+        """Returns rate, percentiles of the work, overruns and real-time factor of the steps that began from time
+        ``since`` to ``until`` [s].
 
-        Raises :class:`ValueError` if fewer than two steps began in it.
+        Raises :class:`ValueError` if fewer than two steps began in this span of time.
         """
         part = slice(*np.searchsorted(self.begins, (since, until)))
         begins = self.begins[part]
@@ -83,19 +83,19 @@ class RateLoop:
     LEAST_SPACING = 0.5
     """Real time between the begins of two steps, as a share of ``dt``."""
     MAX_LEAD = 5.0
-    """If the clock is behind the loop by more than this [s], it is a different clock, and the loop jumps to its time at
-    once."""
+    """Time by which the clock may be behind the loop before it counts as a different clock [s]. The loop then jumps to
+    the clock's time at once."""
     MAX_SKIP = 3600.0
-    """If the clock is ahead of the loop by more than this [s], the loop also jumps to its time at once. The first time
-    that a server reports is that far ahead."""
+    """Time by which the clock may be ahead of the loop before the loop jumps to the clock's time at once [s]. The first
+    time that a server reports is that far ahead."""
     FREE_LEAD = 0.015
-    """If the clock is behind the loop by more than this [s], the clock was set back. Steps continue at
-    :data:`LEAD_RATE` until the clock has caught up."""
+    """Time by which the clock may be behind the loop before it counts as set back [s]. Steps then continue at the
+    real-time factor :data:`LEAD_RATE` until the clock has caught up."""
     LEAD_RATE = 0.9
     LONGEST_SLEEP = 0.05
     """Longest single sleep [s]. The loop keeps the clock up to date between two sleeps."""
     SHORTEST_SLEEP = 1e-6
-    """A step that is due within this time begins now [s]."""
+    """Largest time until a step is due with which the step begins now, without a sleep [s]."""
     HOLD_POLL = 0.001
     """Time between two checks whether a step is still held back [s]."""
     CLOCK_PATIENCE = 3.0
@@ -113,9 +113,10 @@ class RateLoop:
         """Time of the clock at which the next step is due [s]; between :meth:`begin` and :meth:`end`, the time of the
         present step."""
         self.hold: Callable[[], str] = lambda: ""
-        """Returns the reason why the step that is due has to wait, such as "sensors", or "" if it may begin."""
+        """Function that returns the reason why the step that is due has to wait, such as "sensors", or "" if it may
+        begin."""
         self.is_stopping: Callable[[], bool] = lambda: False
-        """Returns whether the loop should stop waiting, because the run ends."""
+        """Function that returns whether the loop should stop waiting, because the run ends."""
         self.meter = PaceMeter(dt)
         self.ticks = 0
         self.overruns = 0

@@ -75,7 +75,7 @@ class Spectator(Client):
         )
 
     def sense(self) -> None:
-        """Call the callbacks of :attr:`post_step`."""
+        """Call the functions of :attr:`post_step`."""
         for sense in self.post_step:
             sense(self)
 

@@ -192,8 +192,8 @@ class RecentCounts:
         """Time at which the last rise of each counter was noticed [s]."""
 
     def update(self, counts: Mapping[str, int], time: float) -> list[str]:
-        """Take the ``counts`` at ``time`` [s]. Returns the names of the counters that rose within the last
-        :data:`RECENT_TIME`."""
+        """Compare the present ``counts``, by name, with earlier ones. Returns the names of the counters that rose
+        within the :data:`RECENT_TIME` before ``time`` [s]."""
         self._risen |= {name: time for name, count in counts.items() if count > self.counts.get(name, 0)}
         self.counts = dict(counts)
         return [name for name, risen in self._risen.items() if time - risen < RECENT_TIME]

@@ -20,14 +20,14 @@ GAIN = 0.01
 MAX_RATE = 0.1
 """Largest rate of change of the offset [s/s]: the stamps of two successive steps of 10 ms differ by 9 to 11 ms."""
 MAX_LAG = 0.05
-"""[s] Stamps are never further behind the server's clock than this: the stamps of a slow client skip ahead. If stamps
-are further ahead than this while steps follow each other faster than ``dt`` (a loop catches up), the stamps advance no
+"""[s] Largest difference between stamps and the server's clock. The stamps of a slow client that are further behind
+skip ahead. If stamps are further ahead while a loop catches up, with steps faster than ``dt``, the stamps advance no
 faster than the server's clock."""
 MIN_RATE = 0.1
-"""[s/s] Stamps rise in every step, by at least this share of ``dt``."""
+"""[s/s] Smallest rise of the stamps in a step, as a share of ``dt``."""
 MAX_LEAD = 5.0
-"""A server's clock that is further behind than this [s] belongs to another run of the world. The offset then jumps to
-it at once."""
+"""Time by which a server's clock may be behind the stamps before it counts as the clock of another run of the world
+[s]. The offset then jumps to that clock at once."""
 
 
 class WorldTime:
@@ -43,7 +43,8 @@ class WorldTime:
         self._clock = 0.0  # server's time at the last step
 
     def follow(self, simulated: float, clock: float) -> None:
-        """Follow the server's ``clock`` [s] at the step that starts at ``simulated`` time [s]; call it every step."""
+        """Adapt the offset to the time of the server's ``clock`` [s] at the step that starts at ``simulated`` time [s].
+        Call this in every step."""
         away = clock - simulated - self.offset
         passed = clock - self._clock
         self._clock = clock

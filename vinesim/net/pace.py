@@ -60,7 +60,7 @@ class PaceReport(NamedTuple):
     factor: float
     """Largest real-time factor that the client can follow. May be above 1."""
     cause: str = ""
-    """What limits the factor: "steps", "sensors" or "ROS messages"."""
+    """Part of the client that limits the factor: "steps", "sensors" or "ROS messages"."""
 
 
 @dataclasses.dataclass
@@ -104,7 +104,7 @@ class WorldClock:
         return self._time + self.factor * (now - self._now)
 
     def report(self, name: str, now: float, report: PaceReport) -> None:
-        """Take a report that arrived from the client ``name`` at ``now`` [s]."""
+        """Store a report that arrived from the client ``name`` at ``now`` [s]."""
         self.advance(now)
         lag = max(self._time - report.time, 0.0)
         before = self._clients.get(name)

@@ -35,8 +35,8 @@ SUBSCRIPTION_COUNT_PERIOD = 0.1
 
 
 class Node:
-    """A ROS 2 node under ``namespace``. Several nodes may exist in one process, each with its own ROS context unless it
-    shares that of another node (``beside``). A node is a context manager, which calls :meth:`close` at its end.
+    """A ROS 2 node under ``namespace``. Several nodes may exist in one process. Each has its own ROS context, or shares
+    the context of another node (``beside``). A node is a context manager, which calls :meth:`close` at its end.
 
     Raises :class:`middleware.RosUnavailableError`, :class:`message_packages.InterfacesError`, or :class:`ValueError`
     for a name that ROS does not allow. Their messages have one line.
@@ -102,22 +102,23 @@ class Node:
             raise ValueError(f"{params_file} is no ROS 2 parameter file: {' '.join(str(error).split())}") from error
 
     def _open(self) -> None:
-        """Create the publishers and subscriptions of a subclass."""
+        """Create publishers and subscriptions. Subclasses override this method."""
 
     def _own_threads(self, name: str) -> list[threading.Thread]:
-        """Returns the threads that a subclass needs besides the receiving one. They must end once ``_closing`` is
-        set and :meth:`_wake` was called."""
+        """Returns the threads that a subclass needs in addition to the receiving thread. They must end once
+        ``_closing`` is set and :meth:`_wake` was called."""
         return []
 
     def _wake(self) -> None:
         """Wake the threads of :meth:`_own_threads`, so that they notice that the node closes."""
 
     def _look_around(self) -> None:
-        """Hook for subclasses, called by the receiving thread every :data:`SUBSCRIPTION_COUNT_PERIOD`."""
+        """Do the regular work of a subclass, such as a search for other publishers. The receiving thread calls this
+        method every :data:`SUBSCRIPTION_COUNT_PERIOD`; subclasses override it."""
 
     def has_subscribers(self, family: str) -> bool:
-        """Returns whether a topic, or any topic below it, has subscribers. ``family`` is a topic or the first part of
-        one, such as ``"head_front_camera/depth"``, ``"lidar"`` or ``"tf"``.
+        """Returns whether a topic, or any topic below it, has subscribers. ``family``: a topic or the first part of a
+        topic's name, such as ``"head_front_camera/depth"``, ``"lidar"`` or ``"tf"``.
 
         The count is at most :data:`SUBSCRIPTION_COUNT_PERIOD` old. Raises :class:`ValueError` for an unknown topic.
         """

@@ -54,7 +54,8 @@ EXACT_ODOMETRY = "exact_odometry"
 ODOM_FRAME_ID = "odom_frame_id"
 """Name of the parameter with the frame id of odometry."""
 LOOK_PERIOD = 1.0
-"""Wall time between two checks for another robot under the same names, and for commands of another type [s]."""
+"""Wall time between two checks for another robot with the same topics, and for commands with a wrong message type
+[s]."""
 STAMPED_REMEDY = " (teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)"
 """Hint that is added to the warning about a base command of the wrong message type."""
 UNKNOWN = "_NODE_NAME_UNKNOWN_"
@@ -198,7 +199,7 @@ class RobotNode(Node):
             self._warn_of_types()
 
     def _locate_subscribers(self) -> None:
-        """Update for each topic that is published in every step whether all its subscribers are on this machine.
+        """Find out, for each topic that is published in every step, whether all its subscribers are on this machine.
 
         The first four bytes of a Fast DDS identifier are the vendor and the machine, two bytes each.
         """
@@ -302,7 +303,7 @@ class RobotNode(Node):
         self._send(self._sound.pending(time, pcm))
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
-        """Publish the states of the client's ``components`` and that of this node. Call this about once a second."""
+        """Publish the states of the client's ``components`` and of this node. Call this about once a second."""
         own = {"refused_commands": self.refused_commands}
         prefix = self._node.get_fully_qualified_name()
         trouble = [f"{topic} is published as {', '.join(types)}" for topic, types in self._foreign_types.items()]

@@ -146,8 +146,8 @@ class SensorNode(Node):
             self._changed.notify()
 
     def _send(self) -> None:
-        """Body of the sending thread: build and send the waiting messages, first that of the topic that has waited
-        longest."""
+        """Body of the sending thread: build and send waiting messages. The topic that has waited longest is served
+        first."""
         while True:
             with self._changed:
                 self._sending = False

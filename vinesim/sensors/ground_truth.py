@@ -1,8 +1,8 @@
 """Ground truth of pictures: visible bunches, their occlusion, boxes and cut points, and optical flow.
 
 The ground truth is computed from the primitives, not from the picture, so noise and range limits of a camera do not
-affect it. Ids are equal on all clients: bunch indices are those of the model, berry indices those of
-:func:`vinesim.scene.berries.lay_out_berries`.
+affect it. Ids are equal on all clients: bunches have their indices in the model, and berries their indices in the
+result of :func:`vinesim.scene.berries.lay_out_berries`.
 """
 
 from __future__ import annotations
@@ -148,8 +148,9 @@ def visible_bunches(
     """Returns the ground truth of every bunch that is visible in at least one pixel, sorted by index, fast enough for
     live pictures.
 
-    ``drawn``: rasteriser with the view from ``pose`` [7] of ``primitives``, posed to ``snapshot``; its keys are
-    overwritten. A cut point counts as visible if its pixel shows the bunch's own peduncle; this test needs no rays.
+    ``drawn``: rasteriser that has drawn the ``primitives``, posed to ``snapshot``, as seen from ``pose`` [7]. Its keys
+    (depth and primitive of each pixel) are overwritten. A cut point counts as visible if its pixel shows the bunch's
+    own peduncle; this test needs no rays.
     """
     view = lens_map(info)
     shape = view.pinhole.height, view.pinhole.width
@@ -164,7 +165,7 @@ def visible_bunches(
 
 @dataclasses.dataclass(frozen=True)
 class _Look:
-    """One view, for the computation of its ground truth; ``rasterizer`` draws single bunches without their
+    """One view of a camera, for the computation of its ground truth. ``rasterizer`` draws single bunches without their
     surroundings."""
 
     primitives: Primitives

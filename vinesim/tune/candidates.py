@@ -1,4 +1,5 @@
-"""Simulates many candidates of one specimen at once, each a tree with its own stiffness, damping, mass and pull.
+"""Simulates many candidates of one specimen at once. A candidate is the specimen with trial numbers: a tree with its
+own stiffness, damping, mass and pull.
 
 :class:`~vinesim.plants.articulation_solver.ArticulationSolver` computes the dynamics. A run begins in static
 equilibrium under a pull at the tip, which the same solver finds in long steps; then the pull ends. A shaken base is the
@@ -23,7 +24,7 @@ from vinesim.scene.state import State
 from vinesim.tune.specimen import TIP, base_pose, build_tree, hanging_bends, place_markers, rest_bends
 
 COLUMNS = ("modulus", "damping", "mass", "bow_y", "bow_z", "pull_y", "pull_z")
-"""Columns of a candidate.
+"""Columns of the array of candidates [n, 7], which are variants of the specimen.
 
 They are natural logarithms of the ratios of modulus, damping and mass to the specimen's, the bow [rad], and the pull at
 the tip along the base's y and z [N at the specimen's modulus; it is scaled with the modulus].
@@ -56,7 +57,7 @@ class Motion:
 
 
 class Candidates:
-    """Runs candidates of one specimen.
+    """Simulates candidates of one specimen: variants with trial numbers, each as a tree of its own.
 
     Args:
         specimen: the specimen of which all candidates are variations.
@@ -163,12 +164,13 @@ class Candidates:
         return np.concatenate([candidates, np.repeat(candidates[-1:], size - count, 0)])
 
     def _begin(self, plants: ArticulationSolver, count: int) -> None:
-        """Wake the first ``count`` candidates and no others."""
+        """Wake the trees of the first ``count`` candidates, and put all other trees to sleep."""
         plants.put_to_sleep(np.arange(count, len(plants.model.tree_first)))
         plants.wake(np.arange(count))
 
     def _bodies(self, count: int) -> np.ndarray:
-        """Returns the bodies [n, marker] that carry the markers."""
+        """Returns the indices [n, marker] of the bodies to which the markers of the first ``count`` candidates are
+        fixed."""
         return np.arange(count)[:, None] * self.size + self._body
 
     def _new_solvers(self, count: int) -> None:
@@ -185,7 +187,8 @@ class Candidates:
         self._own[count] = tuple(x.copy() for x in (moving.body_mass, moving.body_inertia, moving.body_product))
 
     def _write(self, plants: ArticulationSolver, candidates: np.ndarray, damped: float) -> None:
-        """Give each tree its stiffness, damping, masses and slack shape."""
+        """Write stiffness, damping, masses and slack shape of ``candidates`` [n, 7] to the trees of a solver.
+        ``damped``: factor on all damping."""
         model = plants.model
         count = len(candidates)
         modulus, damping, mass = np.exp(candidates[:, :3]).T.repeat(self.size, axis=1)[..., None]
@@ -205,13 +208,13 @@ class Candidates:
         plants.launches.changed = True
 
     def _sags(self, candidates: np.ndarray) -> np.ndarray:
-        """Returns the rotation of joints by weight [n, body, 3] rad, for candidates [n, 7] of a specimen with an
-        axis."""
+        """Returns the rotation of each joint from its slack shape by the specimen's weight [n, body, 3] rad, for
+        candidates [n, 7] of a specimen with an axis."""
         assert self._sag is not None
         return self._sag * np.exp(candidates[:, 2] - candidates[:, 0])[:, None, None]
 
     def _settle(self, plants: ArticulationSolver, candidates: np.ndarray, count: int) -> None:
-        """Bring the first ``count`` trees into equilibrium under their pull."""
+        """Find the static equilibrium of the first ``count`` trees under the pulls of ``candidates`` [n, 7]."""
         state = plants.state
         state.joint_q[:] = frames.IDENTITY
         if self._sag is not None:
@@ -227,7 +230,7 @@ class Candidates:
         plants.forward_kinematics()
 
     def _push(self, plants: ArticulationSolver, candidates: np.ndarray) -> None:
-        """Apply the pull at the present position of the tip."""
+        """Apply the pulls of ``candidates`` [n, 7] at the present positions of the trees' tips."""
         body = np.arange(len(candidates)) * self.size + self._pulled
         force = (candidates[:, 5:7] * np.exp(candidates[:, :1])) @ self.pull_axes()
         turn = plants.state.body_q[body, 3:].astype(float)
@@ -237,8 +240,8 @@ class Candidates:
     def _load(
         self, plants: ArticulationSolver, candidates: np.ndarray, pushed: bool, base_velocity: np.ndarray | None
     ) -> Callable[[int], None] | None:
-        """Returns a function of a tick that loads the bodies for the step after it; None if the load does not
-        change."""
+        """Returns a function that applies the loads of the step after a given tick to the bodies; None if the loads are
+        constant."""
         plants.body_load[:] = 0.0
         plants.tree_air[:] = 0.0
         if base_velocity is None and not pushed:
@@ -250,7 +253,8 @@ class Candidates:
 
 
 def _advance(plants: ArticulationSolver, first: int, end: int, load: Callable[[int], None] | None) -> None:
-    """Simulate from tick ``first`` to tick ``end``."""
+    """Simulate from tick ``first`` to tick ``end``. ``load``: function that applies the loads of the step after a
+    tick."""
     if load is None:
         plants.upload()
         plants.advance(end - first)
@@ -263,9 +267,9 @@ def _advance(plants: ArticulationSolver, first: int, end: int, load: Callable[[i
 
 
 def _shake(plants: ArticulationSolver, base_velocity: np.ndarray, tick: int) -> None:
-    """Load every body with the inertial force of the base's mean acceleration over the step.
+    """Apply to every body the inertial force of the base's mean acceleration over the step after ``tick``.
 
-    ``base_velocity``: [tick, 3] m/s.
+    ``base_velocity``: [tick, 3] m/s, velocity of the shaken base.
     """
     now, later = base_velocity[tick : tick + 2]
     force = plants.body_mass[:, None] * ((now - later) / plants.dt).astype(np.float32)

@@ -22,16 +22,17 @@ FREQUENCIES_PER_BIN = 4
 RELATIVE_STEP = 0.03
 """[1] Relative spacing of the trial frequencies of a shaken oscillator."""
 SUBSTEPS = 8
-"""Number of parts of a sample interval in each of which the acceleration of a base is taken as constant."""
+"""Number of equal parts of a sample interval. The acceleration of a shaken base is taken as constant in each part."""
 STANDS_OUT = 0.1
-"""A sample counts as motion, not noise, if it differs from the first samples by this fraction of the whole range [1].
+"""Fraction of a track's whole range by which a sample must differ from the first samples to count as motion, not noise
+[1].
 
 Detection of the onset after its true time does no harm, because the turning point is known to a quarter of a period.
 Detection during the hold does.
 """
 CLEARLY = 5.0
-"""Reduction of the loss, in squared standard deviations, by which another release time must be better to replace the
-first [1]."""
+"""Reduction of the loss that another release time must achieve to replace the first estimate [squared standard
+deviations]."""
 DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 """Trial damping ratios."""
 
@@ -183,7 +184,8 @@ def _free_features(track: Trajectory, onset: float) -> Features:
 def _find_release(track: Trajectory, features: Features) -> float:
     """Returns the time of the release [s]: the turning point of the sinusoid before which the track is still.
 
-    It is the release in ``features`` unless a turning point some half periods away fits clearly better.
+    This is the release in ``features``, unless a turning point one or more half periods earlier or later fits clearly
+    better.
     """
     values = columns_of(track)
     time = track.time

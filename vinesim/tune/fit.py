@@ -27,7 +27,7 @@ _LOGARITHMIC = ("modulus", "damping", "mass")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Minimum:
-    """Another minimum of the loss."""
+    """A minimum of the loss other than the best one."""
 
     modulus: float
     """Modulus at this minimum [Pa]."""

@@ -1,4 +1,5 @@
-"""Tracks from RGB-D pictures: a marker ball is found by its colour, its centre by the measured depth."""
+"""Tracks of markers from RGB-D pictures. A marker is a coloured ball on a plant: its pixels are found by their colour,
+and its centre is computed from the measured depth."""
 
 from __future__ import annotations
 
@@ -14,18 +15,19 @@ from vinesim.tune.specimen import TIP
 from vinesim.tune.trajectory import MIN_SAMPLES, Trajectory, TrajectoryError
 
 MAX_TURN = np.radians(30.0)
-"""Largest difference in hue between a pixel and the colour of its marker [rad].
+"""Largest difference in hue between a pixel and the colour of a marker for which the pixel belongs to the marker [rad].
 
-It is the angle between their chromaticities, measured around grey. The shaded side of a ball differs from the sunny
-side by 20 degrees.
+The difference is the angle between the two chromaticities as seen from grey. The shaded side of a ball differs from the
+sunny side by 20 degrees.
 """
 LEAST_SATURATION = 0.5
-"""Smallest accepted distance of a pixel's chromaticity from grey, as a share of the marker colour's distance [1]. A
-pixel half covered by the marker has 0.5."""
+"""Smallest saturation with which a pixel belongs to a marker [1]: distance of the pixel's chromaticity from grey,
+divided by the distance of the marker's colour from grey. A pixel that the marker covers by half has 0.5."""
 DARKEST = 60
-"""Smallest sum of red, green and blue (of 765) with which a pixel has a usable colour [1]."""
+"""Smallest sum of red, green and blue (at most 765) with which a pixel may belong to a marker [1]; darker pixels have
+no reliable hue."""
 MIN_PIXELS = 12
-"""Smallest number of pixels with which the middle of a ball can be located."""
+"""Smallest number of pixels of a ball from which its centre is computed."""
 MIDDLE_DEPTH = 0.707
 """Distance by which a ball's visible surface is nearer than its centre, in radii [1]: the median over the ball's
 disc."""
@@ -100,8 +102,8 @@ def find_marker(rgb: np.ndarray, colour: Colour) -> np.ndarray | None:
 
 
 def _off_grey(rgb: np.ndarray) -> np.ndarray:
-    """Returns the offset of each chromaticity from grey: shares [..., 3] of red, green and blue in their sum, minus
-    1/3."""
+    """Returns the offset of each colour's chromaticity from grey [..., 3]: red, green and blue, each divided by their
+    sum, minus 1/3."""
     return rgb / np.maximum(rgb.sum(-1, dtype=np.int32), 1)[..., None] - 1.0 / 3.0
 
 

@@ -13,7 +13,8 @@ from vinesim.tune.problem import SOFT, Evaluation, Problem
 Z90 = 1.6448536269514722
 """Number of standard deviations from the mean of a normal distribution to either end of its 90 % interval."""
 DECIDED = 3.0
-"""The data determine a direction if their information (1 / variance) is at least this multiple of the prior's [1]."""
+"""Ratio of the data's information (1 / variance) along a direction to the prior's from which the data determine the
+direction [1]."""
 _CORRELATED = 3.0
 
 
@@ -29,13 +30,14 @@ class Ridge:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Posterior:
-    """A normal distribution of all parameters around the best ones."""
+    """A normal distribution of all parameters of a fit around the best parameters."""
 
     names: tuple[str, ...]
     mean: np.ndarray
     covariance: np.ndarray
     physical: int
-    """Number of parameters of the plant, which come first; the others belong to the experiment."""
+    """Number of parameters that describe the plant. These are the first ones; the remaining parameters describe the
+    experiment."""
     ridges: tuple[Ridge, ...]
     correlation_time: float
     """Correlation time of the residuals in samples, 1 if they are independent. Its square root widens the intervals."""

@@ -24,7 +24,7 @@ from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
 PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
-"""[standard deviations] Residuals larger than this have reduced weight (soft L1)."""
+"""[standard deviations] Size from which residuals have reduced weight (soft L1)."""
 FINER = 3
 """Factor by which the finer run that determines the discretisation bias has more steps and segments."""
 Noise = float | np.ndarray
@@ -35,7 +35,7 @@ PHASE_STEP = 0.05
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Model and derivatives for one set of parameters."""
+    """Simulated track and its derivatives for one set of parameters."""
 
     model: np.ndarray
     """Positions of the simulated markers [observation] m."""
@@ -114,7 +114,8 @@ class Problem:
     # ------------------------------------------------------------------ parameters
 
     def row(self, theta: np.ndarray) -> np.ndarray:
-        """Returns the candidate [7] for the parameters ``theta`` [parameter]."""
+        """Returns the candidate [7], a row of :data:`vinesim.tune.candidates.COLUMNS`, for the parameters ``theta``
+        [parameter]."""
         theta = theta + self.shift
         candidate = np.zeros(len(COLUMNS))
         candidate[3:5] = self.specimen.bow
@@ -163,8 +164,11 @@ class Problem:
         return thetas[:, self.names.index("release")]
 
     def _base_velocity(self, last: int) -> np.ndarray | None:
-        """Returns the velocity of the base up to the tick after the ``last`` one [tick, 3] m/s; None if the base
-        rests."""
+        """Returns the velocity of the shaken base at ticks 0 to ``last`` + 1: [tick, 3] m/s; None if the base is not
+        shaken.
+
+        ``last``: last tick at which the simulated motion is compared with the track.
+        """
         if self.shaking is None:
             return None
         return self.shaking.velocity(self.track.time[0] + self.candidates.dt * np.arange(last + 2))
@@ -201,7 +205,8 @@ class Problem:
         return theta - self.shift
 
     def _origin(self, thetas: np.ndarray) -> np.ndarray:
-        """Returns the origin of the markers for each of the ``thetas`` [n, column] m."""
+        """Returns the origin that is added to simulated positions, in the columns of the track: [n, column] m. It is 0
+        unless it is fitted. ``thetas`` [n, parameter]: parameters of each candidate."""
         axis = np.nonzero(self.track.tracked)[1]
         if not self.origins:
             return np.zeros((len(thetas), len(axis)))
@@ -232,7 +237,8 @@ class Problem:
         return Evaluation(x[0][seen], jacobian, *self._extra(theta))
 
     def _extra(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the extra rows of the force reading and the priors, and their derivatives."""
+        """Returns the residuals [row] of the force reading and the priors, in standard deviations, and their
+        derivatives [row, parameter]."""
         values = []
         rows = []
         for i, prior in enumerate(self.priors):

@@ -24,13 +24,13 @@ from vinesim.tune.trajectory import Trajectory, TrajectoryError
 STEP_PHASE = 0.1
 """[rad] Phase of the first mode in one step of the simulation; the modulus error before correction is then 0.2 %."""
 PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",), "rest": ("bow_y", "bow_z")}
-"""Parameters that can be fitted, and their columns of a candidate."""
+"""Parameters that can be fitted, and their columns in :data:`vinesim.tune.candidates.COLUMNS`."""
 CONTRADICTS = 4.0
-"""[standard deviations] A fitted mass further than this from its prior cannot be a mass of wood."""
+"""[standard deviations] Distance of a fitted mass from its prior beyond which it cannot be a mass of wood."""
 WIDE = 0.5
 """Width of the swing as a fraction of the plant's length [1]. A larger swing suggests a wrong unit."""
 UNEXPLAINED = 1.3
-"""[1] A fit has failed if its residuals exceed those of a damped sinusoid by this factor."""
+"""[1] Ratio of a fit's residuals to the residuals of a damped sinusoid from which the fit has failed."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
 """[period] Growing durations after the release that are fitted if fitting the whole track at once fails."""
 MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
@@ -157,8 +157,10 @@ def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> N
 
 
 def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluation, np.ndarray]:
-    """Returns the minimum near ``theta``, its evaluation and noise. If fitting the whole track at once fails, growing
-    parts of it are fitted."""
+    """Returns the parameters at the minimum near ``theta``, their evaluation, and the noise [column] m.
+
+    If fitting the whole track at once fails, growing parts of the track are fitted one after the other.
+    """
     features = problem.features
     best = _settle(problem, theta, features.noise)
     if _left(problem, best[1]) <= UNEXPLAINED * features.noise:
@@ -173,7 +175,8 @@ def _minimise(problem: Problem, theta: np.ndarray) -> tuple[np.ndarray, Evaluati
 
 
 def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarray, Evaluation, np.ndarray]:
-    """Minimise, estimate the noise [column] m from the residuals, and repeat if the weights change.
+    """Minimise the loss from ``theta`` on, estimate the noise [column] m from the residuals, and repeat if the weights
+    change.
 
     Returns parameters, evaluation and noise.
     """
@@ -218,7 +221,8 @@ def _look_for_minima(
 
 
 def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> Features:
-    """Returns the features of the fitted candidate without noise, at the times of the track."""
+    """Returns frequency, damping and other features of the fitted plant's swing without noise, at the times of the
+    track."""
     position = np.full(problem.track.position.shape, np.nan)
     position[:, problem.track.tracked] = model
     release = float(theta[problem.names.index("release")]) if problem.begins else None

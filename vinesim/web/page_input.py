@@ -1,4 +1,5 @@
-"""Messages of a page: the last state that it has drawn, its viewpoint, and poses of its person's head and hands."""
+"""Messages that a page (browser tab) sends: the last state that it has drawn, its viewpoint, and the poses of its
+person's head and hands."""
 
 from __future__ import annotations
 

@@ -29,7 +29,8 @@ from vinesim.web.voice_socket import Sound, VoiceSocket
 log = logging.getLogger(__name__)
 
 WINDOW = 2
-"""Largest number of states in flight to one page. Without a limit a page on a busy machine was 0.4 to 1 s late."""
+"""Largest number of states that were sent to one page and that it has not drawn yet. Without a limit a page on a busy
+machine was 0.4 to 1 s late."""
 _MAX_INPUT = 8192
 """Longest message of a page [B]."""
 _NEEDS_HTTPS = "this page needs https: open the address that the client has printed, with https:// and its token"
@@ -50,13 +51,15 @@ _POLICY = "; ".join(
 
 
 class World(Protocol):
-    """Interface of the world to pages. All methods are called in the server's thread.
+    """Interface of an object that provides the world to pages (connected browser tabs) and takes their input. All
+    methods are called in the server's thread.
 
     Messages are encoded by :mod:`vinesim.web.array_message`.
     """
 
     def scene(self) -> bytes:
-        """Returns a message with everything that does not change."""
+        """Returns a message with everything that does not change while a page is open, such as ground, textures and
+        light."""
         ...
 
     def plants(self, place: np.ndarray) -> bytes:
@@ -69,16 +72,16 @@ class World(Protocol):
         ...
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Returns tick and message of the newest state, with everything moved after tick ``since``; None without
-        changes."""
+        """Returns the tick of the newest state, and a message with everything that has moved after tick ``since``; None
+        without changes."""
         ...
 
     def take(self, page: int, said: PageInput) -> None:
-        """Handle a message of a page; pages are counted from 0."""
+        """Apply a message of a page. ``page``: number of the page, counted from 0; ``said``: content of the message."""
         ...
 
     def leave(self, page: int) -> None:
-        """Called when a page has disconnected."""
+        """Called when the page with this number has disconnected."""
         ...
 
 
@@ -95,7 +98,7 @@ class PageServer:
         token: str | None = None,
         sound: Sound | None = None,
     ) -> None:
-        """Prepare to serve a world.
+        """Start the server of a world.
 
         Args:
             world: the world to show.
@@ -277,7 +280,9 @@ class PageServer:
     async def _read(
         self, page: int, socket: web.WebSocketResponse, flight: collections.deque[int], fresh: asyncio.Event
     ) -> None:
-        """Handle the messages of a page. ``flight``: ticks of the states that the page has not drawn yet."""
+        """Read the messages of a page until it disconnects, and pass them to the world. ``page``: number of the page.
+        ``flight``: ticks of the states that were sent and that the page has not drawn yet. ``fresh``: set when the page
+        can take a state."""
         async for message in socket:
             if message.type is not WSMsgType.TEXT or (said := decode_input(message.data)) is None:
                 if self.refused == 0:

@@ -40,7 +40,7 @@ _PACE = 2.5 / FRAME
 
 
 class PageEars(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Abilities of a page."""
+    """Sound formats that a page (browser tab) can play."""
 
     opus: bool
     """Whether the page can decode Opus."""
@@ -50,14 +50,14 @@ _ears = msgspec.json.Decoder(PageEars)
 
 
 class PageVoice:
-    """The connection to one page; may be used from any thread."""
+    """The connection for sound to one page (browser tab). May be used from any thread."""
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
         self._fresh = asyncio.Event()
         self._waiting: collections.deque[bytes | str] = collections.deque()
         self.ears: PageEars | None = None
-        """Abilities of the page; None until it has sent them."""
+        """Sound formats that the page can play; None until the page has sent them."""
         self.dropped = 0
         """Number of frames dropped because the page did not receive them in time."""
 
@@ -142,7 +142,7 @@ class VoiceSocket:
             await socket.close()
 
     def _take(self, page: PageVoice, kind: WSMsgType, data: bytes | str) -> bool:
-        """Handle a message of a page. Returns whether the message is valid."""
+        """Store the page's sound formats, or pass on its frame of sound. Returns whether the message is valid."""
         if kind is WSMsgType.TEXT:
             try:
                 ears = _ears.decode(data)

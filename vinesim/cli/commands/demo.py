@@ -50,7 +50,7 @@ def demo(
     \b
     Examples:
       vinesim demo
-      vinesim demo --seconds 30 --seed 3 --out /tmp/run
+      vinesim demo --seconds 30 --seed 3 --out run
       vinesim demo --scene my-block.toml --robot my-robot.urdf --headless
       vinesim demo --real-time-factor 0.5
       vinesim demo --job pick --seed 5

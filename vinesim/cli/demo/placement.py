@@ -32,8 +32,8 @@ def choose_poses(scene: Scene, model: Model) -> tuple[int, tuple[list[str], list
 
 
 def visitor_pose(scene: Scene) -> list[str] | None:
-    """Returns the pose of a visitor that watches a task, next to the picker, towards the second start place. None if
-    the scene has no second start place."""
+    """Returns command line options for the pose of a visitor that watches a task: next to the picker, towards the
+    second start place. None if the scene has no second start place."""
     if len(scene.spawns) < 2:
         return None
     here, there = (start_poses.spawn_pose(scene, i)[:2] for i in (0, 1))

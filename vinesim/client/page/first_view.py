@@ -9,16 +9,17 @@ from vinesim.core import frames
 from vinesim.scene.model import Model
 
 NEAR = 3.0
-"""An actor nearer than this to a tree is viewed over its shoulder [m]. GUESSED."""
+"""Distance from the nearest tree below which an actor is viewed over its shoulder [m]. GUESSED."""
 BESIDE = 0.25
-"""Angle of the viewpoint to the side of the line behind an actor [rad], used if plants hide the actor more at other
-angles. A phone held upright still shows an actor at this angle from the middle."""
+"""Angle between the line straight behind an actor and the line from the actor to the viewpoint [rad], used if plants
+hide the actor more at larger angles. The picture of a phone held upright still contains the actor at this angle."""
 YAWS = (FOLLOW_YAW, -FOLLOW_YAW, 0.45, -0.45, BESIDE, -BESIDE)
-"""Angles of the viewpoint to the side of the line behind an actor among vines, in order of preference [rad]."""
+"""Tried angles between the line straight behind an actor among vines and the line from the actor to the viewpoint
+[rad], in order of preference."""
 HEAD = 1.3
 """Height of the point of an actor that must be visible [m]."""
 HIDING = 0.3
-"""Parts of plants nearer than this to the line of sight hide the actor with their leaves [m]. GUESSED."""
+"""Distance from the line of sight below which a part of a plant hides the actor with its leaves [m]. GUESSED."""
 AROUND = 2.5
 """Radius of the group of trees around the tree nearest to a distant actor [m]. GUESSED."""
 BEFORE_VINES = (2.5, 3.5, 4.5, 5.5, 6.5)
@@ -26,13 +27,13 @@ BEFORE_VINES = (2.5, 3.5, 4.5, 5.5, 6.5)
 BEARINGS = 32
 """Number of tried directions of the viewpoint around the group of trees nearest to a distant actor."""
 AWAY = (0.15, 0.55)
-"""Range of angles of a distant actor from the middle of the picture [rad]; a desktop shows 0.8."""
+"""Accepted range of the angle between a distant actor and the middle of the picture [rad]. A desktop shows 0.8."""
 FREE = 0.7
 """Smallest distance of any part of a plant from the viewpoint [m], because near leaves fill the picture. GUESSED."""
 MOST_HIDING = 3
 """Largest number of parts of plants that may hide a distant actor. GUESSED."""
 LARGE = 8.0
-"""Vines beyond this distance from the viewpoint are ignored when a picture is rated [m]. GUESSED."""
+"""Distance from the viewpoint beyond which vines are ignored when a picture is rated [m]. GUESSED."""
 FIELD = 0.78
 """Half of the horizontal field of view of a rated picture [rad]."""
 COLUMNS = 24

@@ -14,13 +14,15 @@ from vinesim.web.page_input import ReplayCommand
 from vinesim.web.page_server import PageServer
 
 LEAD = 1.0
-"""To seek a time, playback begins this much earlier [s], so that actors and clocks are known at that time."""
+"""Time before a requested position at which playback begins [s], so that actors and clocks are known at the
+position."""
 REPEAT = 50
-"""Number of steps between two states while playing is paused, for pages that connect meanwhile."""
+"""Number of steps between two states that are sent while playback is paused, for pages that connect meanwhile."""
 
 
 class PageReplay:
-    """A spectator in a recording, and its pages. One loop calls :meth:`step`; pages call from the server's thread."""
+    """A recording that pages (browser tabs) play: a spectator in the recorded world. One loop calls :meth:`step`; pages
+    call from the server's thread."""
 
     def __init__(
         self,
@@ -65,7 +67,8 @@ class PageReplay:
         }
 
     def take(self, command: ReplayCommand) -> None:
-        """Set the command of a page, replacing earlier commands since the last step. Safe from any thread."""
+        """Set the command of a page for the next step. It replaces commands since the last step. Safe from any
+        thread."""
         with self._lock:
             before = None if self._command is None else self._command.seek
             seek = before if command.seek is None else command.seek

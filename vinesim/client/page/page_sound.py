@@ -1,4 +1,5 @@
-"""Sound of one client for its pages: all pages hear what the actor hears; the first page that speaks is its voice.
+"""Sound of one client for its pages (browser tabs): all pages hear what the client's actor hears, and the first page
+that speaks is the actor's voice.
 
 A page that only watches a robot hears what the robot hears, and cannot speak.
 """
@@ -28,22 +29,23 @@ class PageSound:
         self._kind = client.replicator.hello.kind
         self._pages: dict[PageVoice, _Page] = {}
         self._speaker: PageVoice | None = None
-        """The page that is the actor's voice."""
+        """The page that speaks for the actor; None before any page has spoken."""
 
     def join(self, page: PageVoice) -> None:
-        """Let a page listen from now on."""
+        """Start to send a page what the actor hears."""
         self._pages[page] = listener = _Page(self, page)
         self._client.sound.voice_of(self._name)
         self._client.sound.listen(self._name, listener)
 
     def leave(self, page: PageVoice) -> None:
-        """Handle that a page has disconnected."""
+        """Stop sending sound to a page that has disconnected. If the page spoke for the actor, another page may do so
+        now."""
         self._client.sound.stop_listening(self._pages.pop(page))
         if self._speaker is page:
             self._speaker = None
 
     def speak(self, page: PageVoice, codec: Codec, data: bytes, is_main: bool) -> None:
-        """Handle a frame of sound from a page."""
+        """Send a frame of sound from a page as the actor's voice, unless the page may not speak."""
         if self.objection(page):
             return
         self._speaker = page
@@ -60,7 +62,8 @@ class PageSound:
         return ""
 
     def status(self, page: PageVoice, tones: dict[str, list[float]]) -> str:
-        """Returns the status text for a page. It is sent when it changes."""
+        """Returns the sound status of a page as JSON: why it may not speak, which frames it shall send, ``tones`` of
+        robots, and how loudness falls with distance. The caller sends it to the page when it changes."""
         voice = self._client.sound.voice_of(self._name)
         objection = self.objection(page)
         send = [] if objection else ["main"] * voice.is_heard + ["pcm"] * voice.is_heard_plain

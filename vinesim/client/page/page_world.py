@@ -1,4 +1,7 @@
-"""The world as sent to pages: first all primitives of the cameras, then the poses of moved bodies."""
+"""The world as the server sends it to pages, which are the browser tabs that show a client.
+
+A page first receives the shapes of everything (the primitives that cameras render), then the poses of moved bodies.
+"""
 
 from __future__ import annotations
 
@@ -36,14 +39,16 @@ GRASS = 25.0
 MAX_PRIMITIVES = 400_000
 """Largest number of primitives of plants and ground in a page at a time: 32 MB."""
 LOADED = {int(materials.STEM): 0.4, int(materials.GRASS): 0.5, int(materials.BERRY): 1.0}
-"""Loading distance by material, relative to berries: about the distance up to which a page draws them. GUESSED."""
+"""Distance up to which a page loads primitives of a material, relative to the distance for berries: about the distance
+up to which the page draws them. GUESSED."""
 ELSE_LOADED = 2.0
-"""Loading distance of leaves and wood, relative to berries. GUESSED."""
+"""Distance up to which a page loads leaves and wood, relative to the distance for berries. GUESSED."""
 AMONG_VINES = 1.08
 """Ratio of a page's exposure to the usual daylight exposure. Automatic exposure of cameras among vines yields 1.06 to
 1.12 in the pictures of docs/web.md."""
 MAX_SENTENCES = 4
-"""Largest number of recent closings of shears in a state, enough for both hands between two states."""
+"""Largest number of texts about recent closings of the person's shears in one state for a page. Enough for both hands
+between two states."""
 BLADE_STEPS = 5
 """Number of steps between two reports of the wood that is between the blades of shears."""
 _TURN_STEPS = 32767
@@ -58,16 +63,18 @@ class Replay(Protocol):
         ...
 
     def take(self, command: ReplayCommand) -> None:
-        """Handle a command of a page; called in the server's thread."""
+        """Execute a command of a page: play, pause or seek. Called in the server's thread."""
         ...
 
 
 class PageWorld:
-    """The world of one client as its pages receive it. The client's loop writes it, the server's thread reads it.
+    """The world of one client as its pages (browser tabs) receive it.
 
-    Primitives are built when the first page requests them. A page starts with all trees at their rest poses. This
-    object keeps the tick in which each tree last moved, and sends a page the trees that have moved since the last state
-    sent to that page.
+    The client's loop writes it, and the server's thread reads it.
+
+    The primitives (shapes) are built when the first page requests them. A page starts with the poses that the plants
+    had when this object was made. This object stores the tick in which each tree last moved. A state for a page
+    contains the trees that have moved since the last state for that page.
     """
 
     def __init__(
@@ -77,7 +84,7 @@ class PageWorld:
         most: int = MAX_PRIMITIVES,
         replay: Replay | None = None,
     ) -> None:
-        """Show a client to pages.
+        """Make the world of a client for its pages.
 
         Args:
             client: the client.
@@ -109,12 +116,13 @@ class PageWorld:
         self._rigid_version = 0
         self._rigid = b""
         self._lamps: dict[str, np.ndarray] = {}
-        """Changes of lights: rows within the rigid primitives, surfaces and materials of primitives whose lights have
-        changed."""
+        """Changed indicator lights, for the state of pages: index of each changed primitive among the primitives of
+        rigid bodies, and its present surface and material."""
         self._laid_out: dict[str, np.ndarray] = {}
-        """Values of the rigid primitives as pages first load them."""
+        """Columns of the primitives of rigid bodies, with the values that pages load before lights change."""
         self._has_shone = np.zeros(0, bool)
-        """Whether each row of the rigid primitives has ever differed from ``_laid_out`` [row]."""
+        """Whether each primitive of a rigid body has ever differed from ``_laid_out``, because its light has changed
+        [row]."""
         self._visuals: tuple[Any, ...] | None = None
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
@@ -136,7 +144,8 @@ class PageWorld:
     # ------------------------------------------------------------------ in the client's loop
 
     def show(self, client: Client) -> None:
-        """Show another client of the same vineyard from this call on. All moved trees are sent again."""
+        """Replace the shown client by another client of the same vineyard. Pages receive all trees again that had
+        moved."""
         with self._lock:
             self._ticks_before += self._client.physics.tick + 1
             self._client = client
@@ -154,9 +163,10 @@ class PageWorld:
         return self._client.physics.tick + self._ticks_before
 
     def collect(self, server: PageServer, *, again: bool = False) -> None:
-        """After a step: record what has moved, take a snapshot if a page is connected, and move a spectator's eyes.
+        """Record the results of a step for pages: what has moved, and a snapshot if a page is connected. Also applies
+        what pages have requested: the eyes of a spectator, and the intention of a person.
 
-        ``again``: there was no step, but pages must be informed of another change.
+        ``again``: whether pages must receive a new state although there was no step.
         """
         physics = self._client.physics
         self._ticks_before += again
@@ -195,7 +205,7 @@ class PageWorld:
         server.notify()
 
     def _follow_wires(self, wires: SegmentPoses) -> None:
-        """Record which segments of wires have moved."""
+        """Record which segments of wires have moved in the last step. ``wires``: poses of the displaced segments."""
         which = np.union1d(self._wires_away, wires.segment).astype(int)
         now = self._wires.poses(which, wires)
         moved = which[(now != self._wire_q[which]).any(1)]
@@ -204,7 +214,7 @@ class PageWorld:
         self._wires_away = wires.segment
 
     def _follow_reset(self) -> None:
-        """After a reset: all trees are at rest, so send pages the trees that had moved."""
+        """Mark all trees that had moved as moved again, so that pages receive their poses after a reset."""
         self._moved_at[self._moved_at >= 0] = self._tick + 1
         self._wire_moved_at[self._wire_moved_at >= 0] = self._tick + 1
         if self._sway is not None:
@@ -213,8 +223,12 @@ class PageWorld:
     # ------------------------------------------------------------------ in the server's thread
 
     def scene(self) -> bytes:
-        """Returns a message with fixed things and plants at rest, the tables of leaf outlines, and the light of the
-        ground."""
+        """Returns the message with which a page starts: everything that does not change while the page is open.
+
+        It contains the settings of the page, the primitives of plants and ground near the first viewpoint, the initial
+        poses of all bodies, the textures, the daylight, and how much of the sky is visible from each part of the
+        ground. For a person's page it also contains the objects that the person can reach for.
+        """
         primitives = self._lay_out()
         scene = self._client.scene
         outline, hull = textures.leaf_outlines()
@@ -260,13 +274,15 @@ class PageWorld:
         )
 
     def plants(self, place: np.ndarray) -> bytes:
-        """Returns the message of :meth:`scene` for the part around ``place`` [3] m, in a vineyard that is too large for
-        a page."""
+        """Returns a message with the primitives of plants and ground around ``place`` [3] m.
+
+        A page requests it in a vineyard that is too large to be loaded as a whole.
+        """
         reach, plants = _nearest(self._lay_out(), place, self._most)
         return array_message.encode({"reach": reach, "place": place.tolist()}, plants)
 
     def _lay_out(self) -> Primitives:
-        """Returns the primitives of plants and ground; builds them at the first call."""
+        """Returns the primitives of the vineyard, and builds them at the first call."""
         if self._primitives is None:
             load_kernels(CameraMount.kind)
             self._sway = Sway(self._client.model)
@@ -274,12 +290,16 @@ class PageWorld:
         return self._primitives
 
     def rigid(self) -> bytes:
-        """Returns a message with the present robots, people, boxes and picked bunches."""
+        """Returns a message with the shapes of the present robots, people, boxes and picked bunches."""
         return self._rigid
 
     def state(self, since: int) -> tuple[int, bytes] | None:
-        """Returns a message with bodies of trees that moved after tick ``since``, all rigid bodies, and the picked
-        bunches."""
+        """Returns the newest state as a message, with its tick before it; None if the state is not newer than tick
+        ``since``.
+
+        The message contains the poses of the bodies of trees that moved after tick ``since``, the poses of all rigid
+        bodies, and which bunches are picked.
+        """
         with self._lock:
             newest = self._snapshot
         if newest is None or self._primitives is None or newest[0] <= since:
@@ -323,7 +343,12 @@ class PageWorld:
         return tick, state
 
     def _follow_visuals(self, primitives: Primitives, snapshot: Snapshot) -> None:
-        """Prepare the rigid bodies for pages, unless only lights have changed, which are part of every state."""
+        """Encode for pages the shapes of the rigid bodies (robots, people, boxes, picked bunches) of a snapshot.
+
+        If only colours of indicator lights differ from the previous shapes, the changed colours become part of every
+        state. Otherwise a new message for :meth:`rigid` is encoded, which pages load again. ``primitives`` are posed to
+        the ``snapshot``.
+        """
         primitives.update(snapshot)
         before = self._visuals
         self._visuals = snapshot.visuals
@@ -351,8 +376,8 @@ class PageWorld:
         )
 
     def take(self, page: int, said: PageInput) -> None:
-        """Apply the viewpoint and the person's state in a page's message, if this page is the one that controls
-        them."""
+        """Apply a message from a page: its overlays and replay command, and its viewpoint and person if this page
+        controls the actor. ``page``: number of the page."""
         (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
         if said.replay is not None and self._replay is not None:
             self._replay.take(said.replay)
@@ -367,13 +392,13 @@ class PageWorld:
                 self._intention = said.person.intention
 
     def leave(self, page: int) -> None:
-        """Handle that a page has disconnected: another page may then control the person."""
+        """Forget a page that has disconnected. If it controlled the person or the eyes, another page may do so now."""
         self._overlay_pages.discard(page)
         if page == self._driver:
             self._driver = None
 
     def _bodies(self, trees: np.ndarray) -> np.ndarray:
-        """Returns the bodies of ``trees``, tree by tree."""
+        """Returns the indices of all bodies of ``trees`` [k], tree by tree."""
         model = self._client.model
         first = model.tree_first[trees]
         size = model.tree_size[trees]
@@ -392,14 +417,15 @@ class PageWorld:
 
 
 def _light(height: float) -> dict[str, Any]:
-    """Returns the light as for cameras, in linear RGB. ``height``: sine of the sun's elevation [1]."""
+    """Returns the daylight for pages, as JSON values: colours (linear RGB), brightness and exposure, equal to those of
+    cameras. ``height``: sine of the sun's elevation [1]."""
     light = OutdoorLight.of(height)
     colours = {name: getattr(light, name).tolist() for name in ("sun", "sky", "haze", "ground", "canopy", "balance")}
     return colours | {"dim": light.dim, "exposure": AMONG_VINES * usual_exposure(light.brightness)}
 
 
 def _bytes(values: np.ndarray) -> np.ndarray:
-    """Returns values from 0 to 1 as bytes."""
+    """Returns an array with values from 0 to 1 as uint8, from 0 to 255."""
     return np.round(255.0 * np.clip(values, 0.0, 1.0)).astype(np.uint8)
 
 
@@ -419,7 +445,7 @@ def _differ_in_lights_only(before: tuple[RigidVisual, ...], now: tuple[RigidVisu
 
 
 def _tracked(person: TrackedPerson) -> TrackedPoints:
-    """Convert a page's person to tracked points for its avatar."""
+    """Convert the head and hands in a page's message to tracked points for the simulated person."""
     hands = person.left, person.right
     left, right = (None if hand is None else np.array(hand.pose) for hand in hands)
     return TrackedPoints(
@@ -457,7 +483,8 @@ def _turns(pose: np.ndarray) -> np.ndarray:
 
 
 def _columns(primitives: Primitives, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
-    """Returns the values of primitives in the format of pages."""
+    """Returns the primitives ``rows`` [n] in the format of pages: shape [n, 16], surface (colour and visible sky) [n,
+    4] uint8, material [n], and index of the body that carries each primitive [n]."""
     columns = primitives.local_columns(rows)
     shape = np.concatenate([columns[name] for name in "abcd"], 1).astype(np.float32)
     colour = np.round(255.0 * np.clip(columns["tint"], 0.0, 1.0) ** (1.0 / 2.2))
@@ -497,7 +524,8 @@ def _nearest(primitives: Primitives, place: np.ndarray, most: int) -> tuple[floa
 
 
 def _clusters(primitives: Primitives, which: slice, row: int = 0) -> dict[str, np.ndarray]:
-    """Returns clusters in the format of pages: runs of primitives, counted from ``row``, and their bounding spheres."""
+    """Returns clusters (runs of adjacent primitives) in the format of pages: first primitive, size, kind, bunch and
+    bounding sphere of each. ``which``: the clusters; ``row``: index of the primitive that counts as the first."""
     return {
         "first": (primitives.cluster_first[which] - row).astype(np.uint32),
         "size": primitives.cluster_size[which].astype(np.uint32),
@@ -515,7 +543,7 @@ MAX_CONTACTS = 300
 
 
 def owners(client: Client) -> dict[str, str]:
-    """Returns the names of the owners of all owned objects, by the name of the object."""
+    """Returns the owner of each object that an actor owns: actor's name by object's name."""
     found = {}
     for replicator in client.replicators.values():
         for number in sorted(replicator.known):

@@ -96,7 +96,7 @@ class Rows:
 
 
 MOVED = 1e-6
-"""A bunch has moved when its centre is further than this from its position before the touch [m]."""
+"""Distance of a bunch's centre from its position before a touch from which on the bunch counts as moved [m]."""
 
 
 def touch_to_motion(rows: Rows) -> int | None:
@@ -118,8 +118,8 @@ def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[st
     """Returns the distance of the remote copy of a bunch from the owner's bunch at equal times of the host's clock
     [mm].
 
-    It is evaluated while the owner's bunch was displaced by more than ``threshold`` [m] and the other client received
-    its states. It includes the delay of the network. None if there is no such time.
+    The distance is evaluated at times at which the owner's bunch was displaced by more than ``threshold`` [m] and the
+    other client received its states. It includes the effect of the network's delay. None if there are no such times.
     """
     if len(remote.clock) < 2:
         return None
@@ -145,7 +145,8 @@ def remote_error(local: Rows, remote: Rows, threshold: float = 0.002) -> dict[st
 
 
 def touch(path: pathlib.Path, traces: dict[str, Rows], title: str) -> None:
-    """Plot force [N] and displacement [mm] against the host's clock into a PNG file, with one line for each client.
+    """Plot force [N] and displacement [mm] of a bunch against the host's clock into a PNG file, with one line for each
+    client.
 
     Shading shows the time from the first to the last state that a client received from the owner of the bunch.
     """

@@ -33,7 +33,7 @@ from vinesim.scene.values import RobotUpdate
 log = logging.getLogger(__name__)
 
 CHOICES = tuple(dict.fromkeys(family.recorded_with for family in FAMILIES.values() if family.recorded_with))
-"""Kinds of messages that ``--only`` can choose. Presence and hellos are always recorded."""
+"""Groups of messages that the option ``--only`` can choose. Presence and hellos of actors are always recorded."""
 
 OBSERVER_SPACING = 7.0
 """Distance between observers in an area [m]. Every point is then within the interest radius (5 m) of an observer."""
@@ -42,7 +42,7 @@ MAX_OBSERVERS = 16
 """Largest number of observers in one area."""
 
 COMPANY_MARGIN = 1.0
-"""Actors may subscribe up to this distance beyond the end of the full rate [m]; actors further away do not count."""
+"""Distance beyond the range of a pose layer up to which another actor may still be the subscriber of the layer [m]."""
 
 
 class AreaTooLarge(ValueError):
@@ -89,8 +89,8 @@ class Recorder:
         self._positions: dict[str, np.ndarray] = {}
         self._far_poses: Subscription | None = None
         self._faster: dict[tuple[str, PoseLayer], tuple[Publisher, Subscription | None]] = {}
-        """By actor and faster pose layer: a publisher that reports whether the layer has subscribers, and this
-        recorder's subscription to the layer."""
+        """For each actor and each pose layer after the first: a publisher that reports whether the layer has
+        subscribers, and this recorder's subscription to the layer, if any."""
         self._log_time = 0
 
     @property
@@ -212,8 +212,9 @@ class Recorder:
     # ------------------------------------------------------------ who is heard by whom
 
     def _update_pose_subscriptions(self) -> None:
-        """Subscribe to poses that another actor may receive: slow pose layers of all actors, fast layers of actors with
-        company."""
+        """Subscribe to the poses that actors may receive: the slowest pose layer of all actors, and each faster layer
+        that another actor may have subscribed to. A pose layer is a share of an actor's poses
+        (:data:`vinesim.net.replication.interest.POSE_LAYERS`)."""
         has_company = self._everything or len(self._live) >= 2
         if has_company and self._far_poses is None:
             self._far_poses = self.bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_ALL)
@@ -240,9 +241,9 @@ class Recorder:
                 self._faster[name, layer] = publisher, None
 
     def _has_company(self, name: str, layer: PoseLayer) -> bool:
-        """Returns whether another actor may be the subscriber of an actor's pose layer.
+        """Returns whether another actor is near enough to be the subscriber of the actor's pose ``layer``.
 
-        Otherwise the subscriber is a recorder, and two recorders would keep each other subscribed for ever.
+        If not, the subscriber is another recorder, and two recorders would keep each other subscribed for ever.
         """
         if name not in self._positions:
             return False

@@ -154,7 +154,7 @@ class ReplayBus:
 
     @property
     def time(self) -> float:
-        """Network time [s]."""
+        """Network time up to which the recording has been played [s]."""
         return self._playhead.time
 
     @property
@@ -296,7 +296,7 @@ class Replay:
         start: float = 0.0,
         end: float | None = None,
     ) -> None:
-        """Prepare a replay.
+        """Begin a replay of a recording to a network.
 
         Args:
             recording: the recording.

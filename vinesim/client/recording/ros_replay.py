@@ -15,7 +15,7 @@ from vinesim.ros.world_node import WorldNode
 from vinesim.scene.ids import Organ
 
 ENVIRONMENT_PERIOD = 0.1
-"""Period of the true poses of the environment [s]."""
+"""Simulated time between two messages with the true poses of boxes, bunches and people [s]."""
 
 
 class RosReplay:

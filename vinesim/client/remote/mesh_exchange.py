@@ -123,7 +123,7 @@ class MeshExchange:
             return {} if robot is None else dict(robot.received)
 
     def refuse(self, name: str) -> None:
-        """Count the received meshes of a robot as unusable, and use boxes from now on."""
+        """Count the received meshes of a robot as unusable, and stop using them, so that boxes replace them."""
         with self._lock:
             robot = self._robots.get(name)
             if robot is not None:

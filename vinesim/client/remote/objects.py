@@ -32,14 +32,15 @@ that a hand has slipped off the copy or the original. Below it the share is inte
 ACTIVATION_PERIOD = 20
 """Ticks between two activations of dormant bunches."""
 CARRIED_DISTANCE = 3.0
-"""The record of an object that rests on an actor is published again after this distance [m]. It is half a cell, so
-that clients that join later receive the record from the cells around them."""
+"""Distance over which an actor carries a resting object before the object's record is published again [m]. It is half a
+cell, so that clients that join later receive the record from the cells around them."""
 ACTIVATION_BATCH = 4
 """Largest number of dormant bunches that get bodies at once; making a body takes milliseconds."""
 
 
 class ObjectSync:
-    """One client's record of shared objects and of changes to trees. Numbers are ids of :mod:`vinesim.scene.ids`."""
+    """One client's record of shared objects and of changes to trees. Arguments ``number`` are object ids, by
+    :mod:`vinesim.scene.ids`."""
 
     def __init__(
         self, physics: Physics, local_actors: Collection[str], is_present: Callable[[str], bool] = lambda _: True
@@ -49,13 +50,13 @@ class ObjectSync:
         self._local_actors = local_actors
         self._is_present = is_present
         self._remote_updates: dict[int, ObjectUpdate] = {}
-        """Last states of the objects that remote actors are moving."""
+        """Last received state of each object that a remote actor is moving, by object id."""
         self._resting: dict[int, RetainedRecord] = {}
-        """Objects at rest according to a retained record."""
+        """Retained record of each object that is at rest according to its record, by object id."""
         self._supported: dict[str, set[int]] = {}
-        """Objects at rest on each parent frame except the ground."""
+        """Ids of the objects at rest on each parent frame, except the ground, by name of the frame."""
         self._changed_trees: set[int] = set()
-        """Trees changed by picks or cuts."""
+        """Indices of the trees that picks or cuts have changed."""
         self._cut_bodies: dict[int, list[int]] = {}
         """Bodies that were cut off each tree, ascending."""
         self._detachments: tuple[Detachment, ...] = ()
@@ -196,7 +197,8 @@ class ObjectSync:
             self._changed_trees.add(self._tree_of(bunch))
 
     def _hold_resting_objects(self) -> None:
-        """Move resting objects with their remote supports, and put back objects that only remote copies have pushed."""
+        """Move resting objects with the supports that remote actors move, and put back objects that only copies of
+        remote actors have pushed."""
         if not self._resting:
             return
         moving = set(self.physics.support_tracker.moving)
@@ -253,7 +255,8 @@ class ObjectSync:
                     tracker.set_at_rest(number, GROUND, np.array(place))
 
     def touched_blend(self, update: TreeUpdate) -> float:
-        """Returns the share for :meth:`blend_tree` for a tree that an actor of this client touches."""
+        """Returns the share of the error by which :meth:`blend_tree` shall correct a tree in one step while an actor of
+        this client touches the tree."""
         here = self.physics.state.joint_q[self.physics.model.bodies_of(update.tree)].astype(float)
         return touched_share(float(dead_reckoning.angle_between(here, update.joint_q).max()))
 
@@ -278,7 +281,7 @@ class ObjectSync:
     # ------------------------------------------------------------------ to send
 
     def collect(self) -> None:
-        """After the step: record detachments and update the set of moving objects."""
+        """Record the detachments of the last step, and update the set of moving objects. Call it after every step."""
         self.physics.support_tracker.update()
         self._detachments = self.physics.detachments
         for detachment in self._detachments:
@@ -304,8 +307,11 @@ class ObjectSync:
         return [*detached, *trees]
 
     def touched_by(self, name: str, mine: Container[int]) -> list[int]:
-        """Returns the moving objects that a local actor touches, directly or through an object of ``mine``, or that
-        slip off it."""
+        """Returns the ids of the moving objects for which an actor of this client is responsible.
+
+        These are the objects that the actor ``name`` touches, the objects that touch one of ``mine``, and the objects
+        that slip off the actor. ``mine``: ids of the objects that the actor owns.
+        """
         tracker = self.physics.support_tracker
         touched = self.physics.touched
         found: set[int] = set()
@@ -353,7 +359,8 @@ class ObjectSync:
         return [*self.physics.sleep_monitor.restless.tolist(), *self.physics.support_tracker.moving]
 
     def read_state(self, number: int) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the state of an object, for :meth:`Replicator.send`."""
+        """Returns state and rate of an object for :meth:`Replicator.send`: joints of a tree ([n, 4], [n, 3] rad/s), or
+        pose [7] and velocity [6] of another object."""
         if not is_tree(number):
             return self.physics.support_tracker.object_state(number)
         here = self.physics.model.bodies_of(number)
@@ -396,7 +403,8 @@ class ObjectSync:
         ]
 
     def mark_resting(self, record: RetainedRecord | None) -> None:
-        """After a record of rest was sent: treat the object as at rest on this client, as all other clients do."""
+        """Treat an object as at rest after its retained record was sent, as all other clients do. ``record``: the
+        record; None: nothing was sent."""
         if record is not None and not record.moving and record.object in self.physics.support_tracker:
             self._set_resting(record.object, record)
             self.physics.support_tracker.set_at_rest(record.object, record.parent, np.array(record.pose))
@@ -416,7 +424,8 @@ class ObjectSync:
 
 
 def touched_share(away: float) -> float:
-    """Returns the share by which a touched copy is corrected in one step; ``away`` [rad]: largest error of a joint."""
+    """Returns the share of its error by which a touched copy of a tree is corrected in one step. ``away`` [rad]:
+    largest error of a joint."""
     return max(TOUCHED_BLEND_PER_STEP, BLEND_PER_STEP * min(1.0, away / FAR_ANGLE))
 
 

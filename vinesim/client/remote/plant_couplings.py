@@ -32,37 +32,48 @@ MAX_FORCE = 100.0
 """Largest force of a coupling [N]: the largest force of a hand (CANOPIES D6.4, section 3.1.1)."""
 
 MIN_FORCE = 1e-3
-"""Contacts with a smaller force are not sent [N]."""
+"""Smallest contact force for which a coupling is sent [N]."""
 
 SLIDE = 0.005
-"""A coupling is moved on its body when its point has slid by more than this [m]."""
+"""Distance by which the point of a coupling must slide on its body before the spring is attached at the new point
+[m]."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Tie:
-    """The tie that applies one coupling to a body."""
+    """The solver's tie (spring and damper) that applies one received coupling to a body."""
 
     tie: int
     point: np.ndarray
 
 
 class PlantCouplings:
-    """Makes couplings from this client's contacts, and ties for the couplings of other clients."""
+    """Makes the couplings of this client's actors, and applies the couplings that other clients send.
+
+    A coupling (:class:`vinesim.net.codec.forces.Coupling`) is a virtual spring. It stands for the contact of one
+    client's actor with a tree that another client simulates, too. This class applies a received coupling as a tie of
+    the plant solver: a spring and damper between a point of a body and an anchor in the world.
+    """
 
     def __init__(self, physics: Physics) -> None:
         self.physics = physics
         self.refused = 0
-        """Number of refused couplings: those that found no free tie in the solver, each counted once."""
+        """Number of received couplings that were not applied, because the solver had no free tie. Each is counted
+        once."""
         self._ties: dict[tuple[str, int], _Tie] = {}
         self._refused: set[tuple[str, int]] = set()
 
     @property
     def trees(self) -> set[int]:
-        """Trees that couplings of remote actors hold."""
+        """Indices of the trees on which couplings of other clients' actors act now."""
         return {int(self.physics.model.body_tree[body]) for _, body in self._ties}
 
     def of_actor(self, actor: str, trees: Collection[int]) -> list[Coupling]:
-        """Returns couplings for a local actor's contacts with ``trees`` in the last step."""
+        """Returns the couplings (virtual springs) to send for an actor of this client.
+
+        There is one coupling for each body that the actor touched in the last step. ``trees``: indices of the trees
+        whose contacts count. A contact with a berry cluster counts for the body of its bunch.
+        """
         model = self.physics.model
         found = {}
         for contact in self.physics.contacts if trees else ():
@@ -85,7 +96,11 @@ class PlantCouplings:
         return couplings
 
     def apply(self, couplings: Mapping[str, Collection[Coupling]]) -> None:
-        """Before a step: hold bodies by these couplings of remote actors, and release all others."""
+        """Apply the couplings (virtual springs) that other clients' actors have sent. Call it before every step.
+
+        ``couplings``: the couplings that are valid now, by actor. Springs of couplings that are no longer in it are
+        removed.
+        """
         if not (couplings or self._ties or self._refused):
             return
         wanted = {
@@ -125,7 +140,7 @@ class PlantCouplings:
         self.physics.plants.remove_tie(key[1], self._ties.pop(key).tie)
 
     def _carrier(self, body: int) -> int:
-        """Returns the body of the bunch for a berry cluster; ``body`` itself otherwise."""
+        """Returns the index of the bunch's body if ``body`` is one of its berry clusters; otherwise ``body`` itself."""
         model = self.physics.model
         tree = int(model.body_tree[body])
         while body - model.tree_first[tree] >= model.tree_core[tree]:
@@ -133,6 +148,6 @@ class PlantCouplings:
         return body
 
     def _is_attached(self, body: int) -> bool:
-        """Returns whether a body is on its plant; false for picked bunches."""
+        """Returns whether a body is still part of its plant: False for the body of a picked bunch."""
         bunch = np.flatnonzero(self.physics.model.bunch_body == body)
         return not len(bunch) or bool(self.physics.state.bunch_attached[bunch[0]])

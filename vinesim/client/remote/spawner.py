@@ -87,7 +87,8 @@ class RemoteSpawner:
         self._outdated.discard(name)
 
     def remove(self, name: str, copy: RemoteRobot | RemoteHuman) -> None:
-        """Start to remove the copy of an actor that has left; :meth:`removed` reports the end."""
+        """Start to remove the copy of an actor that has left. :meth:`removed` returns the actor's name when this is
+        done."""
         if self._executor is None:
             copy.remove()
             self._removed.append(name)

@@ -15,13 +15,13 @@ from vinesim.scene.values import TreeUpdate
 from vinesim.world import Physics
 
 CONTACT_MEMORY = 0.15
-"""Time after the end of a contact for which a copy still counts as pressed [s], so that a contact may open briefly.
-GUESSED."""
+"""Time after the end of a contact for which a tree's copy still counts as pressed [s], so that a contact may open
+briefly. GUESSED."""
 
 
 @dataclasses.dataclass(slots=True)
 class _Copy:
-    """One tree of another client."""
+    """The copy of one tree that an actor of another client owns."""
 
     update: TreeUpdate
     """Last state from the owner, with its time of arrival."""
@@ -52,7 +52,7 @@ class TreeCopies:
 
     @property
     def trees(self) -> KeysView[int]:
-        """Indices of the copied trees."""
+        """Indices of the trees of which this client moves copies."""
         return self._copies.keys()
 
     def apply(
@@ -67,7 +67,7 @@ class TreeCopies:
         """Before every step: take new states from owners and correct the copies; ``now``: time of the client's clock
         [s].
 
-        ``coupled_trees``: trees that couplings of other clients hold on this client.
+        ``coupled_trees``: trees on which couplings (virtual springs) of other clients' actors act.
         """
         solver = self.physics.contact_solver
         copies = self._copies

@@ -29,10 +29,11 @@ MAX_WAITING = 100
 """Largest number of frames of one actor that wait for the next step (two seconds); older frames are dropped."""
 
 RESTART = 0.08
-"""[s] A voice restarts if a frame is late by more than this; frames that are early by more than this are dropped."""
+"""[s] Largest difference between the arrival of a frame and the time at which it is due. Beyond it, a voice with a late
+frame restarts, and an early frame is dropped."""
 
 RESET = 2.0
-"""[s] Frames early by more than this show that the clock was set; the voice then restarts."""
+"""[s] Time by which a frame must be early to show that the clock was set. The voice then restarts."""
 
 
 class Spoken(NamedTuple):
@@ -78,12 +79,12 @@ class Listener(Protocol):
     def decodes_opus(self) -> bool: ...
 
     def hear(self, step: SoundStep) -> None:
-        """Take the sound of one step. It is called in the client's loop and must return at once."""
+        """Receive the sound of one step. The client's loop calls this method, which must return at once."""
         ...
 
 
 class Voice(NamedTuple):
-    """Audience of an actor."""
+    """Audience of an actor: whether other actors hear it, and in which codec."""
 
     may_speak: bool
     """Whether anyone may hear the actor."""
@@ -157,7 +158,7 @@ class SoundExchange:
     # ------------------------------------------------------------------ from any thread
 
     def listen(self, actor: str, listener: Listener) -> None:
-        """Pass the sound that reaches a local actor to a listener from now on."""
+        """Start to pass the sound that reaches a local actor to a listener."""
         self._listeners = [*self._listeners, (actor, listener)]
 
     def stop_listening(self, listener: Listener) -> None:

@@ -36,7 +36,7 @@ BOX_MASS = 1.6
 PERSON_HEIGHT = 1.75
 """[m] Height of a spawned person."""
 BUNCH_REACH = 0.35
-"""Space kept free around a bunch [m]; no bunch is longer."""
+"""Half edge of the bounding box that is reported for a bunch to be spawned [m]; no bunch is longer."""
 MAX_DISTANCE = 10_000.0
 """[m] Poses further from the origin are refused, because single precision does not resolve a millimetre there."""
 _UNKNOWN = np.full(6, np.nan)

@@ -127,7 +127,7 @@ GRASP_DEPTH = 0.06
 MIN_HAND_CLEARANCE = 0.005
 """[m] Smallest gap between the moving hand and anything but its bunch. GUESSED"""
 FULL_CLEARANCE = 0.03
-"""Gap from which on a wider gap does not improve the rating of a grasp [m]. GUESSED"""
+"""Largest gap between hand and obstacles that counts in the rating of a grasp [m]; wider gaps count as this. GUESSED"""
 BASE_CLEARANCE = 0.68
 """Free distance that a base with folded arms needs around its centre [m]."""
 BOX_AHEAD = 0.10
@@ -140,7 +140,7 @@ APPROACH_LENGTHS = (1.1, 0.8)
 LANE_HALF_WIDTH = 0.36
 """[m] Free distance that a base driving straight needs on either side of its centre."""
 OBSTACLE_RADIUS = 0.8
-"""[m] Obstacles further than this from a bunch cannot touch the hand."""
+"""[m] Distance from a bunch beyond which obstacles cannot touch the hand."""
 OBSTACLE_SPACING = 0.04
 """[m] Largest distance between the spheres that represent trellis and old wood."""
 MAX_CANDIDATES = 200
@@ -341,7 +341,8 @@ def plan_swap(model: Model, start: np.ndarray, full: int = 0, empty: int = 1) ->
 
 
 def turning_places(model: Model, box: int) -> list[np.ndarray]:
-    """Returns positions [2] m in front of the long sides of a box, with room to turn and a free lane to the box."""
+    """Returns positions [2] m in front of the long sides of a box, with room for a carrier to turn and to drive
+    straight to the box."""
     pose = model.box_pose[box].astype(float)
     size = model.box_size[box].astype(float)
     across = np.array([0.0, 1.0, 0.0]) if size[0] >= size[1] else np.array([1.0, 0.0, 0.0])
@@ -397,7 +398,7 @@ PERSON_CLEARANCE = 0.30
 BUNCH_HEIGHT = (1.1, 1.75)
 """[m] Range of heights of a bunch's centre that a hand reaches easily. GUESSED"""
 MAX_PULL = 75.0
-"""[N] Bunches that need a larger pull are not chosen; a hand pulls with 100 N."""
+"""[N] Largest pull that a chosen bunch may need to come off its vine; a hand pulls with 100 N."""
 KEPT_AWAY = 2.2
 """Distance of the carrier from the place where the person picks [m]: half the carrier's length, the box, and some steps
 back. GUESSED"""
@@ -436,8 +437,8 @@ def plan_meeting(model: Model, near: np.ndarray, box: int = 0) -> MeetPlan:
 
 
 def _keeps_away(path: np.ndarray, stand: np.ndarray) -> bool:
-    """Returns whether the ``path`` [n, 2] m of a carrier leaves room for a person who steps back from ``stand`` [2]
-    m."""
+    """Returns whether a carrier on its ``path`` [n, 2] m keeps the distance :data:`KEPT_AWAY` from a person at
+    ``stand`` [2] m."""
     start = path[:-1]
     way = np.diff(path, axis=0)
     share = np.clip(((stand - start) * way).sum(1) / np.maximum((way * way).sum(1), 1e-12), 0.0, 1.0)
@@ -478,7 +479,7 @@ TASKS = ("pick", "exchange", "meet")
 
 
 class UnknownTask(ValueError):
-    """There is no task of that name; the message lists the tasks."""
+    """Error: no task has the given name. The message lists all tasks."""
 
 
 def validate_task_name(job: str | None) -> str | None:

@@ -85,7 +85,8 @@ class SimulationControl:
                 self._answer(request, **result)
 
     def _do(self, request: SimulationRequest) -> dict[str, Any]:
-        """Execute a request that needs no steps. Returns values for the answer in addition to time and pause."""
+        """Execute a request that needs no steps. Returns the values of its answer, except the time and whether the
+        simulation is paused."""
         editor = self._editor
         arguments = request.entity or EntityArguments("")
         match request.action:
@@ -107,7 +108,7 @@ class SimulationControl:
         return {}
 
     def _play(self, request: SimulationRequest) -> None:
-        """Play, pause, or begin to step."""
+        """Let the simulation run, pause it, or begin to simulate the requested number of steps."""
         client = self._client
         is_step = request.action is SimulationAction.STEP
         if client.world_time.is_shared:

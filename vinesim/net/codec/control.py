@@ -32,7 +32,7 @@ RETAINED = 4
 HELLO = 16
 CLOCK = 17
 WELCOME = 18
-"""Numbers of the kinds of messages, the fourth byte of each message."""
+"""Numbers of the kinds of messages in this module. The fourth byte of a message is the number of its kind."""
 
 MAX_RECORDS = 4096
 """Largest number of retained records in one message."""
@@ -62,7 +62,8 @@ class Hello(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     urdf: str = ""
     """The URDF as text."""
     sidecar: str = ""
-    """What a URDF cannot express, as JSON: see :func:`vinesim.robot.description.sidecar.encode_sidecar`."""
+    """Properties of the robot that a URDF cannot express, as JSON: see
+    :func:`vinesim.robot.description.sidecar.encode_sidecar`."""
     scene: str = ""
     """Name of the actor's scene."""
     digest: str = ""
@@ -84,13 +85,13 @@ class Welcome(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The server's reply to a :class:`Hello`."""
 
     refused: str = ""
-    """Empty if the actor is admitted, else why it is not and what to do about that."""
+    """Reason why the actor is not admitted, and the remedy; empty if it is admitted."""
     scene: str = ""
     """Name of the world's scene."""
     digest: str = ""
     """``Model.digest()`` of the world's scene."""
     spectators_speak_to: SpectatorsSpeakTo = SpectatorsSpeakTo.PEOPLE
-    """Who hears spectators in this world."""
+    """Actors that hear spectators in this world."""
     protocol: int = PROTOCOL
 
 
@@ -106,7 +107,8 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """Id of the object, by :func:`vinesim.scene.ids.object_id`."""
     ownership: int
     authority: int
-    """Sequence numbers (u16) of the author's claim when the record was published."""
+    """Ownership and authority sequence (u16) of the author's :class:`~vinesim.net.replication.authority.Claim` on the
+    object when the record was published."""
     author: str
     pose: tuple[float, float, float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)
     """Pose of a bunch or a box in the frame of ``parent``: position [m], quaternion xyzw."""
@@ -120,8 +122,8 @@ class RetainedRecord(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """Whether the object was falling or carried when the record was published. Clients nearby then receive its
     states."""
     place: tuple[float, float, float, float, float, float, float] | None = None
-    """Pose in the world of an object that rests on a link of a robot, when the record was published: position [m],
-    quaternion xyzw. Clients use it if the robot has left."""
+    """For an object that rests on a link of a robot: pose in the world when the record was published, position [m] and
+    quaternion xyzw. Clients use this pose if the robot has left."""
 
     @property
     def claim(self) -> Claim:

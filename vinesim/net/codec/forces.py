@@ -1,4 +1,4 @@
-"""Wire formats of forces on objects that another client simulates: wrenches, and virtual couplings.
+"""Wire formats of forces on objects that another client simulates: wrenches and couplings.
 
 A wrench is the force and moment of a person's hands on one link of a robot. A coupling is the force of an actor on one
 body of a tree that another actor owns, sent as a spring.
@@ -17,7 +17,7 @@ from vinesim.net.codec.json_values import COUNT, NUMBER, TEXT, list_of, object_o
 
 WRENCHES = 7
 COUPLINGS = 8
-"""Numbers of the kinds of messages, the fourth byte of each message."""
+"""Numbers of the kinds of messages in this module. The fourth byte of a message is the number of its kind."""
 
 MAX_WRENCH = 2000.0
 """Largest magnitude of a component of a wrench [N, N m]. A message with a larger one is refused. GUESSED."""
@@ -99,7 +99,7 @@ def describe_wrenches(payload: bytes, _: str) -> dict[str, Any]:
 
 
 MAX_COUPLINGS = 8
-"""Largest number of couplings in one message, one for each body that the actor touches."""
+"""Largest number of couplings (:class:`Coupling`) in one message; there is one for each body that the actor touches."""
 
 MAX_LEVER = 10.0
 """Largest coordinate of a coupling's point in the frame of its body [m]."""
@@ -125,7 +125,7 @@ class Coupling:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CouplingMessage:
-    """All couplings of one actor to the trees that one other actor owns."""
+    """All couplings (virtual springs, :class:`Coupling`) of one actor to the trees that one other actor owns."""
 
     time: float
     """Network time [s]."""
@@ -134,7 +134,7 @@ class CouplingMessage:
 
 
 def encode_couplings(message: CouplingMessage) -> bytes:
-    """Encode couplings in 14 bytes and 28 for each coupling. Raises :class:`MessageError` if they are invalid."""
+    """Encode couplings in 14 bytes, and 28 more for each coupling. Raises :class:`MessageError` if they are invalid."""
     rows = np.zeros(len(message.couplings), _COUPLING)
     for row, coupling in zip(rows, message.couplings, strict=True):
         row["body"], row["point"], row["anchor"] = coupling.body, coupling.point, coupling.anchor

@@ -1,4 +1,4 @@
-"""JSON values and JSON schemas of which codecs compose the description of a message in a recording.
+"""JSON values and JSON schemas. Codecs compose from them the description of a message in a recording.
 
 The text of the schemas is part of the file format. Poses have the fields of ``foxglove.PoseInFrame``, so that Foxglove
 can draw them.

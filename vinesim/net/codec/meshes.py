@@ -15,7 +15,7 @@ from vinesim.scene.triangles import MAX_BYTES, is_digest
 MESH_PART = 19
 MESH_REQUEST = 20
 MESH_WANTED = 21
-"""Numbers of the kinds of messages, the fourth byte of each message."""
+"""Numbers of the kinds of messages in this module. The fourth byte of a message is the number of its kind."""
 
 MAX_PART = 64_000
 """Largest size of the part of a mesh in one message [B]."""
@@ -47,7 +47,7 @@ class MeshWanted(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fi
     """Position in the mesh of the part that the actor shall send next [B]. Equal to the size of the
     mesh if the server has all parts."""
     refused: str = ""
-    """Why the server does not take the mesh now; empty if it takes it."""
+    """Reason why the server does not accept the mesh now; empty if it accepts the mesh."""
 
 
 def encode_part(part: MeshPart) -> bytes:

@@ -29,7 +29,7 @@ class Message(NamedTuple):
     kind: int
     """Number of the kind, the fourth byte of each of its messages."""
     families: tuple[str, ...]
-    """Names of the families of keys under which messages of this kind travel."""
+    """Names of the families of keys (:class:`Family`) under which messages of this kind are sent."""
     has_time: bool = False
     """Whether the header contains the network time [s] at which the content was sampled."""
     describe: Callable[[bytes, str], dict[str, Any]] | None = None
@@ -64,25 +64,30 @@ assert len(MESSAGES) == len(_ROWS), "two kinds of messages have the same number"
 
 
 class Family(NamedTuple):
-    """A family of keys: all keys that begin with the same chunk after the world's prefix. ``docs/network.md`` lists
-    them."""
+    """A family of keys: all Zenoh keys that begin with the same chunk after the world's prefix, like ``tree`` or
+    ``own``.
+
+    ``docs/network.md`` lists the families.
+    """
 
     keys: tuple[str, ...]
-    """Patterns of the keys. ``{actor}`` stands for the name of the actor that publishes, ``*`` for any chunk."""
+    """Patterns of the family's keys. ``{actor}`` stands for the name of the actor that publishes, ``*`` for any
+    chunk."""
     traffic: str
-    """Field of :class:`Counters` that counts the messages under these keys."""
+    """Name of the field of :class:`Counters` that counts the messages of this family of keys."""
     schema: str = "vinesim.Message"
     purpose: str = ""
-    """Name (``schema``) and description (``purpose``) of the JSON schema of the messages under these keys."""
+    """Name (``schema``) and description (``purpose``) of the JSON schema by which recordings describe the family's
+    messages."""
     recorded_with: str = ""
     """Value of ``vinesim record --only`` that selects this family; empty: the family is recorded always or never."""
     is_published: bool = True
-    """Whether actors publish under these keys. If not, the messages are replies to queries, or a recorder makes
-    them."""
+    """Whether actors publish the messages of this family of keys. If not, the messages are replies to queries, or a
+    recorder makes them."""
     is_reliable: bool = False
-    """Whether messages under these keys are sent reliably, in order and without loss."""
+    """Whether the messages of this family of keys are sent reliably, in order and without loss."""
     by_spectators: bool = False
-    """Whether spectators publish under these keys, too."""
+    """Whether spectators, too, publish messages of this family of keys."""
 
 
 FAMILIES = {
@@ -128,13 +133,13 @@ FAMILIES = {
         ("live/{actor}", "live/{actor}/*"), "control", "vinesim.Live", "An actor came or went.", is_published=False
     ),
 }
-"""All families of keys that are published or recorded, by the first chunk of their keys."""
+"""All families of keys (:class:`Family`) that are published or recorded, by the first chunk of their keys."""
 
 _OTHER = Family((), "event")
 
 
 def family_of(key: str) -> Family:
-    """Returns the family of a key; for an unknown key, one that is counted as events."""
+    """Returns the family of a key. An unknown key gets a family without patterns that is counted as events."""
     return FAMILIES.get(key.partition("/")[0], _OTHER)
 
 
@@ -219,7 +224,8 @@ def describe_message(key: str, payload: bytes) -> dict[str, Any]:
 
 @dataclasses.dataclass(slots=True)
 class Traffic:
-    """Number of messages and of payload bytes that were received and sent under some families of keys."""
+    """Number of messages and of payload bytes that were received and sent, for one of the groups in
+    :class:`Counters`."""
 
     messages_in: int = 0
     bytes_in: int = 0
@@ -250,7 +256,8 @@ class Counters:
     retained: Traffic = dataclasses.field(default_factory=Traffic)
     """Retained records. They are sent even if no peer is near, because the server keeps them."""
     force: Traffic = dataclasses.field(default_factory=Traffic)
-    """Wrenches of people's hands on robots of other clients, and couplings of two actors to one tree."""
+    """Wrenches of people's hands on robots of other clients, and couplings (virtual springs) of two actors to one
+    tree."""
     voice: Traffic = dataclasses.field(default_factory=Traffic)
     """Frames of sound: voices, and loudspeakers of robots."""
     control: Traffic = dataclasses.field(default_factory=Traffic)
@@ -266,10 +273,12 @@ class Counters:
     """Number of messages and steps in which wrenches were reduced to what hands can exert."""
 
     couplings_refused: int = 0
-    """Number of refused couplings of peers: neither side owns the tree, or the peer's arms do not reach it."""
+    """Number of refused couplings (virtual springs that peers send for their contacts with trees): neither side owns
+    the tree, or the peer's arms do not reach it."""
 
     foreign: int = 0
-    """Number of messages and replies that the bus dropped because their session does not hold the name in their key."""
+    """Number of messages and replies that the bus dropped because their key contains the name of an actor and they come
+    from another session than the actor's."""
     lost: int = 0
     """Number of received samples that the bus discarded because its store was full or the sample too large."""
     network_failures: int = 0

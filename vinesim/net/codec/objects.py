@@ -55,7 +55,7 @@ class ObjectStates:
     """States of several boxes and free bunches of one owner at one instant; object ids strictly increase."""
 
     time: float
-    """Network time [s]."""
+    """Network time of the states [s]."""
     object: np.ndarray
     """[k] object ids, by :func:`vinesim.scene.ids.object_id`"""
     ownership: np.ndarray

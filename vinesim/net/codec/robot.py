@@ -20,7 +20,8 @@ ROBOT = 1
 """Number of the kind of message with a robot's pose, the fourth byte of the message."""
 
 JOINT_RATE_LSB = 1e-5
-"""Quantisation step of the scale of joint velocities [rad/s, m/s]. The largest scale encodes up to 83 rad/s or m/s."""
+"""Quantisation step of the scale of a message's joint velocities [rad/s, m/s]. With the largest scale, velocities up to
+83 rad/s or m/s can be encoded."""
 
 JOINT_POSITION_LSB = 2e-4
 """Quantisation step of a joint position [rad, m]."""

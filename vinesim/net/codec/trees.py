@@ -64,7 +64,7 @@ class TreeStates:
     """States of several trees of one owner at one instant, as flat arrays. Tree ids strictly increase."""
 
     time: float
-    """Network time [s]."""
+    """Network time of the states [s]."""
     tree: np.ndarray
     """[k] tree ids"""
     ownership: np.ndarray

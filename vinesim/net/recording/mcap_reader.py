@@ -47,7 +47,8 @@ class Recording:
     messages: list[RecordedMessage]
     """All messages, sorted by time."""
     damage: str
-    """Why the messages end early, in one line; empty if the file is whole. Everything before the damage was read."""
+    """Reason why the messages end early, in one line; empty if the file is whole. All messages before the damage were
+    read."""
 
     @property
     def start(self) -> float:

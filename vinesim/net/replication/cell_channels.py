@@ -1,4 +1,8 @@
-"""Subscriptions and publishers of one actor, for the cells around the actor and those of the objects that it owns."""
+"""Channels: subscriptions and publishers of one actor for cells of the ground
+(:mod:`vinesim.net.replication.interest`).
+
+An actor has open channels for the cells around itself and for the cells of the objects that it owns.
+"""
 
 from __future__ import annotations
 
@@ -12,18 +16,22 @@ from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_64, Bus, Publisher, Su
 
 OPEN_MARGIN = 0.3
 CLOSE_MARGIN = 0.8
-"""Margins [m] at which the channels of a cell are opened and closed.
+"""Margins [m] at which the channels of a cell, which are its subscriptions and publishers, are opened and closed.
 
-A cell is opened within the distance of its layer plus OPEN_MARGIN, and closed beyond that distance plus CLOSE_MARGIN.
-OPEN_MARGIN is needed because peers know this actor's position late. The difference keeps an actor that walks along the
-edge of a cell from opening and closing it in turn."""
+The channels of a cell are opened when the actor is nearer to the cell than the distance of a layer
+(:data:`vinesim.net.replication.interest.TREE_LAYERS`) plus OPEN_MARGIN. They are closed beyond that distance plus
+CLOSE_MARGIN. OPEN_MARGIN is needed because peers know this actor's position late. The margins differ so that channels
+do not open and close in turn for an actor that walks along the edge of a cell.
+"""
 
 STEP = 0.1
 """Distance that the actor moves before its cells are chosen again [m]."""
 
 
 class CellChannels:
-    """The open publishers and subscriptions of one actor for boxes, bunches and events, which follow its position.
+    """The channels of one actor for states of boxes and bunches and for events, which follow the actor's position.
+
+    The channels of a cell are two subscriptions and two publishers: for states and for events.
 
     Keys: ``c/<x>/<y>/<actor>`` for states of boxes and bunches that move (best effort), ``own/<x>/<y>/<actor>`` for
     claims and states at rest (reliable).
@@ -43,7 +51,7 @@ class CellChannels:
         self.publishers: dict[Cell, tuple[Publisher, Publisher]] = {}
         """Publishers of states and of events, by cell."""
         self.changes = 0
-        """Number of times that channels were opened or closed."""
+        """Number of calls of :meth:`update` that have opened or closed channels."""
 
     def update(self, owned_cells: set[Cell]) -> None:
         """Open the channels of the 3x3 cells around :attr:`position` and of ``owned_cells``, and close all others.
@@ -84,7 +92,7 @@ class CellChannels:
 
 
 class TreeChannels:
-    """The open publishers and subscriptions of one actor for states of moving trees, by layer and cell.
+    """The channels of one actor for states of moving trees: subscriptions and publishers, by layer and cell.
 
     Keys: ``tree/<x>/<y>/<actor>`` for all actors within the interest radius, ``near/<x>/<y>/<actor>`` for additional
     states that only actors near the tree need (:data:`vinesim.net.replication.interest.TREE_LAYERS`). An actor

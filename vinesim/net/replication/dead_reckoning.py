@@ -1,5 +1,7 @@
 """Dead reckoning: extrapolation of states between messages, decision when to send a state, and error smoothing. No I/O.
 
+The owner of an object sends its states. Every other client nearby moves a copy of the object.
+
 Sender and receiver extrapolate with the same function, :func:`extrapolate`. So the sender knows the error of the copies
 and sends nothing while the error is small (IEEE 1278.1, dead reckoning). Distances in metres, angles in radians, times
 in seconds.
@@ -18,10 +20,10 @@ TREE_VELOCITY_DECAY = 0.080
 TUNED on a bunch that is pushed: from 60 to 120 ms the errors differ by 4 %."""
 
 POSITION_ERROR = 0.005
-"""Position error of the copies of an object above which its state is published [m]."""
+"""Position error of an object's copies, which other clients move, above which the object's state is published [m]."""
 
 ANGLE_ERROR = float(np.radians(1.0))
-"""Angle error of the copies of an object above which its state is published [rad]."""
+"""Angle error of an object's copies, which other clients move, above which the object's state is published [rad]."""
 
 HEARTBEAT_PERIOD = 1.0
 """Longest time between two published states of an object that is awake [s]."""
@@ -71,18 +73,20 @@ def clamp_age(age: float | np.ndarray) -> float | np.ndarray:
 
 
 def faded_age(age: float | np.ndarray) -> float | np.ndarray:
-    """Returns the time [s] by which the joints of a tree are extrapolated at the velocity in a state of ``age`` [s].
+    """Returns the time [s] for which a tree must move at its last sent velocity to reach its extrapolated state.
 
-    The velocity decays with :data:`TREE_VELOCITY_DECAY`, because hands stop branches and branches swing back. The
-    returned time is the integral of this decay.
+    ``age``: time since the state was sent [s].
+
+    The extrapolated velocity decays exponentially with :data:`TREE_VELOCITY_DECAY`, because hands stop branches and
+    branches swing back. So the returned time, which is the integral of the decay, is shorter than ``age``.
     """
     return TREE_VELOCITY_DECAY * -np.expm1(-clamp_age(age) / TREE_VELOCITY_DECAY)
 
 
 def faded_share(age: float) -> float:
-    """Returns the share of the sent velocity that a tree still has when a state of ``age`` [s] is extrapolated.
+    """Returns the share of its last sent velocity that a tree still has ``age`` [s] after the state was sent.
 
-    The share is 0 from :data:`MAX_EXTRAPOLATION` on.
+    The velocity decays as in :func:`faded_age`. The share is 0 from :data:`MAX_EXTRAPOLATION` on.
     """
     return float(np.exp(-max(age, 0.0) / TREE_VELOCITY_DECAY)) if age < MAX_EXTRAPOLATION else 0.0
 
@@ -113,9 +117,9 @@ def needs_update(
 ) -> np.ndarray:
     """Returns which of ``k`` objects need to be published: [k] bool.
 
-    An object needs it if its copies are wrong by more than ``tolerance`` times 5 mm or 1 degree, or if its last state
-    was sent a :data:`HEARTBEAT_PERIOD` ago. ``position_error`` [k] m, ``angle_error`` [k] rad: errors of the copies.
-    ``silence`` [k] s: time since the last state.
+    The state of an object needs to be published if its copies on other clients are wrong by more than ``tolerance``
+    times 5 mm or 1 degree, or if its last state was sent a :data:`HEARTBEAT_PERIOD` ago. ``position_error`` [k] m,
+    ``angle_error`` [k] rad: errors of the copies. ``silence`` [k] s: time since the last state.
     """
     wrong = (position_error > tolerance * POSITION_ERROR) | (angle_error > tolerance * ANGLE_ERROR)
     return wrong | (silence >= HEARTBEAT_PERIOD - 1e-9)

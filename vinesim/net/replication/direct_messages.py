@@ -1,4 +1,5 @@
-"""Direct messages: what actors send each other apart from poses and states of objects. This module has the forces.
+"""Direct messages: all messages between actors except poses and states of objects. This module contains those with
+forces.
 
 Each kind of message has a :class:`MessageSync`, which sends and receives messages of this kind. :func:`make_syncs`
 makes the syncs of forces. The receiver passes the messages of a kind to its sync. The replicator passes the values of
@@ -66,13 +67,15 @@ MAX_PUSHING_PEOPLE = 4
 REACH = 1.2
 """Largest distance of a palm from the centre of mass of a link that the hand touches [m].
 
-Half the length of a long link, and the way of a running person until the pose arrives. GUESSED."""
+It covers half the length of a long link, and the distance that a person runs until the pose arrives. GUESSED.
+"""
 
 COUPLING_MAX_AGE = 0.2
-"""Time for which couplings are applied after their arrival, unless newer ones arrive [s].
+"""Time for which couplings (virtual springs) are applied after their arrival, unless newer ones arrive [s].
 
 Couplings are springs, so old ones are stable, too. Over a link with a delay of 100 +- 40 ms and a loss of 4 %, messages
-arrive up to 0.15 s apart. With a value of 0.1 s the bunch jumped."""
+arrive up to 0.15 s apart. With a value of 0.1 s the bunch jumped.
+"""
 
 ARM_REACH = 2.5
 """Largest distance on the ground of a coupling's anchor from the base of its actor [m]: a long arm. GUESSED."""
@@ -89,8 +92,8 @@ class MessageSync(abc.ABC):
 
     @abc.abstractmethod
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a message of a peer at own time ``now`` and network ``time`` [s]. Raises ``MessageError`` if it is
-        invalid."""
+        """Store a message that arrived from a peer at own time ``now`` and network ``time`` [s]. Raises
+        ``MessageError`` if the message is invalid."""
 
     def current(self, now: float) -> Any:  # noqa: B027 - optional
         """Returns the received values that are valid at own time ``now`` [s]. They become part of the inbox."""
@@ -121,7 +124,8 @@ class _Partner:
 
 
 class ForceSync(MessageSync):
-    """Base class of the syncs of forces. Stores the last message of each sender; all messages have a field ``time``.
+    """Base class for sending and receiving direct messages with forces. Stores the last message of each sender; all
+    messages have a field ``time``.
 
     At most 60 messages a second are sent to an actor while there are forces, then one empty message, then nothing.
     :func:`make_syncs` subscribes to the keys, once for all kinds of forces.
@@ -254,7 +258,7 @@ class WrenchSync(ForceSync):
         self._pushes: dict[str, _Push] = {}
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a message with the wrenches of a person on the own robot. Refused and reduced wrenches are counted.
+        """Store a message with the wrenches of a person on the own robot. Refused and reduced wrenches are counted.
 
         Raises :class:`MessageError` if the message is invalid or not from a person.
         """
@@ -314,7 +318,8 @@ class WrenchSync(ForceSync):
 
 
 class CouplingSync(ForceSync):
-    """Sends couplings of the own actor's contacts with trees, and receives those of other actors to the same trees."""
+    """Sends couplings (virtual springs) of the own actor's contacts with trees, and receives couplings of other
+    actors."""
 
     kind = COUPLINGS
 
@@ -335,7 +340,7 @@ class CouplingSync(ForceSync):
         self._peers = peers
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a message with the couplings of another actor.
+        """Store a message with the couplings (virtual springs) of another actor.
 
         Couplings to trees that neither actor owns, or that the other actor's arms do not reach, are counted and not
         used. Raises :class:`MessageError` if the message is invalid or names bodies that do not exist.
@@ -384,10 +389,10 @@ class CouplingSync(ForceSync):
         return sent
 
     def _by_partner(self, couplings: Iterable[Coupling], now: float) -> dict[str, list[Coupling]]:
-        """Returns the own couplings by the peer that shall receive them.
+        """Returns the own couplings (virtual springs), by name of the peer that shall receive them.
 
-        This is the owner of the tree. Couplings to an own tree go to each peer whose couplings to it are valid at own
-        time ``now`` [s].
+        The receiver of a coupling is the owner of its tree. A coupling to a tree of the own actor is sent to each peer
+        whose couplings to the tree are valid at own time ``now`` [s].
         """
         found: dict[str, list[Coupling]] = {}
         for coupling in couplings:
@@ -419,7 +424,8 @@ def make_syncs(
     hand_force: float = HAND_FORCE,
     link_centre: LinkCentre = lambda _: None,
 ) -> tuple[MessageSync, ...]:
-    """Make the syncs of all direct messages of the actor ``name`` except voices, and subscribe to their keys.
+    """Make the senders and receivers (:class:`MessageSync`) of all direct messages of the actor ``name`` except voices,
+    and subscribe to their keys.
 
     ``owner(object_id)``: name of the actor that owns an object, or None. ``hand_force``, ``link_centre``: see
     :class:`WrenchSync`.

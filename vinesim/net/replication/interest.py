@@ -40,7 +40,8 @@ class PoseLayer(NamedTuple):
     suffix: str
     """Suffix of the layer's key, after ``a/<actor>``."""
     every: int
-    """Number such that this layer and all layers before it in the list together have every ``every``-th pose."""
+    """Divisor of the pose rate: this layer and the layers before it in :data:`POSE_LAYERS` together contain every
+    ``every``-th pose."""
     distance: float
     """Distance within which actors subscribe to the layer [m]."""
 
@@ -72,9 +73,10 @@ class TreeLayer(NamedTuple):
     distance: float
     """Distance within which actors receive the layer [m]. The interest radius is an upper bound."""
     tolerance: float
-    """Largest error of the copies at receivers that receive no layer after this one, as a factor on
+    """Error of a tree's copies above which a state is sent on this layer, as a factor on
     :data:`~vinesim.net.replication.dead_reckoning.POSITION_ERROR` and
-    :data:`~vinesim.net.replication.dead_reckoning.ANGLE_ERROR`. Beyond it a state is sent."""
+    :data:`~vinesim.net.replication.dead_reckoning.ANGLE_ERROR`. The copies are those at peers that receive this layer
+    and no later one."""
 
 
 TREE_LAYERS = (TreeLayer("tree", MAX_INTEREST_RADIUS, 3.0), TreeLayer("near", 3.0, 1.0))
@@ -153,18 +155,18 @@ def count_listeners(middles: np.ndarray, actors: np.ndarray, near: float) -> np.
 
 
 def count_layers(distance: float, now: int) -> int:
-    """Returns the number of :data:`POSE_LAYERS` to receive from an actor at ``distance`` [m], with hysteresis.
+    """Returns how many of the :data:`POSE_LAYERS` to subscribe to, from the first on, for an actor at ``distance`` [m].
 
-    ``now``: number of layers that are received at present.
+    ``now``: number of layers that are received at present, for hysteresis.
     """
     factors = (LAYER_HYSTERESIS if number < now else 1.0 for number in range(len(POSE_LAYERS)))
     return sum(distance <= layer.distance * factor for layer, factor in zip(POSE_LAYERS, factors, strict=True))
 
 
 def pose_layer(before: int, number: int) -> int:
-    """Returns the index of the layer on which the pose with a ``number`` is sent.
+    """Returns the index of the layer in :data:`POSE_LAYERS` on which the pose with a ``number`` is sent.
 
-    If poses between the last sent number ``before`` and ``number`` were skipped, this pose replaces them. The first of
-    all their layers is returned.
+    ``before``: number of the last pose that was sent. The pose also replaces skipped poses between ``before`` and
+    ``number``, so the lowest index of the layers of all these poses is returned.
     """
     return next(i for i, layer in enumerate(POSE_LAYERS) if number // layer.every != before // layer.every)

@@ -1,9 +1,9 @@
 """Network time of one client: its estimate of the world's time, from the server's replies to pings.
 
-Pings measure the offset between two real-time clocks, that of the client and that of the server. This offset stays
-constant whatever the world's real-time factor is. Each reply also contains a time of the server's clock, the time of
-the world at that moment, and the real-time factor. The present time of the world follows from these. Own time runs at
-the real-time factor and is slewed towards the time of the world.
+Pings measure the offset between the real-time clocks of client and server. This offset does not depend on the world's
+real-time factor. Each reply also contains a time of the server's clock, the time of the world at that moment, and the
+real-time factor. The present time of the world follows from these. Own time runs at the real-time factor and is slewed
+towards the time of the world.
 
 Key: the query ``clock/<actor>``, which also reports how fast the actor's client can follow (:mod:`vinesim.net.pace`).
 """
@@ -55,7 +55,7 @@ class NetworkClock:
         self.factor = 1.0
         """Real-time factor of the world, from the server's last reply."""
         self.cause = ""
-        """What limits the real-time factor, from the server's last reply; empty if nothing limits it."""
+        """Client and part that limit the real-time factor, from the server's last reply; empty if nothing limits it."""
         self.offset = offset
         """Network time minus own time [s]."""
         self.report: Callable[[], PaceReport | None] = lambda: None
@@ -119,7 +119,7 @@ class NetworkClock:
             self._bus.query(f"clock/{self._bus.name}", encode_time(self._now, report=self.report()))
 
     def receive(self, payload: bytes, age: float) -> None:
-        """Take a reply to a ping, which arrived ``age`` [s] of real time ago.
+        """Use a reply to a ping, which arrived ``age`` [s] of real time ago, for the estimate of the world's time.
 
         Raises :class:`MessageError` if the reply cannot be decoded.
         """
@@ -132,7 +132,7 @@ class NetworkClock:
         settles = len(self.estimate.pings) < PING_WINDOW
         self.estimate = self.estimate.with_ping(Ping(reply.asked, reply.real, received))
         is_other = len(self.estimate.pings) == 1 and not is_first
-        """Whether another server has replied, or the same one after its clock was set."""
+        """Whether another server has replied, or this server has set its clock."""
         if not (is_first or is_other) and (
             self._now - reply.asked > MAX_REPLY_AGE or (self._known is not None and reply.real < self._known[0])
         ):

@@ -153,7 +153,7 @@ class Ownership:
         known.claim = known.claim._replace(authority=(known.claim.authority + 1) % authority.SEQUENCE_COUNT)
 
     def rollback(self, object_id: int) -> None:
-        """Return to the claim before the own one, which no peer knows. So sequence numbers count only published
+        """Undo the own claim on an object, which no peer knows yet, so that sequence numbers count only published
         claims."""
         known = self._known[object_id]
         known.claim = authority.release(known.previous) if known.previous.owner == self.name else known.previous
@@ -218,10 +218,11 @@ class Ownership:
     # ------------------------------------------------------------ what follows
 
     def remove_actor(self, name: str, time: float, successor: Callable[[int], str]) -> None:
-        """Handle an actor that has left. Take over the objects that it moved and whose successor is the own actor.
+        """Mark the claims of an actor that has left as silent, and take over its objects whose successor is the own
+        actor.
 
-        ``successor(object_id)``: name of the actor that takes over an object. The claims of the actor that left are
-        kept, in case it returns, and only marked as silent. Otherwise two clients might never agree again.
+        ``successor(object_id)``: name of the actor that takes over an object. Silent claims are kept in case the actor
+        returns. Without them two clients might never agree again.
         """
         for object_id in sorted(object_id for object_id, known in self._known.items() if known.claim.owner == name):
             known = self._known[object_id]
@@ -246,8 +247,8 @@ class Ownership:
                 known.silent = True
 
     def released(self) -> list[int]:
-        """Returns the objects that have lost their remote owner since the last call, and are not owned by this
-        actor."""
+        """Returns the ids of objects that have lost their remote owner since the last call, and that this actor does
+        not own."""
         released = []
         for object_id in sorted(self.remote):
             if object_id in self.owned or self.owner(object_id) is None:
@@ -257,8 +258,8 @@ class Ownership:
         return released
 
     def corrections(self, time: float) -> list[int]:
-        """Returns the objects that a peer has claimed with a lesser claim, and whose claim this actor shall publish
-        again.
+        """Returns the ids of objects for which this actor shall publish the greatest known claim again, because a peer
+        has made a lesser claim.
 
         The peer must have missed a message. The correction restores agreement.
         """

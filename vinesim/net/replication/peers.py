@@ -67,7 +67,8 @@ class PeerRegistry:
         self._rejected: set[str] = set()
         self._warned: set[str] = set()
         self._unread: tuple[Reply, ...] = ()
-        """Replies that arrived in :meth:`keep_clock` and wait for :meth:`process_replies`."""
+        """Replies to other queries than pings that arrived in :meth:`keep_clock` and wait for
+        :meth:`process_replies`."""
         self._layers = [bus.publisher(f"a/{hello.name}{layer.suffix}") for layer in interest.POSE_LAYERS]
         bus.subscribe(f"a/*{interest.POSE_LAYERS[0].suffix}", KEEP_LAST_1)
         self._pose_number: int | None = None
@@ -119,7 +120,8 @@ class PeerRegistry:
         return gone
 
     def keep_clock(self, now: float) -> None:
-        """Advance the clock to real time ``now`` [s], send a due ping to the server, and take the replies to pings.
+        """Advance the clock to real time ``now`` [s], send a ping to the server if it is due, and process replies to
+        pings.
 
         Called between steps that are far apart. Other replies wait for :meth:`process_replies`.
         """
@@ -138,7 +140,10 @@ class PeerRegistry:
         self._unread += tuple(others)
 
     def process_replies(self) -> tuple[list[Hello], list[Reply]]:
-        """Take all replies with hellos and from the clock. Returns the hellos of new peers, and all other replies."""
+        """Process the replies to queries for hellos and for the server's clock.
+
+        Returns the hellos of new peers, and the replies to all other queries.
+        """
         joined: list[Hello] = []
         others: list[Reply] = []
         answers = (*self._unread, *self.bus.replies())
@@ -229,7 +234,8 @@ class PeerRegistry:
                 actor.near.append(self.bus.subscribe(f"a/{name}{layer.suffix}", KEEP_LAST_1))
 
     def publish_pose(self, robot: RobotUpdate | HumanUpdate, now: float, time: float) -> None:
-        """Publish the own pose on one of the layers, if it is due at own time ``now`` [s]: 60 times a second.
+        """Publish the own pose on one of the :data:`~vinesim.net.replication.interest.POSE_LAYERS`, if it is due at own
+        time ``now`` [s]: 60 times a second.
 
         ``time``: network time [s], which becomes the time of the pose. The pose is encoded only if the layer has a
         subscriber.

@@ -46,8 +46,10 @@ MAX_EARLY_TOTAL = 4 << 20
 
 @dataclasses.dataclass(slots=True)
 class Inbox:
-    """What a step of one actor's client needs from the network. States are extrapolated to the step. Times are own
-    times."""
+    """Content of the messages that one actor has received, for the next step of its client.
+
+    States are extrapolated to the time of the step. All times are own time, which is that of the client's clock.
+    """
 
     joined: list[Hello] = dataclasses.field(default_factory=list)
     left: list[str] = dataclasses.field(default_factory=list)
@@ -60,7 +62,7 @@ class Inbox:
     """Contents of direct messages to this actor that are valid now, by kind of message: results of
     :meth:`vinesim.net.replication.direct_messages.MessageSync.current`."""
     trees: list[TreeUpdate] = dataclasses.field(default_factory=list)
-    """Trees of which a new state has arrived: the newest state of each, extrapolated by at most 150 ms."""
+    """Newest state of each tree for which a new state has arrived, extrapolated by at most 150 ms."""
     objects: list[ObjectUpdate] = dataclasses.field(default_factory=list)
     """All boxes and free bunches that peers move, whether or not a new state has arrived, extrapolated by at most 150
     ms."""
@@ -76,16 +78,16 @@ class _Step:
     """Times and results of one call of :meth:`Receiver.receive`."""
 
     now: float
-    """Own time [s]."""
+    """Own time of the step [s]: a time of this client's clock."""
     time: float
-    """Network time [s]."""
+    """Network time of the step [s]: the time of the world, as this client estimates it."""
     inbox: Inbox = dataclasses.field(default_factory=Inbox)
     new_trees: dict[int, tuple[TreeStates, str]] = dataclasses.field(default_factory=dict)
     """The newest accepted batch that contains a tree, and its owner, by tree."""
 
 
 class EarlyMessages:
-    """Messages with retained records whose senders have not been accepted as peers yet.
+    """Messages with retained records that arrived before their senders were accepted as peers.
 
     The messages are kept until the sender is accepted, because records are published only once. Their number and size
     are limited. If there is no room, messages of live senders displace those of senders that are not live.
@@ -237,7 +239,8 @@ class Receiver:
         return self.early.put(sender, key, payload, peers.may_join)
 
     def _receive_trees(self, trees: TreeStates, sender: str, step: _Step) -> None:
-        """Accept or drop each state in a batch of trees, by its claim and its distance."""
+        """Accept or drop each state in a batch of trees, by the claim in it and by the distance of the tree from this
+        actor."""
         state = self._state
         check_tree_states(trees, state.model)
         is_near = state.cells.is_within_radius(state.tree_stream.middle[trees.tree])
@@ -252,7 +255,8 @@ class Receiver:
                 state.counters.dropped += 1
 
     def _receive_objects(self, objects: ObjectStates, cell: Cell, sender: str, step: _Step) -> None:
-        """Accept or drop each state in a batch of boxes and bunches, by its claim and its distance."""
+        """Accept or drop each state in a batch of boxes and bunches, by the claim in it and by the distance of the
+        object from this actor."""
         state = self._state
         updates = objects.updates(sender)
         for update in updates:
@@ -270,7 +274,7 @@ class Receiver:
     def _receive_record(
         self, cell: Cell, record: RetainedRecord, sender: str, step: _Step, *, is_remote: bool = True
     ) -> None:
-        """Merge a retained record. If it changes anything, add it to the inbox, unless it is not ``is_remote``.
+        """Merge a retained record. If it changes the retained state, and ``is_remote``, add it to the inbox.
 
         A record that contradicts the model is dropped; others in the same message are not affected. ``is_remote``:
         whether the record comes from another client.

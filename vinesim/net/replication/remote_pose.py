@@ -44,7 +44,8 @@ class RemotePose:
         self._cached: RobotUpdate | HumanUpdate | None = None
 
     def receive(self, update: RobotUpdate | HumanUpdate, time: float) -> bool:
-        """Take a pose of the peer that arrived at network ``time`` [s]. Returns whether it is newer than the last one.
+        """Store a pose of the peer that arrived at network ``time`` [s]. Returns whether the pose is newer than the
+        last one.
 
         Raises :class:`MessageError` if the kind of pose or its number of joints does not fit the peer.
         """

@@ -24,7 +24,8 @@ SPECTATOR = "spectator"
 
 
 class ReplicationState:
-    """State of replication of one actor: peers, claims, streams, retained records, and channels of cells."""
+    """State of replication of one actor: its peers, the claims on objects, the streams of states, the retained records,
+    and the channels (subscriptions and publishers) of cells."""
 
     def __init__(
         self,
@@ -57,7 +58,8 @@ class ReplicationState:
             link_centre=link_centre,
         )
         self.syncs: dict[int, MessageSync] = {sync.kind: sync for sync in (*direct, self.voices)}
-        """The syncs of direct messages between actors, by kind of message."""
+        """The senders and receivers of direct messages between actors
+        (:class:`~vinesim.net.replication.direct_messages.MessageSync`), by kind of message."""
         self.siblings: tuple[ReplicationState, ...] = ()
         """States of replication of the other actors of the same client."""
         self.retained = RetainedSync(bus, self.counters)
@@ -76,7 +78,7 @@ class ReplicationState:
         return self.tree_stream.middle[object_id] if is_tree(object_id) else self.object_stream.position(object_id)
 
     def cell_of(self, object_id: int) -> Cell | None:
-        """Returns the cell under which an object is published; None for an object that never was."""
+        """Returns the cell of the ground under which an object is published; None if the object was never published."""
         return self.tree_stream.cell[object_id] if is_tree(object_id) else self.object_stream.cell(object_id)
 
     def owner_candidates(self) -> dict[str, np.ndarray]:

@@ -281,7 +281,7 @@ class Replicator:
     def _follow_clock(self) -> None:
         """Shift all stored times of peers and objects if network time was set, as after a restart of the server.
 
-        Otherwise, if it was set back, everything that arrives would count as older than the stored states.
+        Without this, after network time was set back, all states that arrive would count as older than the stored ones.
         """
         step = self.offset - self._offset
         self._offset = self.offset

@@ -44,9 +44,9 @@ class LocalStep:
     :meth:`vinesim.net.replication.replicator.Replicator.send`."""
 
     now: float
-    """Own time [s]."""
+    """Own time of the step [s]: a time of this client's clock."""
     time: float
-    """Network time [s]."""
+    """Network time of the step [s]: the time of the world, as this client estimates it."""
     touched: set[int]
     moving: set[int]
     grabbed: set[int]
@@ -111,7 +111,12 @@ class Sender:
                 state.ownership.take_over(object_id)
 
     def _update_interest(self, now: float) -> None:
-        """Open and close channels for the present position of the actor and for the objects that it owns."""
+        """Adapt subscriptions and publishers to the actor's present position and to the objects that it owns.
+
+        The actor exchanges states of objects in the cells of the ground around it and in the cells of its own objects,
+        poses of actors at rates that depend on their distance, and voices of actors within hearing reach. ``now``: own
+        time [s].
+        """
         state = self._state
         owned = {cell for object_id in state.ownership.owned if (cell := state.cell_of(object_id)) is not None}
         state.cells.update(owned)
@@ -124,7 +129,8 @@ class Sender:
     # ------------------------------------------------------------ moving
 
     def _publish_trees(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
-        """Publish, layer by layer and cell by cell, the states of trees whose copies are wrong."""
+        """Publish the states of those trees whose copies at peers are wrong, one message or more for each cell of each
+        layer (:data:`vinesim.net.replication.interest.TREE_LAYERS`)."""
         state = self._state
         stream = self._state.tree_stream
         channels = self._state.tree_channels
@@ -164,7 +170,8 @@ class Sender:
     def _find_due_trees(
         self, entries: list[ObjectRecord], listeners: list[np.ndarray], contact: list[bool], step: LocalStep
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Decide which of the ``k`` trees that were last read to publish: [k] bool for each of the two layers.
+        """Returns which of the ``k`` trees that were last read are to be published: [k] bool for each of the two
+        layers.
 
         A tree is published if the copies of the layer's receivers are wrong, if a peer has come near, if this actor has
         just claimed the tree, or if its contact with the tree has begun or ended.
@@ -191,7 +198,8 @@ class Sender:
         return for_all, wrong[1] & (near > 0) & ~for_all
 
     def _publish_objects(self, active: tuple[int, ...], touched: set[int], step: LocalStep) -> None:
-        """Publish, cell by cell, the states of boxes and bunches whose copies are wrong."""
+        """Publish the states of those boxes and bunches whose copies at peers are wrong, one message or more for each
+        cell."""
         state = self._state
         stream = self._state.object_stream
         entries = [state.ownership[object_id] for object_id in active]
@@ -231,7 +239,7 @@ class Sender:
         contact: list[bool],
         step: LocalStep,
     ) -> np.ndarray:
-        """Decide which of the ``k`` boxes and bunches ``active`` to publish: [k] bool.
+        """Returns which of the ``k`` boxes and bunches ``active`` are to be published: [k] bool.
 
         An object is published if its copies are wrong, if a peer has come near, if this actor has just claimed the
         object, or if its contact with the object has begun or ended.
@@ -245,7 +253,7 @@ class Sender:
         return due & (listeners > 0)
 
     def _announce(self, events: Publisher | None, objects: list[tuple[int, ObjectRecord]]) -> None:
-        """Publish those claims on ``objects`` that no peer can know yet, reliably through ``events``."""
+        """Publish reliably, through ``events``, the claims on ``objects`` that no peer can know yet."""
         new = [(object_id, entry.claim, entry.touching) for object_id, entry in objects if not entry.announced]
         if new and events is not None:
             put_counted(events, encode_claims(new), self._state.counters.event)

@@ -1,5 +1,5 @@
-"""Streams of states of moving objects: last published states, errors of the copies, and messages that correct the
-copies.
+"""Streams of states of moving objects. A stream stores the last published states, computes the errors of the copies on
+other clients, and encodes the messages that correct the copies.
 
 :class:`TreeStream` is for trees, which stay in one cell. :class:`ObjectStream` is for boxes and free bunches, which
 move between cells. Sender and receiver store the same quantised states and extrapolate them in the same way
@@ -62,7 +62,8 @@ class TreeStream:
         self._bodies = [model.bodies_of(tree) for tree in range(len(model.tree_first))]
         self._lever_arm = _lever_arms(model)
         self._published_q = np.tile(np.array([0.0, 0.0, 0.0, 1.0]), (layers, body_count, 1))
-        """Last published joint rotations [layer, body, 4], at peers that receive all layers up to ``layer``."""
+        """Last published joint rotations [layer, body, 4]: those that peers know which receive all layers up to
+        ``layer``."""
         self._published_rate = np.zeros((layers, body_count, 4))
         self._published_roots: tuple[dict[int, DetachedRoots], ...] = tuple({} for _ in range(layers))
         self._active: tuple[int, ...] | None = None
@@ -71,7 +72,7 @@ class TreeStream:
         self._roots: list[DetachedRoots] = []
 
     def read(self, active: tuple[int, ...], read: StateReader, cut: Callable[[int], DetachedRoots]) -> None:
-        """Read the present states of the trees ``active`` for :meth:`prediction_error` and :meth:`encode`.
+        """Store the present states of the trees ``active``, for :meth:`prediction_error` and :meth:`encode`.
 
         ``cut(tree)``: function that returns the bodies that were cut off a tree.
         """
@@ -86,7 +87,8 @@ class TreeStream:
         self._roots = [cut(tree) for tree in active]
 
     def prediction_error(self, layer: int, silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the errors of the copies of the ``k`` trees that were last read: positions [k] m, angles [k] rad.
+        """Returns the errors of the copies, on other clients, of the ``k`` trees that were last read: positions [k] m,
+        angles [k] rad.
 
         The copies are those of peers that receive no layer after ``layer``. ``silence`` [k]: time since the last state
         that these peers received [s].
@@ -182,7 +184,7 @@ class ObjectStream:
         return self._published[object_id][0][:3] if object_id in self._published else np.zeros(3)
 
     def positions(self, active: tuple[int, ...], read: StateReader) -> np.ndarray:
-        """Read the present states of the objects ``active``, and return their positions [k, 3] m."""
+        """Store the present states of the objects ``active``, and return their positions [k, 3] m."""
         self._active = active
         state = [read(object_id) for object_id in active]
         self._pose = np.array([pose for pose, _ in state], float)
@@ -196,7 +198,8 @@ class ObjectStream:
         return [self._cell[object_id] for object_id in active]
 
     def prediction_error(self, active: tuple[int, ...], silence: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the errors of the copies of the ``k`` objects that were last read: positions [k] m, angles [k] rad.
+        """Returns the errors of the copies, on other clients, of the ``k`` objects that were last read: positions [k]
+        m, angles [k] rad.
 
         ``silence`` [k]: time since the last published state [s].
         """

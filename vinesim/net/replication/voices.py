@@ -33,8 +33,8 @@ MAX_AGE = 2.0
 """Largest difference between the time of a frame and the present; other frames are refused [s]."""
 
 BURST = 25.0
-"""Number of frames of one speaker that may arrive at once in addition to those of the elapsed time: half a second of
-sound, which a slow link may have delayed."""
+"""Number of frames by which one speaker may exceed its usual rate at once: half a second of sound, which a slow link
+may have delayed."""
 
 
 ROBOT_MOUTH = np.array([0.0, 0.0, 1.2])
@@ -91,9 +91,10 @@ class VoiceSync(MessageSync):
         self.listens = False
         """Whether this actor listens to other actors."""
         self.decodes_opus = True
-        """Whether everything that plays received voices here can decode Opus."""
+        """Whether all players of received voices in this client can decode Opus."""
         self._made: list[Publisher] = []
-        """Publishers of this actor's voice, as encoded and as PCM16. Empty until the voice is first needed."""
+        """Publishers of this actor's voice: of frames as the speaker has encoded them, and of PCM16. Empty before the
+        first use."""
         self._numbers = [0, 0]
         self._sources: dict[str, _Source] = {}
         self._is_plain = False
@@ -102,7 +103,8 @@ class VoiceSync(MessageSync):
 
     @property
     def _publishers(self) -> list[Publisher]:
-        """Publishers of this actor's voice, declared at the first use: as encoded, and as PCM16."""
+        """Publishers of this actor's voice: of frames as the speaker has encoded them, and of PCM16. Declared at the
+        first use."""
         if not self._made:
             self._made = [self._bus.publisher(f"voice/{self._hello.name}{suffix}") for suffix in ("", "/pcm")]
         return self._made
@@ -114,7 +116,7 @@ class VoiceSync(MessageSync):
 
     @property
     def is_heard_plain(self) -> bool:
-        """Whether another actor listens to this one and cannot decode Opus."""
+        """Whether another actor listens to this one and cannot decode Opus, so that it needs plain PCM16."""
         return self._publishers[1].matching
 
     @property
@@ -162,7 +164,7 @@ class VoiceSync(MessageSync):
             self._sources[name] = _Source(self._bus.subscribe(key, KEEP_LAST_64), now)
 
     def receive(self, payload: bytes, sender: RemotePose, now: float, time: float) -> None:
-        """Take a frame of another actor at own time ``now`` and network ``time`` [s].
+        """Store a frame of another actor that arrived at own time ``now`` and network ``time`` [s].
 
         Raises :class:`MessageError` if the frame is invalid, or its time is too far from the present.
         """

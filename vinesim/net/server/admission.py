@@ -149,7 +149,7 @@ class AdmissionControl:
         return Welcome(reason, *self.scene_of(world), self._spectators_speak_to)
 
     def _find_objection(self, world: str, name: str, session: str, hello: Hello) -> str:
-        """Returns why an actor cannot be admitted and what to do about it; empty if it can."""
+        """Returns the reason why an actor cannot be admitted, and the remedy; empty if it can."""
         if hello.name != name:
             return f"{name!r} introduces itself as {hello.name!r}"
         admitted = self._admitted.get((world, name), (session, 0.0))[0]

@@ -26,13 +26,13 @@ class MeshLimits:
     """Limits for the meshes that the server keeps."""
 
     count: int = 4096
-    """Number of meshes."""
+    """Largest number of meshes in the store."""
     total: int = 256 << 20
-    """Size of all meshes [B], including incomplete ones."""
+    """Largest size of all meshes together [B], including incomplete ones."""
     per_actor: int = 64 << 20
-    """Size of the meshes that one actor offers [B], including those that other actors offer, too."""
+    """Largest size of all meshes that one actor offers [B], including meshes that other actors offer, too."""
     count_per_actor: int = 256
-    """Number of meshes that one actor offers."""
+    """Largest number of meshes that one actor offers."""
 
 
 @dataclasses.dataclass(slots=True)
@@ -95,8 +95,8 @@ class MeshStore:
         return MeshPart(digest, size, offset, kept.payload[offset : offset + MAX_PART])
 
     def offer(self, actor: Actor, part: MeshPart) -> MeshWanted:
-        """Take a part of a mesh that an actor offers. Returns the reply, which names the part that the actor shall send
-        next."""
+        """Store a part of a mesh that an actor offers. Returns the reply, which names the part that the actor shall
+        send next."""
         with self._lock:
             kept = self._kept.get(part.digest)
             if kept is not None:
@@ -149,7 +149,7 @@ class MeshStore:
         return self._bytes + sum(begun.size for begun, _ in self._incomplete.values())
 
     def _objection(self, actor: Actor, size: int, room: int) -> str:
-        """Returns why an actor may not offer a mesh of ``size`` [B]; empty if it may.
+        """Returns the reason why an actor may not offer a mesh of ``size`` [B]; empty if it may.
 
         Removes meshes of actors that have left if fewer than ``room`` [B] are free.
         """

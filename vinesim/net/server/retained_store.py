@@ -144,7 +144,7 @@ class RetainedStore:
         self._wakeup = threading.Event()
         self._closing = False
         self.status_message = ""
-        """Why the journals cannot be written now; empty if they can. Records stay in memory until they can be
+        """Reason why the journals cannot be written now; empty if they can. Records stay in memory until they can be
         written."""
         self._thread = threading.Thread(target=self._run, name="retained store", daemon=True)
         self._thread.start()

@@ -102,7 +102,7 @@ class Bus(Protocol):
 
     @property
     def status_message(self) -> str:
-        """Why the network is unreachable now; empty if it is reachable."""
+        """Reason why the network is unreachable now; empty if it is reachable."""
         ...
 
     def join(self, greeting: bytes) -> None:
@@ -149,7 +149,7 @@ class Bus(Protocol):
 
     @property
     def spectators_speak_to(self) -> SpectatorsSpeakTo:
-        """Who hears spectators in this world, as set by the server; people if there is no server."""
+        """Actors that hear spectators in this world, as set by the server; people if there is no server."""
         ...
 
     @property

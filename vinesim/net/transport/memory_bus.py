@@ -41,7 +41,7 @@ class MemoryHub:
         self.rejection_reason: Callable[[bytes], str] = lambda greeting: ""
         """Function that returns why the emulated server rejects a hello; empty if it admits the actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
-        """Who hears spectators, as set by the emulated server."""
+        """Actors that hear spectators, as set by the emulated server."""
         self._random = random.Random(seed)
         self._order = 0
         self._pending: list[tuple[float, int, Callable[[], None]]] = []

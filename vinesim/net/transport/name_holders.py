@@ -1,5 +1,5 @@
-"""Which Zenoh session holds the name of an actor. A message under a name is accepted only from the session that holds
-it.
+"""Zenoh sessions that hold the names of actors. A message under an actor's name is accepted only from the session that
+holds the name.
 
 A session holds a name once it has declared the liveliness token ``live/<name>/<session>``. If a second session declares
 a token of the same name, members that know the first token still accept the first session. A member that joins while

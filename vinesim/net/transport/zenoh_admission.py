@@ -51,11 +51,11 @@ class ServerAdmission:
         self.is_served = True
         """Whether the server of this world is present. Also true if there never was a server."""
         self.rejection = ""
-        """Why a server that was restarted does not admit this actor; empty if none has rejected it."""
+        """Reason why a server that was restarted does not admit this actor; empty if none has rejected it."""
         self.count = 0
         """Number of times that a server has admitted this actor."""
         self.spectators_speak_to = SpectatorsSpeakTo.PEOPLE
-        """Who hears spectators, as set by the server that admitted this actor."""
+        """Actors that hear spectators, as set by the server that admitted this actor."""
         self._servers: frozenset[str] | None = None
         """Session of the server that admitted this actor; empty: no server has; None: the actor has not asked."""
         self._declared: list[object] = []

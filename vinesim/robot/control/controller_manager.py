@@ -71,8 +71,8 @@ class ControllerManager:
     # ------------------------------------------------------------------ goals
 
     def start_trajectory(self, name: str, trajectory: Trajectory, time: float, goal: bytes | None = None) -> None:
-        """Follow a trajectory from ``time`` [s]. ``goal``: id of the goal; None if nobody waits for its result. Raises
-        :class:`CommandError` for an unknown controller.
+        """Start to follow a trajectory, with the controller ``name``, at ``time`` [s]. ``goal``: id of the goal; None
+        if nobody waits for its result. Raises :class:`CommandError` for an unknown controller.
 
         If the trajectory is invalid, its goal ends at once; without a goal, :class:`TrajectoryError` is raised.
         """

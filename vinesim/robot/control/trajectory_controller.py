@@ -185,7 +185,8 @@ class TrajectoryController:
     # ------------------------------------------------------------------ commands
 
     def start(self, trajectory: Trajectory, time: float) -> GoalHandle:
-        """Follow a trajectory from its start time, or from ``time`` [s] if it has none. The active goal is preempted.
+        """Start to follow a trajectory at its start time, or at ``time`` [s] if it has none. The active goal is
+        preempted.
 
         Joints that are not in the trajectory continue as before. Raises :class:`TrajectoryError` and changes nothing if
         the trajectory is invalid.

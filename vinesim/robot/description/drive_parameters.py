@@ -26,7 +26,7 @@ are derived. GUESSED"""
 STANDARD_GRAVITY = 9.80665
 """[m/s2] Standard acceleration of gravity, from which the weight on a drive is computed."""
 CENTRED_SHARE = 0.1
-"""Share of a joint's range. If the middle of the range is nearer to 0 than this share, the home position is 0."""
+"""Share of a joint's range within which the middle of the range counts as 0, so that the home position is 0."""
 
 
 def home_positions(driven: list[Joint], groups: dict[str, JointGroup]) -> np.ndarray:

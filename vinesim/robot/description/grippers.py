@@ -50,8 +50,11 @@ class Fingers(Gripper, frozen=True, tag="fingers"):
 
 
 class Cutter(Gripper, frozen=True, tag="cutter"):
-    """A gripper with two blades: the box-shaped space between them in which wood is cut. x is along the blades, y
-    from one blade to the other, z across the plane of the blades."""
+    """A gripper with two blades, described by the box-shaped space between the blades in which wood is cut.
+
+    The x axis of the box is along the blades, y points from one blade to the other, and z is perpendicular to the plane
+    of the blades.
+    """
 
     frame: str
     """Link that carries the cutter."""

@@ -113,7 +113,7 @@ def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
 
 
 def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
-    """Raise principal moments that are 0 or, by a rounding error, negative."""
+    """Increase principal moments of inertia that are 0, or negative by a rounding error, to a small positive value."""
     repaired = []
     for link in root.iterfind("link"):
         inertial = parse_inertial(link.find("inertial"))

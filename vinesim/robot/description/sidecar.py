@@ -71,12 +71,14 @@ class JointGroup(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class SensorTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings for whether simulated time waits for the robot's sensors; see
-    :class:`vinesim.scene.values.SensorPacing`."""
+    """Table of a robot's TOML file that sets how simulated time waits for the robot's cameras and lidars.
+
+    The fields are those of :class:`vinesim.scene.values.SensorPacing`.
+    """
 
     mode: SensorMode = SensorMode.LIVE
     least_rate: float = SensorPacing().least_rate
-    """Lowest acceptable rate of the sensors [Hz]; see :class:`vinesim.scene.values.SensorPacing`."""
+    """Lowest rate of live sensors [Hz of simulated time]. Simulated time waits for a sensor that would be slower."""
 
 
 class Controller(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -36,7 +36,7 @@ NUMBER_COUNTS = {
     ("mesh", "bounds"): 6,
     ("mesh", "faces"): 1,
 }
-"""How many numbers each attribute has, by element and attribute."""
+"""Number of numbers in each attribute, by element and attribute."""
 
 MAX_NUMBER = 1e6
 """Largest number in a URDF [m, kg, kg m2, rad]. Larger numbers would make the state of everything that touches the
@@ -118,7 +118,8 @@ def merge_disabled_collisions(root: etree._Element, file: pathlib.Path, notes: l
     """Copy the ``disable_collisions`` of an SRDF ``file`` into the URDF, for links that exist in the URDF. Adds this to
     ``notes``.
 
-    Then everything that reads the URDF knows them. Raises :class:`DescriptionError` if the file is missing or no SRDF.
+    Physics, ROS and other clients read the pairs from the URDF. Raises :class:`DescriptionError` if the file is missing
+    or no SRDF.
     """
     if not file.is_file():
         raise description_error(file, "this SRDF is missing", "correct its path in the robot's TOML file")

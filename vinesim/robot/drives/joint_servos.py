@@ -198,7 +198,8 @@ class JointServos:
         self._rigid.command(self._name, self.setpoint, rate)
 
     def _prepare_interfaces(self) -> None:
-        """Compute values that change only when interfaces, gains or limits change."""
+        """Compute again the values of the set-points' computation that depend only on interfaces, gains and effort
+        limits."""
         self._in_effort = self.interface == CommandInterface.EFFORT
         self._in_motor_position = self.interface == CommandInterface.MOTOR_POSITION
         self._gains_vary = bool(self._in_effort.any() or self._in_motor_position.any())
@@ -220,8 +221,10 @@ class JointServos:
 
     def _speed_limiters(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Returns which joints would exceed their largest velocity under their commanded effort [joint] bool, and the
-        damping that prevents this [joint] N m s/rad or N s/m. The damping acts on the difference from the largest
+        damping [joint] N m s/rad or N s/m that prevents this. The damping acts on the difference from the largest
         velocity.
+
+        ``velocity``: present velocities [joint] rad/s or m/s.
 
         Below 90 % of the largest velocity there is no damping. The velocity is extrapolated by one step. The damping
         force never exceeds the commanded effort, because a saturated servo does not notice that the velocity decreases

@@ -21,8 +21,8 @@ _EXACT = np.tile(LEAST_VARIANCE * np.eye(3), (2, 1, 1))
 
 
 class TrackOdometry:
-    """Pose of the base since the start, integrated from the travel of its tracks, of which a constant share is lost
-    by slip."""
+    """Pose of the base since the start, integrated from the travel of its tracks. A constant share of the travel is
+    lost by slip."""
 
     def __init__(self, linear_slip: float, angular_slip: float, pose: np.ndarray) -> None:
         """``linear_slip``, ``angular_slip``: lost shares of travel ahead and of turns, from 0 to below 1. ``pose``

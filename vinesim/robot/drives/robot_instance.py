@@ -1,5 +1,4 @@
-"""A robot in the rigid world: base class of robots that this client or another client controls, and the latter's
-copy."""
+"""A robot in the rigid world: the base class of all robots, and the copy of a robot that another client controls."""
 
 from __future__ import annotations
 
@@ -21,7 +20,8 @@ _NO_POSES = np.zeros((0, 7))
 
 
 class RobotInstance:
-    """A robot in the rigid world; base class of local and remote robots."""
+    """A robot in the rigid world. Base class of robots that this client controls and of copies of other clients'
+    robots."""
 
     def __init__(
         self,
@@ -63,7 +63,7 @@ class RobotInstance:
         return self._shown_color
 
     def show_lights(self, time: float) -> None:
-        """Update the colour of the indicator lights to the ``time`` of the world [s]. This is cheap if the colour
+        """Set the colour that the indicator lights show at the ``time`` of the world [s]. This is cheap if the colour
         does not change."""
         shown = self.lights.shown(time)
         if shown != self._shown_color:
@@ -75,8 +75,8 @@ class RobotInstance:
         self.rigid.remove_robot(self.name)
 
     def sample(self, time: float, contacts: Sequence[Contact] = ()) -> RobotSample:
-        """Returns the state of the robot at ``time`` [s]. ``contacts``: contacts in the world, of which the robot's
-        own are included."""
+        """Returns the state of the robot at ``time`` [s]. ``contacts``: all contacts in the world; the state includes
+        those of this robot."""
         measured = self.measure(time, contacts)
         return dataclasses.replace(measured, transform_q=self.description.moving_joints.poses(measured.joints.position))
 

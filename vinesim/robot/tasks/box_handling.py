@@ -56,7 +56,8 @@ class BoxHandling(Task):
     # ------------------------------------------------------------------ motions
 
     def _take(self, phase: str, end: str, box: int) -> Iterator[str]:
-        """Approach a box with the clamp at ``end``, clamp and lift it, and return to where the base can turn."""
+        """Approach a box with the clamp at ``end`` of the robot, clamp and lift the box, and drive back to where the
+        base can turn. Yields ``phase`` once per step."""
         group = f"clamp_{end}"
         here = self._base_pose()[:2].copy()
         fingers = self.robot.description.joint_indices(group)

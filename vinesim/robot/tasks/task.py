@@ -35,7 +35,7 @@ class Task(abc.ABC):
     """Base class of tasks. :meth:`run` is advanced by one step in each :meth:`control`."""
 
     key_phases: frozenset[str] = frozenset()
-    """Names of the phases of which pictures are most useful."""
+    """Names of the phases in which pictures are most useful."""
 
     def __init__(self, robot: Robot, *, timeout: float) -> None:
         """``timeout`` [s]: time after which the task fails."""
@@ -60,7 +60,7 @@ class Task(abc.ABC):
         return self.is_done and not self.reason
 
     def frame_score(self) -> float:
-        """How useful a picture would be now, 0 to 1: 1 in a key phase."""
+        """Returns how useful a picture would be now, from 0 to 1; 1 in one of :attr:`key_phases`."""
         return float(self.phase in self.key_phases)
 
     def report(self) -> dict[str, Any]:

@@ -41,8 +41,8 @@ MAX_GOALS = 32
 
 
 class DeferredActionServer(ActionServer):
-    """An action server whose accepted goals have the state EXECUTING, but no execution task. :meth:`notify_execute`
-    is called with a callback once the result is known."""
+    """An action server whose accepted goals have the state EXECUTING, but no execution task. The owner of the server
+    calls :meth:`notify_execute` with a callback once the result is known."""
 
     def notify_execute(self, goal_handle: ServerGoalHandle, execute_callback: Callable[..., Any] | None) -> None:
         if execute_callback is not None:
@@ -95,7 +95,7 @@ class ControllerActions:
     # ------------------------------------------------------------------ in the receiving thread
 
     def _judge(self, take: Callable[..., object], request: Any) -> GoalResponse:
-        """Accept or reject a goal request: it must be valid, and fewer than :data:`MAX_GOALS` goals may be
+        """Returns whether a goal request is accepted: it must be valid, and fewer than :data:`MAX_GOALS` goals may be
         executing."""
         try:
             take(request, goal=b"")

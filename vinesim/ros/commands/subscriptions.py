@@ -61,7 +61,7 @@ class CommandQueue:
         return commands
 
     def put(self, command: Command) -> None:
-        """Add a command. A set-point replaces an older one for the same target."""
+        """Add a command. If it is a set-point, it replaces an older set-point for its target."""
         key = _setpoint_key(command)
         with self._lock:
             if key is not None:
@@ -80,8 +80,8 @@ class CommandQueue:
 
 
 def _setpoint_key(command: Command) -> tuple[str, ...] | None:
-    """Returns the target of a set-point command: a newer command with the same key replaces it. None for
-    trajectories and goals."""
+    """Returns a key that identifies the target of a set-point command. In the queue, a newer command replaces an older
+    one with an equal key. None for trajectories and goals, which are all kept."""
     match command:
         case BaseVelocity():
             return ("base",)

@@ -524,8 +524,8 @@ def _align(body: bytearray, size: int) -> None:
 _MARK_TIME = 1_589_640_193.708529245
 """[s] Unmistakable stamp by which the positions of stamps in a serialised message are found."""
 _FIRST_MARK = 1.2345e200
-"""First of the unmistakable numbers by which the positions of numbers in a serialised message are found; the others
-are its multiples."""
+"""First of the unmistakable numbers by which the positions of numbers in a serialised message are found. Further ones
+are multiples of this number."""
 _NONE = np.zeros(0)
 
 

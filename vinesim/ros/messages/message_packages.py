@@ -287,8 +287,8 @@ class InterfacesError(RuntimeError):
 
 
 def ensure_importable(packages: Iterable[str]) -> None:
-    """Make message packages importable: the official package if it is installed, else that of vinesim, which is built
-    at the first call.
+    """Make message packages importable: the official package if it is installed, else vinesim's own build, which is
+    made at the first call.
 
     The first build of a package takes 4 to 15 s of CPU time. Raises :class:`InterfacesError`, with the reason in one
     line, if a package cannot be built.
@@ -493,5 +493,6 @@ def install(packages: list[str]) -> None:
 
 
 def _digest(content: bytes) -> str:
-    """Returns the SHA-256 digest of a file as a wheel's RECORD contains it."""
+    """Returns the SHA-256 digest of a file's ``content``, in the encoding of a wheel's file ``RECORD``: URL-safe base64
+    without padding."""
     return base64.urlsafe_b64encode(hashlib.sha256(content).digest()).rstrip(b"=").decode()

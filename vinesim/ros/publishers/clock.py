@@ -55,8 +55,8 @@ class ClockPublisher:
         return topic is not None and self._sends and topic.subscription_count > 0
 
     def update(self) -> None:
-        """Search for other publishers of /clock, and start or stop publishing. Called by the receiving thread of the
-        node."""
+        """Search for other publishers of /clock, and start or stop publishing. The node's receiving thread calls this
+        method."""
         now = wall.monotonic()
         if now < self._next_look:
             return

@@ -150,7 +150,7 @@ class ShadowSquare:
         return windows
 
     def _casters_inside(self, primitives: Primitives, window: Window) -> np.ndarray:
-        """Returns the clusters [k] whose shadows may touch the rectangle ``window``."""
+        """Returns the clusters [k] (runs of primitives) whose shadows may touch the rectangle ``window`` of the map."""
         ball = primitives.ball.numpy()
         texels = self._texels(ball)
         inside = (ball[:, 3] > 0.0) & (texels[:, 0] < window[1]) & (texels[:, 1] > window[0])
@@ -160,7 +160,8 @@ class ShadowSquare:
         return np.flatnonzero(inside)
 
     def _casters(self, primitives: Primitives) -> wp.array:
-        """Returns all clusters of the kinds that this map draws, at any place."""
+        """Returns all clusters (runs of primitives) that this map draws, wherever they are: plants, and rigid bodies if
+        the map draws them."""
         if self._known != primitives.layout_version:
             every = np.arange(len(primitives.cluster_first), dtype=np.int32)
             mine = every if self.rigid else np.delete(every, primitives.rigid_clusters)
@@ -345,8 +346,8 @@ class Sunlight:
     def update(
         self, primitives: Primitives, eye: np.ndarray, forward: np.ndarray, time: float
     ) -> tuple[shadow_maps.ShadowMap, shadow_maps.ShadowMap]:
-        """Update the light, and return the fine and the coarse shadow map for a camera at ``eye`` [3] m that looks
-        along ``forward`` [3]."""
+        """Compute light and shadows again where they are no longer valid at ``time`` [s], for a camera at ``eye`` [3] m
+        that looks along ``forward`` [3]. Returns the fine and the coarse shadow map."""
         self._update_light(time)
         for one in (self._near, self._far):
             one.follow(primitives, eye, forward, time, self.period)

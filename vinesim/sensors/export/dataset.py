@@ -225,7 +225,7 @@ class VineyardRenderer:
         write_files({folder / name: [data] for name, data in files.items()})
 
     def _pose_scene(self, image: int) -> tuple[Snapshot, np.ndarray | None, dict[str, Any]]:
-        """Pose the primitives for one image, whatever image was rendered before.
+        """Move all primitives to their poses in one image, independently of images that were rendered before.
 
         Returns the snapshot, the point [2] m of the ground near which to look (None: anywhere), and the scene's record.
         """
@@ -311,7 +311,7 @@ def _file_of(kind: str, image: int) -> str:
 
 
 def prepare_folder(plan: DatasetPlan, folder: pathlib.Path, images: int) -> None:
-    """Create the folder of a data set with ``images`` images, or prepare to continue one that exists.
+    """Create the folder of a data set with ``images`` images, or check that an existing data set can be continued.
 
     An existing folder must have been begun with the same plan, and must not contain more images. Raises
     :class:`DatasetError` otherwise.

@@ -39,8 +39,8 @@ FOOTPRINT_RANGE = 3.0
 narrower than the real one at shorter range, and wider at longer range."""
 MAX_SHARED_TRANSLATION = 4e-3
 MAX_SHARED_ROTATION = 3.5e-3
-"""Rotation [rad] of the lidar's mount between firings below which the firings are computed from one pose, that of the
-middle firing; ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
+"""Rotation [rad] of the lidar's mount during some firings below which all of them are computed from the pose at the
+middle firing. ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
 
 The error is at most half a step of the head, and clusters nearby need not be searched for every firing.
 """
@@ -78,9 +78,10 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     separation: Annotated[Number, "m", (0.0, 10.0)]
     """Least distance along the beam between two returns of one shot."""
     returns: Literal["strongest", "last", "dual"] = "strongest"
-    """Which echoes of a shot are reported; ``dual``: the strongest and the last, or the two strongest."""
+    """Echoes of a shot that are reported. ``dual``: the strongest and the last one, or the two strongest if the
+    strongest is the last."""
     noise: Annotated[Number, "m", (0.0, 1.0)]
-    """Least standard deviation of the range, that of a strong echo."""
+    """Least standard deviation of the range, which strong echoes have."""
     weak_noise: Annotated[Number, "m", (0.0, 1.0)]
     """Standard deviation of the range of the weakest detectable echo; for stronger echoes it decreases with the square
     root of the signal, down to ``noise``."""

@@ -100,8 +100,8 @@ class Primitives:
         self._bodies = len(model.body_mass)
         self._wires = wire_segments(model)
         self._static_carrier = self._bodies + len(self._wires)
-        """Index of the carrier of the static scene. Lower indices are bodies of plants, then segments of wires; higher
-        indices are rigid bodies."""
+        """Index of the carrier (row of poses) of the static scene. Lower indices are bodies of plants, then segments of
+        wires; higher indices are rigid bodies."""
         self._wires_away = np.zeros(0, int)
         """Segments of wires [k] that were deflected at the last update."""
         self._visuals: tuple[RigidVisual, ...] = ()
@@ -147,7 +147,8 @@ class Primitives:
         return {name: int((kinds == kind).sum()) for name, kind in KINDS.items()}
 
     def clusters_shown(self) -> np.ndarray:
-        """Returns [cluster] whether each cluster is drawn; clusters of picked bunches on their vines are not."""
+        """Returns whether each cluster (run of primitives) is drawn [cluster]: all but those of picked bunches at their
+        former place on the vine."""
         return self.ball.numpy()[:, 3] > 0.0
 
     def local_columns(self, rows: slice | np.ndarray) -> dict[str, np.ndarray]:
@@ -217,7 +218,10 @@ class Primitives:
         return [b for b in batches if len(b)] or [placeholder_batch(static)]
 
     def _open(self, baked: disk_cache.Arrays) -> None:
-        """Use the result of :meth:`_bake`, just computed or read from the cache; poses are not applied yet."""
+        """Store the result of :meth:`_bake` in this object. Poses are not applied yet.
+
+        ``baked``: arrays that were just computed or read from the disk cache.
+        """
         low, high = _ground_extent(self.model)
         low = low - 3.0
         high = high + 3.0
@@ -293,8 +297,8 @@ class Primitives:
         self.layout_version += 1
 
     def _lay_out_rigid(self, visuals: tuple[RigidVisual, ...]) -> list[tuple[int, ClusterLayout]]:
-        """Returns carrier and clusters of each rigid body in ``visuals`` that has shapes; for known bodies the cached
-        clusters."""
+        """Returns carrier (index of the pose that moves a body) and clusters of each rigid body in ``visuals`` that has
+        shapes. Clusters of known bodies are taken from the cache."""
         picked = self._picked_bunch_shapes(visuals)
         known = {}
         found = []
@@ -323,7 +327,8 @@ class Primitives:
                 self._columns = self._columns | {name: column}
 
     def _write(self, layout: ClusterLayout, sky: np.ndarray, row: int, cluster: int) -> None:
-        """Write a layout to the device: primitives from index ``row`` on, clusters from index ``cluster`` on.
+        """Copy a layout of primitives to the device: primitives from index ``row`` on, clusters from index ``cluster``
+        on.
 
         ``sky``: [primitive] share of the sky that is visible.
         """
@@ -382,7 +387,8 @@ class Primitives:
     # -- following the world
 
     def update(self, snapshot: Snapshot, moved: np.ndarray | None = None) -> np.ndarray:
-        """Move the primitives to the poses of ``snapshot``, and return the clusters [k] that moved.
+        """Move the primitives to the poses of ``snapshot``, and return the clusters [k] (runs of primitives) that
+        moved.
 
         ``moved``: trees that may have moved since the last call (default: the moved trees of this snapshot and of the
         one before). A caller that skips snapshots must collect the moved trees of all skipped snapshots.
@@ -448,7 +454,8 @@ class Primitives:
 
 
 def _clusters_shown(bunch: np.ndarray, attached: np.ndarray) -> np.ndarray:
-    """Returns [cluster] int32: 0 for clusters whose bunch no longer hangs on its vine, else 1.
+    """Returns 0 for each cluster (run of primitives) whose bunch no longer hangs on its vine, and 1 for all others:
+    [cluster] int32.
 
     ``bunch``: [cluster] bunch of each cluster, -1 for none; ``attached``: [bunch] whether the bunch hangs.
     """

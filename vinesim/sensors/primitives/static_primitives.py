@@ -100,8 +100,8 @@ def row_layout(model: Model) -> tuple[float, float]:
 
 
 def _row_greenness(rows: tuple[float, float], y: np.ndarray) -> np.ndarray:
-    """Returns the change of the ground's share of sod at ``y`` [n] m across the rows, equal to
-    :func:`vinesim.kernels.shading.materials.row_greenness`."""
+    """Returns by how much the rows of vines change the share of the ground that is covered with sod at ``y`` [n] m:
+    negative under vines and in wheel tracks [n]. Equal to :func:`vinesim.kernels.shading.materials.row_greenness`."""
     lane = (y - rows[0]) / rows[1]
     away = np.abs(lane - np.round(lane)) * rows[1]
     track = np.abs(away - 0.5 * rows[1] + 0.7)

@@ -154,7 +154,8 @@ class CameraRasterizer:
         return row_bands(lens, BANDS_PER_THREAD * self.workers.size if self.workers.size > 1 else 1)
 
     def _resolve(self, primitives: PosedPrimitives, lens: Pinhole, nearest: float, farthest: float) -> None:
-        """Convert the keys in the rows of ``lens`` to primitive, depth and label."""
+        """Convert the keys (depth and primitive of each pixel as one integer) in the rows of ``lens`` to primitive,
+        depth and label."""
         run = self.width if self.device == "cpu" else 1  # on a CPU one thread takes a row, to pass structs less often
         wp.launch(
             camera_raster.resolve_keys,
@@ -175,7 +176,8 @@ class CameraRasterizer:
         )
 
     def cluster_distances(self, primitives: PosedPrimitives, lens: Pinhole) -> np.ndarray:
-        """Returns [cluster] m the least distance of each cluster from the camera, or FAR for clusters out of view."""
+        """Returns the least distance [cluster] m of each cluster (run of primitives) from the camera, or FAR for
+        clusters out of view."""
         distance = wp.empty(len(primitives.cluster_first), dtype=float, device=self.device)
         wp.launch(
             camera_raster.cull_clusters,
@@ -187,9 +189,10 @@ class CameraRasterizer:
         return distance.numpy()
 
     def coverage(self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray) -> np.ndarray:
-        """Returns [height, width] which pixels would show the ``clusters`` [k] if the scene contained no others.
+        """Returns which pixels [height, width] would show the ``clusters`` [k] (runs of primitives) if the scene
+        contained no other clusters.
 
-        This overwrites the keys, but neither depth nor labels.
+        This overwrites the keys (depth and primitive of each pixel as one integer), but neither depth nor labels.
         """
         if primitives.rasterizer is None:
             self._rasterize(primitives, lens, clusters)
@@ -198,8 +201,10 @@ class CameraRasterizer:
         return self.keys.numpy().reshape(self.height, self.width) < int(EMPTY_KEY)
 
     def _rasterize(self, primitives: PosedPrimitives, lens: Pinhole, seen: np.ndarray) -> None:
-        """Compute the keys in the rows of ``lens`` from the clusters ``seen`` [k], which should be sorted from near to
-        far for speed."""
+        """Compute the keys (depth and primitive of each pixel as one integer) in the rows of ``lens``.
+
+        ``seen`` [k]: clusters (runs of primitives) to draw, sorted from near to far for speed.
+        """
         assert self._keys is not None, "these kernels draw on a CPU only"
         rows = slice(lens.first_row * self.width, lens.end_row * self.width)
         self._keys[rows].fill(int(EMPTY_KEY))  # numpy fills this memory five times as fast as Warp

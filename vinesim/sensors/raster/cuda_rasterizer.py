@@ -13,7 +13,8 @@ _LISTS = int(cuda_raster.TILE_LISTS)
 
 
 class CudaRasterizer:
-    """Rasteriser on a CUDA GPU: lists tiles of primitives, then draws them into the keys of a picture of any size.
+    """Rasteriser on a CUDA GPU. It lists tiles (small rectangles of the picture that cover each primitive), then draws
+    the tiles. The result is a key for each pixel: depth and primitive as one integer.
 
     The host does not wait for the GPU.
 
@@ -47,8 +48,10 @@ class CudaRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """Write the nearest primitive of every pixel to ``keys`` [pixel], of all clusters or only of ``clusters``
-        [k]."""
+        """Write depth and index of the nearest primitive of every pixel to ``keys`` [pixel].
+
+        ``clusters`` [k]: clusters (runs of primitives) to draw; None: all.
+        """
         if len(self._all) != len(primitives.cluster_first):
             self._all = wp.array(np.arange(len(primitives.cluster_first), dtype=np.int32), device=self.device)
         which = self._all if clusters is None else wp.array(np.asarray(clusters, np.int32), device=self.device)

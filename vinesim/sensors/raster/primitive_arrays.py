@@ -35,8 +35,8 @@ KINDS = {
 
 
 class PosedPrimitives(Protocol):
-    """Interface of the primitives of a scene in world poses, for rasterisers; implemented by
-    :class:`vinesim.sensors.primitives.scene_primitives.Primitives`."""
+    """Interface of the primitives of a scene in world poses, for rasterisers. A cluster is a run of adjacent
+    primitives. Implemented by :class:`vinesim.sensors.primitives.scene_primitives.Primitives`."""
 
     device: str
     shapes: primitives.Shapes
@@ -70,6 +70,6 @@ class PrimitiveRasterizer(Protocol):
     ) -> None:
         """Write the key of the nearest primitive of every pixel to ``keys`` [pixel] int64.
 
-        ``clusters``: [k] clusters to draw; None: all clusters.
+        ``clusters``: [k] clusters (runs of adjacent primitives) to draw; None: all clusters.
         """
         ...

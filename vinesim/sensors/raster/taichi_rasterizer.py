@@ -59,7 +59,8 @@ def lens_of(view: ti.template()):
 
 @functools.cache
 def _draw_kernel(kind: int, phase: int):
-    """Returns the Taichi kernel that draws clusters of primitives of one ``kind``; ``phase``: KEY, DEPTH or NUMBER.
+    """Returns the Taichi kernel that draws clusters of primitives of one ``kind``. ``phase``: the kernel's result, KEY,
+    DEPTH or NUMBER.
 
     One thread draws every ``slices``-th row of every ``lanes``-th primitive of one cluster.
     """
@@ -142,8 +143,10 @@ class TaichiRasterizer:
     def rasterize(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, clusters: np.ndarray | None, keys: wp.array
     ) -> None:
-        """Write the nearest primitive of every pixel to ``keys`` [pixel], of all clusters or only of ``clusters``
-        [k]."""
+        """Write depth and index of the nearest primitive of every pixel to ``keys`` [pixel].
+
+        ``clusters`` [k]: clusters (runs of primitives) to draw; None: all.
+        """
         which = _visible_clusters(primitives, lens) if clusters is None else np.asarray(clusters, np.int32)
         kind = primitives.cluster_kind[which]
         mine = {number: which[kind == number] for number in KERNEL_FUNCTIONS}
@@ -163,7 +166,8 @@ class TaichiRasterizer:
     def _rasterize_on_gpu(
         self, primitives: PosedPrimitives, lens: pinhole.Pinhole, mine: dict[int, np.ndarray], keys: np.ndarray
     ) -> None:
-        """Draw clusters ``mine`` (by kind) on a GPU in two passes: first depths, then indices of primitives.
+        """Draw clusters (runs of primitives) on a GPU in two passes: first depths, then indices of primitives.
+        ``mine``: clusters to draw, by kind of primitive.
 
         Arrays of primitives are copied to the GPU only after motion.
         """
@@ -225,7 +229,7 @@ def _pinhole_values(lens: pinhole.Pinhole) -> np.ndarray:
 
 
 def _visible_clusters(primitives: PosedPrimitives, lens: pinhole.Pinhole) -> np.ndarray:
-    """Returns the clusters [k] that may be in the camera's view, sorted from near to far."""
+    """Returns the clusters [k] (runs of primitives) that may be in the camera's view, sorted from near to far."""
     ball = primitives.ball.numpy()
     r = ball[:, 3]
     p = (ball[:, :3] - np.array(lens.eye)) @ np.array(lens.rotation).reshape(3, 3).T
