@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.support.killed_programs import ROBOTS, Vineyard
 from vinesim.bench.live_client import own_processes
-from vinesim.client.processes.child_process import START_TIMEOUT, ProcessFailed
+from vinesim.client.programs import START_TIMEOUT, ProgramFailed
 from vinesim.scene.values import Measurement
 
 KINDS = ("server", "router", "client", "sensors", "ROS node", "ROS listener")
@@ -59,7 +59,7 @@ def kill(
 ) -> Iterator[Measurement]:
     """Kill ``times`` programs or a few more, of each of the ``kinds`` as many, with SIGKILL.
 
-    Before each round a bunch is picked. ``announce`` takes a line for each round. :class:`ProcessFailed` if a program
+    Before each round a bunch is picked. ``announce`` takes a line for each round. :class:`ProgramFailed` if a program
     ends that was not killed.
     """
     random = np.random.default_rng(seed)
@@ -71,7 +71,7 @@ def kill(
         possible = [kind for kind in kinds if vineyard.ros or kind not in ROS_KINDS]
         missing = _wait_until_all_go_on(vineyard, START_TIMEOUT)[1]
         if missing:
-            raise ProcessFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
+            raise ProgramFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
         rounds: list[Round] = []
         count = -(-times // len(possible))
         for number in range(1, count + 1):

@@ -18,8 +18,7 @@ import numpy as np
 
 from vinesim.bench.live_client import own_processes
 from vinesim.bench.process_memory import ProcessHistory, ProcessSampler, check_proc
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessFailed, ProcessGroup
-from vinesim.client.processes.ros_listener import RosListener
+from vinesim.client.programs import START_TIMEOUT, Program, ProgramFailed, ProgramGroup, RosListener
 from vinesim.client.tasks import start_poses
 from vinesim.core.frames import to_yaw
 from vinesim.ros import middleware
@@ -105,7 +104,7 @@ def measurements(result: SoakResult) -> Iterator[Measurement]:
 def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> SoakResult:
     """Start all, wait until they are ready, sample them for ``minutes`` [min], end them.
 
-    Raises :class:`ProcessFailed` if a process ends before, :class:`ProcUnavailable` where there is no /proc.
+    Raises :class:`ProgramFailed` if a process ends before, :class:`ProcUnavailable` where there is no /proc.
     """
     check_proc()
     with own_processes() as group, tempfile.TemporaryDirectory() as folder:
@@ -149,7 +148,7 @@ def settle(
 class _Run:
     """The programs of one run."""
 
-    def __init__(self, group: ProcessGroup, cast: Cast, folder: pathlib.Path) -> None:
+    def __init__(self, group: ProgramGroup, cast: Cast, folder: pathlib.Path) -> None:
         """Start them; what they write goes below ``folder``."""
         self._folder = folder
         self.server = group.start(
@@ -168,10 +167,10 @@ class _Run:
         )
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
         self._endpoint = self._figures["endpoints"][0]
-        self.clients: dict[str, Process] = {}
+        self.clients: dict[str, Program] = {}
         self._newest: dict[str, dict[str, Any]] = {}
         self.listeners: list[RosListener] = []
-        self.processes: list[tuple[str, Process]] = [("server", self.server)]
+        self.processes: list[tuple[str, Program]] = [("server", self.server)]
         self._start_clients(group, cast)
         self.recorder = None
         if cast.records:
@@ -181,7 +180,7 @@ class _Run:
             self.processes.append(("recorder", self.recorder))
         self.sampler = ProcessSampler([(kind, process.child.pid) for kind, process in self.processes])
 
-    def _start_clients(self, group: ProcessGroup, cast: Cast) -> None:
+    def _start_clients(self, group: ProgramGroup, cast: Cast) -> None:
         """Robots one behind the other, the first of which pushes a bunch; people beside bunches of their own."""
         scene = load_scene(cast.scene)
         model = generate(scene)
@@ -197,7 +196,7 @@ class _Run:
                 topics = [f"/{name}/{topic}" for topic in TOPICS]
                 listener = RosListener(group, topics)
                 self.listeners.append(listener)
-                self.processes.append(("ROS listener", group.processes[-1]))
+                self.processes.append(("ROS listener", group.programs[-1]))
             self._start_client(group, "robot", name, cast, [*options, *(["--push", str(pushed)] if i == 0 else [])])
         centres = start_poses.bunch_centres(model)[:, :2]
         # a person's bunch lies apart from the robots
@@ -209,7 +208,7 @@ class _Run:
                 group, "human", f"person_{i + 1}", cast, ["--reach", str(bunch), *_pose_option(place, 0.0)]
             )
 
-    def _start_client(self, group: ProcessGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
+    def _start_client(self, group: ProgramGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
         common = ["--connect", self._endpoint, "--scene", cast.scene, "--status", "json"]
         self.clients[name] = group.start(
             name,
@@ -228,7 +227,7 @@ class _Run:
         self.processes.append(("robot client" if role == "robot" else "person's client", self.clients[name]))
 
     def read(self) -> None:
-        """Take what the processes have printed; :class:`ProcessFailed` if one has ended."""
+        """Take what the processes have printed; :class:`ProgramFailed` if one has ended."""
         for name, client in self.clients.items():
             for line in client.new_lines():
                 self._newest[name] = json.loads(line)
@@ -278,7 +277,7 @@ class _Run:
             try:
                 client.finish()
                 reports.append(json.loads((self._folder / name / "report.json").read_text()))
-            except (ProcessFailed, OSError) as error:
+            except (ProgramFailed, OSError) as error:
                 counts[f"{name} without a report ({error})"] = 1
                 reports.append({"malformed": 0, **self._newest[name]})
         for report in reports:

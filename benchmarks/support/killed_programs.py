@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.client.client import Client
-from vinesim.client.processes.child_process import Process, ProcessFailed, ProcessGroup
+from vinesim.client.programs import Program, ProgramFailed, ProgramGroup
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.core import frames
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -42,17 +42,17 @@ SETTLING = 1.0
 
 
 @dataclasses.dataclass
-class Program:
+class RestartedProgram:
     """A program as its user starts it, and starts it again after it was killed."""
 
     name: str
     arguments: tuple[str, ...]
-    process: Process
+    process: Program
     lines: list[tuple[float, dict[str, Any]]] = dataclasses.field(default_factory=list)
     """When each line of JSON came [s, monotonic], since the last kill of any program; the newest of before is first."""
 
     def read(self) -> None:
-        """Take the lines that have come; :class:`ProcessFailed` if it has ended."""
+        """Take the lines that have come; :class:`ProgramFailed` if it has ended."""
         now = time.monotonic()
         self.lines += [(now, json.loads(line)) for line in self.process.new_lines() if line.startswith("{")]
 
@@ -64,12 +64,12 @@ class Program:
 class Vineyard:
     """The programs, and the person. A context; leaving it ends all."""
 
-    def __init__(self, group: ProcessGroup, folder: pathlib.Path, *, ros: bool, seed: int) -> None:
+    def __init__(self, group: ProgramGroup, folder: pathlib.Path, *, ros: bool, seed: int) -> None:
         """Start all; ``folder`` takes the server's state. ``ros``: with ROS processes and a listener."""
         self._group = group
         self._random = np.random.default_rng(seed)
         self.ros = ros and middleware.unavailable_reason() is None
-        self.programs: dict[str, Program] = {}
+        self.programs: dict[str, RestartedProgram] = {}
         self.picked: set[int] = set()
         """Bunches that the person has picked."""
         server = _free_endpoint()
@@ -110,7 +110,7 @@ class Vineyard:
         self._next_tick = time.monotonic()
 
     def _start(self, name: str, *arguments: str) -> None:
-        self.programs[name] = Program(name, arguments, self._group.start(name, *arguments))
+        self.programs[name] = RestartedProgram(name, arguments, self._group.start(name, *arguments))
 
     def _wait_for_endpoint(self, endpoint: str) -> None:
         """Return when a server listens there."""
@@ -120,12 +120,12 @@ class Vineyard:
             with contextlib.suppress(OSError), socket.create_connection((host, int(port)), 1.0):
                 return
             time.sleep(0.05)
-        raise ProcessFailed(f"nothing listens on {endpoint}")
+        raise ProgramFailed(f"nothing listens on {endpoint}")
 
     # ------------------------------------------------------------------ while all goes on
 
     def step(self) -> None:
-        """Step the person when it is due, and take what the programs say; :class:`ProcessFailed` if one has ended."""
+        """Step the person when it is due, and take what the programs say; :class:`ProgramFailed` if one has ended."""
         time.sleep(max(self._next_tick - time.monotonic(), 0.0))
         self._next_tick = max(self._next_tick + self.witness.physics.dt, time.monotonic())
         self.witness.tick()

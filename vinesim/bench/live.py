@@ -144,7 +144,7 @@ ROWS = {
 def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measurement]:
     """The named rows of :data:`ROWS`, all if none are named; ``announce`` takes a line for each as it begins.
 
-    A row that fails raises :class:`ProcessFailed` or :class:`RosMissing`.
+    A row that fails raises :class:`ProgramFailed` or :class:`RosMissing`.
     """
     chosen = [name for name in ROWS if not rows or name in rows]
     left = sum(ROWS[name].seconds for name in chosen)
@@ -156,7 +156,7 @@ def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measu
 
 
 def run_command(*arguments: str) -> float:
-    """How long ``vinesim ARGUMENTS`` takes [s]; :class:`ProcessFailed` unless it ends with 0."""
+    """How long ``vinesim ARGUMENTS`` takes [s]; :class:`ProgramFailed` unless it ends with 0."""
     with own_processes() as group:
         process = group.start(f"vinesim {arguments[0]}", "-m", "vinesim", *arguments)
         start = time.perf_counter()

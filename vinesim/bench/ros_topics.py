@@ -21,8 +21,7 @@ import numpy as np
 from vinesim.bench import stock_publisher
 from vinesim.bench.live_client import CLOCK, DEPTH, LIDAR, RGB, RosMissing, own_processes
 from vinesim.bench.ros_resets import RESETS, measure_resets
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup
-from vinesim.client.processes.ros_listener import RosListener
+from vinesim.client.programs import START_TIMEOUT, Program, ProgramGroup, RosListener
 from vinesim.client.rate_loop import TickLog
 from vinesim.ros import middleware
 from vinesim.scene.values import Measurement
@@ -189,7 +188,7 @@ def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
 
 
 def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Measurement]:
-    """All rows; ``window`` [s] is measured twice. :class:`RosMissing` or :class:`ProcessFailed` if that fails."""
+    """All rows; ``window`` [s] is measured twice. :class:`RosMissing` or :class:`ProgramFailed` if that fails."""
     if (reason := middleware.unavailable_reason()) is not None:
         raise RosMissing(reason)
     with own_processes() as group, tempfile.TemporaryDirectory() as name:
@@ -202,7 +201,7 @@ def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Mea
         yield from measure_resets(group)
 
 
-def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
+def _measure_topics(group: ProgramGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
     """Measure topics next to a subscriber that reads, then next to one that has stopped reading."""
     arrivals = folder / "arrivals.npz"
     log = folder / "ticks.npz"
@@ -243,7 +242,7 @@ def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) ->
     yield from loss_rows(heard, published, sum(dropped.get(topic, 0) for topic in TOPICS))
 
 
-def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
+def _measure_actions(group: ProgramGroup) -> Iterator[Measurement]:
     """Goals of a stock action client in a process of its own."""
     client = _start_client(group)
     sender = group.start(
@@ -265,11 +264,11 @@ def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
     yield from action_rows(rows)
 
 
-def _start_client(group: ProcessGroup, *options: str) -> Process:
+def _start_client(group: ProgramGroup, *options: str) -> Program:
     return group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
 
 
-def _rest(client: Process, settling: float, window: float) -> tuple[float, float, float]:
+def _rest(client: Program, settling: float, window: float) -> tuple[float, float, float]:
     """Wait; wall times between which to measure [s since the epoch], and the monotonic time of the first [s]."""
     time.sleep(settling)
     since = time.time()
