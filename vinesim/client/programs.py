@@ -252,7 +252,7 @@ class RosListener:
             self._read(json.loads(self._program.next_line(START_TIMEOUT)))
 
     def missing(self) -> list[str]:
-        """Returns the topics that have no message yet, in the order in which they were named. ``events`` are left out."""
+        """Returns the topics without a message so far, in the order in which they were named, without ``events``."""
         for line in self._program.new_lines():
             self._read(json.loads(line))
         return [topic for topic in self.topics if topic not in self.first]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from vinesim.client.processes.shared_arrays import SharedArrays
+from vinesim.client.processes.shared_memory import SharedArrays
 from vinesim.scene.values import RigidVisual, Shape
 
 _FIRST_CAPACITY = 256

@@ -22,8 +22,7 @@ import numpy as np
 from vinesim.audio.frame import to_pcm
 from vinesim.audio.microphone import Microphone
 from vinesim.client.processes.rigid_visual_list import VisualListReceiver
-from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
-from vinesim.client.processes.shared_queue import SharedQueue
+from vinesim.client.processes.shared_memory import SharedArrays, SharedQueue, SharedSnapshot
 from vinesim.client.processes.step_record import StepRecords
 from vinesim.client.processes.worker_process import report_ready, serve
 from vinesim.client.sound.microphone_step import MicrophoneStep

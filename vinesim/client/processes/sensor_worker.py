@@ -20,7 +20,7 @@ import numpy as np
 
 from vinesim.client.processes.picture_keeper import PictureKeeper
 from vinesim.client.processes.rigid_visual_list import VisualListMessage, VisualListReceiver
-from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
+from vinesim.client.processes.shared_memory import SharedArrays, SharedSnapshot
 from vinesim.client.processes.worker_process import report_ready, serve
 from vinesim.client.world_time import OffsetHistory
 from vinesim.core import allocator, progress
