@@ -20,8 +20,8 @@ from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
 from vinesim.client.client import Client
 from vinesim.client.processes import worker_process
-from vinesim.client.processes.picture_keeper import RENEWAL_PERIOD, PictureKeeper
 from vinesim.client.processes.sensor_process import SensorProcess
+from vinesim.client.processes.sensor_worker import RENEWAL_PERIOD, PictureKeeper
 from vinesim.client.processes.worker_process import WorkerError
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.core import frames

@@ -78,7 +78,7 @@ class OneProcess:
 
     def render(self) -> None:
         """Let the worker take the newest snapshot."""
-        assert self.worker._take_requests()
+        assert self.worker._take_messages()
         if (world := self.worker._read()) is not None:
             snapshot, earlier = world
             self.worker.scheduler.advance(snapshot, earlier.pop()[1], earlier)
@@ -126,7 +126,7 @@ def test_wires_that_a_swinging_shoot_takes_along_are_read_as_they_are(monkeypatc
         for _ in range(20):
             world.client.tick()
             world.client.tick()  # a snapshot is written every second step
-            assert world.worker._take_requests()
+            assert world.worker._take_messages()
             snapshot, _ = world.worker._read()
             expected = physics.snapshot().wires
             np.testing.assert_array_equal(snapshot.wires.segment, expected.segment)

@@ -20,9 +20,8 @@ from vinesim.client.client import Client
 from vinesim.client.pace import Limit
 from vinesim.client.processes.rigid_visual_list import VisualListSender
 from vinesim.client.processes.ros_worker import RosChannel, RosConfig, run_ros_worker
-from vinesim.client.processes.spawned_process import ROS_MODULES
 from vinesim.client.processes.step_record import StepRecords
-from vinesim.client.processes.worker_process import Hold, Run, WorkerProcess
+from vinesim.client.processes.worker_process import ROS_MODULES, Hold, Run, WorkerProcess
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.signals import GestureLog, IntentionLog
 from vinesim.client.sound.exchange import SoundStep
@@ -72,14 +71,6 @@ class RosProcess:
         """
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
-        self._sent: dict[str, int] = {}
-        self._dropped: dict[str, int] = {}
-        self._sent_before: collections.Counter[str] = collections.Counter()
-        self._dropped_before: collections.Counter[str] = collections.Counter()
-        """Dropped messages of the earlier runs of the process, by topic."""
-        self._losses: collections.Counter[str] = collections.Counter()
-        self._losses_before: collections.Counter[str] = collections.Counter()
-        """Lost frames of sound and refused commands, in the earlier runs of the process."""
         self._contacts_left_out = 0
         self._is_restarted = False
         self._leads = clock
@@ -125,13 +116,13 @@ class RosProcess:
         """[topic] Number of messages of steps that were lost because the queue to the process was full."""
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
-        self._parameters = config.parameters
-        self._hold: Hold | None = None
+        title = f"the ROS process of {name}"
+        self._hold = Hold(title, "its messages are lost, and counted", lambda run: int(run.shared.wanted["turns"][0]))
         self._taken = 0.0, 0, np.inf
         """Time of the last measurement of the process's rate [s], number of steps that the process had taken then, and
         the rate as a factor of real time."""
         self.worker = WorkerProcess(
-            f"the ROS process of {name}",
+            title,
             ROS_MODULES,
             run_ros_worker,
             config,
@@ -180,16 +171,9 @@ class RosProcess:
         run = self.worker.current()
         cause = _cause_to_wait(run.shared) if self.worker.is_ready else ""
         if not cause:
-            self._hold = None
+            self._hold.end()
             return ""
-        if self._hold is None or self._hold.run is not run:
-            self._hold = Hold(
-                run,
-                self.worker.title,
-                "its messages are lost, and counted",
-                lambda: int(run.shared.wanted["turns"][0]),
-            )
-        return "" if self._hold.is_over() else cause
+        return "" if self._hold.is_over(run) else cause
 
     @property
     def backlog(self) -> float:
@@ -326,28 +310,16 @@ class RosProcess:
             self._commands.extend(value)
         elif kind == "simulation" and self._simulation is not None:
             self._simulation.put(value)
-        elif kind == "statistics":
-            self._sent = value["sent"]
-            self._dropped = value["dropped"]
-            self._losses = collections.Counter({kind: value[kind] for kind in ("sound_lost", "commands_refused")})
-        elif kind == "parameters":
-            self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
-            self._sent_before.update(self._sent)
-            self._dropped_before.update(self._dropped)
-            self._losses_before = self._losses_before + self._losses
-            self._losses = collections.Counter()
-            self._sent = dict.fromkeys(self._sent, 0)
-            self._dropped = {}
 
     def sent_messages(self) -> dict[str, int]:
         """Messages sent so far, by topic."""
-        return {topic: count + self._sent_before[topic] for topic, count in self._sent.items()}
+        return self.worker.total("sent")
 
     def dropped_messages(self) -> dict[str, int]:
         """Messages that had subscribers and were not sent, by topic."""
-        dropped = collections.Counter(self._dropped) + self._dropped_before
+        dropped = collections.Counter(self.worker.total("dropped"))
         dropped.update(dict(zip(self._step_topics, self._lost.tolist(), strict=True)))
         dropped["vine/contacts"] += self._contacts_left_out
         dropped["tf_environment"] += self._missed_truth
@@ -356,13 +328,12 @@ class RosProcess:
     @property
     def sound_lost(self) -> int:
         """Number of frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
-        return self._losses_before["sound_lost"] + self._losses["sound_lost"]
+        return self.worker.total("losses").get("sound_lost", 0)
 
     @property
     def commands_refused(self) -> int:
         """Number of commands that were refused, because they contradict themselves or do not fit the robot."""
-        kind = "commands_refused"
-        return self._losses_before[kind] + self._losses[kind] + self.handler.rejected_count
+        return self.worker.total("losses").get("commands_refused", 0) + self.handler.rejected_count
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
         """Publish states of parts of the client on /diagnostics at simulation time ``time`` [s]."""

@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import pathlib
 import queue
-import sys
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -24,7 +23,7 @@ from vinesim.audio.microphone import Microphone
 from vinesim.client.processes.rigid_visual_list import VisualListReceiver
 from vinesim.client.processes.shared_memory import SharedArrays, SharedQueue, SharedSnapshot
 from vinesim.client.processes.step_record import StepRecords
-from vinesim.client.processes.worker_process import report_ready, serve
+from vinesim.client.processes.worker import POLL_PERIOD, Worker, report_ready, serve
 from vinesim.client.sound.microphone_step import MicrophoneStep
 from vinesim.ros.commands.types import GoalResult, SimulationRequest
 from vinesim.ros.names import ros_name
@@ -42,15 +41,8 @@ QUEUE_CAPACITY = 100
 (:meth:`RosProcess.held`)."""
 WAIT_PERIOD = 0.004
 """Time between two checks whether subscribers are behind [s]."""
-STATISTICS_PERIOD = 0.2
-"""Wall time between two reports to the client [s]."""
 COUNT_PERIOD = 0.05
 """Wall time between two checks which topics have subscribers [s]. The node counts subscribers half as often."""
-SWITCH_INTERVAL = 5e-4
-"""[s] Python's switch interval: after this time the receiving thread yields to the publishing thread. Python's default
-is half a step."""
-POLL_PERIOD = 0.02
-"""Longest time between two checks for commands and requests [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,11 +119,10 @@ class RosChannel:
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
     """Main function of the process: publish until told to stop."""
-    sys.setswitchinterval(SWITCH_INTERVAL)
     serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
 
 
-class RosWorker:
+class RosWorker(Worker):
     """The robot's ROS node, fed with the records of steps."""
 
     def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
@@ -139,10 +130,10 @@ class RosWorker:
         from vinesim.ros.robot_node import RobotNode
         from vinesim.ros.simulation_node import SimulationNode
 
+        super().__init__(pipe)
         middleware.configure(large_messages=False)
         self.config = config
         self.channel = channel
-        self.pipe = pipe
         self.node = RobotNode(
             ros_name(config.name),
             config.urdf,
@@ -174,15 +165,15 @@ class RosWorker:
         self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
         """Goals that have ended, each with the number of step records after which its result is sent."""
         self._microphone = Microphone()
-        self._next_count = self._next_statistics = 0.0
+        self._next_count = 0.0
         self._pace = Pace()
-        self._reported_parameters = self.node.set_parameters
+        self._watch_parameters(self.node)
 
     def run(self) -> None:
         """Publish until a "stop"."""
         report_ready(self.pipe, NICENESS)
         with self.node, self.simulation or contextlib.nullcontext():
-            while self._take_requests():
+            while self._take_messages():
                 record = self._next_record()
                 if record is not None:
                     self.node.publish_clock(float(record["time"]))
@@ -215,29 +206,24 @@ class RosWorker:
             self._pace.add()
         return record
 
-    def _take_requests(self) -> bool:
-        """Answer the client's requests; False after a "stop"."""
-        while self.pipe.poll():
-            kind, value = self.pipe.recv()
-            if kind == "stop":
-                return False
-            if kind == "diagnose":
-                self.node.publish_diagnostics(*value)
-            elif kind == "sound":
-                self._record(value)
-            elif kind == "intentions":
-                self.node.publish_intentions(value)
-            elif kind == "gestures":
-                self.node.publish_gestures(*value)
-            elif kind == "lights":
-                self.node.publish_lights(value)
-            elif kind == "truth":
-                self._rigid.take(value)
-            elif kind == "finish":
-                self._ends.append(value)
-            elif kind == "simulated" and self.simulation is not None:
-                self.simulation.answer(value)
-        return True
+    def _take(self, kind: str, value: Any) -> None:
+        """Publish a value of the client, or keep it for later."""
+        if kind == "diagnose":
+            self.node.publish_diagnostics(*value)
+        elif kind == "sound":
+            self._record(value)
+        elif kind == "intentions":
+            self.node.publish_intentions(value)
+        elif kind == "gestures":
+            self.node.publish_gestures(*value)
+        elif kind == "lights":
+            self.node.publish_lights(value)
+        elif kind == "truth":
+            self._rigid.take(value)
+        elif kind == "finish":
+            self._ends.append(value)
+        elif kind == "simulated" and self.simulation is not None:
+            self.simulation.answer(value)
 
     def _record(self, step: MicrophoneStep) -> None:
         """Mix the sound at the robot's microphone, and publish the frames that are complete."""
@@ -266,7 +252,7 @@ class RosWorker:
         self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
-        """Tell the client which topics have subscribers, and every :data:`STATISTICS_PERIOD` what was sent."""
+        """Write the demands of the process to the shared memory, then report to the client as every worker does."""
         wanted = self.channel.wanted
         now = time.monotonic()
         wanted["turns"][0] += 1
@@ -276,21 +262,11 @@ class RosWorker:
             wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
             wanted["sound"][0] = any(map(self.node.has_subscribers, SOUND_TOPICS))
             wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
-        if (parameters := self.node.set_parameters) is not self._reported_parameters:
-            self._reported_parameters = parameters
-            self.pipe.send(("parameters", parameters))
-        if now >= self._next_statistics:
-            self._next_statistics = now + STATISTICS_PERIOD
-            self._send_statistics()
+        super()._report()
 
-    def _send_statistics(self) -> None:
-        statistics: dict[str, Any] = {
-            "sent": self.node.sent,
-            "dropped": self.node.dropped,
-            "sound_lost": self._microphone.missed,
-            "commands_refused": self.node.refused_commands,
-        }
-        self.pipe.send(("statistics", statistics))
+    def _statistics(self) -> dict[str, dict[str, int]]:
+        losses = {"sound_lost": self._microphone.missed, "commands_refused": self.node.refused_commands}
+        return {"sent": self.node.sent, "dropped": self.node.dropped, "losses": losses}
 
 
 class Pace:

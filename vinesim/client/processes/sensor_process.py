@@ -5,7 +5,6 @@ The loop writes snapshots of the world to shared memory while a sensor has subsc
 
 from __future__ import annotations
 
-import collections
 import logging
 import math
 import pathlib
@@ -19,8 +18,14 @@ from vinesim.client.client import Client
 from vinesim.client.pace import Limit
 from vinesim.client.processes.rigid_visual_list import VisualListSender
 from vinesim.client.processes.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
-from vinesim.client.processes.spawned_process import SENSOR_REHEARSAL, sensor_modules
-from vinesim.client.processes.worker_process import Hold, Run, WorkerProcess, cpu_use
+from vinesim.client.processes.worker_process import (
+    SENSOR_WORKER,
+    Hold,
+    Run,
+    WorkerProcess,
+    cpu_use,
+    sensor_modules,
+)
 from vinesim.core.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
@@ -40,9 +45,6 @@ COUNT_TIMEOUT = 20.0
 """How long the process may take to report its counts [s]: it completes its present picture first."""
 SAVE_TIMEOUT = 60.0
 """How long the process may take to write its pictures [s]; on a busy machine it renders first."""
-
-Counts = dict[str, dict[str, int]]
-"""Counts: kind of count -> sensor or topic -> number."""
 
 
 def time_of_snapshot(time: float, dt: float) -> float:
@@ -83,9 +85,6 @@ class SensorProcess:
         """Number of snapshots that were written one step later, because the process was reading."""
         self._awaited: tuple[str, ...] = ("process",)
         self._device = device
-        self._counts: Counts = {}
-        self._counts_before: dict[str, collections.Counter[str]] = {}
-        """Counts of the earlier runs of the process: kind of count -> sensor or topic -> number."""
         self._saved = threading.Event()
         self._save_failure = ""
         """Why the last picture could not be written."""
@@ -113,17 +112,21 @@ class SensorProcess:
         self._pacing = config.pacing
         self._digests: dict[str, str] = {}
         self._counted = threading.Event()
-        self._hold: Hold | None = None
         self._frames = tuple(config.sensor_frames.values())
-        self._parameters = config.parameters
+        title = f"the sensor process of {name}"
+        self._hold = Hold(
+            title,
+            "simulated time waits" if self.is_lockstep else "simulated time goes on without its pictures",
+            lambda run: cpu_use(run.process.pid or 0)[0],
+        )
         self.worker = WorkerProcess(
-            f"the sensor process of {name}",
+            title,
             sensor_modules(ros),
             run_sensor_worker,
             config,
             lambda context: SensorChannel(config, context),
             self._receive,
-            rehearsal=SENSOR_REHEARSAL if standby else "",
+            rehearsal=SENSOR_WORKER if standby else "",
         )
         self._run: Run[SensorChannel] | None = None
         """The run of the process for which the last snapshot was written."""
@@ -177,16 +180,9 @@ class SensorProcess:
             self._wake()
             is_behind = True
         if not is_behind:
-            self._hold = None
+            self._hold.end()
             return ""
-        if self._hold is None or self._hold.run is not run:
-            self._hold = Hold(
-                run,
-                self.worker.title,
-                "simulated time goes on without its pictures",
-                lambda: cpu_use(run.process.pid or 0)[0],
-            )
-        return "" if self._hold.is_over() and not self.is_lockstep else "sensors"
+        return "" if self._hold.is_over(run) and not self.is_lockstep else "sensors"
 
     @property
     def is_lockstep(self) -> bool:
@@ -269,26 +265,15 @@ class SensorProcess:
             self._awaited = value
             if value:
                 log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
-        elif kind == "statistics":
-            self._digests = value.pop("digests")
-            self._counts = value
+        elif kind == "digests":
+            self._digests = value
         elif kind == "counted":
             self._counted.set()
-        elif kind == "parameters":
-            self._parameters.update(value)
-        elif kind == "restarted":
-            for what, counts in self._counts.items():
-                self._counts_before.setdefault(what, collections.Counter()).update(counts)
-            self._counts = {what: dict.fromkeys(counts, 0) for what, counts in self._counts.items()}
         elif kind == "device":
             self._device = value
         elif kind == "saved":
             self._save_failure = value
             self._saved.set()
-
-    def _total(self, what: str) -> dict[str, int]:
-        before = self._counts_before.get(what, collections.Counter())
-        return {name: count + before[name] for name, count in self._counts.get(what, {}).items()}
 
     def awaited(self) -> list[str]:
         """Names of the steps of preparation before all sensors are ready. Empty when they are ready."""
@@ -298,20 +283,20 @@ class SensorProcess:
 
     def sent_messages(self) -> dict[str, int]:
         """ROS messages sent so far, by topic."""
-        return self._total("sent")
+        return self.worker.total("sent")
 
     def dropped_messages(self) -> dict[str, int]:
         """Number of ROS messages that newer ones replaced before they were sent, by topic."""
-        return self._total("ros_dropped")
+        return self.worker.total("ros_dropped")
 
     def report(self) -> dict[str, Any]:
         """Counts of frames delivered and dropped, by sensor; of snapshots that could not be shown or were late; of
         restarts. Also the device and, in lockstep, a digest of all frames of each sensor."""
         digests = {"frame_digests": self._digests} if self.is_lockstep else {}
         return digests | {
-            "frames": self._total("frames"),
-            "frames_dropped": self._total("frames_dropped"),
-            "frames_skipped": self._total("frames_skipped").get("snapshots", 0),
+            "frames": self.worker.total("frames"),
+            "frames_dropped": self.worker.total("frames_dropped"),
+            "frames_skipped": self.worker.total("frames_skipped").get("snapshots", 0),
             "snapshots_missed": self.missed_snapshots,
             "sensor_restarts": self.worker.restarts,
             "sensor_device": self._device,

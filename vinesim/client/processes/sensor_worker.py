@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import logging
 import pathlib
-import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -18,23 +17,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinesim.client.processes.picture_keeper import PictureKeeper
 from vinesim.client.processes.rigid_visual_list import VisualListMessage, VisualListReceiver
 from vinesim.client.processes.shared_memory import SharedArrays, SharedSnapshot
-from vinesim.client.processes.worker_process import report_ready, serve
+from vinesim.client.processes.worker import POLL_PERIOD, Worker, report_ready, serve
 from vinesim.client.world_time import OffsetHistory
-from vinesim.core import allocator, progress
+from vinesim.core import allocator, frames, progress
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
+from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 from vinesim.scene.values import (
     SENSOR_KINDS,
     CameraFrame,
     CameraMount,
     CameraOutput,
+    LidarMount,
     RenderedMount,
     SegmentPoses,
     SensorFrame,
@@ -53,14 +53,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-STATISTICS_PERIOD = 0.2
-"""Wall time between two reports to the client [s]."""
 SEND_POLL = 5e-4
 """Time between two checks whether all messages were sent [s]."""
-POLL_PERIOD = 0.02
-"""Longest time between two checks for requests and subscribers [s]."""
-SWITCH_INTERVAL = 5e-4
-"""How long one thread here may hold the interpreter lock when another wants it [s]."""
 NICENESS = 10
 """Niceness of the process. The client's loop and its ROS process take precedence, but a much higher niceness would let
 other programs starve the renderer (docs/decisions/sensor-process.md)."""
@@ -68,8 +62,14 @@ POSE_HISTORY = 128
 """Number of poses of each sensor that are kept for sensors that sweep, such as lidars: 2.5 s."""
 OFFSET_HISTORY = 512
 """Number of offsets of the world's time that are kept for the stamps of scans: 10 s."""
-
-
+RENEWAL_PERIOD = 1.0
+"""Simulated time after which a picture replaces an older picture with the same score [s]."""
+REHEARSAL_SCENE = "demo"
+REHEARSAL_CAMERA = "d435"
+REHEARSAL_LIDAR = "vlp16"
+REHEARSAL_SIZE = (64, 48)
+"""Size of the picture of :func:`rehearse` [px]. It may be small, because the first call of each kernel is what takes
+long."""
 LIVE = SensorPacing()
 
 
@@ -159,7 +159,6 @@ class SensorChannel:
 
 def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
     """Main function of the process: render and publish until told to stop."""
-    sys.setswitchinterval(SWITCH_INTERVAL)
 
     def work() -> None:
         with contextlib.ExitStack() as stack:
@@ -168,16 +167,69 @@ def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connec
     serve("sensor process", pipe, work)
 
 
-class SensorWorker:
+def rehearse() -> None:
+    """Render a first picture and a first lidar revolution of a small vineyard on the CPU, and release their memory.
+
+    A sensor process that stands by has then loaded the kernels and modules that they need.
+    """
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.sensors.camera.camera import Camera, CameraSpec
+    from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+    from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
+    from vinesim.sensors.sensor import load_kernels
+
+    load_kernels(CameraMount.kind, LidarMount.kind)
+    scene = load_scene(REHEARSAL_SCENE)
+    spec = CameraSpec.load(REHEARSAL_CAMERA)
+    model = generate(scene)
+    camera = Camera(spec, spec.info("camera", size=REHEARSAL_SIZE), "camera", scene.sun.direction)
+    lidar = Lidar(LidarSpec.load(REHEARSAL_LIDAR), "lidar")
+    sensors = [ScheduledSensor(sensor, lambda _: None) for sensor in (camera, lidar)]
+    state = State.at_rest(model)
+    trees = np.arange(len(model.tree_first))
+    pose = frames.pose(np.array([0.0, 0.0, 1.0]))
+    snapshot = Snapshot(0.0, 0, state.body_q, state.bunch_attached, (), np.zeros((0, 7)), trees)
+    for _ in SensorScheduler(model, sensors).warm_up(snapshot, {sensor.name: pose for sensor in sensors}):
+        pass
+    del sensors, camera, lidar, model, state, snapshot
+    allocator.release_free_memory()
+
+
+class PictureKeeper:
+    """Keeps the picture with the highest score, and requests a picture only if it would be kept.
+
+    A picture costs the same with a subscriber and without, and only one of all pictures is written in the end
+    (docs/decisions/sensor-process.md).
+    """
+
+    def __init__(self) -> None:
+        self.frame: CameraFrame | None = None
+        """The picture that is kept: colours, depth and labels."""
+        self._score = 0.0
+
+    def wants(self, time: float, score: float) -> bool:
+        """Whether a picture of this simulated ``time`` [s] would be kept: its score is higher than that of the kept
+        picture, or the same and it is at least :data:`RENEWAL_PERIOD` later."""
+        if self.frame is None or score > self._score:
+            return True
+        return score == self._score and time >= self.frame.time + RENEWAL_PERIOD
+
+    def keep(self, frame: CameraFrame, score: float) -> None:
+        """Keep this ``frame`` and its score instead of the present one."""
+        self.frame = frame
+        self._score = score
+
+
+class SensorWorker(Worker):
     """The robot's sensors and their ROS node, fed with snapshots."""
 
     def __init__(
         self, config: SensorConfig, channel: SensorChannel, pipe: Connection, stack: contextlib.ExitStack
     ) -> None:
         """Starts the node and the sensors in ``stack``."""
+        super().__init__(pipe)
         self.config = config
         self.channel = channel
-        self.pipe = pipe
         self.frames_skipped = 0
         """Number of snapshots that could not be shown because their list of bodies had not arrived."""
         self._state = State.at_rest(config.model)
@@ -193,10 +245,10 @@ class SensorWorker:
         self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
         """Digest of all frames that each sensor has delivered in lockstep, by the sensor's name."""
         self._time = self._frame_score = 0.0  # of the newest snapshot
-        self._next_statistics = 0.0
         self._awaits("kernels and scene")
         self.node = self._open_node(stack) if config.ros else None
-        self._reported_parameters = None if self.node is None else self.node.set_parameters
+        if self.node is not None:
+            self._watch_parameters(self.node)
         self.scheduler = self._open_sensors()
 
     def _awaits(self, *parts: str) -> None:
@@ -305,7 +357,7 @@ class SensorWorker:
         """Warm the sensors up with the first snapshot, report "ready", then render until a "stop"."""
         is_ready = False
         self._awaits("snapshot of the world")
-        while self._take_requests():
+        while self._take_messages():
             if self._wait_for_snapshot() and (world := self._read()) is not None:
                 snapshot, earlier = world
                 poses = earlier.pop()[1]
@@ -324,10 +376,7 @@ class SensorWorker:
             is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
             self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
             self._publish_pace()
-            self._report_parameters()
-            if time.monotonic() >= self._next_statistics:
-                self._next_statistics = time.monotonic() + STATISTICS_PERIOD
-                self.pipe.send(("statistics", self._statistics()))
+            self._report()
 
     def _publish_pace(self) -> None:
         """Tell the client up to which time the world may continue, and how fast."""
@@ -340,32 +389,21 @@ class SensorWorker:
         while self.node is not None and self.node.has_pending:
             time.sleep(SEND_POLL)
 
-    def _report_parameters(self) -> None:
-        """Tell the client which parameters were set, so that a further run starts with them."""
-        if self.node is not None and (parameters := self.node.set_parameters) is not self._reported_parameters:
-            self._reported_parameters = parameters
-            self.pipe.send(("parameters", parameters))
-
     def _wait_for_snapshot(self) -> bool:
         """Wait for a snapshot. Returns whether there is one to read: a new one, or one that was skipped and whose list
         of bodies has arrived since."""
         return self.channel.snapshot.wait(POLL_PERIOD) or self._visuals.version == self._missing_version
 
-    def _take_requests(self) -> bool:
-        """Do what the client asks for; False after a "stop"."""
-        while self.pipe.poll():
-            kind, value = self.pipe.recv()
-            if kind == "stop":
-                return False
-            if kind == "visuals":
-                assert isinstance(value, VisualListMessage)
-                self._visuals.take(value)
-            elif kind == "save":
-                self._save_kept_frame(value)
-            elif kind == "count":
-                self.pipe.send(("statistics", self._statistics()))
-                self.pipe.send(("counted", None))
-        return True
+    def _take(self, kind: str, value: Any) -> None:
+        """Take the list of bodies, or do what the client asks for."""
+        if kind == "visuals":
+            assert isinstance(value, VisualListMessage)
+            self._visuals.take(value)
+        elif kind == "save":
+            self._save_kept_frame(value)
+        elif kind == "count":
+            self._send_statistics()
+            self.pipe.send(("counted", None))
 
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
         """The newest snapshot, and the sensor poses since the snapshot before, with their times [s]. The last poses
@@ -427,17 +465,21 @@ class SensorWorker:
         )
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 
-    def _statistics(self) -> dict[str, Any]:
-        """Counts of frames and messages that were rendered, sent and dropped."""
-        statistics: dict[str, Any] = {
+    def _statistics(self) -> dict[str, dict[str, int]]:
+        statistics = {
             "frames": dict(self.scheduler.frames),
             "frames_dropped": dict(self.scheduler.dropped),
             "frames_skipped": {"snapshots": self.frames_skipped},
-            "digests": {name: digest.hexdigest() for name, digest in self._digests.items()},
         }
         if self.node is not None:
             statistics |= {"sent": self.node.sent, "ros_dropped": self.node.dropped}
         return statistics
+
+    def _send_statistics(self) -> None:
+        """Send the counts and, in lockstep, the digests of the frames of each sensor."""
+        if self._is_lockstep:
+            self.pipe.send(("digests", {name: digest.hexdigest() for name, digest in self._digests.items()}))
+        super()._send_statistics()
 
     def _deliver(self, frame: Any) -> None:
         """Digest, publish and perhaps keep a frame: any :class:`SensorFrame`."""
@@ -465,5 +507,5 @@ class SensorWorker:
                 images.save_frame(self._keeper.frame, folder, "")
             except OSError as bad:
                 failure = bad.strerror or str(bad)
-        self.pipe.send(("statistics", self._statistics()))
+        self._send_statistics()
         self.pipe.send(("saved", failure))
