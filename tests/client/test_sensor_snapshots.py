@@ -6,6 +6,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import multiprocessing
+import os
 import types
 from collections.abc import Iterator
 
@@ -67,7 +68,11 @@ class OneProcess:
         pipe, self.worker_pipe = multiprocessing.Pipe()
         self.config = config
         self.channel = open_channel(multiprocessing.get_context("spawn"))
-        run = types.SimpleNamespace(shared=self.channel, send=lambda kind, value: pipe.send((kind, value)))
+        run = types.SimpleNamespace(
+            shared=self.channel,
+            send=lambda kind, value: pipe.send((kind, value)),
+            process=types.SimpleNamespace(pid=os.getpid()),
+        )
         return types.SimpleNamespace(
             is_ready=True,
             current=lambda: run,
@@ -82,6 +87,7 @@ class OneProcess:
         if (world := self.worker._read()) is not None:
             snapshot, earlier = world
             self.worker.scheduler.advance(snapshot, earlier.pop()[1], earlier)
+            self.channel.wanted["shown"][0] = self.worker._last_number
 
 
 @pytest.fixture
@@ -133,3 +139,17 @@ def test_wires_that_a_swinging_shoot_takes_along_are_read_as_they_are(monkeypatc
             np.testing.assert_array_equal(snapshot.wires.q, expected.q)
             seen = max(seen, len(expected.segment))
         assert seen > 0
+
+
+def test_a_subscriber_that_leaves_and_returns_between_two_checks_does_not_hold_the_steps_for_ever(world: OneProcess):
+    """The worker has then said that it wants no snapshots, and still has the promise to the sensor."""
+    client = world.client
+    client.tick()
+    client.tick()
+    world.render()
+    world.channel.wanted["world"][0] = False
+    while not client.held():
+        client.tick()
+    assert client.physics.time < 1.0
+    world.render()
+    assert not client.held()
