@@ -182,7 +182,9 @@ class SensorProcess:
             and wanted["shown"][0] == self._snapshot_count
             and physics.time > self._written_time
         )
-        if is_starved or (self._is_overdue and (is_behind or self.is_lockstep)):
+        # No step writes the first snapshot for a process that was started again, because lockstep holds all steps.
+        is_unfed = self.is_lockstep and run is not self._run
+        if is_starved or is_unfed or (self._is_overdue and (is_behind or self.is_lockstep)):
             self._write(self.client)
             self._wake()
             is_behind = True
