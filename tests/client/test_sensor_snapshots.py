@@ -7,6 +7,7 @@ import contextlib
 import itertools
 import multiprocessing
 import os
+import threading
 import types
 from collections.abc import Iterator
 
@@ -15,7 +16,7 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim.client.client import Client
-from vinesim.client.processes import sensor_process
+from vinesim.client.processes import sensor_process, sensor_worker
 from vinesim.client.processes.sensor_process import SensorProcess
 from vinesim.client.processes.sensor_worker import SensorWorker
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -39,6 +40,8 @@ class Node:
 
     def __init__(self) -> None:
         self.set_parameters: dict[str, object] = {}
+        self.sent: dict[str, int] = {}
+        self.dropped: dict[str, int] = {}
         self.scans: list[LidarScan] = []
         self.publish = self.scans.append
 
@@ -65,12 +68,12 @@ class OneProcess:
         self.channel.wanted["world"][0] = True
 
     def _worker_process(self, _name, _modules, _entry, config, open_channel, _receive, rehearsal):
-        pipe, self.worker_pipe = multiprocessing.Pipe()
+        self.pipe, self.worker_pipe = multiprocessing.Pipe()
         self.config = config
         self.channel = open_channel(multiprocessing.get_context("spawn"))
         run = types.SimpleNamespace(
             shared=self.channel,
-            send=lambda kind, value: pipe.send((kind, value)),
+            send=lambda kind, value: self.pipe.send((kind, value)),
             process=types.SimpleNamespace(pid=os.getpid()),
         )
         return types.SimpleNamespace(
@@ -153,3 +156,20 @@ def test_a_subscriber_that_leaves_and_returns_between_two_checks_does_not_hold_t
     assert client.physics.time < 1.0
     world.render()
     assert not client.held()
+
+
+def test_counts_include_the_snapshots_that_were_written_before_they_were_asked_for(world: OneProcess, monkeypatch):
+    """Also if the worker takes the request first: the digests of two runs in lockstep are of the same frames."""
+    monkeypatch.setattr(sensor_worker, "report_ready", lambda *_: None)  # it lowers the priority of its process
+    world.client.tick()
+    world.client.tick()
+    world.pipe.send(("count", None))
+    thread = threading.Thread(target=world.worker.run, daemon=True)
+    thread.start()
+    try:
+        while world.pipe.recv()[0] != "counted":
+            pass
+        assert world.channel.wanted["shown"][0] == world.sensors._snapshot_count
+    finally:
+        world.pipe.send(("stop", None))
+        thread.join()

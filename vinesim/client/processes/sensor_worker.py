@@ -240,6 +240,8 @@ class SensorWorker(Worker):
         """Version of the list of bodies of the newest snapshot, if this list has not arrived. Otherwise None."""
         self._offsets = OffsetHistory(OFFSET_HISTORY)
         self._last_number = 0
+        self._must_count = False
+        """Whether the client waits for the counts."""
         self._pose_count = 0
         self._keeper = PictureKeeper() if config.keep_pictures else None
         self._kept_camera = next((mount.name for mount in config.description.sensors_of(CameraMount.kind)), "")
@@ -376,6 +378,10 @@ class SensorWorker(Worker):
                     report_ready(self.pipe, NICENESS)
                     allocator.release_free_memory()  # takes 0.1 s, for which nothing waits here
                 self.channel.wanted["shown"][0] = self._last_number
+            if self._must_count:  # now that the snapshots before the request are rendered
+                self._must_count = False
+                self._send_statistics()
+                self.pipe.send(("counted", None))
             is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
             self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
             self._publish_pace()
@@ -398,15 +404,14 @@ class SensorWorker(Worker):
         return self.channel.snapshot.wait(POLL_PERIOD) or self._visuals.version == self._missing_version
 
     def _take(self, kind: str, value: Any) -> None:
-        """Take the list of bodies, or do what the client asks for."""
+        """Take the list of bodies, write the kept picture, or note that the client waits for the counts."""
         if kind == "visuals":
             assert isinstance(value, VisualListMessage)
             self._visuals.take(value)
         elif kind == "save":
             self._save_kept_frame(value)
         elif kind == "count":
-            self._send_statistics()
-            self.pipe.send(("counted", None))
+            self._must_count = True
 
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
         """Returns the newest snapshot, and the sensor poses since the snapshot before with their times [s]. The last
