@@ -43,7 +43,7 @@ from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.spec import load_scene
-from vinesim.scene.values import CameraOutput
+from vinesim.scene.values import CameraMount, CameraOutput
 from vinesim.sensors.camera.camera import Camera, CameraSpec
 from vinesim.sensors.export.images import look_at
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
@@ -57,8 +57,7 @@ RGBD = CameraOutput.RGB | CameraOutput.DEPTH
 def render_all(config: Any, channel: Any, pipe: Any) -> None:
     """Entry point of the sensor process. Unlike the client's own, it renders every sensor without any subscriber."""
     worker: Any = sensor_worker.SensorWorker
-    worker._camera_demand = lambda self, name, always: lambda: RGBD
-    worker._lidar_demand = lambda self, name: lambda: CameraOutput.DEPTH
+    worker._demand = lambda self, mount: lambda: RGBD if mount.kind == CameraMount.kind else CameraOutput.DEPTH
     sensor_worker.run_sensor_worker(config, channel, pipe)
 
 

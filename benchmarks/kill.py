@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.support.killed_programs import ROBOTS, Vineyard
 from vinesim.bench.live_client import own_processes
-from vinesim.client.processes.child_process import START_TIMEOUT, ProcessFailed
+from vinesim.client.programs import START_TIMEOUT, ProgramFailed
 from vinesim.scene.values import Measurement
 
 KINDS = ("server", "router", "client", "sensors", "ROS node", "ROS listener")
@@ -61,7 +61,7 @@ def kill(
     """Kill about ``times`` programs with SIGKILL, equally many of each of the ``kinds``, and yield the measurements.
 
     Before each round a bunch is picked. ``announce`` is called with a line of text after each round. ``ros``: kill
-    programs of ROS, too. Raises :class:`ProcessFailed` if a program ends that was not killed.
+    programs of ROS, too. Raises :class:`ProgramFailed` if a program ends that was not killed.
     """
     random = np.random.default_rng(seed)
     with (
@@ -72,7 +72,7 @@ def kill(
         possible = [kind for kind in kinds if vineyard.ros or kind not in ROS_KINDS]
         missing = _wait_until_all_go_on(vineyard, START_TIMEOUT)[1]
         if missing:
-            raise ProcessFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
+            raise ProgramFailed(f"not ready after {START_TIMEOUT:.0f} s: {', '.join(missing)}")
         rounds: list[Round] = []
         count = -(-times // len(possible))
         for number in range(1, count + 1):

@@ -17,7 +17,7 @@ import aiohttp
 import numpy as np
 
 from vinesim.bench.live_client import own_processes
-from vinesim.client.processes.child_process import START_TIMEOUT, free_port
+from vinesim.client.programs import START_TIMEOUT, free_port
 from vinesim.scene.values import Measurement
 from vinesim.web import array_message
 

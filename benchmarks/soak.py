@@ -18,8 +18,7 @@ import numpy as np
 
 from vinesim.bench.live_client import own_processes
 from vinesim.bench.process_memory import ProcessHistory, ProcessSampler, check_proc
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessFailed, ProcessGroup
-from vinesim.client.processes.ros_listener import RosListener
+from vinesim.client.programs import START_TIMEOUT, Program, ProgramFailed, ProgramGroup, RosListener
 from vinesim.client.tasks import start_poses
 from vinesim.core.frames import to_yaw
 from vinesim.ros import middleware
@@ -106,7 +105,7 @@ def measurements(result: SoakResult) -> Iterator[Measurement]:
 def run_soak(cast: Cast, minutes: float, announce: Callable[[str], None]) -> SoakResult:
     """Start all programs, wait until they are ready, sample them for ``minutes`` [min], and end them.
 
-    Raises :class:`ProcessFailed` if a process ends too early, :class:`ProcUnavailable` on systems without /proc.
+    Raises :class:`ProgramFailed` if a process ends too early, :class:`ProcUnavailable` on systems without /proc.
     """
     check_proc()
     with own_processes() as group, tempfile.TemporaryDirectory() as folder:
@@ -151,7 +150,7 @@ def settle(
 class _Run:
     """Programs of one run."""
 
-    def __init__(self, group: ProcessGroup, cast: Cast, folder: pathlib.Path) -> None:
+    def __init__(self, group: ProgramGroup, cast: Cast, folder: pathlib.Path) -> None:
         """Start the programs; their files go below ``folder``."""
         self._folder = folder
         self.server = group.start(
@@ -170,10 +169,10 @@ class _Run:
         )
         self._figures: dict[str, Any] = json.loads(self.server.next_line(START_TIMEOUT))
         self._endpoint = self._figures["endpoints"][0]
-        self.clients: dict[str, Process] = {}
+        self.clients: dict[str, Program] = {}
         self._newest: dict[str, dict[str, Any]] = {}
         self.listeners: list[RosListener] = []
-        self.processes: list[tuple[str, Process]] = [("server", self.server)]
+        self.processes: list[tuple[str, Program]] = [("server", self.server)]
         self._start_clients(group, cast)
         self.recorder = None
         if cast.records:
@@ -183,7 +182,7 @@ class _Run:
             self.processes.append(("recorder", self.recorder))
         self.sampler = ProcessSampler([(kind, process.child.pid) for kind, process in self.processes])
 
-    def _start_clients(self, group: ProcessGroup, cast: Cast) -> None:
+    def _start_clients(self, group: ProgramGroup, cast: Cast) -> None:
         """Start robots one behind the other, of which the first pushes a bunch, and people next to bunches of their
         own."""
         scene = load_scene(cast.scene)
@@ -200,7 +199,7 @@ class _Run:
                 topics = [f"/{name}/{topic}" for topic in TOPICS]
                 listener = RosListener(group, topics)
                 self.listeners.append(listener)
-                self.processes.append(("ROS listener", group.processes[-1]))
+                self.processes.append(("ROS listener", group.programs[-1]))
             self._start_client(group, "robot", name, cast, [*options, *(["--push", str(pushed)] if i == 0 else [])])
         centres = start_poses.bunch_centres(model)[:, :2]
         # bunches for people are far from the robots
@@ -212,7 +211,7 @@ class _Run:
                 group, "human", f"person_{i + 1}", cast, ["--reach", str(bunch), *_pose_option(place, 0.0)]
             )
 
-    def _start_client(self, group: ProcessGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
+    def _start_client(self, group: ProgramGroup, role: str, name: str, cast: Cast, options: list[str]) -> None:
         common = ["--connect", self._endpoint, "--scene", cast.scene, "--status", "json"]
         self.clients[name] = group.start(
             name,
@@ -231,7 +230,7 @@ class _Run:
         self.processes.append(("robot client" if role == "robot" else "person's client", self.clients[name]))
 
     def read(self) -> None:
-        """Read the processes' output. Raises :class:`ProcessFailed` if a process has ended."""
+        """Read the processes' output. Raises :class:`ProgramFailed` if a process has ended."""
         for name, client in self.clients.items():
             for line in client.new_lines():
                 self._newest[name] = json.loads(line)
@@ -282,7 +281,7 @@ class _Run:
             try:
                 client.finish()
                 reports.append(json.loads((self._folder / name / "report.json").read_text()))
-            except (ProcessFailed, OSError) as error:
+            except (ProgramFailed, OSError) as error:
                 counts[f"{name} without a report ({error})"] = 1
                 reports.append({"malformed": 0, **self._newest[name]})
         for report in reports:

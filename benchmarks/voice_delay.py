@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.support.browser import AS_RECORDED, Page, browser_page, microphone, write_sound
 from vinesim.bench.live_client import own_processes
-from vinesim.client.processes.child_process import START_TIMEOUT, ProcessFailed, ProcessGroup, free_port
+from vinesim.client.programs import START_TIMEOUT, ProgramFailed, ProgramGroup, free_port
 from vinesim.scene.values import Measurement
 
 _Frames = dict[str, list[tuple[float, str]]]
@@ -129,7 +129,7 @@ def _bursts() -> np.ndarray:
     return np.concatenate([part for pause in pauses for part in (pause, burst)])
 
 
-def _start(group: ProcessGroup) -> list[str]:
+def _start(group: ProgramGroup) -> list[str]:
     """Start a server and two people; return the addresses of their pages."""
     server = group.start("server", "-m", "vinesim", "server", "--listen", "tcp/127.0.0.1:0", "--status", "json")
     endpoint = json.loads(server.next_line(START_TIMEOUT))["endpoints"][0]
@@ -210,5 +210,5 @@ def _wait(condition: Callable[[], object], what: str) -> None:
     until = time.monotonic() + TIMEOUT
     while not condition():
         if time.monotonic() > until:
-            raise ProcessFailed(f"a browser had not {what} within {TIMEOUT:.0f} s")
+            raise ProgramFailed(f"a browser had not {what} within {TIMEOUT:.0f} s")
         time.sleep(0.1)

@@ -51,11 +51,11 @@ def processes_share_their_imports() -> Iterator[None]:
 
     Real starts are the subject of tests/client/test_spawned_process.py, and clients of the command line have them.
     """
-    from vinesim.client.processes import spawned_process, worker_process
+    from vinesim.client.processes import worker_process
 
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload([*spawned_process.sensor_modules(ros=False), spawned_process.SENSOR_REHEARSAL])
-    spawned_process.CONTEXT = worker_process.CONTEXT = context
+    context.set_forkserver_preload([*worker_process.sensor_modules(ros=False), "vinesim.scene.generation.vineyard"])
+    worker_process.CONTEXT = context
     yield
     multiprocessing.forkserver._forkserver._stop()
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.client.client import Client
-from vinesim.client.processes.child_process import Process, ProcessFailed, ProcessGroup
+from vinesim.client.programs import Program, ProgramFailed, ProgramGroup
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.core import frames
 from vinesim.net.transport.zenoh_bus import ZenohBus
@@ -42,18 +42,18 @@ SETTLING = 1.0
 
 
 @dataclasses.dataclass
-class Program:
+class RestartedProgram:
     """A program as its user starts it; it is started again after it was killed."""
 
     name: str
     arguments: tuple[str, ...]
-    process: Process
+    process: Program
     lines: list[tuple[float, dict[str, Any]]] = dataclasses.field(default_factory=list)
     """Time of arrival [s, monotonic] and content of each JSON line since the last kill of any program, after the newest
     line from before that kill."""
 
     def read(self) -> None:
-        """Read new lines of the program. Raises :class:`ProcessFailed` if it has ended."""
+        """Read new lines of the program. Raises :class:`ProgramFailed` if it has ended."""
         now = time.monotonic()
         self.lines += [(now, json.loads(line)) for line in self.process.new_lines() if line.startswith("{")]
 
@@ -65,12 +65,12 @@ class Program:
 class Vineyard:
     """The programs and the person of one vineyard. A context manager that ends all at its exit."""
 
-    def __init__(self, group: ProcessGroup, folder: pathlib.Path, *, ros: bool, seed: int) -> None:
+    def __init__(self, group: ProgramGroup, folder: pathlib.Path, *, ros: bool, seed: int) -> None:
         """Start all programs. ``folder``: for the server's state; ``ros``: start ROS processes and a listener, too."""
         self._group = group
         self._random = np.random.default_rng(seed)
         self.ros = ros and middleware.unavailable_reason() is None
-        self.programs: dict[str, Program] = {}
+        self.programs: dict[str, RestartedProgram] = {}
         self.picked: set[int] = set()
         """Bunches that the person has picked."""
         server = _free_endpoint()
@@ -111,7 +111,7 @@ class Vineyard:
         self._next_tick = time.monotonic()
 
     def _start(self, name: str, *arguments: str) -> None:
-        self.programs[name] = Program(name, arguments, self._group.start(name, *arguments))
+        self.programs[name] = RestartedProgram(name, arguments, self._group.start(name, *arguments))
 
     def _wait_for_endpoint(self, endpoint: str) -> None:
         """Return when a server listens at ``endpoint``."""
@@ -121,12 +121,12 @@ class Vineyard:
             with contextlib.suppress(OSError), socket.create_connection((host, int(port)), 1.0):
                 return
             time.sleep(0.05)
-        raise ProcessFailed(f"nothing listens on {endpoint}")
+        raise ProgramFailed(f"nothing listens on {endpoint}")
 
     # ------------------------------------------------------------------ while all goes on
 
     def step(self) -> None:
-        """Step the person if due, and read the programs' output. Raises :class:`ProcessFailed` if a program has
+        """Step the person if due, and read the programs' output. Raises :class:`ProgramFailed` if a program has
         ended."""
         time.sleep(max(self._next_tick - time.monotonic(), 0.0))
         self._next_tick = max(self._next_tick + self.witness.physics.dt, time.monotonic())

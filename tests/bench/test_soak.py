@@ -14,7 +14,7 @@ import pytest
 from benchmarks import soak
 from benchmarks.soak import Cast, SoakResult, _Run, measurements, run_soak, settle
 from vinesim.bench.process_memory import ProcessHistory, ProcessSample, ProcessSampler, sample_process
-from vinesim.client.processes.child_process import Process, ProcessFailed
+from vinesim.client.programs import Program, ProgramFailed
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/proc/self/smaps_rollup"), reason="needs /proc of Linux")
 
@@ -107,12 +107,12 @@ def test_a_client_that_ends_badly_does_not_cost_the_figures(tmp_path: pathlib.Pa
         def interrupt(self) -> None: ...
 
         def finish(self) -> None:
-            raise ProcessFailed("ended with exit code -9")
+            raise ProgramFailed("ended with exit code -9")
 
     run = _Run.__new__(_Run)
     run._folder = tmp_path
     run._figures = {"malformed": 0, "refused": 1}
-    run.clients = {"robot_1": cast(Process, Killed())}
+    run.clients = {"robot_1": cast(Program, Killed())}
     run._newest = {"robot_1": {"faults": {"messages_refused": 3}, "sensor_restarts": 2}}
     counts = run.end()
     assert counts.pop("robot_1 without a report (ended with exit code -9)") == 1

@@ -7,11 +7,11 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 from vinesim.cli.demo.readiness import progress_of
-from vinesim.client.processes.child_process import Process
+from vinesim.client.programs import Program
 
 
-def client(*stderr: str) -> Process:
-    return cast(Process, SimpleNamespace(stderr_tail=list(stderr), stdout_lines=queue.Queue()))
+def client(*stderr: str) -> Program:
+    return cast(Program, SimpleNamespace(stderr_tail=list(stderr), stdout_lines=queue.Queue()))
 
 
 def test_the_line_says_what_the_first_waiting_client_does() -> None:

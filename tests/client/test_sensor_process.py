@@ -20,8 +20,8 @@ from tests.support.contact_scenes import cane
 from tests.support.waiting import wait
 from vinesim.client.client import Client
 from vinesim.client.processes import worker_process
-from vinesim.client.processes.picture_keeper import RENEWAL_PERIOD, PictureKeeper
 from vinesim.client.processes.sensor_process import SensorProcess
+from vinesim.client.processes.sensor_worker import RENEWAL_PERIOD, PictureKeeper
 from vinesim.client.processes.worker_process import WorkerError
 from vinesim.client.tasks.start_poses import spawn_pose
 from vinesim.core import frames
@@ -40,13 +40,21 @@ CAMERA = "head_front_camera"
 class Robot:
     """A client with one vinebot far from a single cane, and its sensor process."""
 
-    def __init__(self, device: str = "cpu", *, standby: bool = False) -> None:
+    def __init__(self, device: str = "cpu", *, standby: bool = False, pacing: SensorPacing | None = None) -> None:
         scene = load_scene("demo")
         vinebot = load_description("vinebot")
         model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
         self.hub = MemoryHub()
         self.sensors = SensorProcess(
-            "robot", scene, model, vinebot, ros=False, keep_pictures=True, device=device, standby=standby
+            "robot",
+            scene,
+            model,
+            vinebot,
+            ros=False,
+            keep_pictures=True,
+            device=device,
+            standby=standby,
+            pacing=pacing,
         )
         self.client = Client(scene, model, vinebot, self.hub.bus("robot"), name="robot", pose=spawn_pose(scene, 0))
 
@@ -344,3 +352,23 @@ def test_a_sensor_process_that_is_not_ready_holds_nothing(robot):
     robot.kill_sensors()
     wait(lambda: not robot.sensors.worker.is_ready, "the end of the process")
     assert robot.sensors.held() == ""
+
+
+def test_in_lockstep_a_killed_process_is_started_again_and_the_steps_go_on():
+    """No step runs until the new process has rendered, and it renders only when it has a snapshot."""
+    one = Robot(pacing=SensorPacing(SensorMode.LOCKSTEP))
+    with one.sensors:
+        one.sensors.attach(one.client)
+
+        def step() -> None:
+            if one.client.held():
+                time.sleep(0.001)
+            else:
+                one.client.tick()
+
+        seen = one.client.physics.time
+        wait(lambda: (step(), one.client.physics.time > seen)[-1], "a step")
+        one.kill_sensors()
+        wait(lambda: (step(), one.sensors.report()["sensor_restarts"] == 1)[-1], "a restart")
+        seen = one.client.physics.time
+        wait(lambda: (step(), one.client.physics.time > seen + 0.5)[-1], "steps after the restart")

@@ -6,6 +6,8 @@ from __future__ import annotations
 import contextlib
 import itertools
 import multiprocessing
+import os
+import threading
 import types
 from collections.abc import Iterator
 
@@ -14,7 +16,7 @@ import pytest
 
 from tests.support.contact_scenes import cane
 from vinesim.client.client import Client
-from vinesim.client.processes import sensor_process
+from vinesim.client.processes import sensor_process, sensor_worker
 from vinesim.client.processes.sensor_process import SensorProcess
 from vinesim.client.processes.sensor_worker import SensorWorker
 from vinesim.client.tasks.start_poses import spawn_pose
@@ -38,6 +40,8 @@ class Node:
 
     def __init__(self) -> None:
         self.set_parameters: dict[str, object] = {}
+        self.sent: dict[str, int] = {}
+        self.dropped: dict[str, int] = {}
         self.scans: list[LidarScan] = []
         self.publish = self.scans.append
 
@@ -64,10 +68,14 @@ class OneProcess:
         self.channel.wanted["world"][0] = True
 
     def _worker_process(self, _name, _modules, _entry, config, open_channel, _receive, rehearsal):
-        pipe, self.worker_pipe = multiprocessing.Pipe()
+        self.pipe, self.worker_pipe = multiprocessing.Pipe()
         self.config = config
         self.channel = open_channel(multiprocessing.get_context("spawn"))
-        run = types.SimpleNamespace(shared=self.channel, send=lambda kind, value: pipe.send((kind, value)))
+        run = types.SimpleNamespace(
+            shared=self.channel,
+            send=lambda kind, value: self.pipe.send((kind, value)),
+            process=types.SimpleNamespace(pid=os.getpid()),
+        )
         return types.SimpleNamespace(
             is_ready=True,
             current=lambda: run,
@@ -78,10 +86,11 @@ class OneProcess:
 
     def render(self) -> None:
         """Let the worker take the newest snapshot."""
-        assert self.worker._take_requests()
+        assert self.worker._take_messages()
         if (world := self.worker._read()) is not None:
             snapshot, earlier = world
             self.worker.scheduler.advance(snapshot, earlier.pop()[1], earlier)
+            self.channel.wanted["shown"][0] = self.worker._last_number
 
 
 @pytest.fixture
@@ -126,10 +135,41 @@ def test_wires_that_a_swinging_shoot_takes_along_are_read_as_they_are(monkeypatc
         for _ in range(20):
             world.client.tick()
             world.client.tick()  # a snapshot is written every second step
-            assert world.worker._take_requests()
+            assert world.worker._take_messages()
             snapshot, _ = world.worker._read()
             expected = physics.snapshot().wires
             np.testing.assert_array_equal(snapshot.wires.segment, expected.segment)
             np.testing.assert_array_equal(snapshot.wires.q, expected.q)
             seen = max(seen, len(expected.segment))
         assert seen > 0
+
+
+def test_a_subscriber_that_leaves_and_returns_between_two_checks_does_not_hold_the_steps_for_ever(world: OneProcess):
+    """The worker has then said that it wants no snapshots, and still has the promise to the sensor."""
+    client = world.client
+    client.tick()
+    client.tick()
+    world.render()
+    world.channel.wanted["world"][0] = False
+    while not client.held():
+        client.tick()
+    assert client.physics.time < 1.0
+    world.render()
+    assert not client.held()
+
+
+def test_counts_include_the_snapshots_that_were_written_before_they_were_asked_for(world: OneProcess, monkeypatch):
+    """Also if the worker takes the request first: the digests of two runs in lockstep are of the same frames."""
+    monkeypatch.setattr(sensor_worker, "report_ready", lambda *_: None)  # it lowers the priority of its process
+    world.client.tick()
+    world.client.tick()
+    world.pipe.send(("count", None))
+    thread = threading.Thread(target=world.worker.run, daemon=True)
+    thread.start()
+    try:
+        while world.pipe.recv()[0] != "counted":
+            pass
+        assert world.channel.wanted["shown"][0] == world.sensors._snapshot_count
+    finally:
+        world.pipe.send(("stop", None))
+        thread.join()

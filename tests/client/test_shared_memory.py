@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.support.waiting import deadline
-from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
-from vinesim.client.processes.shared_queue import SharedQueue
+from vinesim.client.processes.shared_memory import SharedArrays, SharedQueue, SharedSnapshot
 
 RECORD = np.dtype([("number", "i8"), ("values", "f8", (5,))])
 LAYOUT = {"number": ((1,), "i8"), "values": ((1000,), "f8")}

@@ -10,8 +10,8 @@ import sys
 import pytest
 
 from tests.support.waiting import wait
-from vinesim.client.processes import spawned_process
-from vinesim.client.processes.spawned_process import spawn, start_early
+from vinesim.client.processes import worker_process
+from vinesim.client.processes.worker_process import spawn, start_early
 
 MODULES = ("json", "a_module.that_is_missing", "tests.client.test_spawned_process")
 
@@ -22,7 +22,7 @@ CONTEXT = multiprocessing.get_context("spawn")
 @pytest.fixture(autouse=True)
 def real_starts(monkeypatch):
     """Not those of other tests, which share their imports."""
-    monkeypatch.setattr(spawned_process, "CONTEXT", CONTEXT)
+    monkeypatch.setattr(worker_process, "CONTEXT", CONTEXT)
 
 
 def report(lock, words, pipe):
@@ -57,7 +57,7 @@ def test_a_process_that_was_started_early_is_taken_once():
 
 def test_a_process_that_nobody_took_ends_with_its_parent():
     code = (
-        "from vinesim.client.processes import spawned_process as s; s.start_early('x', ('json',)); "
+        "from vinesim.client.processes import worker_process as s; s.start_early('x', ('json',)); "
         "print(s._started_early[('json',)].process.pid)"
     )
     parent = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -14,7 +14,7 @@ import pytest
 
 from tests.support.waiting import wait
 from vinesim.client.processes import worker_process
-from vinesim.client.processes.worker_process import WorkerProcess
+from vinesim.client.processes.worker_process import Totals, WorkerProcess
 
 MODULES = ("tests.client.test_worker_process",)
 HANG_TIMEOUT = 2
@@ -114,3 +114,19 @@ def test_a_process_that_hangs_before_it_is_ready_is_started_again_later(start, m
     stopped = time.monotonic()
     wait(lambda: worker.restarts == 2, "another restart")
     assert time.monotonic() - stopped > 2.0 * HANG_TIMEOUT
+
+
+def test_counts_are_summed_over_all_runs_of_a_process():
+    """A topic that the present run has not yet, and a kind that no run has, are no errors."""
+    totals = Totals()
+    assert totals.of("sent") == {}
+    totals.take({"sent": {"/clock": 3, "/tf": 1}})
+    totals.take({"sent": {"/clock": 5, "/tf": 2}})
+    assert totals.of("sent") == {"/clock": 5, "/tf": 2}
+    totals.begin_run()
+    assert totals.of("sent") == {"/clock": 5, "/tf": 2}
+    totals.take({"sent": {"/clock": 1}, "dropped": {"/clock": 4}})
+    totals.begin_run()
+    totals.take({"sent": {"/joint_states": 1}})
+    assert totals.of("sent") == {"/clock": 6, "/tf": 2, "/joint_states": 1}
+    assert totals.of("dropped") == {"/clock": 4}

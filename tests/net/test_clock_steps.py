@@ -89,7 +89,7 @@ ALLOWED = {
     "ros/dead_segments.py": "age of files",
     "ros/tools/topic_monitor.py": "age of stamps, which are the time of day in ROS",
     "ros/tools/bag_recorder.py": "times of messages in a recording, as rosbag2 has them",
-    "client/processes/child_process.py": "beside what the topic monitor says",
+    "client/programs.py": "beside what the topic monitor says",
     "cli/demo/push_demo.py": "beside what the topic monitor says",
     "cli/demo/readiness.py": "beside what the topic monitor says",
 }

@@ -24,7 +24,7 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from tests.support.stock_node import wait_until
-from vinesim.client.processes.child_process import Process, process_group
+from vinesim.client.programs import Program, program_group
 from vinesim.robot.description.loader import load_description
 from vinesim.ros.commands.types import JointTrajectory
 from vinesim.ros.messages.definitions import message_definition
@@ -46,7 +46,7 @@ ROS_OWN = ("/rosout", "/parameter_events")
 class CyclonePeer:
     """The program of the peer, as the test speaks with it."""
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: Program) -> None:
         self.process = process
         self.topics: dict[str, str] = {}
         """Types of the topics that are published, as the peer has found them."""
@@ -100,7 +100,7 @@ def test_a_peer_of_another_vendor_hears_and_commands(domain: str) -> None:
     zeros = np.zeros((2, 3, 3))
     sample = RobotSample("robot", joints, rest, np.zeros(6), rest, np.zeros(6), zeros, (), np.zeros((0, 7)))
     spec = ControllerSpec("head_controller", ControllerKind.JOINT_TRAJECTORY, names)
-    with process_group() as group, RobotNode("robot", "<robot name='small'/>", controllers=[spec]) as node:
+    with program_group() as group, RobotNode("robot", "<robot name='small'/>", controllers=[spec]) as node:
         peer = CyclonePeer(group.start("peer", str(PROGRAM), domain))
         peer.ask(read="/joint_states", type="sensor_msgs/msg/JointState", qos="default")
         received: list[JointTrajectory] = []
@@ -421,7 +421,7 @@ ROWS = [(topic, qos) for topic in TABLE for qos in (("latched",) if topic in LAT
 @pytest.fixture(scope="module")
 def whole(domain: str) -> Iterator[CyclonePeer]:
     """A whole client, and the peer after it has heard all that it will hear."""
-    with process_group(10.0) as group:
+    with program_group(10.0) as group:
         client = group.start(
             "client",
             "-m",

@@ -161,7 +161,7 @@ def test_pictures_and_clouds_come_and_killed_processes_come_back_and_diagnostics
     for node, (name, value) in values.items():
         set_parameter(robot, node, name, value)
     workers = robot.processes.ros, robot.processes.sensors
-    robot.run_until(lambda: all(one._parameters for one in workers))
+    robot.run_until(lambda: all(one.worker.config.parameters for one in workers))
     commands = robot.peer.node.create_publisher(Float64MultiArray, "/forward_position_controller/commands", 10)
     robot.run_until(commands.get_subscription_count)
     commands.publish(Float64MultiArray(data=[1.0, 2.0]))  # it has more joints

@@ -24,7 +24,7 @@ from sensor_msgs.msg import JointState
 from visualization_msgs.msg import MarkerArray
 
 from tests.support.stock_node import StockNode, wait_until
-from vinesim.client.processes.child_process import Process, ProcessGroup, process_group
+from vinesim.client.programs import Program, ProgramGroup, program_group
 from vinesim.client.world_time import MAX_LAG
 from vinesim.ros.messages import message_packages
 from vinesim.ros.robot_node import RobotNode
@@ -69,11 +69,11 @@ def test_two_robots_under_one_namespace_are_told_of_in_one_line(peer: StockNode,
 class World:
     """A server and its clients, and a stock node that hears every message of /clock."""
 
-    def __init__(self, group: ProcessGroup, peer: StockNode) -> None:
+    def __init__(self, group: ProgramGroup, peer: StockNode) -> None:
         self._group = group
         self.peer = peer
         _, self._endpoint = group.start_server()
-        self.clients: dict[str, Process] = {}
+        self.clients: dict[str, Program] = {}
         self.clocks: list[tuple[int, int]] = []
         """Time [ns] and number of each message, which its publisher counts."""
         self.clock_leads: collections.deque[int] = collections.deque(maxlen=NEWEST)
@@ -139,7 +139,7 @@ class World:
 @pytest.fixture(scope="module")
 def world(peer: StockNode) -> Iterator[World]:
     """Two clients that were started at once."""
-    with process_group(10.0) as group:
+    with program_group(10.0) as group:
         one = World(group, peer)
         one.start("north", 0)
         one.start("south", 1)

@@ -42,7 +42,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 from tests.support.stock_node import StockNode, wait_until
 from vinesim.bench.ros_resets import reset_rows
 from vinesim.bench.ros_topics import action_rows
-from vinesim.client.processes.child_process import process_group
+from vinesim.client.programs import program_group
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.joint_servos import series_stiffness
 from vinesim.ros.messages import message_packages
@@ -65,7 +65,7 @@ def robot(tmp_path_factory) -> Iterator[StockNode]:
     (folder / "vinebot.toml").write_text(text.replace("[base]", f"[base]\nslip = [0.0, {SLIP}]", 1))
     message_packages.ensure_importable(["tf2_msgs", "control_msgs", "simulation_interfaces"])
     domain = {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    with pytest.MonkeyPatch.context() as monkeypatch, process_group(10.0) as group:
+    with pytest.MonkeyPatch.context() as monkeypatch, program_group(10.0) as group:
         for name, value in (*domain.items(), ("ROS_LOG_DIR", str(folder))):
             monkeypatch.setenv(name, value)
         client = group.start(

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from vinesim.client.processes.spawned_process import ROS_MODULES
+from vinesim.client.processes.worker_process import ROS_MODULES
 
 HEAVY = ("warp", "mujoco", "zenoh", "rclpy", "taichi", "cv2", "numpy", "open3d")
 

@@ -145,7 +145,7 @@ def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measu
     """Measure the named rows of :data:`ROWS`, or all of them. ``announce`` is called with a line of text before each
     row.
 
-    Raises :class:`ProcessFailed` or :class:`RosMissing` if a row fails.
+    Raises :class:`ProgramFailed` or :class:`RosMissing` if a row fails.
     """
     chosen = [name for name in ROWS if not rows or name in rows]
     left = sum(ROWS[name].seconds for name in chosen)
@@ -157,7 +157,7 @@ def live(rows: Sequence[str], announce: Callable[[str], None]) -> Iterator[Measu
 
 
 def run_command(*arguments: str) -> float:
-    """Returns the time that ``vinesim ARGUMENTS`` takes [s]. Raises :class:`ProcessFailed` unless it ends with exit
+    """Returns the time that ``vinesim ARGUMENTS`` takes [s]. Raises :class:`ProgramFailed` unless it ends with exit
     code 0."""
     with own_processes() as group:
         process = group.start(f"vinesim {arguments[0]}", "-m", "vinesim", *arguments)

@@ -13,8 +13,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from vinesim.client.processes.child_process import EXIT_TIMEOUT, START_TIMEOUT, ProcessGroup, process_group
-from vinesim.client.processes.ros_listener import RosListener, TopicReport
+from vinesim.client.programs import EXIT_TIMEOUT, START_TIMEOUT, ProgramGroup, RosListener, TopicReport, program_group
 from vinesim.client.rate_loop import TickLog
 from vinesim.ros import middleware
 
@@ -48,11 +47,11 @@ class LiveRun:
 
 
 @contextlib.contextmanager
-def own_processes(**environ: str) -> Iterator[ProcessGroup]:
+def own_processes(**environ: str) -> Iterator[ProgramGroup]:
     """Yields a group for processes in a ROS domain of their own, unless the user has set one. When the context ends,
     each process gets time to end its own children."""
     domain = {} if "ROS_DOMAIN_ID" in os.environ else {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100)}
-    with process_group(3.0 * EXIT_TIMEOUT, **domain, **environ) as group:
+    with program_group(3.0 * EXIT_TIMEOUT, **domain, **environ) as group:
         yield group
 
 
@@ -60,7 +59,7 @@ def run_client(options: Sequence[str], topics: Sequence[str], seconds: float, **
     """Start ``vinesim client OPTIONS``, subscribe to ``topics``, and measure for ``seconds`` once all topics have a
     message.
 
-    ``environ`` is added to the client's environment. Raises :class:`RosMissing`, or :class:`ProcessFailed` if the
+    ``environ`` is added to the client's environment. Raises :class:`RosMissing`, or :class:`ProgramFailed` if the
     client ends or a topic stays silent.
     """
     if (reason := middleware.unavailable_reason()) is not None:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vinesim.bench.process_memory import ProcessHistory, ProcessSampler
-from vinesim.client.processes.child_process import START_TIMEOUT, ProcessGroup
+from vinesim.client.programs import START_TIMEOUT, ProgramGroup
 from vinesim.scene.values import Measurement
 
 RESETS = 20
@@ -21,7 +21,7 @@ GROWTH = 0.5
 GRAPH = ("nodes", "publishers", "services")
 
 
-def measure_resets(group: ProcessGroup, resets: int = RESETS, *options: str) -> Iterator[Measurement]:
+def measure_resets(group: ProgramGroup, resets: int = RESETS, *options: str) -> Iterator[Measurement]:
     """Measure ``resets`` resets of a client that is started with ``options``."""
     client = group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
     caller = group.start("reset caller", "-m", "vinesim.bench.reset_caller", "--resets", str(resets))

@@ -22,8 +22,7 @@ import numpy as np
 from vinesim.bench import stock_publisher
 from vinesim.bench.live_client import CLOCK, DEPTH, LIDAR, RGB, RosMissing, own_processes
 from vinesim.bench.ros_resets import RESETS, measure_resets
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup
-from vinesim.client.processes.ros_listener import RosListener
+from vinesim.client.programs import START_TIMEOUT, Program, ProgramGroup, RosListener
 from vinesim.client.rate_loop import TickLog
 from vinesim.ros import middleware
 from vinesim.scene.values import Measurement
@@ -195,7 +194,7 @@ def action_rows(rows: list[dict[str, Any]]) -> Iterator[Measurement]:
 
 def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Measurement]:
     """Measure topics, actions and resets; topics are measured twice for ``window`` [s]. Raises :class:`RosMissing` or
-    :class:`ProcessFailed` if that fails."""
+    :class:`ProgramFailed` if that fails."""
     if (reason := middleware.unavailable_reason()) is not None:
         raise RosMissing(reason)
     with own_processes() as group, tempfile.TemporaryDirectory() as name:
@@ -208,7 +207,7 @@ def ros(announce: Callable[[str], None], window: float = WINDOW) -> Iterator[Mea
         yield from measure_resets(group)
 
 
-def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
+def _measure_topics(group: ProgramGroup, folder: pathlib.Path, window: float) -> Iterator[Measurement]:
     """Measure topics while a third process reads them, then after that process has stopped reading."""
     arrivals = folder / "arrivals.npz"
     log = folder / "ticks.npz"
@@ -249,7 +248,7 @@ def _measure_topics(group: ProcessGroup, folder: pathlib.Path, window: float) ->
     yield from loss_rows(heard, published, sum(dropped.get(topic, 0) for topic in TOPICS))
 
 
-def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
+def _measure_actions(group: ProgramGroup) -> Iterator[Measurement]:
     """Measure goals of a stock action client that runs in a process of its own."""
     client = _start_client(group)
     sender = group.start(
@@ -271,11 +270,11 @@ def _measure_actions(group: ProcessGroup) -> Iterator[Measurement]:
     yield from action_rows(rows)
 
 
-def _start_client(group: ProcessGroup, *options: str) -> Process:
+def _start_client(group: ProgramGroup, *options: str) -> Program:
     return group.start("client", "-m", "vinesim", "client", "--role", "robot", "--status", "json", *options)
 
 
-def _rest(client: Process, settling: float, window: float) -> tuple[float, float, float]:
+def _rest(client: Program, settling: float, window: float) -> tuple[float, float, float]:
     """Wait for ``settling`` and ``window`` [s]. Returns begin and end of the window as wall times [s since the epoch],
     and its begin on the monotonic clock [s]."""
     time.sleep(settling)

@@ -29,7 +29,7 @@ def client(ctx: typer.Context, **values: Any) -> None:
     options = ClientOptions(**values)
     check_role(options.role, {option for option in values if _is_given(ctx, option)})
     if options.role == "robot":
-        from vinesim.client.processes.spawned_process import sensor_modules, start_early
+        from vinesim.client.processes.worker_process import sensor_modules, start_early
 
         start_early("sensor process", sensor_modules(options.ros))
         from vinesim.cli.robot_client import run

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from vinesim.client.processes.child_process import REPORT_TIMEOUT, Process
+from vinesim.client.programs import REPORT_TIMEOUT, Program
 from vinesim.net.pace import describe
 
 PICKER = "picker"
@@ -26,9 +26,9 @@ Statuses = dict[str, dict[str, Any]]
 
 
 def show_progress(
-    picker: Process,
-    visitor: Process | None,
-    server: Process,
+    picker: Program,
+    visitor: Program | None,
+    server: Program,
     newest: Statuses,
     console: Console,
     headless: bool,
@@ -36,7 +36,7 @@ def show_progress(
 ) -> None:
     """Show the status of both clients until the picker ends. If ``is_over(newest)`` is true, the picker is interrupted.
 
-    Raises :class:`ProcessFailed` if any process ends too early or the picker fails.
+    Raises :class:`ProgramFailed` if any process ends too early or the picker fails.
     """
     live = contextlib.nullcontext() if headless or not console.is_terminal else Live(console=console, transient=True)
     with live as view:

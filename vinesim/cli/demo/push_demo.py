@@ -13,8 +13,7 @@ from vinesim.cli.demo.placement import APPROACH_DISTANCE, check_device, choose_p
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.readiness import wait_until_ready
 from vinesim.cli.demo.summary import Window, push_summary, push_table, write_summary
-from vinesim.client.processes.child_process import START_TIMEOUT, Process, ProcessGroup, free_port, process_group
-from vinesim.client.processes.ros_listener import RosListener
+from vinesim.client.programs import START_TIMEOUT, Program, ProgramGroup, RosListener, free_port, program_group
 from vinesim.core.errors import writing
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
@@ -69,7 +68,7 @@ def run_push(
     no_ros = middleware.unavailable_reason()
     if no_ros:
         console.print(f"ROS 2 is not usable here, the demo runs without it: {no_ros}")
-    with process_group() as group:
+    with program_group() as group:
         topics = listened_topics(description)
         listener = None if no_ros else RosListener(group, topics.always, topics.once, topics.events)
         server, endpoint = group.start_server(real_time_factor)
@@ -133,13 +132,13 @@ class _RunTimer:
 
 
 def _start_clients(
-    group: ProcessGroup,
+    group: ProgramGroup,
     common: list[str],
     bunch: int,
     poses: tuple[list[str], list[str]],
     page: int | None,
     out: pathlib.Path,
-) -> dict[str, Process]:
+) -> dict[str, Program]:
     """Start both clients with the ``common`` options and return them by name.
 
     One pushes the ``bunch``; the other drives up to it and serves a page on the port ``page``.

@@ -10,8 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from rich.console import Console
 
 from vinesim.cli.demo.progress import Statuses
-from vinesim.client.processes.child_process import Process, ProcessFailed
-from vinesim.client.processes.ros_listener import RosListener
+from vinesim.client.programs import Program, ProgramFailed, RosListener
 
 POLL_PERIOD = 0.05
 """Wall time between two checks whether all programs, sensors and topics of the demo are ready [s]."""
@@ -22,8 +21,8 @@ LINE_PERIOD = 5.0
 
 
 def wait_until_ready(
-    clients: Mapping[str, Process],
-    others: list[Process],
+    clients: Mapping[str, Program],
+    others: list[Program],
     listener: RosListener | None,
     newest: Statuses,
     describe: Callable[[str], str],
@@ -33,7 +32,7 @@ def wait_until_ready(
     """Wait until every client steps and every topic of the listener has had a message.
 
     Returns the wall time of each first event [s since the epoch] by name of the client or topic. ``describe`` returns a
-    text for a missing topic. Raises :class:`ProcessFailed` if a process ends, or after ``timeout`` [s].
+    text for a missing topic. Raises :class:`ProgramFailed` if a process ends, or after ``timeout`` [s].
     """
     ready: dict[str, float] = {}
     with _waiting_line(console) as show:
@@ -54,13 +53,13 @@ def wait_until_ready(
                 return ready | ({} if listener is None else listener.first)
             waited = time.monotonic() - begin
             if waited > timeout:
-                raise ProcessFailed(f"not ready after {timeout:.0f} s: {', '.join(missing)}")
+                raise ProgramFailed(f"not ready after {timeout:.0f} s: {', '.join(missing)}")
             doing = progress_of(clients, newest)
             show(f"{waited:3.0f} s: waiting for {', '.join(missing)}{f' ({doing})' if doing else ''}")
             time.sleep(POLL_PERIOD)
 
 
-def progress_of(clients: Mapping[str, Process], newest: Statuses) -> str:
+def progress_of(clients: Mapping[str, Program], newest: Statuses) -> str:
     """Returns the progress text of the first client that waits for something, such as the number of compiled kernels.
 
     All clients wait for the same kernels. Other output of clients, such as warnings, is left out.

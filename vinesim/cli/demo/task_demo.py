@@ -11,7 +11,7 @@ from rich.console import Console
 from vinesim.cli.demo.placement import check_device, visitor_pose
 from vinesim.cli.demo.progress import PICKER, VISITOR, Statuses, show_progress
 from vinesim.cli.demo.summary import job_summary, write_summary
-from vinesim.client.processes.child_process import START_TIMEOUT, process_group
+from vinesim.client.programs import START_TIMEOUT, program_group
 from vinesim.client.tasks.planning import UnknownTask, plan_meeting
 from vinesim.client.tasks.start_poses import bunch_centres, start_pose
 from vinesim.core.errors import writing
@@ -55,7 +55,7 @@ def run_job(
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
     (out / "summary.json").unlink(missing_ok=True)
-    with process_group() as group:
+    with program_group() as group:
         server, endpoint = group.start_server(real_time_factor)
         console.print(f"server on {endpoint}; {robot} is to {job} (a first run compiles kernels)")
         client = ["-m", "vinesim", "client", "--connect", endpoint, "--scene", scene, "--seed", str(plan.seed)]

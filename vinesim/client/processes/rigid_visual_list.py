@@ -1,18 +1,20 @@
-"""The list of rigid bodies that sensors show, with a version, as the client sends it to the sensor process.
+"""A list of rigid bodies with a version, which the client sends to a process, and memory for the poses of the bodies.
 
-The list is compared by content: a new list with the same content keeps its version. A message has the shapes only of
-the bodies that the process does not have yet.
+The sensor process shows the bodies; the ROS process publishes their poses as ground truth. Lists are compared by
+content: a new list with the same content keeps its version. A message has the shapes only of the bodies that the
+process does not have yet.
 """
 
 from __future__ import annotations
 
 import dataclasses
 
-from vinesim.client.processes.shared_arrays import SharedArrays
+from vinesim.client.processes.shared_memory import SharedArrays
 from vinesim.scene.values import RigidVisual, Shape
 
 _FIRST_CAPACITY = 256
-"""Number of bodies for whose poses there is room at first. It is doubled whenever there are more bodies."""
+"""Least number of bodies for which the memory has room. If there are more bodies than room, new memory has room for
+twice their number."""
 
 _Key = tuple[str, int, int, int]
 """Key of a body: its name, organ and index, and the identity of its shapes."""
@@ -20,32 +22,37 @@ _Key = tuple[str, int, int, int]
 
 @dataclasses.dataclass(frozen=True)
 class VisualListMessage:
-    """Message with one version of the list."""
+    """Message with one version of a list of rigid bodies."""
 
     version: int
+    """Number of the version, from 1."""
     numbers: tuple[int, ...]
-    """Number of each body. Equal numbers mean the same body in all versions."""
+    """Number of each body of the list. A body has the same number in all versions, as long as it stays in the list."""
     new: dict[int, RigidVisual]
-    """Bodies that no earlier version had, by number."""
+    """Bodies that the version before did not have, by number."""
     visual_q: SharedArrays | None
-    """Memory for the poses of the bodies, or None if it is the memory of the version before."""
+    """New memory for the poses of the bodies, or None if the memory of the version before is still used."""
 
 
 class VisualListSender:
-    """The client's side, for one run of the process."""
+    """Makes the messages for one run of a process, in the client."""
 
     def __init__(self) -> None:
         self.version = 0
+        """Number of the newest version. 0 before the first list."""
         self._visuals: tuple[RigidVisual, ...] | None = None
         self._numbers: tuple[int, ...] = ()
         self._known: dict[_Key, tuple[int, tuple[Shape, ...]]] = {}
-        """Number of each body in the list. The shapes are kept alive, so that no other object gets their identity."""
+        """Number and shapes of each body in the list. A reference to the shapes keeps their identity from being used
+        for another object."""
         self._next_number = 0
         self.capacity = 0
+        """Number of bodies for which the memory has room."""
         self._memory: SharedArrays | None = None
 
     def update(self, visuals: tuple[RigidVisual, ...]) -> VisualListMessage | None:
-        """The message to send before poses of this list are written. None if the list equals that of the last call."""
+        """Returns the message to send before poses of the bodies ``visuals`` are written. None if the last call had the
+        same list."""
         if visuals is self._visuals:
             return None
         self._visuals = visuals
@@ -74,7 +81,7 @@ class VisualListSender:
 
     @property
     def memory(self) -> SharedArrays:
-        """Room for the poses of the list's bodies, ``visual_q`` [capacity, 7]."""
+        """Memory for the poses of the bodies: array ``visual_q`` [capacity, 7]."""
         assert self._memory is not None, "no list was passed yet"
         return self._memory
 
@@ -85,17 +92,19 @@ class VisualListSender:
 
 
 class VisualListReceiver:
-    """The process's side."""
+    """Takes the messages, in the process."""
 
     def __init__(self) -> None:
         self.version = 0
+        """Number of the newest version that has arrived. 0 before the first list."""
         self.visuals: tuple[RigidVisual, ...] = ()
-        """The bodies of the list. It is the same object as long as the version is the same."""
+        """Bodies of the newest version. The tuple is the same object as long as the version is the same."""
         self.memory: SharedArrays | None = None
+        """Memory for the poses of the bodies: array ``visual_q`` [capacity, 7]. None before the first list."""
         self._by_number: dict[int, RigidVisual] = {}
 
     def take(self, message: VisualListMessage) -> None:
-        """Take over a version of the list."""
+        """Take a message with a new version of the list."""
         known = self._by_number | message.new
         self._by_number = {number: known[number] for number in message.numbers}
         self.visuals = tuple(self._by_number.values())

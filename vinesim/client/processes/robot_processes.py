@@ -1,4 +1,4 @@
-"""The processes of one robot of the client: its sensors, and its ROS node if ROS 2 can be used."""
+"""The processes of one robot of a client: the sensor process and, if ROS 2 can be used, the ROS process."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _NETWORK_VALUES = ("others", "round_trip_ms", "bytes_in", "bytes_out")
 
 
 class RobotProcesses:
-    """Starts the processes of one robot. It is a context manager: the processes end with the context."""
+    """The sensor process and the ROS process of one robot. A context manager: the processes end with the context."""
 
     def __init__(
         self,
@@ -64,9 +64,7 @@ class RobotProcesses:
         pacing: SensorPacing | None = None,
         standby: bool = False,
     ) -> None:
-        """``clock``: whether the ROS node may publish /clock; only one node of a ROS domain does. ``params_file``: ROS
-        parameters of the nodes. ``interest_radius``: see :class:`RosProcess`. For the other arguments see
-        :class:`SensorProcess`."""
+        """Starts the processes. For the arguments see :class:`SensorProcess` and :class:`RosProcess`."""
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
@@ -104,33 +102,34 @@ class RobotProcesses:
         self._restarts = RecentCounts()
 
     def attach(self, client: Client, robot: Robot | None = None, *, wait_for_sensors: bool = True) -> None:
-        """Connect the processes with a robot of the client: its first robot unless ``robot`` is given.
+        """Connect the processes with ``robot``, by default the first robot of the client.
 
-        Waits until the ROS node is ready and, if ``wait_for_sensors``, the sensors; see :meth:`SensorProcess.attach`.
+        Waits until the ROS process is ready and, if ``wait_for_sensors``, until the sensor process is ready. See
+        :meth:`SensorProcess.attach`.
         """
         self.sensors.attach(client, robot, wait=wait_for_sensors)
         if self.ros is not None:
             self.ros.attach(client, robot)
 
     def sent_messages(self) -> dict[str, int]:
-        """ROS messages sent so far, by topic."""
+        """Returns the number of ROS messages sent so far, by topic."""
         return self.sensors.sent_messages() | ({} if self.ros is None else self.ros.sent_messages())
 
     def dropped_messages(self) -> dict[str, int]:
-        """Number of ROS messages that had subscribers and were not sent, by topic. Topics that lost none are left
-        out."""
+        """Returns the number of ROS messages that had subscribers and were not sent, by topic. Topics without such
+        messages are left out."""
         dropped = collections.Counter(self.sensors.dropped_messages())
         if self.ros is not None:
             dropped.update(self.ros.dropped_messages())
         return {topic: count for topic, count in sorted(dropped.items()) if count}
 
     def awaited(self) -> list[str]:
-        """Names of the steps of preparation that are still needed before pictures and messages are sent."""
+        """Returns the names of the steps of preparation that are still needed before pictures and messages are sent."""
         ros = [] if self.ros is None or self.ros.worker.is_ready else [f"{self.sensors.name}: ROS node"]
         return self.sensors.awaited() + ros
 
     def status(self) -> dict[str, Any]:
-        """Whether the sensors are ready, counts of losses so far, and process ids; for the status of a client."""
+        """Returns values for a client's status: whether the sensors are ready, counts of losses, and process ids."""
         report = self.sensors.report()
         awaited = self.awaited()
         pids = {f"sensors of {self.sensors.name}": self.sensors.worker.pid}
@@ -151,12 +150,12 @@ class RobotProcesses:
         }
 
     def report(self) -> dict[str, Any]:
-        """All counts, by sensor and topic."""
+        """Returns all counts, by sensor and topic."""
         restarts = 0 if self.ros is None else self.ros.worker.restarts
         return self.sensors.report() | {"ros_dropped": self.dropped_messages(), "ros_restarts": restarts}
 
     def publish_diagnostics(self, status: dict[str, Any]) -> None:
-        """Publish the status of a client and of the sensors on /diagnostics."""
+        """Publish the ``status`` of the client and the state of the sensors on /diagnostics."""
         if self.ros is None:
             return
         report = self.report() | {"sound_lost": self.ros.sound_lost}
@@ -169,12 +168,12 @@ class RobotProcesses:
         )
 
     def close_ros(self) -> None:
-        """End the ROS node; the counts of its messages are complete then."""
+        """End the ROS process. The counts of its messages are complete after that."""
         if self.ros is not None:
             self.ros.close()
 
     def save_picture(self, folder: pathlib.Path) -> None:
-        """Write the kept picture; see :meth:`SensorProcess.save_picture`."""
+        """Write the kept picture to a ``folder``. See :meth:`SensorProcess.save_picture`."""
         self.sensors.save_picture(folder)
 
     def close(self) -> None:
@@ -189,8 +188,10 @@ class RobotProcesses:
 
 
 def loop_status(status: dict[str, Any]) -> ComponentStatus:
-    """State of a client's loop for /diagnostics: a warning while the loop is behind and after recent faults. The values
-    include the counts of all faults."""
+    """Returns the state of a client's loop for /diagnostics: a warning while it is behind and after recent faults.
+
+    The values include the counts of all faults. ``status``: status of the client.
+    """
     trouble = ["behind"] * (status["recent_real_time_factor"] < BEHIND * status["target_real_time_factor"])
     trouble += [name.replace("_", " ") for name in status["recent_faults"]]
     values = {key: status[key] for key in _LOOP_VALUES} | status["faults"]
@@ -200,15 +201,21 @@ def loop_status(status: dict[str, Any]) -> ComponentStatus:
 
 
 def network_status(status: dict[str, Any]) -> ComponentStatus:
-    """State of a client's network for /diagnostics: a warning while its server is gone or rejects the client."""
+    """Returns the state of a client's network for /diagnostics: a warning if the server is gone or rejects the client.
+
+    ``status``: status of the client.
+    """
     trouble = status["network"]
     values = {key: status[key] for key in _NETWORK_VALUES}
     return ComponentStatus("network", "warning" if trouble else "ok", trouble or "well", values)
 
 
 def sensors_status(awaited: Sequence[str], restarted: Sequence[str], report: dict[str, Any]) -> ComponentStatus:
-    """State of a robot's sensors for /diagnostics, with all counts. It is an error while any is ``awaited``, and a
-    warning after a process was started again, because a restart can be shorter than the time between two messages."""
+    """Returns the state of a robot's sensors for /diagnostics, with the counts of ``report``.
+
+    It is an error while steps of preparation are ``awaited``. It is a warning after processes were ``restarted``,
+    because a restart can be shorter than the time between two messages.
+    """
     if awaited:
         return ComponentStatus("sensors", "error", f"not ready: {awaited[0]}", report)
     trouble = [f"{process} restarted" for process in restarted]

@@ -1,5 +1,5 @@
-"""The client's side of a robot's ROS process: it passes the robot's state after every step to the process, and takes
-commands from it."""
+"""The part of a ROS process that runs in the client: it passes the robot's state after every step to the process, and
+applies the commands that the process receives."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ from vinesim.client.client import Client
 from vinesim.client.pace import Limit
 from vinesim.client.processes.rigid_visual_list import VisualListSender
 from vinesim.client.processes.ros_worker import RosChannel, RosConfig, run_ros_worker
-from vinesim.client.processes.spawned_process import ROS_MODULES
 from vinesim.client.processes.step_record import StepRecords
-from vinesim.client.processes.worker_process import Hold, Run, WorkerProcess
+from vinesim.client.processes.worker_process import ROS_MODULES, Hold, Run, WorkerProcess
 from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.signals import GestureLog, IntentionLog
 from vinesim.client.sound.exchange import SoundStep
@@ -42,17 +41,17 @@ from vinesim.scene.values.signals import Color
 log = logging.getLogger(__name__)
 
 START_TIMEOUT = 120.0
-"""How long the process may take to start; a first run builds message packages [s]."""
+"""Longest time in which the process starts [s]. A first run builds message packages."""
 FREE_BACKLOG = 0.2
-"""Share of the queue of steps that may be occupied before the world slows down."""
+"""Share of the queue of step records that may be occupied before the world slows down."""
 RATE_PERIOD = 0.5
-"""Time over which the rate at which the process takes steps is measured [s]."""
+"""Time over which the rate is measured at which the process takes step records [s]."""
 TRUTH_ORGANS = (Organ.BOX, Organ.BUNCH, Organ.HUMAN)
 """Organs of the rigid bodies whose true poses are published. Robots publish their own transforms."""
 
 
 class RosProcess:
-    """The ROS node of one robot of the client, in a process of its own. A context: the process ends with it."""
+    """The ROS node of one robot of a client, in a process. A context manager: the process ends with the context."""
 
     def __init__(
         self,
@@ -65,21 +64,15 @@ class RosProcess:
         clock: bool = True,
         interest_radius: float | None = None,
     ) -> None:
-        """Starts the process; :meth:`attach` connects it with a client.
+        """Starts the process. :meth:`attach` connects it with a client.
 
-        ``clock``: whether its node may publish /clock and serves simulation_interfaces. ``params_file``: ROS parameters
-        of its node. ``interest_radius`` [m]: interest radius of the client, to be shown; None without a server.
+        ``name``: name of the robot. ``namespace``: prefix of the robot's topics. ``params_file``: file with ROS
+        parameters of the node. ``clock``: whether the process publishes /clock and serves simulation_interfaces; only
+        one process of a ROS domain may. ``interest_radius``: interest radius of the client [m], which a marker shows;
+        None without a server.
         """
         self._model = model
         self._commands: collections.deque[Command] = collections.deque()
-        self._sent: dict[str, int] = {}
-        self._dropped: dict[str, int] = {}
-        self._sent_before: collections.Counter[str] = collections.Counter()
-        self._dropped_before: collections.Counter[str] = collections.Counter()
-        """Dropped messages of the earlier runs of the process, by topic."""
-        self._losses: collections.Counter[str] = collections.Counter()
-        self._losses_before: collections.Counter[str] = collections.Counter()
-        """Lost frames of sound and refused commands, in the earlier runs of the process."""
         self._contacts_left_out = 0
         self._is_restarted = False
         self._leads = clock
@@ -90,9 +83,9 @@ class RosProcess:
         self._had_people = False
         """Whether there were people after the last step."""
         self._told_run: Run[RosChannel] | None = None
-        """The run of the process that received the present :attr:`_intentions` and :attr:`_gestures`."""
-        self._told_lights: tuple[Run[RosChannel], Color | None] | None = None
-        """The run of the process that received the state of the indicator lights, and the colour that was sent."""
+        """Run of the process that received the present intentions, gestures and lights."""
+        self._told_lights: Color | None = None
+        """Colour of the indicator lights that was sent to this run."""
         poles = np.flatnonzero(model.fixed_organ == Organ.POLE)
         fixed = zip(description.fixed_frames, description.fixed_poses, strict=True)
         self._records = StepRecords(name, description, series_stiffness(description.drives))
@@ -114,24 +107,24 @@ class RosProcess:
             params_file,
         )
         self._visuals: tuple[RigidVisual, ...] | None = None
-        """All rigid bodies at the time when the list of bodies in the ground truth was made."""
+        """All rigid bodies of the world when the list of bodies in the ground truth was made."""
         self._truth_rows = np.zeros(0, np.intp)
         self._truth_visuals: tuple[RigidVisual, ...] = ()
         self._truth_list = VisualListSender()
         self._run: Run[RosChannel] | None = None
-        """The run of the process that :attr:`_truth_list` belongs to."""
+        """Run of the process that :attr:`_truth_list` belongs to."""
         self._step_topics = config.step_topics
         self._lost = np.zeros(len(self._step_topics), np.int64)
-        """[topic] Number of messages of steps that were lost because the queue to the process was full."""
+        """[topic] Number of messages that were lost because the queue of step records was full."""
         body_sensors = {*config.imus, *config.wrenches}
         self._reads_body_sensors = np.array([topic in body_sensors for topic in self._step_topics])
-        self._parameters = config.parameters
-        self._hold: Hold | None = None
+        title = f"the ROS process of {name}"
+        self._hold = Hold(title, "its messages are lost, and counted", lambda run: int(run.shared.wanted["turns"][0]))
         self._taken = 0.0, 0, np.inf
-        """Time of the last measurement of the process's rate [s], number of steps that the process had taken then, and
-        the rate as a factor of real time."""
+        """Time of the last measurement of the process's rate [s], number of step records that the process had taken
+        then, and the rate as a factor of real time."""
         self.worker = WorkerProcess(
-            f"the ROS process of {name}",
+            title,
             ROS_MODULES,
             run_ros_worker,
             config,
@@ -140,10 +133,9 @@ class RosProcess:
         )
 
     def attach(self, client: Client, robot: Robot | None = None) -> None:
-        """Publish a robot of the client from now on, and execute the commands that it receives.
+        """Publish the state of ``robot``, by default the first robot of the client, and execute its commands.
 
-        ``robot``: the client's first robot unless given. Waits until the process is ready. Raises :class:`WorkerError`
-        if the process fails.
+        Waits until the process is ready. Raises :class:`WorkerError` if the process fails.
         """
         self.client = client
         self.robot = robot or client.robot
@@ -170,35 +162,30 @@ class RosProcess:
     # ------------------------------------------------------------------ in the loop
 
     def held(self) -> str:
-        """Returns why the next step must wait: "ROS messages" if the queue to the process is full, "ROS subscribers" if
-        the process waits for subscribers that are behind, "" if the step may run.
+        """Returns the reason why the next step must wait, or "" if the step may run.
 
-        A loop that calls this method before each step, until it returns "", loses no message of a step on the way. A
-        process that is not ready, or has done nothing for :data:`HOLD_TIMEOUT`, does not hold the loop. Messages that
-        find no room are lost then, and counted.
+        A step waits while the queue of step records is full. The reason is "ROS subscribers" if the process waits for
+        subscribers that are behind, otherwise "ROS messages". So no message of a step is lost on the way. A process
+        that is not ready, or has done nothing for
+        :data:`~vinesim.client.processes.worker_process.HOLD_TIMEOUT`, holds no step. Messages that find no room are
+        lost then, and counted.
         """
         run = self.worker.current()
         cause = _cause_to_wait(run.shared) if self.worker.is_ready else ""
         if not cause:
-            self._hold = None
+            self._hold.end()
             return ""
-        if self._hold is None or self._hold.run is not run:
-            self._hold = Hold(
-                run,
-                self.worker.title,
-                "its messages are lost, and counted",
-                lambda: int(run.shared.wanted["turns"][0]),
-            )
-        return "" if self._hold.is_over() else cause
+        return "" if self._hold.is_over(run) else cause
 
     @property
     def backlog(self) -> float:
-        """Share of the queue of steps to the process that is occupied, 0 to 1."""
+        """Share of the queue of step records that is occupied, 0 to 1."""
         steps = self.worker.current().shared.steps
         return steps.waiting_count / steps.capacity
 
     def limit(self) -> Limit:
-        """The largest real-time factor at which the process takes every step; infinite unless steps pile up."""
+        """Returns the largest real-time factor at which the process takes every step record. Infinite unless records
+        pile up."""
         now = time.monotonic()
         steps = self.worker.current().shared.steps
         since, before, factor = self._taken
@@ -209,7 +196,7 @@ class RosProcess:
         return Limit(factor if self.backlog > FREE_BACKLOG else np.inf, "ROS messages")
 
     def _control(self, time: float) -> None:
-        """Apply the received commands. Goals of a process that has ended end, too."""
+        """Apply the received commands. If the process was started again, cancel the goals of the run before."""
         if self._is_restarted:
             self._is_restarted = False
             self.handler.cancel_all(time)
@@ -218,18 +205,19 @@ class RosProcess:
         self.handler(time)
 
     def _finish(self, result: GoalResult) -> None:
-        """Tell the process the result of a goal. The action client receives it after the steps that led to it."""
+        """Send the result of a goal to the process. The action client receives the result after the steps that led to
+        it."""
         run = self.worker.current()
         run.send("finish", (run.shared.steps.put_count, result))
 
     def _begin_anew(self) -> None:
-        """After a reset: drop earlier commands, and publish the new robot."""
+        """After a reset of the client: drop earlier commands, and publish the new robot."""
         self._take_commands()
         self.robot = self.client.robots[self.robot.name]
         self.handler.begin_anew(self.robot)
 
     def _after_step(self, client: Client) -> None:
-        """Pass the parts of the robot's state whose topics have subscribers to the process."""
+        """Pass the parts of the robot's state that have subscribers to the process."""
         physics = client.physics
         channel = self.worker.current().shared
         wanted = channel.wanted["steps"]
@@ -249,19 +237,19 @@ class RosProcess:
                 else:
                     now = physics.time + client.world_time.offset
                     self._contacts_left_out += self._records.write(record, now, sample)
-        self._tell_of_people(client)
-        self._tell_lights()
+        run = self.worker.current()
+        is_new = run is not self._told_run
+        self._told_run = run
+        self._tell_of_people(client, run, is_new)
+        self._tell_lights(run, is_new)
         truth_period = float(channel.wanted["truth_period"][0])
         if truth_period and physics.tick % max(round(truth_period / physics.dt), 1) == 0:
             self._write_truth(client)
 
-    def _tell_of_people(self, client: Client) -> None:
-        """Send people's intentions and hand gestures to the ROS process when they change, and to a restarted one."""
+    def _tell_of_people(self, client: Client, run: Run[RosChannel], is_new: bool) -> None:
+        """Send people's intentions and hand gestures to the process when they change, and to a run that is new."""
         people: dict[str, LocalHuman | RemoteHuman] = dict(client.humans)
         people |= {name: one for name, one in client.remote_actors.items() if isinstance(one, RemoteHuman)}
-        run = self.worker.current()
-        is_new = run is not self._told_run
-        self._told_run = run
         had_people = self._had_people
         self._had_people = bool(people)
         if not (is_new or people or had_people):
@@ -272,15 +260,15 @@ class RosProcess:
         if self._gestures.update({name: one.pose for name, one in people.items() if one.pose is not None}) or is_new:
             run.send("gestures", (now, self._gestures.gestures))
 
-    def _tell_lights(self) -> None:
-        """Pass the colour of the indicator lights to the process when it changes, and to a new run."""
-        told = self.worker.current(), self.robot.shown_lights
-        if told != self._told_lights:
-            self._told_lights = told
-            told[0].send("lights", told[1])
+    def _tell_lights(self, run: Run[RosChannel], is_new: bool) -> None:
+        """Send the colour of the indicator lights to the process when it changes, and to a run that is new."""
+        lights = self.robot.shown_lights
+        if is_new or lights != self._told_lights:
+            self._told_lights = lights
+            run.send("lights", lights)
 
     def _write_truth(self, client: Client) -> None:
-        """Pass the true poses of bunches, boxes and people to the process."""
+        """Write the true poses of bunches, boxes and people, unless the process is reading now."""
         physics = client.physics
         run = self.worker.current()
         if run is not self._run:  # a new run knows nothing yet
@@ -307,7 +295,7 @@ class RosProcess:
             self._truth_list.memory["visual_q"][: len(self._truth_rows)] = physics.visual_q()[self._truth_rows]
 
     def hear(self, step: SoundStep) -> None:
-        """Pass the sound at the robot's microphone in this step to the process."""
+        """Send the sound at the robot's microphone in this ``step`` to the process."""
         self.worker.send("sound", at_place(step, self.client.sound.place_of(self.robot.name)))
 
     def _wake(self) -> None:
@@ -321,33 +309,21 @@ class RosProcess:
     # ------------------------------------------------------------------ outside the loop
 
     def _receive(self, kind: str, value: Any) -> None:
-        """Take a message of the process; in a thread."""
+        """Take a message of the process. This method is called in a thread."""
         if kind == "commands":
             self._commands.extend(value)
         elif kind == "simulation" and self._simulation is not None:
             self._simulation.put(value)
-        elif kind == "statistics":
-            self._sent = value["sent"]
-            self._dropped = value["dropped"]
-            self._losses = collections.Counter({kind: value[kind] for kind in ("sound_lost", "commands_refused")})
-        elif kind == "parameters":
-            self._parameters.update(value)
         elif kind == "restarted":
             self._is_restarted = True
-            self._sent_before.update(self._sent)
-            self._dropped_before.update(self._dropped)
-            self._losses_before = self._losses_before + self._losses
-            self._losses = collections.Counter()
-            self._sent = dict.fromkeys(self._sent, 0)
-            self._dropped = {}
 
     def sent_messages(self) -> dict[str, int]:
-        """Messages sent so far, by topic."""
-        return {topic: count + self._sent_before[topic] for topic, count in self._sent.items()}
+        """Returns the number of messages sent so far, by topic."""
+        return self.worker.total("sent")
 
     def dropped_messages(self) -> dict[str, int]:
-        """Messages that had subscribers and were not sent, by topic."""
-        dropped = collections.Counter(self._dropped) + self._dropped_before
+        """Returns the number of messages that had subscribers and were not sent, by topic."""
+        dropped = collections.Counter(self.worker.total("dropped"))
         dropped.update(dict(zip(self._step_topics, self._lost.tolist(), strict=True)))
         dropped["vine/contacts"] += self._contacts_left_out
         dropped["tf_environment"] += self._missed_truth
@@ -355,21 +331,21 @@ class RosProcess:
 
     @property
     def sound_lost(self) -> int:
-        """Number of frames of voices that the microphone missed: lost on the network, too late, or not decoded."""
-        return self._losses_before["sound_lost"] + self._losses["sound_lost"]
+        """Number of frames of voices that the microphone missed. They were lost on the network, too late, or not
+        decoded."""
+        return self.worker.total("losses").get("sound_lost", 0)
 
     @property
     def commands_refused(self) -> int:
         """Number of commands that were refused, because they contradict themselves or do not fit the robot."""
-        kind = "commands_refused"
-        return self._losses_before[kind] + self._losses[kind] + self.handler.rejected_count
+        return self.worker.total("losses").get("commands_refused", 0) + self.handler.rejected_count
 
     def publish_diagnostics(self, time: float, components: Sequence[ComponentStatus]) -> None:
-        """Publish states of parts of the client on /diagnostics at simulation time ``time`` [s]."""
+        """Publish states of parts of the client on /diagnostics, with the stamp ``time`` [s]."""
         self.worker.send("diagnose", (time, list(components)))
 
     def close(self) -> None:
-        """End the process. Its counts are complete after that. A second call does nothing."""
+        """End the process. The counts are complete after that. A second call does nothing."""
         self.worker.close()
         self._truth_list.close()
 
@@ -387,7 +363,7 @@ def _cause_to_wait(channel: RosChannel) -> str:
 
 
 class _Microphone:
-    """Microphone of a robot, which listens while the robot's topics of sound have subscribers."""
+    """Microphone of a robot. It is open while the robot's topics of sound have subscribers."""
 
     decodes_opus = opus.is_available()
 

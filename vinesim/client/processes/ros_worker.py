@@ -1,7 +1,8 @@
-"""The ROS process of one robot: publishes its state, the ground truth and diagnostics, and takes commands.
+"""The part of a ROS process that runs in the process: it publishes the robot's state, the ground truth and diagnostics,
+and takes commands.
 
-It renders nothing and imports neither Warp nor the renderer. So it starts at once, needs little memory, and keeps the
-rate of the topics that are published every step, whatever the sensors do.
+The process renders nothing and imports neither Warp nor the renderer. So it starts quickly, needs little memory, and
+keeps the rate of the topics that are published every step, whatever the sensors do.
 """
 
 from __future__ import annotations
@@ -11,7 +12,6 @@ import contextlib
 import dataclasses
 import pathlib
 import queue
-import sys
 import time
 from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
@@ -22,10 +22,9 @@ import numpy as np
 from vinesim.audio.frame import to_pcm
 from vinesim.audio.microphone import Microphone
 from vinesim.client.processes.rigid_visual_list import VisualListReceiver
-from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
-from vinesim.client.processes.shared_queue import SharedQueue
+from vinesim.client.processes.shared_memory import SharedArrays, SharedQueue, SharedSnapshot
 from vinesim.client.processes.step_record import StepRecords
-from vinesim.client.processes.worker_process import report_ready, serve
+from vinesim.client.processes.worker import POLL_PERIOD, Worker, report_ready, serve
 from vinesim.client.sound.microphone_step import MicrophoneStep
 from vinesim.ros.commands.types import GoalResult, SimulationRequest
 from vinesim.ros.names import ros_name
@@ -33,67 +32,68 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.values import ControllerKind, ControllerSpec, RigidVisual
 
 STATE_TOPICS = ("joint_states", "tf", "mobile_base_controller/odom", "vine/contacts", "vine/markers")
-"""Topics of every robot that need its state after a step."""
+"""Topics of every robot that need the robot's state after a step."""
 TRUTH_TOPIC = "tf_environment"
 SOUND_TOPICS = ("audio", "audio_stamped")
 NICENESS = 5
-"""Niceness of the process: it yields to the client's loop, and takes precedence over the renderer."""
+"""Niceness of the process. It yields to the client's loop, and takes precedence over the sensor process."""
 QUEUE_CAPACITY = 100
-"""Number of steps that may wait for the process (1 s of them). When the queue is full, the loop waits
+"""Number of step records that may wait for the process. They span 1 s. When the queue is full, the loop waits
 (:meth:`RosProcess.held`)."""
 WAIT_PERIOD = 0.004
 """Time between two checks whether subscribers are behind [s]."""
-STATISTICS_PERIOD = 0.2
-"""Wall time between two reports to the client [s]."""
 COUNT_PERIOD = 0.05
 """Wall time between two checks which topics have subscribers [s]. The node counts subscribers half as often."""
-SWITCH_INTERVAL = 5e-4
-"""[s] Python's switch interval: after this time the receiving thread yields to the publishing thread. Python's default
-is half a step."""
-POLL_PERIOD = 0.02
-"""Longest time between two checks for commands and requests [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class RosConfig:
-    """Data that the process needs to start. They are plain values only, so that it imports nothing large."""
+    """Data that the ROS process needs to start. All values are plain, so that the process imports nothing large."""
 
     name: str
     """The robot's name."""
     urdf: str
+    """Text of the robot's URDF."""
     base: str
+    """Link at the root of the robot's tree of links."""
     namespace: str
     """Prefix of the robot's topics."""
     clock: bool
-    """Whether the node may publish /clock. Only one node of a ROS domain does."""
+    """Whether the node may publish /clock, and serves simulation_interfaces. Only one node of a ROS domain may."""
     static_transforms: tuple[tuple[str, str, np.ndarray], ...]
+    """Parent link, child link and pose [7] of each fixed joint."""
     poles: np.ndarray
-    """Poses of the poles [pole, 7] m, 1."""
+    """[pole, 7] Poses of the poles: position [m] and quaternion."""
     records: StepRecords
+    """Layout of the step records."""
     bunch_count: int
+    """Number of bunches of the vineyard."""
     bunch_of_body: np.ndarray
-    """[body] Index of the bunch that a body belongs to; -1 for wood."""
+    """[body] Index of the bunch of each body, -1 for wood."""
     controllers: tuple[ControllerSpec, ...]
     imus: tuple[str, ...]
+    """Names of the IMUs."""
     wrenches: tuple[str, ...]
+    """Names of the force-torque sensors."""
     interest_radius: float | None = None
     """[m] Radius of the area around the robot within which the network sends it the motion of objects that others move.
     None without a server."""
     params_file: pathlib.Path | None = None
-    """ROS parameters of the node."""
+    """File with ROS parameters of the nodes."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Values of the node's parameters that were set. The client updates them, and each run starts with them."""
+    """Values of the node's parameters that were set, by name. The client updates them, and each run starts with
+    them."""
 
     @property
     def step_topics(self) -> tuple[str, ...]:
-        """Topics that need the record of a step, or prefixes of several such topics. /clock is the first."""
+        """Topics that need the records of steps, or prefixes of several such topics. The first is /clock."""
         states = [one.name for one in self.controllers if one.kind is ControllerKind.JOINT_TRAJECTORY]
         elastic = [one.name for one in self.controllers if one.kind is ControllerKind.SERIES_ELASTIC]
         return ("/clock", *STATE_TOPICS, *self.imus, *self.wrenches, *states, *elastic)
 
 
 class RosChannel:
-    """Shared memory of the client and the process."""
+    """Shared memory of a client and its ROS process: step records, the newest true poses, and the process's demands."""
 
     def __init__(self, config: RosConfig, context: BaseContext) -> None:
         self.steps = SharedQueue(config.records.dtype, QUEUE_CAPACITY, context)
@@ -116,9 +116,10 @@ class RosChannel:
                 "turns": ((1,), "i8"),
             }
         )
-        """Demands of the process, written by it: whether topics have subscribers; whether actions have goals; the
-        period at which true poses are wanted [s], 0 for never; whether the process waits for subscribers; the number of
-        times that the process has updated these values, by which the client sees that it is alive."""
+        """Demands, which the process writes. ``steps``: [topic] whether each of the step topics has subscribers.
+        ``truth_period``: period at which true poses are wanted [s], 0 for never. ``goals``: whether actions have goals.
+        ``sound``: whether topics of sound have subscribers. ``waits``: whether the process waits for subscribers.
+        ``turns``: number of times that the process has updated these values. It rises while the process is alive."""
 
     def close(self) -> None:
         """Release the memory."""
@@ -127,23 +128,22 @@ class RosChannel:
 
 
 def run_ros_worker(config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
-    """Main function of the process: publish until told to stop."""
-    sys.setswitchinterval(SWITCH_INTERVAL)
+    """Function that a ROS process runs: publish until the client sends "stop"."""
     serve("ROS process", pipe, lambda: RosWorker(config, channel, pipe).run())
 
 
-class RosWorker:
-    """The robot's ROS node, fed with the records of steps."""
+class RosWorker(Worker):
+    """The robot's ROS nodes, in the ROS process. Their input is the step records and the true poses."""
 
     def __init__(self, config: RosConfig, channel: RosChannel, pipe: Connection) -> None:
         from vinesim.ros import middleware
         from vinesim.ros.robot_node import RobotNode
         from vinesim.ros.simulation_node import SimulationNode
 
+        super().__init__(pipe)
         middleware.configure(large_messages=False)
         self.config = config
         self.channel = channel
-        self.pipe = pipe
         self.node = RobotNode(
             ros_name(config.name),
             config.urdf,
@@ -170,20 +170,20 @@ class RosWorker:
         self._rigid = VisualListReceiver()
         self._truth_names: tuple[str, ...] = ()
         self._named: tuple[int, bytes] = 0, b""
-        """Version of the list of rigid bodies, and array of the attached bunches as bytes, for which
+        """Version of the list of rigid bodies, and indices of the attached bunches as bytes, for which
         :attr:`_truth_names` was made."""
         self._ends: collections.deque[tuple[int, GoalResult]] = collections.deque()
         """Goals that have ended, each with the number of step records after which its result is sent."""
         self._microphone = Microphone()
-        self._next_count = self._next_statistics = 0.0
+        self._next_count = 0.0
         self._pace = Pace()
-        self._reported_parameters = self.node.set_parameters
+        self._watch_parameters(self.node)
 
     def run(self) -> None:
-        """Publish until a "stop"."""
+        """Publish until the client sends "stop"."""
         report_ready(self.pipe, NICENESS)
         with self.node, self.simulation or contextlib.nullcontext():
-            while self._take_requests():
+            while self._take_messages():
                 record = self._next_record()
                 if record is not None:
                     self.node.publish_clock(float(record["time"]))
@@ -201,7 +201,7 @@ class RosWorker:
         self._send_statistics()  # so that the last messages are counted, too
 
     def _next_record(self) -> Any | None:
-        """The next step to publish; None if none comes for a while, or subscribers are behind."""
+        """Returns the next step record to publish. None if no record comes for a while, or subscribers are behind."""
         steps = self.channel.steps
         wanted = self.channel.wanted
         begin = time.monotonic()
@@ -216,29 +216,24 @@ class RosWorker:
             self._pace.add()
         return record
 
-    def _take_requests(self) -> bool:
-        """Answer the client's requests; False after a "stop"."""
-        while self.pipe.poll():
-            kind, value = self.pipe.recv()
-            if kind == "stop":
-                return False
-            if kind == "diagnose":
-                self.node.publish_diagnostics(*value)
-            elif kind == "sound":
-                self._record(value)
-            elif kind == "intentions":
-                self.node.publish_intentions(value)
-            elif kind == "gestures":
-                self.node.publish_gestures(*value)
-            elif kind == "lights":
-                self.node.publish_lights(value)
-            elif kind == "truth":
-                self._rigid.take(value)
-            elif kind == "finish":
-                self._ends.append(value)
-            elif kind == "simulated" and self.simulation is not None:
-                self.simulation.answer(value)
-        return True
+    def _take(self, kind: str, value: Any) -> None:
+        """Publish a value of the client, or keep it for later."""
+        if kind == "diagnose":
+            self.node.publish_diagnostics(*value)
+        elif kind == "sound":
+            self._record(value)
+        elif kind == "intentions":
+            self.node.publish_intentions(value)
+        elif kind == "gestures":
+            self.node.publish_gestures(*value)
+        elif kind == "lights":
+            self.node.publish_lights(value)
+        elif kind == "truth":
+            self._rigid.take(value)
+        elif kind == "finish":
+            self._ends.append(value)
+        elif kind == "simulated" and self.simulation is not None:
+            self.simulation.answer(value)
 
     def _record(self, step: MicrophoneStep) -> None:
         """Mix the sound at the robot's microphone, and publish the frames that are complete."""
@@ -250,11 +245,11 @@ class RosWorker:
             self.node.publish_sound(block.time + step.to_world, to_pcm(block.samples))
 
     def _publish_truth(self) -> None:
-        """Publish the true poses of rigid bodies, and of the bunches that hang on their plants."""
+        """Publish the true poses of rigid bodies, and of the bunches that are attached to their plants."""
         with self.channel.truth.reading() as truth:
             version = int(truth["version"][0])
             memory = self._rigid.memory
-            if memory is None or version != self._rigid.version:  # the list has not arrived: the next poses will do
+            if memory is None or version != self._rigid.version:  # the list has not arrived: wait for the next poses
                 return
             now = float(truth["time"][0])
             attached = np.flatnonzero(truth["attached"])
@@ -267,7 +262,7 @@ class RosWorker:
         self.node.publish_environment(now, self._truth_names, poses)
 
     def _report(self) -> None:
-        """Tell the client which topics have subscribers, and every :data:`STATISTICS_PERIOD` what was sent."""
+        """Write the demands of the process to the shared memory, then report to the client as every worker does."""
         wanted = self.channel.wanted
         now = time.monotonic()
         wanted["turns"][0] += 1
@@ -277,28 +272,18 @@ class RosWorker:
             wanted["steps"][:] = [self.node.has_subscribers(name) for name in self.config.step_topics]
             wanted["sound"][0] = any(map(self.node.has_subscribers, SOUND_TOPICS))
             wanted["truth_period"][0] = self.node.has_subscribers(TRUTH_TOPIC) / self.node.environment_rate
-        if (parameters := self.node.set_parameters) is not self._reported_parameters:
-            self._reported_parameters = parameters
-            self.pipe.send(("parameters", parameters))
-        if now >= self._next_statistics:
-            self._next_statistics = now + STATISTICS_PERIOD
-            self._send_statistics()
+        super()._report()
 
-    def _send_statistics(self) -> None:
-        statistics: dict[str, Any] = {
-            "sent": self.node.sent,
-            "dropped": self.node.dropped,
-            "sound_lost": self._microphone.missed,
-            "commands_refused": self.node.refused_commands,
-        }
-        self.pipe.send(("statistics", statistics))
+    def _statistics(self) -> dict[str, dict[str, int]]:
+        losses = {"sound_lost": self._microphone.missed, "commands_refused": self.node.refused_commands}
+        return {"sent": self.node.sent, "dropped": self.node.dropped, "losses": losses}
 
 
 class Pace:
-    """Limits the rate at which delayed steps are published: little faster than the world makes them, few at once.
+    """Limit on the rate at which delayed steps are published: little faster than the world steps, few steps at once.
 
-    Stock subscribers keep ten messages of a topic, and overwrite them if more arrive before the messages are taken. A
-    subscriber may wait for a processor, and does not tell the publisher.
+    A subscriber with rclpy's default history keeps ten messages of a topic, and overwrites them if more arrive before
+    the messages are taken. A subscriber may wait for a CPU, and does not tell the publisher.
     """
 
     BURST = 5
@@ -306,7 +291,7 @@ class Pace:
     SPEED = 1.5
     """Rate at which further steps are published, as a multiple of the world's rate."""
     LEAST = 50.0
-    """Lowest rate at which further steps are published [Hz]: the world may have paused."""
+    """Lowest rate at which further steps are published [Hz]. The world may have paused."""
     PERIOD = 0.5
     """Time between two measurements of the world's rate [s]."""
 
@@ -316,8 +301,8 @@ class Pace:
         self._count = 0
 
     def delay(self, put_count: int) -> float:
-        """Time until the next step may be published [s]. ``put_count``: number of steps that the world has put so
-        far."""
+        """Returns the time until the next step may be published [s]. ``put_count``: number of steps that the client has
+        put into the queue so far."""
         now = time.monotonic()
         if (passed := now - self._since) > self.PERIOD:
             rate = self.SPEED * (put_count - self._count) / passed
@@ -327,13 +312,14 @@ class Pace:
         return max(self._due - now, 0.0)
 
     def add(self) -> None:
-        """Count a step that is published now."""
+        """Note that a step is published now."""
         earliest = time.monotonic() - (self.BURST - 1) * self._interval
         self._due = max(self._due, earliest) + self._interval
 
 
 def truth_frame(visual: RigidVisual) -> str:
-    """Frame of a box, a picked bunch or a part of a person: ``box_3``, ``picked_bunch_00017``, ``anna/head``."""
+    """Returns the TF frame of a box, a picked bunch or a part of a person: ``box_3``, ``picked_bunch_00017``,
+    ``anna/head``."""
     if visual.organ == Organ.BUNCH:
         return f"picked_bunch_{visual.index:05d}"
     return f"box_{visual.index}" if visual.organ == Organ.BOX else visual.name

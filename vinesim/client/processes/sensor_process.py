@@ -1,11 +1,11 @@
-"""The client's side of a sensor process, which renders and publishes the cameras and lidars of one robot.
+"""The part of a sensor process that runs in the client: it writes snapshots of the world to shared memory.
 
-The loop writes snapshots of the world to shared memory while a sensor has subscribers, and never waits for an answer.
+The sensor process renders and publishes the cameras and lidars of one robot. Snapshots are written while a sensor has
+subscribers.
 """
 
 from __future__ import annotations
 
-import collections
 import logging
 import math
 import pathlib
@@ -19,8 +19,14 @@ from vinesim.client.client import Client
 from vinesim.client.pace import Limit
 from vinesim.client.processes.rigid_visual_list import VisualListSender
 from vinesim.client.processes.sensor_worker import POSE_HISTORY, SensorChannel, SensorConfig, run_sensor_worker
-from vinesim.client.processes.spawned_process import SENSOR_REHEARSAL, sensor_modules
-from vinesim.client.processes.worker_process import Hold, Run, WorkerProcess, cpu_use
+from vinesim.client.processes.worker_process import (
+    SENSOR_WORKER,
+    Hold,
+    Run,
+    WorkerProcess,
+    cpu_use,
+    sensor_modules,
+)
 from vinesim.core.errors import WriteError
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
@@ -33,26 +39,24 @@ from vinesim.scene.wind import wind_of
 log = logging.getLogger(__name__)
 
 SNAPSHOT_PERIOD = 2
-"""Ticks between two snapshots: 50 Hz, faster than any camera here."""
+"""Number of steps from one snapshot to the next. Snapshots come at 50 Hz, faster than any camera of a robot here."""
 START_TIMEOUT = 300.0
-"""How long the process may take to start; a first run compiles kernels [s]."""
+"""Longest time in which the process starts [s]. A first run compiles kernels."""
 COUNT_TIMEOUT = 20.0
-"""How long the process may take to report its counts [s]: it completes its present picture first."""
+"""Longest time in which the process reports its counts [s]. It completes its present picture first."""
 SAVE_TIMEOUT = 60.0
-"""How long the process may take to write its pictures [s]; on a busy machine it renders first."""
-
-Counts = dict[str, dict[str, int]]
-"""Counts: kind of count -> sensor or topic -> number."""
+"""Longest time in which the process writes the kept picture [s]. It completes its present picture first, on a busy
+machine."""
 
 
 def time_of_snapshot(time: float, dt: float) -> float:
-    """Simulated time of the first snapshot at ``time`` or later [s], for steps of ``dt`` [s]."""
+    """Returns the simulated time of the first snapshot at ``time`` or later [s], for steps of ``dt`` [s]."""
     period = SNAPSHOT_PERIOD * dt
     return math.ceil(time / period - 1e-6) * period if math.isfinite(time) else time
 
 
 class SensorProcess:
-    """Cameras and lidars of one robot of the client. It is a context manager: the process ends with the context."""
+    """Cameras and lidars of one robot of a client. A context manager: the process ends with the context."""
 
     def __init__(
         self,
@@ -71,27 +75,28 @@ class SensorProcess:
         pacing: SensorPacing | None = None,
         standby: bool = False,
     ) -> None:
-        """Starts the process; :meth:`attach` connects it with a client.
+        """Starts the process. :meth:`attach` connects it with a client.
 
-        ``keep_pictures`` keeps the picture of the first camera with the highest ``Client.frame_score`` for
-        :meth:`save_picture`, and renders it even without subscribers. ``sensor_hz`` replaces the sensors' own rates.
-        ``pacing``: whether simulated time waits for sensors; by default as in the ``description``.
-        ``standby``: whether another process stands by and replaces this one if it fails, see :class:`WorkerProcess`.
+        ``name``: name of the robot. ``namespace``: prefix of the robot's topics. ``params_file``: file with ROS
+        parameters of the node. ``ros``: whether the process runs a ROS node, if ROS 2 can be used. ``keep_pictures``:
+        whether the picture of the first camera with the highest ``Client.frame_score`` is kept for
+        :meth:`save_picture`, and rendered even without subscribers. ``sensor_hz``: rate of all sensors instead of their
+        own rates [Hz]. ``pacing``: whether simulated time waits for sensors; by default as in the ``description``.
+        ``standby``: whether another process stands by and replaces this process if it fails, see
+        :class:`WorkerProcess`.
         """
         self.name = name
         self.missed_snapshots = 0
-        """Number of snapshots that were written one step later, because the process was reading."""
+        """Number of snapshots that were written a step later, because the process was reading."""
         self._awaited: tuple[str, ...] = ("process",)
         self._device = device
-        self._counts: Counts = {}
-        self._counts_before: dict[str, collections.Counter[str]] = {}
-        """Counts of the earlier runs of the process: kind of count -> sensor or topic -> number."""
         self._saved = threading.Event()
         self._save_failure = ""
-        """Why the last picture could not be written."""
+        """Reason why the last picture could not be written. Empty if it was written."""
         self._moved_trees = np.zeros(len(model.tree_first), bool)
         """[tree] Whether the tree moved since the last snapshot that was written."""
         self._is_overdue = False
+        """Whether the last snapshot was not written, because the process was reading."""
         self._written_time = -np.inf
         """Simulated time of the last snapshot that was written [s]."""
         ros = ros and middleware.unavailable_reason() is None
@@ -113,28 +118,32 @@ class SensorProcess:
         self._pacing = config.pacing
         self._digests: dict[str, str] = {}
         self._counted = threading.Event()
-        self._hold: Hold | None = None
         self._frames = tuple(config.sensor_frames.values())
-        self._parameters = config.parameters
+        title = f"the sensor process of {name}"
+        self._hold = Hold(
+            title,
+            "simulated time waits" if self.is_lockstep else "simulated time goes on without its pictures",
+            lambda run: cpu_use(run.process.pid or 0)[0],
+        )
         self.worker = WorkerProcess(
-            f"the sensor process of {name}",
+            title,
             sensor_modules(ros),
             run_sensor_worker,
             config,
             lambda context: SensorChannel(config, context),
             self._receive,
-            rehearsal=SENSOR_REHEARSAL if standby else "",
+            rehearsal=SENSOR_WORKER if standby else "",
         )
         self._run: Run[SensorChannel] | None = None
-        """The run of the process for which the last snapshot was written."""
+        """Run of the process for which the last snapshot was written."""
         self._visuals = VisualListSender()
         self._snapshot_count = self._pose_count = 0
 
     def attach(self, client: Client, robot: Robot | None = None, *, wait: bool = True) -> None:
-        """Show the client's world to the process from now on, as ``robot`` sees it (the first robot unless given).
+        """Write snapshots of the client's world for the sensors of ``robot``, by default the first robot of the client.
 
         Waits until the process has rendered a first picture of every sensor. Raises :class:`WorkerError` if the process
-        fails. Without ``wait`` the client may step meanwhile, and the step after the failure raises the error.
+        fails. Without ``wait`` the method returns at once, and a step of the client raises the error.
         """
         self.client = client
         self.robot = robot or client.robot
@@ -151,10 +160,11 @@ class SensorProcess:
     # ------------------------------------------------------------------ in the loop
 
     def held(self) -> str:
-        """Returns why the next step must wait: "sensors" if they have not taken (in lockstep: not sent) the frames that
-        their mode promises, "" if the step may run.
+        """Returns the reason why the next step must wait: "sensors", or "" if the step may run.
 
-        A process that is not ready, or has done nothing for three seconds, holds only the steps of lockstep.
+        A step waits until the process has taken the snapshots of all frames that the pacing mode promises. In lockstep
+        it waits until these frames are sent. A process that is not ready, or has done nothing for
+        :data:`~vinesim.client.processes.worker_process.HOLD_TIMEOUT`, holds no step, except in lockstep.
         """
         run = self.worker.current()
         physics = self.client.physics
@@ -164,29 +174,24 @@ class SensorProcess:
         else:
             latest = time_of_snapshot(float(wanted["horizon"][0]), physics.dt)
             is_behind = self.worker.is_ready and physics.time + 0.5 * physics.dt > latest
-        # The process may wait for a snapshot while the step waits for the process: after a time without subscribers, no
-        # snapshot was written.
+        # The process may wait for a snapshot while the step waits for the process: a subscriber that leaves and
+        # returns between two checks of the process stops the snapshots, but does not end the promise to its sensor.
         is_starved = (
             is_behind
             and not self.is_lockstep
             and wanted["shown"][0] == self._snapshot_count
             and physics.time > self._written_time
         )
-        if is_starved or (self._is_overdue and (is_behind or self.is_lockstep)):
+        # No step writes the first snapshot for a process that was started again, because lockstep holds all steps.
+        is_unfed = self.is_lockstep and run is not self._run
+        if is_starved or is_unfed or (self._is_overdue and (is_behind or self.is_lockstep)):
             self._write(self.client)
             self._wake()
             is_behind = True
         if not is_behind:
-            self._hold = None
+            self._hold.end()
             return ""
-        if self._hold is None or self._hold.run is not run:
-            self._hold = Hold(
-                run,
-                self.worker.title,
-                "simulated time goes on without its pictures",
-                lambda: cpu_use(run.process.pid or 0)[0],
-            )
-        return "" if self._hold.is_over() and not self.is_lockstep else "sensors"
+        return "" if self._hold.is_over(run) and not self.is_lockstep else "sensors"
 
     @property
     def is_lockstep(self) -> bool:
@@ -194,12 +199,12 @@ class SensorProcess:
         return self._pacing.mode is SensorMode.LOCKSTEP
 
     def limit(self) -> Limit:
-        """The largest real-time factor at which the sensors deliver the frames that their mode promises."""
+        """Returns the largest real-time factor at which the sensors deliver the frames that their mode promises."""
         run = self.worker.current()
         return Limit(float(run.shared.wanted["factor"][0]) if self.worker.is_ready else np.inf, "sensors")
 
     def _begin_anew(self) -> None:
-        """After a reset: all plants are elsewhere, and the sensors are on the new robot."""
+        """After a reset of the client: write all plants again, and take the sensor poses from the new robot."""
         self._moved_trees[:] = True
         self.robot = self.client.robots[self.robot.name]
 
@@ -214,7 +219,7 @@ class SensorProcess:
                 self._write(client)
 
     def _write(self, client: Client) -> None:
-        """Write a snapshot of the world."""
+        """Write a snapshot of the world, unless the process is reading now."""
         physics = client.physics
         run = self.worker.current()
         if run is not self._run:  # a new run knows nothing yet
@@ -264,68 +269,58 @@ class SensorProcess:
     # ------------------------------------------------------------------ outside the loop
 
     def _receive(self, kind: str, value: Any) -> None:
-        """Take a message of the process; in a thread."""
+        """Take a message of the process. This method is called in a thread."""
         if kind == "awaited":
             self._awaited = value
             if value:
                 log.info("the sensors of %s are not ready, awaited: %s", self.name, ", ".join(value))
-        elif kind == "statistics":
-            self._digests = value.pop("digests")
-            self._counts = value
+        elif kind == "digests":
+            self._digests = value
         elif kind == "counted":
             self._counted.set()
-        elif kind == "parameters":
-            self._parameters.update(value)
-        elif kind == "restarted":
-            for what, counts in self._counts.items():
-                self._counts_before.setdefault(what, collections.Counter()).update(counts)
-            self._counts = {what: dict.fromkeys(counts, 0) for what, counts in self._counts.items()}
         elif kind == "device":
             self._device = value
         elif kind == "saved":
             self._save_failure = value
             self._saved.set()
 
-    def _total(self, what: str) -> dict[str, int]:
-        before = self._counts_before.get(what, collections.Counter())
-        return {name: count + before[name] for name, count in self._counts.get(what, {}).items()}
-
     def awaited(self) -> list[str]:
-        """Names of the steps of preparation before all sensors are ready. Empty when they are ready."""
+        """Returns the names of the steps of preparation that the sensors still need. Empty when they are ready."""
         if self.worker.is_ready:
             return []
         return [f"{self.name}: {part}" for part in self._awaited or ("process",)]
 
     def sent_messages(self) -> dict[str, int]:
-        """ROS messages sent so far, by topic."""
-        return self._total("sent")
+        """Returns the number of ROS messages sent so far, by topic."""
+        return self.worker.total("sent")
 
     def dropped_messages(self) -> dict[str, int]:
-        """Number of ROS messages that newer ones replaced before they were sent, by topic."""
-        return self._total("ros_dropped")
+        """Returns the number of ROS messages that newer messages replaced before they were sent, by topic."""
+        return self.worker.total("ros_dropped")
 
     def report(self) -> dict[str, Any]:
-        """Counts of frames delivered and dropped, by sensor; of snapshots that could not be shown or were late; of
-        restarts. Also the device and, in lockstep, a digest of all frames of each sensor."""
+        """Returns the counts of delivered and dropped frames, by sensor, of snapshots that could not be shown or were
+        late, and of restarts. Also the device and, in lockstep, a digest of all frames of each sensor."""
         digests = {"frame_digests": self._digests} if self.is_lockstep else {}
         return digests | {
-            "frames": self._total("frames"),
-            "frames_dropped": self._total("frames_dropped"),
-            "frames_skipped": self._total("frames_skipped").get("snapshots", 0),
+            "frames": self.worker.total("frames"),
+            "frames_dropped": self.worker.total("frames_dropped"),
+            "frames_skipped": self.worker.total("frames_skipped").get("snapshots", 0),
             "snapshots_missed": self.missed_snapshots,
             "sensor_restarts": self.worker.restarts,
             "sensor_device": self._device,
         }
 
     def complete_counts(self) -> None:
-        """Wait until the counts and digests are those of all frames so far; at most :data:`COUNT_TIMEOUT`."""
+        """Wait until the counts and digests include all frames so far, at most :data:`COUNT_TIMEOUT`."""
         self._counted.clear()
         if self.worker.is_ready:
             self.worker.send("count")
             self._counted.wait(COUNT_TIMEOUT)
 
     def save_picture(self, folder: pathlib.Path) -> None:
-        """Write the kept picture: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and ``labels`` PNGs.
+        """Write the kept picture to ``folder``, as PNG files: ``rgb``, ``depth`` (colours), ``depth_mm`` (16 bit) and
+        ``labels``.
 
         If the process is not ready, or fails now, the picture is lost and a message is logged. Raises
         :class:`WriteError` if the folder cannot be written.
@@ -342,7 +337,7 @@ class SensorProcess:
         log.error("no picture in %s: the sensor process of %s did not save it", folder, self.name)
 
     def close(self) -> None:
-        """End the process."""
+        """End the process. A second call does nothing."""
         self.worker.close()
         self._visuals.close()
 

@@ -1,4 +1,5 @@
-"""The sensor process of one robot. It renders the sensors that have subscribers, and publishes like their drivers."""
+"""The part of a sensor process that runs in the process: it renders the sensors that have subscribers, and publishes
+their topics."""
 
 from __future__ import annotations
 
@@ -7,7 +8,6 @@ import dataclasses
 import hashlib
 import logging
 import pathlib
-import sys
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
@@ -18,23 +18,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vinesim.client.processes.picture_keeper import PictureKeeper
 from vinesim.client.processes.rigid_visual_list import VisualListMessage, VisualListReceiver
-from vinesim.client.processes.shared_arrays import SharedArrays, SharedSnapshot
-from vinesim.client.processes.worker_process import report_ready, serve
+from vinesim.client.processes.shared_memory import SharedArrays, SharedSnapshot
+from vinesim.client.processes.worker import POLL_PERIOD, Worker, report_ready, serve
 from vinesim.client.world_time import OffsetHistory
-from vinesim.core import allocator, progress
+from vinesim.core import allocator, frames, progress
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.plants.device_buffers import device_fault
 from vinesim.robot.description.description import RobotDescription
 from vinesim.ros.names import ros_name
 from vinesim.scene.model import Model
+from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
 from vinesim.scene.values import (
     SENSOR_KINDS,
     CameraFrame,
     CameraMount,
     CameraOutput,
+    LidarMount,
     RenderedMount,
     SegmentPoses,
     SensorFrame,
@@ -53,29 +54,29 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-STATISTICS_PERIOD = 0.2
-"""Wall time between two reports to the client [s]."""
 SEND_POLL = 5e-4
 """Time between two checks whether all messages were sent [s]."""
-POLL_PERIOD = 0.02
-"""Longest time between two checks for requests and subscribers [s]."""
-SWITCH_INTERVAL = 5e-4
-"""How long one thread here may hold the interpreter lock when another wants it [s]."""
 NICENESS = 10
-"""Niceness of the process. The client's loop and its ROS process take precedence, but a much higher niceness would let
-other programs starve the renderer (docs/decisions/sensor-process.md)."""
+"""Niceness of the process. The client's loop and the ROS process take precedence. With a much higher niceness, other
+programs would starve the renderer (docs/decisions/sensor-process.md)."""
 POSE_HISTORY = 128
-"""Number of poses of each sensor that are kept for sensors that sweep, such as lidars: 2.5 s."""
+"""Number of poses of each sensor that are kept for sensors that sweep, such as lidars. They span 2.5 s."""
 OFFSET_HISTORY = 512
-"""Number of offsets of the world's time that are kept for the stamps of scans: 10 s."""
-
-
+"""Number of offsets of the world's time that are kept for the stamps of scans. They span 10 s."""
+RENEWAL_PERIOD = 1.0
+"""Simulated time after which a picture replaces an older picture with the same score [s]."""
+REHEARSAL_SCENE = "demo"
+REHEARSAL_CAMERA = "d435"
+REHEARSAL_LIDAR = "vlp16"
+REHEARSAL_SIZE = (64, 48)
+"""Size of the picture of :func:`rehearse` [px]. It may be small, because the first call of each kernel is what takes
+long."""
 LIVE = SensorPacing()
 
 
 @dataclasses.dataclass(frozen=True)
 class SensorConfig:
-    """Data that the process needs to start."""
+    """Data that the sensor process needs to start."""
 
     name: str
     """The robot's name."""
@@ -85,30 +86,31 @@ class SensorConfig:
     namespace: str
     """Prefix of the robot's topics."""
     ros: bool
-    """Whether it runs a ROS node."""
+    """Whether the process runs a ROS node."""
     keep_pictures: bool
-    """Whether the best picture of the first camera is kept. If so, it is rendered even without subscribers."""
+    """Whether the best picture of the first camera is kept. If so, pictures are rendered even without subscribers."""
     sensor_hz: float | None
-    """Rate of all sensors [Hz]; None: each sensor's own."""
+    """Rate of all sensors [Hz]. None: each sensor has its own rate."""
     renderer: str = "warp"
     device: str = "cpu"
-    """Device on which the sensors compute. If a GPU fails, it is the CPU from the next start on."""
+    """Device on which the sensors compute. If a GPU has failed, the next run computes on the CPU."""
     pacing: SensorPacing = LIVE
     wind: Wind | None = None
     """Wind of the scene."""
     params_file: pathlib.Path | None = None
-    """ROS parameters of its node."""
+    """File with ROS parameters of the node."""
     parameters: dict[str, Any] = dataclasses.field(default_factory=dict)
-    """Values of the node's parameters that were set. The client updates them, and each run starts with them."""
+    """Values of the node's parameters that were set, by name. The client updates them, and each run starts with
+    them."""
 
     @property
     def sensor_frames(self) -> dict[str, str]:
-        """Link that carries each sensor, by the sensor's name. Poses in snapshots have the same order."""
+        """Link that carries each sensor, by the sensor's name. Poses in snapshots have this order."""
         return {mount.name: mount.frame for mount in self.description.sensors}
 
 
 class SensorChannel:
-    """Shared memory of the client and the process: the newest snapshot of the world, and the process's demands."""
+    """Shared memory of a client and its sensor process: the newest snapshot of the world, and the process's demands."""
 
     def __init__(self, config: SensorConfig, context: BaseContext) -> None:
         model = config.model
@@ -145,10 +147,10 @@ class SensorChannel:
         self.wanted = SharedArrays(
             {"world": ((1,), "?"), "horizon": ((1,), "f8"), "factor": ((1,), "f8"), "shown": ((1,), "i8")}
         )
-        """Demands of the process, written by it. ``world``: whether snapshots of the world are wanted. ``horizon``:
-        simulated time that the world must not pass before another snapshot is taken [s]. ``factor``: the largest
-        real-time factor that the sensors can follow. ``shown``: number of the newest snapshot whose frames are all
-        rendered and sent."""
+        """Demands, which the process writes. ``world``: whether snapshots of the world are wanted. ``horizon``:
+        simulated time that the world must not pass before the process has taken another snapshot [s]. ``factor``:
+        largest real-time factor that the sensors can follow. ``shown``: number of the newest snapshot whose frames are
+        all rendered and sent."""
         self.wanted["horizon"][0] = self.wanted["factor"][0] = np.inf
 
     def close(self) -> None:
@@ -158,8 +160,7 @@ class SensorChannel:
 
 
 def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connection) -> None:
-    """Main function of the process: render and publish until told to stop."""
-    sys.setswitchinterval(SWITCH_INTERVAL)
+    """Function that a sensor process runs: render and publish until the client sends "stop"."""
 
     def work() -> None:
         with contextlib.ExitStack() as stack:
@@ -168,16 +169,69 @@ def run_sensor_worker(config: SensorConfig, channel: SensorChannel, pipe: Connec
     serve("sensor process", pipe, work)
 
 
-class SensorWorker:
-    """The robot's sensors and their ROS node, fed with snapshots."""
+def rehearse() -> None:
+    """Render a first picture and a first lidar revolution of a small vineyard on the CPU, and release their memory.
+
+    A sensor process that stands by has then loaded the kernels and modules that they need.
+    """
+    from vinesim.scene.generation.vineyard import generate
+    from vinesim.sensors.camera.camera import Camera, CameraSpec
+    from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
+    from vinesim.sensors.scheduler import ScheduledSensor, SensorScheduler
+    from vinesim.sensors.sensor import load_kernels
+
+    load_kernels(CameraMount.kind, LidarMount.kind)
+    scene = load_scene(REHEARSAL_SCENE)
+    spec = CameraSpec.load(REHEARSAL_CAMERA)
+    model = generate(scene)
+    camera = Camera(spec, spec.info("camera", size=REHEARSAL_SIZE), "camera", scene.sun.direction)
+    lidar = Lidar(LidarSpec.load(REHEARSAL_LIDAR), "lidar")
+    sensors = [ScheduledSensor(sensor, lambda _: None) for sensor in (camera, lidar)]
+    state = State.at_rest(model)
+    trees = np.arange(len(model.tree_first))
+    pose = frames.pose(np.array([0.0, 0.0, 1.0]))
+    snapshot = Snapshot(0.0, 0, state.body_q, state.bunch_attached, (), np.zeros((0, 7)), trees)
+    for _ in SensorScheduler(model, sensors).warm_up(snapshot, {sensor.name: pose for sensor in sensors}):
+        pass
+    del sensors, camera, lidar, model, state, snapshot
+    allocator.release_free_memory()
+
+
+class PictureKeeper:
+    """Keeps the picture of a camera with the highest score, and requests a picture only if it would be kept.
+
+    A picture costs the same with a subscriber and without, and only one picture is written to a file in the end
+    (docs/decisions/sensor-process.md).
+    """
+
+    def __init__(self) -> None:
+        self.frame: CameraFrame | None = None
+        """The picture that is kept: colours, depth and labels."""
+        self._score = 0.0
+
+    def wants(self, time: float, score: float) -> bool:
+        """Returns whether a picture of this simulated ``time`` [s] and ``score`` would be kept: its score is higher
+        than that of the kept picture, or the same and the picture is at least :data:`RENEWAL_PERIOD` later."""
+        if self.frame is None or score > self._score:
+            return True
+        return score == self._score and time >= self.frame.time + RENEWAL_PERIOD
+
+    def keep(self, frame: CameraFrame, score: float) -> None:
+        """Keep this ``frame`` and its ``score`` instead of the present picture."""
+        self.frame = frame
+        self._score = score
+
+
+class SensorWorker(Worker):
+    """The robot's sensors and their ROS node, in the sensor process. Their input is the snapshots of the world."""
 
     def __init__(
         self, config: SensorConfig, channel: SensorChannel, pipe: Connection, stack: contextlib.ExitStack
     ) -> None:
-        """Starts the node and the sensors in ``stack``."""
+        """Opens the node and the sensors. ``stack`` closes the node."""
+        super().__init__(pipe)
         self.config = config
         self.channel = channel
-        self.pipe = pipe
         self.frames_skipped = 0
         """Number of snapshots that could not be shown because their list of bodies had not arrived."""
         self._state = State.at_rest(config.model)
@@ -186,6 +240,8 @@ class SensorWorker:
         """Version of the list of bodies of the newest snapshot, if this list has not arrived. Otherwise None."""
         self._offsets = OffsetHistory(OFFSET_HISTORY)
         self._last_number = 0
+        self._must_count = False
+        """Whether the client waits for the counts."""
         self._pose_count = 0
         self._keeper = PictureKeeper() if config.keep_pictures else None
         self._kept_camera = next((mount.name for mount in config.description.sensors_of(CameraMount.kind)), "")
@@ -193,10 +249,10 @@ class SensorWorker:
         self._digests = {name: hashlib.blake2b(digest_size=16) for name in config.sensor_frames}
         """Digest of all frames that each sensor has delivered in lockstep, by the sensor's name."""
         self._time = self._frame_score = 0.0  # of the newest snapshot
-        self._next_statistics = 0.0
         self._awaits("kernels and scene")
         self.node = self._open_node(stack) if config.ros else None
-        self._reported_parameters = None if self.node is None else self.node.set_parameters
+        if self.node is not None:
+            self._watch_parameters(self.node)
         self.scheduler = self._open_sensors()
 
     def _awaits(self, *parts: str) -> None:
@@ -204,7 +260,8 @@ class SensorWorker:
 
     @contextlib.contextmanager
     def _awaiting_progress(self) -> Iterator[None]:
-        """Tell the client the progress of work that takes long. This also shows that the process does not hang."""
+        """Context in which the client receives the messages of :mod:`vinesim.core.progress`. They also show that the
+        process does not hang."""
         handler = logging.Handler()
         handler.emit = lambda record: self._awaits(record.getMessage()) if record.getMessage() else None
         progress.log.setLevel(logging.INFO)
@@ -234,14 +291,14 @@ class SensorWorker:
         )
 
     def _rates(self) -> dict[str, float]:
-        """Rates of all sensors at the start [Hz]."""
+        """Returns the rate of each sensor at the start [Hz], by name."""
         from vinesim.sensors.sensor import maker
 
         given = self.config.sensor_hz
         return {m.name: given or m.rate or maker(m.kind).rate(m.type) for m in self.config.description.sensors}
 
     def _present_rate(self, name: str) -> Callable[[], float] | None:
-        """Function that returns the rate of a sensor from its ROS parameter [Hz]; None without such a parameter."""
+        """Returns a function that returns the rate of a sensor from its ROS parameter [Hz]. None without a node."""
         return None if self.node is None else partial(self.node.rate, name)
 
     def _open_sensors(self) -> SensorScheduler:
@@ -274,8 +331,8 @@ class SensorWorker:
         )
 
     def _working_device(self) -> str:
-        """The device of the configuration, or the CPU if that device can no longer be used. A change is logged and
-        reported."""
+        """Returns the device of the configuration, or "cpu" if that device can no longer be used. The client receives
+        the name of the device."""
         device = self.config.device
         if device != "cpu" and (fault := device_fault(device)) is not None:
             log.error("the sensors of %s compute on the CPU: %s", self.config.name, fault)
@@ -284,8 +341,8 @@ class SensorWorker:
         return device
 
     def _demand(self, mount: RenderedMount) -> Callable[[], CameraOutput]:
-        """Function that returns the outputs of a sensor that are needed now: by its subscribers, or for the kept
-        picture."""
+        """Returns a function that returns the outputs of a sensor that are needed now: by its subscribers, or for the
+        kept picture."""
         name = mount.name
         whole = SENSOR_KINDS[mount.kind].whole
         keeper = self._keeper if name == self._kept_camera else None
@@ -302,10 +359,10 @@ class SensorWorker:
     # ------------------------------------------------------------------ loop
 
     def run(self) -> None:
-        """Warm the sensors up with the first snapshot, report "ready", then render until a "stop"."""
+        """Warm up the sensors with the first snapshot, report "ready", then render until the client sends "stop"."""
         is_ready = False
         self._awaits("snapshot of the world")
-        while self._take_requests():
+        while self._take_messages():
             if self._wait_for_snapshot() and (world := self._read()) is not None:
                 snapshot, earlier = world
                 poses = earlier.pop()[1]
@@ -319,18 +376,19 @@ class SensorWorker:
                     is_ready = True
                     self._awaits()
                     report_ready(self.pipe, NICENESS)
-                    allocator.release_free_memory()  # takes 0.1 s; nothing waits for it here
+                    allocator.release_free_memory()  # takes 0.1 s, for which nothing waits here
                 self.channel.wanted["shown"][0] = self._last_number
+            if self._must_count:  # now that the snapshots before the request are rendered
+                self._must_count = False
+                self._send_statistics()
+                self.pipe.send(("counted", None))
             is_rendering = any(sensor.wanted() for sensor in self.scheduler.sensors)
             self.channel.wanted["world"][0] = is_rendering or self._keeper is not None
             self._publish_pace()
-            self._report_parameters()
-            if time.monotonic() >= self._next_statistics:
-                self._next_statistics = time.monotonic() + STATISTICS_PERIOD
-                self.pipe.send(("statistics", self._statistics()))
+            self._report()
 
     def _publish_pace(self) -> None:
-        """Tell the client up to which time the world may continue, and how fast."""
+        """Write the time up to which the world may continue, and the largest real-time factor, to the shared memory."""
         wanted = self.channel.wanted
         wanted["horizon"][0] = self.scheduler.horizon()
         wanted["factor"][0] = self.scheduler.sustainable_factor()
@@ -340,39 +398,27 @@ class SensorWorker:
         while self.node is not None and self.node.has_pending:
             time.sleep(SEND_POLL)
 
-    def _report_parameters(self) -> None:
-        """Tell the client which parameters were set, so that a further run starts with them."""
-        if self.node is not None and (parameters := self.node.set_parameters) is not self._reported_parameters:
-            self._reported_parameters = parameters
-            self.pipe.send(("parameters", parameters))
-
     def _wait_for_snapshot(self) -> bool:
-        """Wait for a snapshot. Returns whether there is one to read: a new one, or one that was skipped and whose list
-        of bodies has arrived since."""
+        """Wait for a snapshot. Returns whether there is a snapshot to read: a new one, or a skipped one whose list of
+        bodies has arrived since."""
         return self.channel.snapshot.wait(POLL_PERIOD) or self._visuals.version == self._missing_version
 
-    def _take_requests(self) -> bool:
-        """Do what the client asks for; False after a "stop"."""
-        while self.pipe.poll():
-            kind, value = self.pipe.recv()
-            if kind == "stop":
-                return False
-            if kind == "visuals":
-                assert isinstance(value, VisualListMessage)
-                self._visuals.take(value)
-            elif kind == "save":
-                self._save_kept_frame(value)
-            elif kind == "count":
-                self.pipe.send(("statistics", self._statistics()))
-                self.pipe.send(("counted", None))
-        return True
+    def _take(self, kind: str, value: Any) -> None:
+        """Take the list of bodies, write the kept picture, or note that the client waits for the counts."""
+        if kind == "visuals":
+            assert isinstance(value, VisualListMessage)
+            self._visuals.take(value)
+        elif kind == "save":
+            self._save_kept_frame(value)
+        elif kind == "count":
+            self._must_count = True
 
     def _read(self) -> tuple[Snapshot, list[tuple[float, Mapping[str, np.ndarray]]]] | None:
-        """The newest snapshot, and the sensor poses since the snapshot before, with their times [s]. The last poses
-        belong to the time of the snapshot.
+        """Returns the newest snapshot, and the sensor poses since the snapshot before with their times [s]. The last
+        poses belong to the time of the snapshot.
 
-        None if the snapshot was read before: it was written between the signal for the snapshot before and its reading.
-        None also if its list of bodies has not arrived; this is counted.
+        Returns None if the snapshot was read before. This happens if a snapshot is written between the signal for the
+        snapshot before and the reading. Returns None also if the list of bodies has not arrived, which is counted.
         """
         with self.channel.snapshot.reading() as shared:
             if shared["number"][0] == self._last_number:
@@ -427,20 +473,25 @@ class SensorWorker:
         )
         return snapshot, [(float(t), dict(zip(names, q, strict=True))) for t, q in zip(times, poses, strict=True)]
 
-    def _statistics(self) -> dict[str, Any]:
-        """Counts of frames and messages that were rendered, sent and dropped."""
-        statistics: dict[str, Any] = {
+    def _statistics(self) -> dict[str, dict[str, int]]:
+        statistics = {
             "frames": dict(self.scheduler.frames),
             "frames_dropped": dict(self.scheduler.dropped),
             "frames_skipped": {"snapshots": self.frames_skipped},
-            "digests": {name: digest.hexdigest() for name, digest in self._digests.items()},
         }
         if self.node is not None:
             statistics |= {"sent": self.node.sent, "ros_dropped": self.node.dropped}
         return statistics
 
+    def _send_statistics(self) -> None:
+        """Send the counts and, in lockstep, the digests of the frames of each sensor."""
+        if self._is_lockstep:
+            self.pipe.send(("digests", {name: digest.hexdigest() for name, digest in self._digests.items()}))
+        super()._send_statistics()
+
     def _deliver(self, frame: Any) -> None:
-        """Digest, publish and perhaps keep a frame: any :class:`SensorFrame`."""
+        """Publish a frame (any :class:`SensorFrame`), in lockstep add it to the digest, and keep it if it is the best
+        picture."""
         if self._is_lockstep:
             self._digest(frame)
         if self.node is not None:
@@ -465,5 +516,5 @@ class SensorWorker:
                 images.save_frame(self._keeper.frame, folder, "")
             except OSError as bad:
                 failure = bad.strerror or str(bad)
-        self.pipe.send(("statistics", self._statistics()))
+        self._send_statistics()
         self.pipe.send(("saved", failure))

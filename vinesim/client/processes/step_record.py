@@ -13,16 +13,17 @@ if TYPE_CHECKING:
     from vinesim.robot.description.description import RobotDescription
 
 MAX_CONTACTS = 32
-"""Number of contacts of one robot that a record holds. Further contacts of the same step are left out and counted."""
+"""Largest number of contacts in a record. Further contacts of the same step are left out and counted."""
 
 _CONTACT = np.dtype([("link", "i4"), ("body", "i4"), ("position", "f8", 3), ("force", "f8", 3), ("distance", "f8")])
 
 
 class StepRecords:
-    """The layout of the records of one robot. It is constant and small, and both processes have the same."""
+    """Layout of the records of one robot. It does not change, so client and process each have a copy."""
 
     def __init__(self, actor: str, description: RobotDescription, series_stiffness: np.ndarray) -> None:
-        """``series_stiffness``: [joint] stiffness of the series elastic elements [N m/rad or N/m]."""
+        """``actor``: name of the robot. ``series_stiffness``: [joint] stiffness of the series elastic elements [N m/rad
+        or N/m]."""
         self.actor = actor
         self.joints = description.joints
         self.transforms = tuple(description.moving_joints.frames)
@@ -61,8 +62,8 @@ class StepRecords:
         )
 
     def write(self, record: Any, time: float, sample: RobotSample | None) -> int:
-        """Fill a record with the ``time`` [s] and, unless it is None, the state. Returns the number of contacts left
-        out.
+        """Fill a record with the ``time`` [s] and, unless ``sample`` is None, the state. Returns the number of contacts
+        left out.
 
         Transforms and elastic elements are not stored: :meth:`read` computes them from the joints.
         """
@@ -84,7 +85,7 @@ class StepRecords:
             sample.odom_qd,
             sample.odom_covariance.ravel(),
         ]
-        has_body_sensors = bool(sample.imus or sample.wrenches)  # they are read when they have subscribers
+        has_body_sensors = bool(sample.imus or sample.wrenches)  # measured only while they have subscribers
         if has_body_sensors:
             for imu in sample.imus:
                 parts += imu.orientation, imu.angular_velocity, imu.linear_acceleration
@@ -104,7 +105,7 @@ class StepRecords:
         return len(sample.contacts) - count
 
     def read(self, record: Any) -> RobotSample:
-        """Returns the state that a record holds. The record must have a state."""
+        """Returns the state in a record. The record must have a state."""
         now = float(record["time"])
         state = record["state"]
         parts = [state[place].reshape(shape) for place, shape in self._parts]

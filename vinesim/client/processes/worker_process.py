@@ -1,45 +1,52 @@
-"""A child process of the client that is started again when it fails, dies or hangs, and never ends the client's loop.
+"""The client's part of a worker process: it starts the process, supervises it, and starts it again when it fails.
 
-Threads of the client start it, send it messages and receive its messages, so that the loop never waits for it. The
-shared memory is created again for every run of the process, so a process that dies while it holds a lock does no harm.
+Threads of the client start the process, send it messages and receive its messages, so that the loop never waits for
+it. :mod:`vinesim.client.processes.worker` is the part that runs in the process. The command line imports this module
+before all others, to start a process early (:func:`start_early`), so this module imports nothing large.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
+import multiprocessing.context
 import os
 import pathlib
 import queue
-import signal
-import sys
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from multiprocessing import connection
-from multiprocessing.connection import Connection
 from multiprocessing.context import BaseContext
-from typing import Any, Generic, NoReturn, Protocol, TypeVar
+from multiprocessing.reduction import ForkingPickler
+from typing import Any, Generic, Protocol, TypeVar
 
-from vinesim.client.processes.spawned_process import CONTEXT, SpawnedProcess, spawn
+from vinesim.client.processes.worker import STANDING_BY, import_and_run
 
 log = logging.getLogger(__name__)
 
+ROS_MODULES = ("vinesim.client.processes.ros_worker", "vinesim.ros.robot_node", "vinesim.ros.simulation_node")
+"""Modules that a ROS process imports."""
+SENSOR_WORKER = "vinesim.client.processes.sensor_worker"
+"""Module of the sensor process. Its function ``rehearse`` prepares a sensor process that stands by."""
+
 EXIT_TIMEOUT = 1.2
-"""How long a process that failed may take to end [s]."""
+"""Longest time in which a process that failed ends by itself [s]."""
 CLOSE_TIMEOUT = 10.0
-"""How long a process that was asked to end may take [s]: it completes its present picture, on a busy machine."""
+"""Longest time in which a process that was asked to end ends by itself [s]. It completes its present picture first, on
+a busy machine."""
 STABLE_TIME = 10.0
-"""A process that ran this long before it failed is started again at once [s]. After a shorter run there is a pause
-first. A start takes two seconds of one core."""
+"""A process that was ready for this long before it failed is started again at once [s]. After a shorter time there is a
+pause first. A start takes two seconds of one core."""
 STANDBY_DELAY = 2.0
-"""Time for which a process must have been ready before another one is started to stand by [s]."""
+"""Time for which a process must have been ready before another process is started to stand by [s]."""
 HANG_TIMEOUT = 15
-"""A process that was ready and then sends nothing for this long is taken to hang, and is started again [s]. A process
-reports to the client five times a second, unless it renders a picture or writes files. Time in which it waits for a CPU
-does not count: to start it again would only load a busy machine more."""
+"""A process that was ready and then sends nothing for this long hangs, and is started again [s]. A process reports to
+the client five times a second, unless it renders a picture or writes files. Time in which it waits for a CPU does not
+count, because another start would only load a busy machine more."""
 START_TIMEOUT = 300
-"""A process that is not ready and sends nothing for this long is taken to hang [s]. A first run may compile kernels."""
+"""A process that is not ready and sends nothing for this long hangs [s]. A first run may compile kernels."""
 HOLD_TIMEOUT = 3.0
 """A process that has done nothing for this long, though it had a CPU, no longer holds the loop [s]."""
 IDLE_LOOK_PERIOD = 0.1
@@ -47,19 +54,97 @@ IDLE_LOOK_PERIOD = 0.1
 LONGEST_PAUSE = 60.0
 """Longest pause before a process is started again [s]. Pauses double with every failure, up to this."""
 
+CONTEXT = multiprocessing.get_context("spawn")
+Counts = Mapping[str, Mapping[str, int]]
+"""Counts of messages, frames and losses: kind of count -> sensor or topic -> number."""
+
+
+class SpawnedProcess:
+    """A daemon process that imports its modules and then waits for its function, and a pipe to the process.
+
+    Imports take most of the time in which a process starts. So a process can start before its function is known, or
+    stand by until another process fails.
+    """
+
+    def __init__(self, title: str, modules: Sequence[str], rehearsal: str = "") -> None:
+        """``modules``: names of the modules that the process imports. ``rehearsal``: name of a module with a function
+        ``rehearse``. If it is given, the process stands by: it imports ``modules``, calls ``rehearse()``, both in a
+        thread of higher niceness than this process, and then reports."""
+        self.pipe, end = CONTEXT.Pipe()
+        """The parent's end of the pipe."""
+        self.stands_by = False
+        """Whether the process ran and had rehearsed when :meth:`look` was called last."""
+        self.process = CONTEXT.Process(
+            target=import_and_run, args=(tuple(modules), end, rehearsal), name=title, daemon=True
+        )
+        self.process.start()
+        end.close()
+
+    def look(self) -> bool:
+        """Update :attr:`stands_by`. Returns whether the process runs. Call it from one thread, before :meth:`run`."""
+        runs = self.process.is_alive()
+        with contextlib.suppress(EOFError, OSError):
+            self.stands_by = runs and (self.stands_by or (self.pipe.poll() and self.pipe.recv() == STANDING_BY))
+        return runs
+
+    def end(self) -> None:
+        """End the process."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+    def run(self, function: Callable[..., None], *arguments: Any) -> None:
+        """Make the process call ``function(*arguments, pipe)``, where ``pipe`` is the process's end of the pipe.
+
+        Locks and semaphores of :data:`CONTEXT` may be among the arguments.
+        """
+        # multiprocessing pickles its locks only while it spawns a process, so the process that it spawned is set here
+        multiprocessing.context.set_spawning_popen(self.process._popen)  # type: ignore[attr-defined]
+        try:
+            message = ForkingPickler.dumps((function, arguments))
+        finally:
+            multiprocessing.context.set_spawning_popen(None)
+        self.pipe.send_bytes(message)
+
+
+_started_early: dict[tuple[str, ...], SpawnedProcess] = {}
+"""Processes that :func:`spawn` has not returned yet, by their modules."""
+
+
+def sensor_modules(ros: bool) -> tuple[str, ...]:
+    """Returns the modules that a sensor process imports, with a ROS node or without."""
+    sensors = ("vinesim.sensors.scheduler", "vinesim.sensors.camera.camera", "vinesim.sensors.lidar.lidar")
+    node = ("vinesim.ros.sensor_node", "vinesim.ros.publishers.camera", "vinesim.ros.publishers.lidar")
+    return (SENSOR_WORKER, *sensors, *(node if ros else ()))
+
+
+def start_early(title: str, modules: Sequence[str]) -> None:
+    """Start a process that :func:`spawn` will return for the same modules.
+
+    The process imports its modules while this program still imports its own.
+    """
+    _started_early[tuple(modules)] = SpawnedProcess(title, modules)
+
+
+def spawn(title: str, modules: Sequence[str]) -> SpawnedProcess:
+    """Returns a process that imports ``modules``: the one that was started early, or a new one."""
+    return _started_early.pop(tuple(modules), None) or SpawnedProcess(title, modules)
+
 
 class WorkerError(RuntimeError):
-    """A process of the client could not start; the text says why."""
+    """A process of the client could not start. The text is the reason."""
 
     exit_code = 3
 
 
 def cpu_use(pid: int) -> tuple[float, bool]:
-    """CPU time of a process [s], and whether any of its threads runs or waits for a CPU now. They are 0 and False if it
-    has ended, and on systems without /proc."""
+    """Returns the CPU time of a process [s], and whether any of its threads runs or waits for a CPU now.
+
+    The values are 0 and False if the process has ended, and on systems without /proc.
+    """
     try:
         place = pathlib.Path("/proc") / str(pid)
-        # The name, in brackets, may hold blanks; behind it come state, ..., user time, system time (proc_pid_stat(5)).
+        # The name, in brackets, may contain blanks. Then come state, ..., user time, system time (proc_pid_stat(5)).
         fields = (place / "stat").read_text().rpartition(")")[2].split()
         used = (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
         threads = [(task / "stat").read_text().rpartition(")")[2] for task in (place / "task").iterdir()]
@@ -69,14 +154,15 @@ def cpu_use(pid: int) -> tuple[float, bool]:
 
 
 class IdleTime:
-    """How long a process has done nothing although it could [s]. Time in which it waits for a CPU does not count.
+    """Time for which a process has done nothing although it could. Time in which it waits for a CPU does not count.
 
-    The time between two calls of :meth:`look` counts as one second at most. So if a shell stops both processes for an
-    hour, only one second counts.
+    The time between two calls of :meth:`look` counts as one second at most. So if a shell stops the client and the
+    process for an hour, only one second counts.
     """
 
     def __init__(self, pid: int) -> None:
         self.seconds = 0.0
+        """Idle time so far [s]."""
         self._pid = pid
         self._used = 0.0
         self._looked = time.monotonic()
@@ -97,72 +183,36 @@ class IdleTime:
         return self.seconds
 
 
-def serve(title: str, pipe: Connection, work: Callable[[], None]) -> NoReturn:
-    """Main function of a process: call ``work`` until it returns, fails, or the client's process has ended.
-
-    ``title`` names the process in its log and in ``ps -o comm``: "sensor process".
-    """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the client, which then stops this process
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
-    with contextlib.suppress(OSError):  # where there is no /proc, the process keeps Python's name
-        pathlib.Path("/proc/self/comm").write_text(title)
-    if hasattr(os, "SCHED_BATCH"):
-        os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
-    code = 0
-    try:
-        work()
-    except (EOFError, BrokenPipeError, ConnectionResetError):
-        pass  # the client is gone
-    except Exception as error:
-        log.exception("the %s failed", title)
-        with contextlib.suppress(OSError):
-            pipe.send(("failed", f"{type(error).__name__}: {error}"))
-        code = 1
-    # All is closed. An orderly shutdown of the interpreter would only delay the client, which waits.
-    logging.shutdown()
-    sys.stdout.flush()
-    os._exit(code)
-
-
-def report_ready(pipe: Connection, niceness: int) -> None:
-    """Tell the client that this process is ready, and give the client's loop precedence over it from now on.
-
-    With its ``niceness`` and scheduling class it does not take the core from the loop that wakes it (docs/decisions/
-    sensor-process.md). Until it is ready it has the niceness of the client, because the start is urgent.
-    """
-    if hasattr(os, "nice"):
-        os.nice(niceness)
-    if os.path.isdir("/proc/self/task"):  # Linux, where every thread has a niceness of its own
-        for thread in os.listdir("/proc/self/task"):
-            with contextlib.suppress(OSError):  # it may have ended by now
-                os.setpriority(os.PRIO_PROCESS, int(thread), os.getpriority(os.PRIO_PROCESS, 0))
-    pipe.send(("ready", None))
-
-
 class Shared(Protocol):
-    """Shared memory of the client and one run of the process."""
+    """Memory that the client and one run of the process share."""
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """Release the memory."""
+        ...
 
 
 S = TypeVar("S", bound=Shared)
 
 
 class Run(Generic[S]):
-    """One run of the process, from its start to its end."""
+    """One run of a process, from the call of its function to its end.
+
+    Each run has shared memory and locks of its own, so a process that dies while it holds a lock does no harm.
+    """
 
     def __init__(self, spawned: SpawnedProcess, target: Callable[..., None], config: Any, shared: S) -> None:
         self.shared = shared
         self.pipe = spawned.pipe
         self.process = spawned.process
         self.ready_since: float | None = None
-        """Time at which the process was ready [s]."""
+        """Time at which the process became ready [s]. None before, and after its end."""
         spawned.run(target, config, shared)
         self._outgoing: queue.SimpleQueue[tuple[str, Any] | None] = queue.SimpleQueue()
         threading.Thread(target=self._send, name=f"to {spawned.process.name}", daemon=True).start()
 
     def send(self, kind: str, value: Any = None) -> None:
-        """Send a message after the earlier ones. A thread packs and writes it."""
+        """Send a message to the process. A thread packs and writes the messages in order, so this method does not
+        wait."""
         self._outgoing.put((kind, value))
 
     def _send(self) -> None:
@@ -171,8 +221,11 @@ class Run(Generic[S]):
                 self.pipe.send(message)
 
     def end(self) -> None:
-        """Release the resources of a process that ends or should have ended. Only the supervising thread may wait for
-        the process."""
+        """Wait for the end of the process, or kill it, and close the pipe.
+
+        The shared memory stays, because the loop may use it. Call this method in the supervising thread only, because
+        no other thread may wait for the process.
+        """
         self._outgoing.put(None)
         self.process.join(EXIT_TIMEOUT)
         if self.process.is_alive():
@@ -182,25 +235,35 @@ class Run(Generic[S]):
 
 
 class Hold:
-    """A time in which one run of a process holds the client's steps."""
+    """Limit on the time for which the client's loop waits for a process: until the process has done nothing for
+    :data:`HOLD_TIMEOUT`."""
 
-    def __init__(self, run: Run[Any], title: str, consequence: str, progress: Callable[[], object]) -> None:
-        """The value of ``progress()`` changes whenever the process has done something. ``consequence``: text for the
-        log about the effect if the process does nothing for :data:`HOLD_TIMEOUT`."""
-        self.run = run
+    def __init__(self, title: str, consequence: str, progress: Callable[[Run[Any]], object]) -> None:
+        """``title``: see :class:`WorkerProcess`. ``consequence``: text for the log about the effect of the end of the
+        wait. ``progress``: function whose value changes whenever the process of a run has done something."""
         self._title = title
         self._consequence = consequence
         self._progress = progress
-        self._idle = IdleTime(run.process.pid or 0)
-        self._seen = progress()
-        self._next_look = 0.0
-        self._is_logged = False
+        self._run: Run[Any] | None = None
+        """The run that the loop waits for now."""
 
-    def is_over(self) -> bool:
-        """Whether the process has done nothing for :data:`HOLD_TIMEOUT`. The first such time is logged."""
-        if (now := time.monotonic()) >= self._next_look:
+    def end(self) -> None:
+        """Note that the loop does not wait now."""
+        self._run = None
+
+    def is_over(self, run: Run[Any]) -> bool:
+        """Note that the loop waits for ``run`` now. Returns whether the process of ``run`` has done nothing for
+        :data:`HOLD_TIMEOUT` since the wait began. The first such time is logged."""
+        now = time.monotonic()
+        if run is not self._run:
+            self._run = run
+            self._idle = IdleTime(run.process.pid or 0)
+            self._seen = self._progress(run)
+            self._next_look = 0.0
+            self._is_logged = False
+        if now >= self._next_look:
             self._next_look = now + IDLE_LOOK_PERIOD
-            if (progress := self._progress()) != self._seen:
+            if (progress := self._progress(run)) != self._seen:
                 self._seen = progress
                 self._idle.end()
             else:
@@ -215,17 +278,48 @@ class Hold:
         return True
 
 
+class Totals:
+    """Counts that a process reports, as sums over all its runs. The methods may be called in different threads."""
+
+    def __init__(self) -> None:
+        self._counts: tuple[Counts, Counts] = {}, {}
+        """Counts of all earlier runs, and of the present run."""
+
+    def take(self, counts: Counts) -> None:
+        """Take the counts of the present run: all counts of each kind so far."""
+        self._counts = self._counts[0], counts
+
+    def begin_run(self) -> None:
+        """Begin another run, which counts from 0."""
+        kinds = self._counts[0].keys() | self._counts[1].keys()
+        self._counts = {kind: self.of(kind) for kind in kinds}, {}
+
+    def of(self, kind: str) -> dict[str, int]:
+        """Returns the sums of one kind of count, by sensor or topic."""
+        before, now = (counts.get(kind, {}) for counts in self._counts)
+        return {name: before.get(name, 0) + now.get(name, 0) for name in {**before, **now}}
+
+
 class WorkerProcess(Generic[S]):
-    """Keeps one process running. ``title`` names it in messages: "the sensor process of picker".
+    """A process that runs a worker for the client. It is started again when it fails, dies or hangs.
 
-    ``target(config, shared, pipe)`` runs in the process after the process has imported ``modules``. It sends
-    ("ready", None) when it is ready, and ("failed", text) before it ends with an error. It ends at ("stop", None) or
-    when the pipe is closed. While it is ready it sends some message at least every :data:`HANG_TIMEOUT`, otherwise it
-    is killed and started again. ``share(context)`` creates the shared memory of one run. ``receive(kind, value)`` is
-    called in a thread with all other messages, and with ("restarted", None) before the messages of a further run.
+    ``title`` names the process in messages: "the sensor process of picker". The process imports ``modules`` and then
+    calls ``target(config, shared, pipe)``. ``share(context)`` creates the shared memory of one run.
 
-    With a ``rehearsal``, another process stands by while one is ready, and replaces it if it fails; see
-    :class:`SpawnedProcess`.
+    Messages of the process are pairs of a kind and a value:
+
+    * ("ready", None) when the process is ready, ("failed", text) before it ends with an error;
+    * ("statistics", :data:`Counts`) with the counts of this run, see :meth:`total`;
+    * ("parameters", values by name) with ROS parameters that were set. They are added to ``config.parameters``, so that
+      the next run starts with them;
+    * all others, which are passed to ``receive(kind, value)`` in a thread. The client adds ("restarted", None) before
+      the messages of a further run.
+
+    The process ends at the message ("stop", None), or when the pipe is closed. While it is ready it sends some message
+    at least every :data:`HANG_TIMEOUT`. Otherwise it hangs, and is killed and started again.
+
+    ``rehearsal``: see :class:`SpawnedProcess`. If it is given, another process stands by while one is ready, and
+    replaces it if it fails.
     """
 
     def __init__(
@@ -241,12 +335,13 @@ class WorkerProcess(Generic[S]):
     ) -> None:
         self.title = title
         self.restarts = 0
-        """How often the process was started again."""
+        """Number of times that the process was started again."""
         self.restart_time = 0.0
-        """Time from the last restart of the process until it was ready [s]."""
+        """Time from the last restart of the process until the process was ready [s]."""
         self._modules = modules
         self._target = target
-        self._config = config
+        self.config = config
+        self._totals = Totals()
         self._share = share
         self._receive = receive
         self._rehearsal = rehearsal
@@ -255,10 +350,10 @@ class WorkerProcess(Generic[S]):
         """Earliest time at which another process may be started to stand by [s]."""
         self._closing = threading.Event()
         self._started = 0.0
-        """When the newest run started [s]."""
+        """Time at which the newest run started [s]."""
         self._first_result = threading.Event()
         self._failure = ""
-        """Why the first run failed before it was ready."""
+        """Reason why the first run failed before it was ready."""
         self._newest = self._current = self._start()
         self._thread = threading.Thread(target=self._supervise, name=f"supervisor of {title}", daemon=True)
         self._thread.start()
@@ -266,7 +361,7 @@ class WorkerProcess(Generic[S]):
     # ------------------------------------------------------------------ for the loop
 
     def current(self) -> Run[S]:
-        """The present run. Call it in one thread only, because it releases the memory of the run before."""
+        """Returns the newest run, and releases the memory of the run before. Call it in the loop's thread only."""
         if self._newest is not self._current:
             former = self._current
             self._current = self._newest
@@ -289,6 +384,10 @@ class WorkerProcess(Generic[S]):
         """Whether the process is ready now."""
         return self._newest.ready_since is not None
 
+    def total(self, kind: str) -> dict[str, int]:
+        """Returns the sums over all runs of one kind of count, by sensor or topic."""
+        return self._totals.of(kind)
+
     # ------------------------------------------------------------------ outside the loop
 
     def wait_until_ready(self, timeout: float) -> None:
@@ -304,11 +403,11 @@ class WorkerProcess(Generic[S]):
             raise WorkerError(f"{self.title} failed: {self._failure}")
 
     def send(self, kind: str, value: Any = None) -> None:
-        """Send a message to the newest run."""
+        """Send a message to the newest run. This method does not wait."""
         self._newest.send(kind, value)
 
     def close(self) -> None:
-        """End the process; a second call does nothing."""
+        """End the process. A second call does nothing."""
         if self._closing.is_set():
             return
         was_ready = self.is_ready
@@ -333,13 +432,13 @@ class WorkerProcess(Generic[S]):
         if standby is not None:
             standby.look()
             if standby.stands_by:
-                with contextlib.suppress(OSError):  # it has ended just now
-                    return Run(standby, self._target, self._config, shared)
+                with contextlib.suppress(OSError):  # the process has ended just now
+                    return Run(standby, self._target, self.config, shared)
             standby.end()
-        return Run(spawn(self.title, self._modules), self._target, self._config, shared)
+        return Run(spawn(self.title, self._modules), self._target, self.config, shared)
 
     def _keep_standby(self, run: Run[S]) -> None:
-        """Start a process that stands by when it is due, and again if it has ended."""
+        """Start a process that stands by when it is due, and another one if it has ended."""
         if not self._rehearsal or run.ready_since is None:
             return
         now = time.monotonic()
@@ -377,6 +476,7 @@ class WorkerProcess(Generic[S]):
             if self._closing.wait(pause):
                 return
             self.restarts += 1
+            self._totals.begin_run()
             self._receive("restarted", None)
             self._started = time.monotonic()
             self._newest = self._start()
@@ -388,7 +488,7 @@ class WorkerProcess(Generic[S]):
             log.error("%s failed again: %s; further attempts follow without a message", self.title, reason)
 
     def _serve(self, run: Run[S]) -> str:
-        """Take the messages of a run until it ends or hangs. Returns the reason."""
+        """Take the messages of a run until the process ends or hangs. Returns the reason."""
         reason = ""
         silence = IdleTime(run.process.pid or 0)
         while silence.seconds < (START_TIMEOUT if run.ready_since is None else HANG_TIMEOUT):
@@ -407,6 +507,10 @@ class WorkerProcess(Generic[S]):
                         self._first_result.set()
                     elif kind == "failed":
                         reason = value
+                    elif kind == "statistics":
+                        self._totals.take(value)
+                    elif kind == "parameters":
+                        self.config.parameters.update(value)
                     else:
                         self._receive(kind, value)
             except (EOFError, OSError):
