@@ -424,7 +424,8 @@ def test_yolo_finds_every_image_and_its_labels_from_any_folder(
     monkeypatch.chdir(tmp_path)
     lines = dict(line.split(": ") for line in (whole / "data.yaml").read_text().splitlines() if line != "names:")
     assert lines.pop("  0") == "bunch"
-    assert list(lines) == list(dataset.SPLITS)  # no `path`: it would be relative to the working folder
+    assert list(lines) == ["train", "val"]  # no `path`: it would be relative to the working folder
+    assert not (whole / "test.txt").exists()  # it would be empty
     found = {}
     for split, name in lines.items():
         listed = (whole / name).read_text().splitlines()
@@ -434,7 +435,8 @@ def test_yolo_finds_every_image_and_its_labels_from_any_folder(
             assert image.is_file()
             assert (whole / "labels" / f"{image.stem}.txt").is_file()
     assert sorted(image for images in found.values() for image in images) == sorted((whole / "images").glob("*.png"))
-    assert [len(found[split]) for split in dataset.SPLITS] == [5, 1, 0]
+    assert [len(found[split]) for split in lines] == [5, 1]
+    assert [dataset.split_needs(split) for split in dataset.SPLITS] == [1, 6, 11]
 
 
 def test_what_stops_a_worker_is_one_line(scene: pathlib.Path, tmp_path: pathlib.Path) -> None:

@@ -118,6 +118,10 @@ def _finish(out: pathlib.Path, images: int, new: int) -> int:
     splits = collections.Counter(map(dataset.split_of, range(images)))
     parts = ", ".join(f"{splits[split]} {split}" for split in dataset.SPLITS)
     print(f"{dataset.finish(out, images)}: {images} images ({parts}), {new} of them new")
+    missing = [split for split in dataset.SPLITS if not splits[split]]
+    if missing:
+        needs = " and ".join(f"--images {dataset.split_needs(split)} for {split}" for split in missing)
+        print(f"data.yaml names no {' and no '.join(missing)}: splits are by vineyard; give at least {needs}")
     return 0
 
 

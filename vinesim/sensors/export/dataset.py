@@ -78,6 +78,11 @@ def split_of(image: int) -> str:
     return {_VAL_VINEYARD: "val", _TEST_VINEYARD: "test"}.get(place, "train")
 
 
+def split_needs(split: str) -> int:
+    """Returns the smallest number of images with which a split is not empty."""
+    return next(image + 1 for image in range(IMAGES_PER_VINEYARD * _SPLIT_PERIOD) if split_of(image) == split)
+
+
 def resized_intrinsics(spec: CameraSpec, size: tuple[int, int] | None) -> CameraInfo:
     """Returns the intrinsics of a camera whose picture has another ``size`` [px], with an equal horizontal field of
     view and square pixels."""
@@ -400,7 +405,7 @@ def render_images(plan: DatasetPlan, folder: pathlib.Path, images: Iterable[int]
 
 def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
     """Write ``annotations.json`` (COCO) from the records of the first ``images`` images, ``data.yaml`` (YOLO) and the
-    lists of images that ``data.yaml`` names.
+    lists of images that ``data.yaml`` names, one for each split that has images.
 
     Returns the path of ``annotations.json``. Raises :class:`WriteError` if one of the files cannot be written; then no
     file is written.
@@ -412,9 +417,10 @@ def finish(folder: pathlib.Path, images: int) -> pathlib.Path:
 
     target = folder / "annotations.json"
     # Without `path`, Ultralytics uses the folder of data.yaml; a relative `path` would count from its working folder.
-    yaml = "".join(f"{split}: {split}.txt\n" for split in SPLITS) + "names:\n  0: bunch\n"
+    some = [split for split in SPLITS if split_needs(split) <= images]
+    yaml = "".join(f"{split}: {split}.txt\n" for split in some) + "names:\n  0: bunch\n"
     files: dict[pathlib.Path, Iterable[bytes]] = {target: map(str.encode, formats.coco_json(read))}
-    for split in SPLITS:  # `./` is relative to the list
+    for split in some:  # `./` is relative to the list
         names = [f"./{_file_of('images', n)}\n" for n in range(images) if split_of(n) == split]
         files[folder / f"{split}.txt"] = map(str.encode, names)
     files[folder / "data.yaml"] = [yaml.encode()]
