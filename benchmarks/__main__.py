@@ -67,6 +67,11 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         "what modelled sensors measure, compared with the truth",
         {"plot": {"type": pathlib.Path, "help": "folder for the plots"}},
     ),
+    "perception": (
+        _later("perception:perception"),
+        "surfaces, registrations, bunches and berries from depth, compared with the truth",
+        {},
+    ),
     "sync": (
         _later("replication_delay:sync"),
         "effect of network delay on contacts and copies, in simulated time",

@@ -8,12 +8,15 @@ A sensor may be used with several simulations in turn; it computes on the device
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from vinesim.api.simulation import Simulation, base_pose
 from vinesim.core.errors import UsageError
+from vinesim.perception.clouds import picture_cloud, scan_cloud
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraMount, LidarMount, LidarScan
 from vinesim.sensors.camera import camera as rgbd
@@ -21,6 +24,42 @@ from vinesim.sensors.camera.sunlight import DEFAULT_SUN
 from vinesim.sensors.export import images
 from vinesim.sensors.export.dataset import resized_intrinsics
 from vinesim.sensors.lidar import lidar
+
+T = TypeVar("T", bound=CameraFrame | LidarScan)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Picture(CameraFrame):
+    """An RGB-D picture of :class:`Camera`."""
+
+    def to_point_cloud(self, *, world: bool = False, exact: bool = False, ids: bool = False, step: int = 1) -> Any:
+        """Returns an ``open3d.t.geometry.PointCloud`` [m] with a coloured point for every pixel that has depth.
+
+        :class:`~vinesim.perception.open3d_library.Open3DMissing` if Open3D (``vinesim[perception]``) is not installed.
+
+        Args:
+            world: points in the frame of the world instead of the camera's optical frame.
+            exact: use the exact depth instead of the measured depth.
+            ids: add the attributes ``labels`` [point, 1] and ``pixels`` [point, 2] (column, row), int32.
+            step: use every ``step``-th row and column only.
+        """
+        return picture_cloud(self, world=world, exact=exact, ids=ids, step=step)
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Scan(LidarScan):
+    """One revolution of :class:`Lidar`."""
+
+    def to_open3d(self, *, world: bool = False, ids: bool = False) -> Any:
+        """Returns an ``open3d.t.geometry.PointCloud`` [m] with the attributes ``intensity``, ``ring`` and ``time``.
+
+        :class:`~vinesim.perception.open3d_library.Open3DMissing` if Open3D (``vinesim[perception]``) is not installed.
+
+        Args:
+            world: points in the frame of the world instead of the lidar's frame.
+            ids: add the attribute ``labels`` [point, 1] int32.
+        """
+        return scan_cloud(self, world=world, ids=ids)
 
 
 class Camera:
@@ -61,7 +100,7 @@ class Camera:
         *,
         robot: Robot | None = None,
         frame: str | None = None,
-    ) -> CameraFrame:
+    ) -> Picture:
         """The picture at the simulation's time: ``rgb``, ``depth`` [m], ``labels``, ``exact_depth`` [m].
 
         Args:
@@ -84,7 +123,9 @@ class Camera:
                 device=simulation.device,
             )
             self._last = simulation
-        return self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+        return _as(
+            Picture, self._camera.render(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+        )
 
 
 class Lidar:
@@ -107,7 +148,7 @@ class Lidar:
         *,
         robot: Robot | None = None,
         frame: str | None = None,
-    ) -> LidarScan:
+    ) -> Scan:
         """One revolution while nothing moves: ``xyz`` [point, 3] m in the lidar's frame, ``intensity``, ``labels``.
 
         Args:
@@ -120,7 +161,8 @@ class Lidar:
         device = simulation.device
         if device not in self._lidars:
             self._lidars[device] = lidar.Lidar(self.spec, self._name, seed=self._seed, device=device)
-        return self._lidars[device].scan(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+        made = self._lidars[device].scan(simulation.primitives(), _sensor_pose(pose, robot, frame), simulation.time)
+        return _as(Scan, made)
 
 
 def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -131,6 +173,11 @@ def look_at(eye: Sequence[float] | np.ndarray, target: Sequence[float] | np.ndar
     if start.shape != (3,) or end.shape != (3,) or np.linalg.norm(end - start) < 1e-6:
         raise UsageError(f"cannot look from {start.tolist()} at {end.tolist()}; give two points [3] m that differ")
     return images.look_at(start, end)
+
+
+def _as(kind: type[T], value: CameraFrame | LidarScan) -> T:
+    """Returns ``value`` as an object of its subclass ``kind``, with the same arrays."""
+    return kind(**{field.name: getattr(value, field.name) for field in dataclasses.fields(value)})
 
 
 def _first_frame(robot: Robot | None, kind: str) -> str | None:

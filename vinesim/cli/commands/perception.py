@@ -1,0 +1,61 @@
+"""``vinesim fuse`` and ``vinesim view``: their options."""
+
+from __future__ import annotations
+
+import pathlib
+from typing import Annotated
+
+import typer
+
+from vinesim.cli.commands.options import ImageSize
+
+
+def fuse(
+    tour: Annotated[
+        pathlib.Path, typer.Argument(help="Folder of vinesim render --path, of vinesim render, or of vinesim dataset.")
+    ],
+    out: Annotated[pathlib.Path, typer.Option(help="PLY file to write: a coloured triangle mesh in metres.")],
+    voxel: Annotated[float, typer.Option(help="Edge of a voxel [m].")] = 0.004,
+    far: Annotated[float, typer.Option(help="Depth beyond which pixels are ignored [m].")] = 2.0,
+    depth: Annotated[str, typer.Option(help="exact: true depth. measured: depth as the camera measures it.")] = "exact",
+    views: Annotated[
+        int | None,
+        typer.Option(min=1, help="Leave out surface that fewer pictures see; by default 2, or 1 for a single picture."),
+    ] = None,
+    ids: Annotated[bool, typer.Option("--ids", help="Add the label of the object to every vertex.")] = False,
+) -> None:
+    """Fuse the RGB-D pictures of a tour into one surface (TSDF). Needs vinesim[perception].
+
+    \b
+    Examples:
+      vinesim fuse tour --out vine.ply
+      vinesim fuse tour --out stems.ply --voxel 0.002 --far 1 --ids
+      vinesim fuse tour --out measured.ply --depth measured
+    """
+    from vinesim.cli.perception import fuse as run
+
+    raise typer.Exit(run(tour, out=out, voxel=voxel, far=far, depth=depth, ids=ids, views=views))
+
+
+def view(
+    file: Annotated[
+        pathlib.Path,
+        typer.Argument(help="PLY, PCD, XYZ, PTS, STL or OBJ file; MCAP file or rosbag2 folder with RGB-D pictures."),
+    ],
+    out: Annotated[pathlib.Path | None, typer.Option(help="Write this PNG file instead of opening a window.")] = None,
+    picture: Annotated[int, typer.Option(min=0, help="Index of the picture in a recording.")] = 0,
+    at: Annotated[str | None, typer.Option(help="With --out: position of the camera, X,Y,Z [m].")] = None,
+    look: Annotated[str | None, typer.Option(help="With --out: the point it looks at, X,Y,Z [m].")] = None,
+    size: ImageSize = None,
+) -> None:
+    """Show a point cloud or a surface in Open3D's viewer, or draw it without a display. Needs vinesim[perception].
+
+    \b
+    Examples:
+      vinesim view vine.ply
+      vinesim view vine.ply --out vine.png
+      vinesim view pictures.mcap --picture 10 --out cloud.png
+    """
+    from vinesim.cli.perception import view as run
+
+    raise typer.Exit(run(file, out=out, picture=picture, at=at, look=look, size=size))
