@@ -19,7 +19,7 @@ from vinesim.perception.truth import TrueBunch
 from vinesim.scene.ids import LABEL_STRIDE
 from vinesim.scene.values import CameraFrame, Measurement
 from vinesim.sensors import ground_truth
-from vinesim.sensors.primitives.ray_caster import enclosing_primitive
+from vinesim.sensors.primitives.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 SEED = 7
@@ -103,13 +103,14 @@ def seen_bunches(simulation: vinesim.Simulation, count: int, quality: str = "fas
     camera = vinesim.Camera("d435", quality=quality)
     primitives = simulation.primitives()
     snapshot = rest_snapshot(simulation.model)
+    caster = RayCaster(primitives)
     for bunch in range(len(simulation.model.bunch_body)):
         truth = true_bunch(simulation, bunch)
         if not len(truth.diameters):
             continue
         middle = truth.centres.mean(0)
         views: dict[int, tuple[CameraFrame, float]] = {}
-        for direction in range(0, 360, 60):
+        for direction in range(0, 360, 120):
             angle = np.radians(direction)
             eye = middle + DISTANCE * np.array([np.cos(angle), np.sin(angle), -0.15])
             if enclosing_primitive(primitives, eye) >= 0:
@@ -120,7 +121,7 @@ def seen_bunches(simulation: vinesim.Simulation, count: int, quality: str = "fas
             if pixels < 100:
                 continue
             seen = ground_truth.render_buffers(primitives, frame.info, pose)
-            own = {one.bunch: one for one in ground_truth.bunch_truths(primitives, snapshot, seen)}.get(bunch)
+            own = {one.bunch: one for one in ground_truth.bunch_truths(primitives, snapshot, seen, caster)}.get(bunch)
             views[direction] = frame, 0.0 if own is None else 1.0 - own.occlusion
         if not views or max(share for _, share in views.values()) < MIN_VISIBLE:
             continue

@@ -62,9 +62,11 @@ def test_one_picture(tmp_path):
 
 
 def test_one_lidar_scan(tmp_path):
-    points, leaves = map(int, re.search(r"^(\d+) points .* (\d+) of them", run("one_lidar_scan.py", tmp_path)).groups())
-    assert points > 5000
-    assert 0 < leaves < points
+    found = re.search(r"^(\d+) points .* (\d+) of them on leaves, (\d+) on", run("one_lidar_scan.py", tmp_path))
+    points, leaves, bunches = map(int, found.groups())
+    assert points > 20_000
+    assert leaves > 0.15 * points
+    assert bunches > 0.05 * points
 
 
 def test_dataset(tmp_path):

@@ -24,7 +24,17 @@ pytestmark = pytest.mark.slow
 ROOT = pathlib.Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
-RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "replay run.mcap --ros", "scene ", "tune ")
+RUNS = (
+    "certs ",
+    "experiment ",
+    "fuse tour ",
+    "render ",
+    "replay run.mcap --out ",
+    "replay run.mcap --ros",
+    "scene ",
+    "tune ",
+    "view vine.ply --out ",
+)
 """How commands begin that end by themselves, in seconds."""
 ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
 """Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""

@@ -23,7 +23,9 @@ def test_a_notebook_uses_the_public_interface_and_ends_with_a_check(path):
     assert checks, "the last cell has no check"
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.ImportFrom):
-            public = node.module == "vinesim.tune" or not (node.module or "").startswith("vinesim.")
+            public = node.module in ("vinesim.perception", "vinesim.tune") or not (node.module or "").startswith(
+                "vinesim."
+            )
             assert public, f"{node.module} is not public"
         if isinstance(node, ast.Import):
             assert not [alias.name for alias in node.names if alias.name.startswith("vinesim.")]

@@ -43,9 +43,9 @@ def _picture(folder: pathlib.Path) -> tuple[dict, np.ndarray, np.ndarray]:
     return camera, depth, frames.rotate(np.array(camera["quaternion_xyzw"]), local) + camera["position"]
 
 
-def _assert_surface(vertices: np.ndarray, folder: pathlib.Path, truncation: float) -> None:
+def _assert_surface(vertices: np.ndarray, folder: pathlib.Path, truncation: float, gap: float) -> None:
     """Vertices [n, 3] m lie on what the pictures show, except within ``truncation`` [m] of the rims of leaves; and what
-    the pictures show has vertices."""
+    the pictures show has vertices within ``gap`` [m]."""
     shown = np.concatenate([_picture(one)[2] for one in sorted((folder / "tour").iterdir())])
     assert len(vertices) > 5000
     off = cKDTree(shown).query(vertices)[0]
@@ -53,16 +53,17 @@ def _assert_surface(vertices: np.ndarray, folder: pathlib.Path, truncation: floa
     assert np.median(off) < VOXEL
     assert np.quantile(off, 0.99) < truncation
     assert np.median(away) < VOXEL
-    assert np.quantile(away, 0.9) < 2.0 * VOXEL
+    assert np.quantile(away, 0.9) < gap
 
 
 def test_the_example_of_the_docs_fuses_pictures(folder: pathlib.Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("open3d", reason="Open3D is an extra (perception)")
-    example = next(code for code in re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S) if "open3d" in code)
+    example = next(code for code in re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S) if "perception" in code)
     monkeypatch.chdir(folder)
     names: dict = {}
     exec(example, names)
-    _assert_surface(names["mesh"].vertex.positions.numpy(), folder, 8.0 * VOXEL)  # Open3D's own
+    assert (folder / "vine.ply").stat().st_size > 100_000
+    _assert_surface(names["surface"].vertices, folder, 2.0 * VOXEL, 4.0 * VOXEL)  # oblique surface has gaps
 
 
 def test_the_older_volume_of_the_pinned_version_fuses_pictures(folder: pathlib.Path) -> None:
@@ -87,4 +88,4 @@ def test_the_older_volume_of_the_pinned_version_fuses_pictures(folder: pathlib.P
         pose[:3, 3] = camera["position"]
         lens = o3d.camera.PinholeCameraIntrinsic(camera["width"], camera["height"], fx, fy, cx, cy)
         volume.integrate(image, lens, np.linalg.inv(pose))
-    _assert_surface(np.asarray(volume.extract_triangle_mesh().vertices), folder, TRUNCATION)
+    _assert_surface(np.asarray(volume.extract_triangle_mesh().vertices), folder, TRUNCATION, 2.0 * VOXEL)

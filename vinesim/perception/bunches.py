@@ -43,6 +43,9 @@ FILLED_ONE_SIDE = 0.534
 """As :data:`FILLED_ALL_ROUND`, for a bunch seen from one side: the hull is taken to be round."""
 SIDES = np.radians(80.0)
 """Angle [rad] between two horizontal viewing directions from which a bunch counts as seen from several sides."""
+MAX_DEPTH = 0.12
+"""Largest difference [m] of a point's depth from the median depth of its bunch. Stereo measures the background in some
+pixels of a bunch."""
 SLICE = 0.006
 """Height of a slice of the hull [m]."""
 _SECTORS = 18
@@ -152,6 +155,10 @@ def _bunch_points(frame: CameraFrame, bunch: int, exact: bool) -> BunchPoints | 
     window = slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1)
     points = picture_points(frame, exact)[window]
     points = np.where((frame.labels[window] == label(Organ.BUNCH, bunch))[..., None], points, np.nan)
+    if not np.isfinite(points[..., 2]).any():
+        return None
+    off = np.abs(points[..., 2] - np.nanmedian(points[..., 2]))
+    points = np.where((off < MAX_DEPTH)[..., None], points, np.nan)
     if np.isfinite(points[..., 2]).sum() < MIN_PIXELS:
         return None
     return BunchPoints(points, np.asarray(frame.pose, float), float(frame.info.fx))
