@@ -247,7 +247,11 @@ class CameraFrame:
 
     @property
     def instances(self) -> np.ndarray:
-        """[height, width] index of the bunch, box, tree or actor of each pixel, counted for each organ from 0."""
+        """[height, width] Index of the object in each pixel among the objects of its kind, from 0: the bunch for a
+        bunch or peduncle; the tree for a cane or leaf; the pole, wire, trunk, arm, box, robot or person.
+
+        Sky and ground have the index 0, too. Use :attr:`organs` to distinguish the kinds.
+        """
         return self.labels % LABEL_STRIDE
 
 
