@@ -213,8 +213,8 @@ class RigidArrays:
         )
 
     def _list(self, rigid: RigidWorld, remote_actors: set[str]) -> None:
-        """Write the geoms that can collide with plants at present to the first entries of the geom arrays, movable geoms
-        before static ones. Also write the actors to which the movable geoms belong.
+        """Write the geoms that can collide with plants at present to the first entries of the geom arrays, movable
+        geoms before static ones. Also write the actors to which the movable geoms belong.
 
         ``remote_actors``: names of the actors that other clients control.
         """

@@ -43,19 +43,22 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ articulation solver (plants)
     phi: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.55
-    """[1] Implicitness of the integration: 1/2 trapezoidal, 1 backward Euler. TUNED."""
+    """[1] Implicitness of the integrator of plants (the theta of the theta method): 0.5 trapezoidal rule, which adds no
+    damping, to 1 backward Euler. TUNED."""
     fast_joint_rate: Positive = 5.0
-    """[rad/s] A tree with a faster joint is integrated with phi = 1, and a drag slows a body that turns faster.
-    TUNED."""
+    """[rad/s] A tree with a joint faster than this is integrated with backward Euler (:attr:`phi` = 1). A body that
+    turns faster than this is slowed by a drag. TUNED."""
     max_joint_rate: Positive = 50.0
     """[rad/s] Joint rates are limited to this value. DERIVED: half a radian in a step of 10 ms."""
     fault_joint_rate: Positive = 5000.0
     """[rad/s] A tree with a joint that would turn faster is stopped and reported as faulty. TUNED."""
     contact_onset_duration: NotNegative = 0.03
-    """[s] A tree is integrated with phi = 1 for this time after one of its contacts began. TUNED."""
+    """[s] A tree is integrated with backward Euler (:attr:`phi` = 1) for this time after one of its contacts began.
+    TUNED."""
     stiff_tie_mass: Positive = 10.0
-    """[kg] A tree with a tie whose stiffness * dt^2 is larger is integrated with phi = 1. TUNED: with phi below 1 such
-    a tie (1e5 N/m at 10 ms) oscillates and feeds energy into the cane."""
+    """[kg] A tree is integrated with backward Euler (:attr:`phi` = 1) if one of its ties (springs that hold a cane to a
+    wire or a fixed point) has a larger stiffness * dt^2 than this. TUNED: with phi below 1 such a tie (1e5 N/m at 10
+    ms) oscillates and feeds energy into the cane."""
     max_held_bodies: Capacity = 16
     """Largest number of plant bodies that hands hold at once."""
     max_hands_per_body: Capacity = 4
@@ -110,7 +113,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     static_contact_margin: Positive = 0.0002
     """[m] A contact with a static geom or another branch exists if a step brings the gap below this. TUNED."""
     impact_speed: Positive = 0.3
-    """[m/s] A contact that closes faster is an impact: its tree is integrated with phi = 1. TUNED."""
+    """[m/s] A contact whose gap closes faster than this is an impact: the tree in contact is integrated with backward
+    Euler (:attr:`phi` = 1). TUNED."""
     max_separation_speed: Positive = 1.0
     """[m/s] Largest speed at which overlap is resolved. TUNED."""
     contact_capacity: Capacity = 1024
