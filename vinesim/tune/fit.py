@@ -62,7 +62,7 @@ class Fit:
     """Features of the track without a model, for comparison: frequency and logarithmic decrement."""
     posterior: Posterior
     sample: Sample | None
-    """Draws from the posterior, if requested."""
+    """Random samples of the posterior; None unless they were requested."""
     noise: float
     """[m] Robust standard deviation of the residuals of all columns together."""
     column_noise: np.ndarray
