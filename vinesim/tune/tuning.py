@@ -61,7 +61,8 @@ def tune(
         samples: number of random samples of the exact posterior, in addition to Laplace's approximation of it.
         seed: seed of the random samples.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
-        pushed: the track shows a push: from rest, a steady force begins to act at ``release``.
+        pushed: whether the track shows a push (from rest, a steady force begins to act at ``release``) instead of a
+            pull and release.
 
     Raises :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen, and
     :class:`~vinesim.core.errors.UsageError` for invalid parameters. A failed fit is returned, with the reasons in
