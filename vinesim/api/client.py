@@ -50,7 +50,7 @@ class Client:
         certificates: pathlib.Path | None = None,
         device: str = "cpu",
     ) -> None:
-        """Join a world: a vineyard that all clients of one server simulate together.
+        """Join a world, which is a vineyard that several clients of one server simulate together.
 
         Args:
             scene: a scene, its name in ``data/scenes`` or the path of its file. Scene and seed must be equal for all
@@ -134,7 +134,7 @@ class Client:
 
     def step(self, count: int = 1) -> None:
         """Advance by ``count`` steps of 10 ms without waiting for real time. Each step receives messages, controls the
-        robot, steps the physics, updates the sensors, and sends messages."""
+        robot, steps the physics, passes the result to pages, and sends messages."""
         for _ in range(count):
             self._client.tick()
 

@@ -51,7 +51,7 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Largest depth that is measured."""
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     stereo: StereoSpec | None = None
-    """Model of the depth measurement; None: depth is exact."""
+    """Parameters of the stereo matching that measures depth; None: depth is measured exactly."""
     distortion: Annotated[spec_file.Numbers | None, "1", (-1000.0, 1000.0)] = None
     """Coefficients of the lens distortion, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8
     (rational_polynomial); None: a pinhole. Colour, depth and labels have equal distortion."""
@@ -107,7 +107,8 @@ class Quality:
     on them."""
 
     taps: int
-    """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
+    """Number of samples of the shadow map for each pixel. 0: the shadow map is filtered with two widths instead; -1:
+    with one width."""
     block: int
     """Width and height [px] of the blocks of pixels within which each primitive is shaded once."""
     samples: int
@@ -155,14 +156,14 @@ class Camera:
     quality: str = "full"
     """Name of one of :data:`QUALITIES`."""
     shadow_period: float | None = None
-    """Period [s] at which shadows of moving objects are redrawn; 0: in every frame; None: 0.2, and 0 for quality
-    ``still``."""
+    """Period [s] at which the shadows of moving objects are rendered again; 0: in every frame; None: 0.2, or 0 with the
+    quality ``still``."""
     exposure: float | None = None
     """Fixed exposure, a factor on radiance (0.75 suits a sunny noon); None: automatic exposure."""
     device: str = "cpu"
     threads: int | None = None
-    """Number of CPU threads that draw; None: the number of cores that this process may use, at most four. The picture
-    does not depend on it."""
+    """Number of CPU threads that render; None: the number of cores that this process may use, at most four. The picture
+    does not depend on this number."""
     seed: int = 0
     image_index: int = 0
     """Index of the next image. The seed, the camera's name and this index determine the noise of a measurement."""
@@ -212,8 +213,9 @@ class Camera:
         return self.spec.rate.value
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> CameraFrame:
-        """Render a frame as :class:`vinesim.sensors.sensor.Sensor` defines it, with the ground truth of the bunches if
-        ``outputs`` contain it."""
+        """Render a frame from ``pose`` [7] of the optical frame in the world, as the interface
+        :class:`vinesim.sensors.sensor.Sensor` defines it. The frame contains the ground truth of the bunches if
+        ``outputs`` contain :attr:`CameraOutput.BUNCHES`."""
         frame = self.render(primitives, pose, snapshot.time, outputs=outputs)
         if CameraOutput.BUNCHES in outputs:
             bunches = visible_bunches(primitives, snapshot, self.info, frame.pose, self.rasterizer)
@@ -301,7 +303,7 @@ class Camera:
         """Render from ``pose`` [7] without lens distortion and return the colours [pixel, 3] on the device.
 
         With a GPU the call returns before rendering ends. Without ``is_lit``, only depth and labels are rendered, and
-        the result is None. ``measures``: draw also the random numbers for a stereo measurement.
+        the result is None. ``measures``: also generate the random numbers for a stereo measurement.
         """
         if self.device == "cpu":
             load_camera_kernels()

@@ -39,15 +39,18 @@ FOOTPRINT_RANGE = 3.0
 narrower than the real one at shorter range, and wider at longer range."""
 MAX_SHARED_TRANSLATION = 4e-3
 MAX_SHARED_ROTATION = 3.5e-3
-"""Rotation [rad] of the lidar's mount during some firings below which all of them are computed from the pose at the
-middle firing. ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
+"""Rotation [rad] of the lidar's mount during successive firings below which these firings are all computed from the
+pose of the lidar at the middle one. ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
 
-The error is at most half a step of the head, and clusters nearby need not be searched for every firing.
+The error is at most half of the angle by which the head turns between two firings. This saves a search of the nearby
+primitives for every firing.
 """
 _BANDS_PER_THREAD = 2
-"""Average number of bands of firings for each thread. A thread that has finished a band takes the next one."""
+"""Average number of bands (successive firings that one thread computes) for each thread. A thread that has finished a
+band computes the next one."""
 _MIN_BAND = 32
-"""Least number of firings in a band. Every band searches all clusters nearby, so small bands waste time."""
+"""Least number of firings in a band, which one thread computes. Every band searches all clusters of primitives nearby,
+so small bands waste time."""
 _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
@@ -76,12 +79,12 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     merge: Annotated[Number, "m", (0.0, 10.0)]
     """Distance along the beam below which two surfaces cause one echo."""
     separation: Annotated[Number, "m", (0.0, 10.0)]
-    """Least distance along the beam between two returns of one shot."""
+    """Least distance along the beam between two reported echoes of one shot."""
     returns: Literal["strongest", "last", "dual"] = "strongest"
     """Echoes of a shot that are reported. ``dual``: the strongest and the last one, or the two strongest if the
     strongest is the last."""
     noise: Annotated[Number, "m", (0.0, 1.0)]
-    """Least standard deviation of the range, which strong echoes have."""
+    """Standard deviation of the range of strong echoes."""
     weak_noise: Annotated[Number, "m", (0.0, 1.0)]
     """Standard deviation of the range of the weakest detectable echo; for stronger echoes it decreases with the square
     root of the signal, down to ``noise``."""
@@ -172,7 +175,8 @@ class Lidar:
         threads: int | None = None,
         grid: Callable[[np.ndarray, np.ndarray, float, int, str], RayGrid] = LidarRasterizer,
     ) -> None:
-        """``seed`` and ``name`` determine the noise of each revolution.
+        """Make a lidar with the data sheet ``spec``. ``seed`` and ``name`` together determine the noise of each
+        revolution.
 
         ``threads``: number of CPU threads that share the firings, without effect on the result; None: the number of
         cores that this process may use, at most four. ``grid(elevation, azimuth, step, columns, device)`` makes the
@@ -184,7 +188,8 @@ class Lidar:
         self.device = device
         self.seed = seed
         self.is_exact = False
-        """Whether revolutions that begin later measure exactly, without noise and along the middle of each beam."""
+        """Whether the next revolutions measure exactly, without noise and along the axis of each beam. The revolution
+        that has begun already is not affected."""
         self.revolution = 0
         """Index of the present revolution."""
         self.lasers = len(spec.elevation.value)
@@ -222,7 +227,8 @@ class Lidar:
             self.firings,
             device,
         )
-        """Finds the hits of the rays. It has a column for each firing, with all rays of all lasers' shots as rows."""
+        """Object that finds the surfaces that the rays hit. It has a column for each firing, and a row for each ray of
+        each laser."""
         self._workers = ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1)
         wp.load_module(lidar_echoes, device=device)  # here, because only one thread may load a module at a time
         self._measuring, self._exact = self._receiver_parameters(spec), self._receiver_parameters(spec.ideal())
@@ -276,12 +282,14 @@ class Lidar:
         return self.finish_revolution(pose, time)
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> LidarScan:
-        """Compute a frame as :class:`vinesim.sensors.sensor.Sensor` defines it: one revolution in a world that stands
-        still."""
+        """Compute one revolution from ``pose`` [7] of the lidar in a world that stands still, as the interface
+        :class:`vinesim.sensors.sensor.Sensor` defines a frame."""
         return self.scan(primitives, pose, snapshot.time)
 
     def sweep(self, rate: float | None) -> SpinningScan:
-        """Returns a sweep as :class:`vinesim.sensors.sensor.SweptSensor` defines it: revolutions in a moving world."""
+        """Returns an object that measures revolutions in a moving world, as the interface
+        :class:`vinesim.sensors.sensor.SweptSensor` defines it. ``rate``: number of revolutions to deliver per second
+        [Hz], at most the lidar's own rate, which is the default."""
         return SpinningScan(self, rate)
 
     def begin_revolution(self) -> None:
@@ -347,8 +355,8 @@ class Lidar:
         )
 
     def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
-        """Returns the scan since :meth:`begin_revolution`; ``pose`` [7] and ``time`` [s] are those of the first
-        firing."""
+        """Returns the scan of the firings since :meth:`begin_revolution`. ``pose`` [7], ``time`` [s]: pose of the lidar
+        in the world at its first firing, and time of this firing."""
         labels = self._label.numpy()
         shot, which = np.nonzero(labels >= 0)
         self.revolution += 1
