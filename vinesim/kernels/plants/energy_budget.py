@@ -125,8 +125,8 @@ def choose_budget(
     scratch_out: Scratch,
     tree_budget_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per tree. Choose how the tree's energy is watched: closely if its springs are weak or it is hardly
-    damped.
+    """One thread per tree. Choose how often the tree's energy is checked: it is watched closely if the tree's springs
+    are weak or hardly damped.
 
     trees: [thread] index of the tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or
     :data:`NO_BUDGET` with a floating root or without geometric stiffness. scratch_out: scratch; later kernels do not

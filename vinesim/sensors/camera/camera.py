@@ -81,8 +81,8 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
         """Returns the intrinsics, with the principal point in the middle of the picture.
 
-        ``scale``: factor on width and height; ``size``: width and height [px] that replace the camera's, with an equal
-        horizontal field of view.
+        ``scale``: factor on width, height and focal lengths. ``size``: width and height [px] instead of the camera's
+        own, with an equal horizontal field of view; ``scale`` is then not used.
         """
         width = round(self.width.value * scale)
         height = round(self.height.value * scale)
@@ -116,8 +116,9 @@ class Quality:
     shadow_texel_divisor: int
     """Divisor of the texel size of the near shadow map; 2 doubles the map's resolution."""
     is_live: bool
-    """Whether, on a CPU, eight points are shaded at once (:mod:`vinesim.sensors.camera.live_light`), and the second
-    view of a stereo camera is computed from the first one instead of rendered."""
+    """Whether two faster methods are used on a CPU: eight points are shaded at once
+    (:mod:`vinesim.sensors.camera.live_light`), and the depth in view of a stereo camera's second imager is computed
+    from the depth of the first imager instead of rendered."""
 
 
 QUALITIES = {
@@ -146,7 +147,8 @@ def load_camera_kernels() -> None:
 
 @dataclasses.dataclass
 class Camera:
-    """One RGB-D camera, which renders frames of the vineyard's primitives from given poses."""
+    """One RGB-D camera, which renders frames of the vineyard's primitives (analytic shapes such as cones and leaves)
+    from given poses."""
 
     spec: CameraSpec
     info: CameraInfo
@@ -154,7 +156,7 @@ class Camera:
     sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
     """Unit vector towards the sun, or a function from simulated time [s] to that vector."""
     quality: str = "full"
-    """Name of one of :data:`QUALITIES`."""
+    """Cost and look of the picture, a key of :data:`QUALITIES`: ``fast``, ``full`` or ``still``."""
     shadow_period: float | None = None
     """Period [s] at which the shadows of moving objects are rendered again; 0: in every frame; None: 0.2, or 0 with the
     quality ``still``."""
@@ -166,7 +168,7 @@ class Camera:
     does not depend on this number."""
     seed: int = 0
     image_index: int = 0
-    """Index of the next image. The seed, the camera's name and this index determine the noise of a measurement."""
+    """Index of the next image. The seed, the camera's name and this index determine the noise of the measured depth."""
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
@@ -335,8 +337,8 @@ class Camera:
     def update_shadows(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0
     ) -> tuple[ShadowMap, ShadowMap]:
-        """Returns the near and the far shadow map, after redrawing each map that is no longer valid at ``time`` [s] for
-        a camera at ``pose`` [7]."""
+        """Returns the near and the far shadow map for a camera at ``pose`` [7] at ``time`` [s]. A map that is no longer
+        valid for this pose and time is rendered again before."""
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         return self._sunlight.update(primitives, pose[:3], forward, time)
 

@@ -96,7 +96,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     flicker: Annotated[Number, "1", (0.0, 2.0)]
     """Standard deviation of the logarithm of the signal, from shot to shot."""
     reflectance: dict[str, Annotated[Number, "1"]]
-    """Diffuse reflectance of each organ, by its name in lower case."""
+    """Diffuse reflectance of each class of object: by name of an :class:`~vinesim.scene.ids.Organ` in lower case."""
 
     @classmethod
     def load(cls, name: str) -> LidarSpec:
@@ -128,8 +128,8 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return spec
 
     def ideal(self) -> LidarSpec:
-        """Returns the data sheet of a lidar with equal firings whose beams have no width, measure exactly and detect
-        every echo."""
+        """Returns the data sheet of an ideal lidar with the same firing times and angles: its beams have no width, it
+        measures exactly, and it detects every echo."""
 
         def but(number: Number, value: float) -> Number:
             return msgspec.structs.replace(number, value=value)
@@ -142,15 +142,16 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class RayGrid(Protocol):
-    """Interface of an object that finds the surfaces that the rays of a spinning head hit, such as
-    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer`."""
+    """Interface of an object that finds the surfaces that the rays of a spinning lidar head hit, such as
+    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer`. A column has the rays of one firing, a row the
+    rays of one direction relative to the head."""
 
     direction: wp.array
     """[column * row] Unit vectors of the rays, in the head's frame."""
     distance: wp.array
     """[column * row] Distance to the nearest hit of each ray [m]."""
     primitive: wp.array
-    """[column * row] Index of the primitive that each ray hits; -2: the ground, -1: no hit."""
+    """[column * row] Index of the primitive (shape) that each ray hits; -2: the ground, -1: no hit."""
 
     def cast(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
         """Compute distances and primitives of ``count`` columns from column ``first`` on, with the head at ``pose``
@@ -162,7 +163,7 @@ class RayGrid(Protocol):
 
 
 class Lidar:
-    """One spinning lidar: its table of firings, and the returns of the present revolution."""
+    """One spinning lidar: the times and angles of its shots, and the returns of the present revolution."""
 
     def __init__(
         self,
@@ -204,7 +205,7 @@ class Lidar:
         elevation = np.radians(spec.elevation.value)
         order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
         self.ring = np.tile(order, self.firings).astype(np.uint16)
-        """[shot] Ring of each shot; 0 for the lowest laser."""
+        """[shot] Number of the laser of each shot, counted from 0 for the lowest laser."""
         # the head turns clockwise seen from above; the first shot looks forward
         beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
         azimuth = beside - 2.0 * np.pi * spec.rate.value * within
@@ -241,7 +242,8 @@ class Lidar:
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
 
     def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the angles [ray] rad across and up of each ray of a shot from the beam's axis.
+        """Returns the angles of the rays that sample one shot, from the beam's axis: [ray] rad sideways and [ray] rad
+        upwards.
 
         The first ray is along the axis, all others are on a ring around it. Each ray represents an equal share of the
         energy of a Gaussian beam.
