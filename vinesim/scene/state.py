@@ -37,8 +37,8 @@ class State(StructOfArrays):
 
     @classmethod
     def at_rest(cls, model: Model) -> State:
-        """Returns the state with all trees asleep in their equilibrium under gravity (``Model.joint_settled``), with
-        zero rates."""
+        """Returns the state with all trees asleep and without motion in the shape that their generator or builder
+        gave them (``Model.joint_settled``)."""
         counts = model.counts()
         state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
         state.joint_q[:] = model.joint_settled
