@@ -7,10 +7,14 @@ This is an ordinary ROS 2 node. It takes each connected area with the colour of 
 camera's optical frame, in metres.
 """
 
+import signal
+import threading
+
 import cv2
 import numpy as np
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 
@@ -54,6 +58,20 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
     return places
 
 
+def main() -> None:
+    # Ctrl-C and SIGTERM only set a flag, so that a callback that is running can still publish.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = BunchFinder()
+    try:
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
 if __name__ == "__main__":
-    rclpy.init()
-    rclpy.spin(BunchFinder())
+    main()
