@@ -45,7 +45,7 @@ def field_of(message: Any, path: str) -> Any:
 
     Raises :class:`vinesim.core.errors.UsageError` if the message has no such field.
     """
-    value = message
+    value: Any = message
     done = ""
     for name, index in re.findall(r"([^.\[\]]+)|\[(-?\d+)\]", path):
         place = f"in {done}" if done else f"of {_type_name(message)}"

@@ -1,0 +1,98 @@
+"""``python -m benchmarks example_signals``: sends SIGINT and SIGTERM to the ROS examples at random moments, and checks
+that they end in order (Linux).
+
+The examples run against a real client. A signal comes up to :data:`LONGEST_RUN` after the example has set its handlers,
+so some signals come while ROS starts. A run is clean if the example ends within :data:`BOUND` with exit code 0, and if
+its output has no traceback and no error of ROS.
+"""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from benchmarks.support.example_programs import NAMES, handles_sigterm, start_example
+from vinesim.client.programs import program_group
+from vinesim.scene.values import Measurement
+
+BOUND = 2.0
+"""Largest accepted time from the signal to the end of the process [s]."""
+LONGEST_RUN = 4.0
+"""Signals come at random moments within this time [s]."""
+START_TIMEOUT = 60.0
+"""Longest time until an example has set its handlers [s]."""
+UNCLEAN = ("Traceback", "Error", "Exception", "invalid")
+"""Words in the output of an example that did not end in order."""
+
+
+def example_signals(
+    runs: int, seed: int = 1, announce: Callable[[str], None] = lambda _: None, names: Sequence[str] = NAMES
+) -> Iterator[Measurement]:
+    """Run each example ``runs`` times, half of them with SIGINT, half with SIGTERM. Yields for each example the number
+    of clean runs and the longest time until the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        os.environ |= {
+            "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+            "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+            "ROS_LOG_DIR": folder,
+        }
+        rng = np.random.default_rng(seed)
+        with program_group() as group:
+            group.start(
+                *("client", "-m", "vinesim", "client", "--role", "robot", "--scene", "harvest", "--status", "none")
+            )
+            for name in names:
+                faults: list[str] = []
+                times: list[float] = []
+                for run in range(runs):
+                    number = (signal.SIGINT, signal.SIGTERM)[run % 2]
+                    delay = float(rng.uniform(0.0, LONGEST_RUN))
+                    took, fault = end_by_signal(name, number, delay, pathlib.Path(folder))
+                    times.append(took)
+                    if fault:
+                        faults.append(f"{number.name} after {delay:.2f} s: {fault}")
+                        announce(f"{name}: {faults[-1]}")
+                announce(f"{name}: {runs - len(faults)} of {runs} clean, at most {max(times):.2f} s")
+                clean = runs - len(faults)
+                yield Measurement("example_signals", f"{name}: clean ends", clean, "runs", "bar", runs, clean / runs)
+                longest = max(times)
+                yield Measurement(
+                    "example_signals", f"{name}: longest end", longest, "s", "bar", BOUND, BOUND / max(longest, 1e-9)
+                )
+
+
+def end_by_signal(name: str, number: signal.Signals, delay: float, folder: pathlib.Path) -> tuple[float, str]:
+    """Start an example and send it a signal ``delay`` [s] after it has set its handlers. Returns the time until the
+    end [s], and what was wrong, an empty text if nothing was."""
+    with (folder / "output").open("w+") as output:
+        example = start_example(name, folder=folder, output=output)
+        try:
+            started = time.monotonic()
+            while not handles_sigterm(example.pid):
+                if example.poll() is not None or time.monotonic() > started + START_TIMEOUT:
+                    output.seek(0)
+                    return 0.0, f"did not start: {' '.join(output.read().split())[-300:]}"
+                time.sleep(0.002)
+            time.sleep(delay)
+            sent = time.monotonic()
+            example.send_signal(number)
+            try:
+                code = example.wait(5.0 * BOUND)
+            except subprocess.TimeoutExpired:
+                return time.monotonic() - sent, "still runs"
+            took = time.monotonic() - sent
+        finally:
+            example.kill()
+            example.wait()
+        output.seek(0)
+        text = output.read()
+    if code != 0 or any(word in text for word in UNCLEAN):
+        return took, f"exit code {code}: {' '.join(text.split())[-300:]}"
+    return took, f"took {took:.2f} s" if took > BOUND else ""
