@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import pathlib
+import resource
 import signal
 import subprocess
 import tempfile
@@ -19,15 +20,13 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from benchmarks.support.example_programs import NAMES, handles_sigterm, start_example
-from vinesim.client.programs import program_group
+from vinesim.client.programs import START_TIMEOUT, RosListener, program_group
 from vinesim.scene.values import Measurement
 
 BOUND = 2.0
 """Largest accepted time from the signal to the end of the process [s]."""
 LONGEST_RUN = 4.0
 """Signals come at random moments within this time [s]."""
-START_TIMEOUT = 60.0
-"""Longest time until an example has set its handlers [s]."""
 UNCLEAN = ("Traceback", "Error", "Exception", "invalid")
 """Words in the output of an example that did not end in order."""
 
@@ -45,32 +44,38 @@ def example_signals(
         }
         rng = np.random.default_rng(seed)
         with program_group() as group:
+            listener = RosListener(group, (), once=["/joint_states"])
             group.start(
                 *("client", "-m", "vinesim", "client", "--role", "robot", "--scene", "harvest", "--status", "none")
             )
+            while listener.missing():
+                time.sleep(0.1)
+            listener.stop()
             for name in names:
                 faults: list[str] = []
-                times: list[float] = []
+                ends: list[tuple[float, float]] = []
                 for run in range(runs):
                     number = (signal.SIGINT, signal.SIGTERM)[run % 2]
                     delay = float(rng.uniform(0.0, LONGEST_RUN))
-                    took, fault = end_by_signal(name, number, delay, pathlib.Path(folder))
-                    times.append(took)
+                    *times, fault = end_by_signal(name, number, delay, pathlib.Path(folder))
+                    ends.append((times[0], times[1]))
                     if fault:
                         faults.append(f"{number.name} after {delay:.2f} s: {fault}")
                         announce(f"{name}: {faults[-1]}")
-                announce(f"{name}: {runs - len(faults)} of {runs} clean, at most {max(times):.2f} s")
+                longest, busiest = (max(column) for column in zip(*ends, strict=True))
+                announce(f"{name}: {runs - len(faults)} of {runs} clean, at most {longest:.2f} s")
                 clean = runs - len(faults)
                 yield Measurement("example_signals", f"{name}: clean ends", clean, "runs", "bar", runs, clean / runs)
-                longest = max(times)
                 yield Measurement(
                     "example_signals", f"{name}: longest end", longest, "s", "bar", BOUND, BOUND / max(longest, 1e-9)
                 )
+                load = f"load {os.getloadavg()[0]:.0f} on {os.cpu_count()} cores"
+                yield Measurement("example_signals", f"{name}: most processor time of an end; {load}", busiest, "s")
 
 
-def end_by_signal(name: str, number: signal.Signals, delay: float, folder: pathlib.Path) -> tuple[float, str]:
-    """Start an example and send it a signal ``delay`` [s] after it has set its handlers. Returns the time until the
-    end [s], and what was wrong, an empty text if nothing was."""
+def end_by_signal(name: str, number: signal.Signals, delay: float, folder: pathlib.Path) -> tuple[float, float, str]:
+    """Start an example and send it a signal ``delay`` [s] after it has set its handlers. Returns wall time
+    and processor time from the signal to the end [s], and what was wrong, an empty text if nothing was."""
     with (folder / "output").open("w+") as output:
         example = start_example(name, folder=folder, output=output)
         try:
@@ -78,21 +83,35 @@ def end_by_signal(name: str, number: signal.Signals, delay: float, folder: pathl
             while not handles_sigterm(example.pid):
                 if example.poll() is not None or time.monotonic() > started + START_TIMEOUT:
                     output.seek(0)
-                    return 0.0, f"did not start: {' '.join(output.read().split())[-300:]}"
+                    return 0.0, 0.0, f"did not start: {' '.join(output.read().split())[-300:]}"
                 time.sleep(0.002)
             time.sleep(delay)
+            busy = _processor_time(example.pid) + _children_time()
             sent = time.monotonic()
             example.send_signal(number)
             try:
                 code = example.wait(5.0 * BOUND)
             except subprocess.TimeoutExpired:
-                return time.monotonic() - sent, "still runs"
+                return time.monotonic() - sent, 0.0, "still runs"
             took = time.monotonic() - sent
+            busy = _children_time() - busy
         finally:
             example.kill()
             example.wait()
         output.seek(0)
         text = output.read()
     if code != 0 or any(word in text for word in UNCLEAN):
-        return took, f"exit code {code}: {' '.join(text.split())[-300:]}"
-    return took, f"took {took:.2f} s" if took > BOUND else ""
+        return took, busy, f"exit code {code}: {' '.join(text.split())[-300:]}"
+    return took, busy, f"took {took:.2f} s" if took > BOUND else ""
+
+
+def _processor_time(process: int) -> float:
+    """Returns the processor time that a process has used [s]."""
+    fields = pathlib.Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _children_time() -> float:
+    """Returns the processor time of all ended child processes [s]."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
