@@ -1,6 +1,6 @@
 """Makes a robot's left arm compliant: the arm gives way when something pushes it, and comes back.
 
-    vinesim client --role robot --name vinebot           # in one terminal
+    vinesim client --role robot --scene harvest          # in one terminal
     python examples/ros/compliant_arm.py                 # in another
 
 This is an ordinary ROS 2 node. It holds the arm at its present pose with low stiffness, and prints when a joint gives
@@ -31,7 +31,7 @@ class CompliantArm(Node):
         self.equilibrium: list[float] = []
         self.is_pushed = False
         self.topics = {
-            what: self.create_publisher(Float64MultiArray, f"/{arm}_impedance_controller/{what}", 1)
+            what: self.create_publisher(Float64MultiArray, f"/{arm}_impedance_controller/{what}", 10)
             for what in ("stiffness", "damping", "equilibrium")
         }
         self.create_subscription(JointState, "/joint_states", self.take, 10)

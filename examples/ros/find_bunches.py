@@ -1,6 +1,6 @@
 """Finds bunches in a robot's colour and depth images, and prints their positions.
 
-    vinesim client --role robot --scene demo             # in one terminal
+    vinesim client --role robot --scene harvest          # in one terminal
     python examples/ros/find_bunches.py                  # in another
 
 This is an ordinary ROS 2 node. It takes each connected area with the colour of fruit as a bunch. Positions are in the
@@ -23,7 +23,7 @@ class BunchFinder(Node):
         super().__init__("find_bunches")
         self.parts: dict[str, Image | CameraInfo] = {}
         for kind, topic in ((Image, "rgb/image_raw"), (Image, "depth/image_raw"), (CameraInfo, "rgb/camera_info")):
-            self.create_subscription(kind, f"{camera}/{topic}", lambda m, t=topic: self.take(t, m), 5)
+            self.create_subscription(kind, f"{camera}/{topic}", lambda m, t=topic: self.take(t, m), 10)
 
     def take(self, topic: str, message: Image | CameraInfo) -> None:
         """Store a message. Find bunches once colour, depth and intrinsics with the same header stamp have arrived."""

@@ -1,7 +1,7 @@
 """Localises a robot without ground truth, from gyroscope and odometry, and publishes the transform map to odom on /tf.
 
-    vinesim client --role robot --name vinebot           # in one terminal
-    python examples/ros/localise.py vinebot              # in another
+    vinesim client --role robot --scene harvest          # in one terminal
+    python examples/ros/localise.py                      # in another
 
 This is an ordinary ROS 2 node. It integrates the yaw rate of the IMU and the velocity of odometry. It sets a parameter
 so that the robot no longer publishes its true pose. The origin of the map is the pose of the robot at the start.
@@ -76,7 +76,7 @@ def main() -> None:
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = Localiser(sys.argv[1] if len(sys.argv) > 1 else "vinebot")
+    node = Localiser(sys.argv[1] if len(sys.argv) > 1 else "robot")
     try:
         while not stop.is_set():
             rclpy.spin_once(node, timeout_sec=0.1)

@@ -209,7 +209,7 @@ def ros_call(
     \b
     Examples:
       vinesim ros call /get_simulation_state
-      vinesim ros call /get_entity_state '{"entity": "vinebot"}'
+      vinesim ros call /get_entity_state '{"entity": "robot"}'
     """
     from vinesim.cli.ros import call
 
