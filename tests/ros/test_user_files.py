@@ -10,6 +10,7 @@ import pathlib
 import queue
 import re
 import runpy
+import shlex
 import shutil
 import signal
 import subprocess
@@ -26,6 +27,7 @@ import pytest
 from benchmarks.example_signals import BOUND, UNCLEAN
 from benchmarks.ros_pick import lies_in_a_box
 from benchmarks.support.example_programs import EXAMPLES, NAMES, handles_sigterm, start_example
+from tests.support import programs
 from tests.support.waiting import deadline
 from vinesim.ros import middleware
 
@@ -521,6 +523,72 @@ def test_a_robot_without_a_server_shows_no_area_of_interest(robot: StockNode) ->
     wait_until(lambda: heard, lambda: robot.spin(0.05), "markers")
     robot.node.destroy_subscription(subscription)
     assert {one.ns for one in heard[-1].markers} == {"contacts"}
+
+
+# ---------------------------------------------------------------- the commands vinesim ros
+
+
+def tutorial_commands() -> dict[str, list[str]]:
+    """What the tutorial gives to ``vinesim ros``, by the command's name and its first argument."""
+    found = {}
+    for line in (ROOT / "docs" / "tutorials" / "robot.md").read_text().splitlines():
+        if re.match("vinesim ros (topics|hz|echo|pub|call) ", line):
+            words = shlex.split(line, comments=True)[2:]
+            found[" ".join(words[:2])] = words
+    return found
+
+
+@contextlib.contextmanager
+def ros_command(words: list[str], number: signal.Signals = signal.SIGINT) -> Iterator[programs.Popen]:
+    """Run ``vinesim ros`` with these words, and end it by a signal, as users do: in order, with exit code 0."""
+    with programs.Popen(
+        [sys.executable, "-m", "vinesim", "ros", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as command:
+        try:
+            yield command
+            command.send_signal(number)
+            _, said = command.communicate(timeout=deadline(30.0))
+            assert (command.returncode, "Traceback" in said) == (0, False), said
+        finally:
+            command.kill()
+
+
+def test_the_commands_of_the_tutorial_do_what_it_says(robot: StockNode) -> None:
+    """They list and measure topics, print and publish messages, and call a service of the running robot."""
+    commands = tutorial_commands()
+    assert {name.split()[0] for name in commands} == {"topics", "hz", "echo", "pub", "call"}
+
+    def run(name: str) -> str:
+        command = [sys.executable, "-m", "vinesim", "ros", *commands[name]]
+        done = programs.run(command, timeout=deadline(60.0))
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    listed = run("topics --types")
+    assert re.search(r"^/joint_states +sensor_msgs/msg/JointState  1 -> \d+$", listed, re.MULTILINE)
+    place = yaml.safe_load(run("echo /mobile_base_controller/odom").removesuffix("---\n"))
+    assert place.keys() == {"x", "y", "z"}
+    state = yaml.safe_load(run("call /get_entity_state"))
+    assert state["result"]["result"] == 1
+    assert state["state"]["pose"]["position"]["x"] == pytest.approx(5.0, abs=3.0)  # in the alley
+    with ros_command(commands["hz /joint_states"]) as command:
+        line = command.stdout.readline()
+        rate = re.match(r"(\d+\.\d\d) Hz  gaps \d+\.\d to \d+\.\d ms, standard deviation", line)
+        assert rate, line
+        assert 1.0 < float(rate[1]) < 120.0  # 100 on an idle machine
+    odometry: list[Odometry] = []
+    subscription = robot.node.create_subscription(Odometry, "/mobile_base_controller/odom", odometry.append, 10)
+    with ros_command(commands["pub /mobile_base_controller/cmd_vel"], signal.SIGTERM) as command:
+        assert command.stdout.readline() == "publishing to /mobile_base_controller/cmd_vel at 10 Hz; Ctrl-C ends it\n"
+        wait_until(
+            lambda: odometry and odometry[-1].twist.twist.linear.x > 0.15,
+            lambda: robot.spin(0.05),
+            "a robot that drives",
+        )
+    wait_until(lambda: abs(odometry[-1].twist.twist.linear.x) < 1e-3, lambda: robot.spin(0.05), "rest")
+    robot.node.destroy_subscription(subscription)
+    with example("battery_light.py") as printed, ros_command(commands["pub /battery_state"]):
+        wait_until(lambda: printed() == ["warning"], lambda: robot.spin(0.05), "a warning")
 
 
 # ---------------------------------------------------------------- the folder ros/

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import itertools
+import os
 import pathlib
 import statistics
+import sys
 import threading
 import time
 from collections import deque
@@ -116,6 +118,11 @@ def topics(namespace: str, with_types: bool) -> int:
         found = node.topics()
     if stop.is_set():
         return 130
+    if not found:
+        where = (
+            f"{f'namespace {namespace} of ' if namespace else ''}ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}"
+        )
+        print(f"no topics in {where}; start a robot, or set the domain of the robot", file=sys.stderr)
     width = max((len(name) for name, *_ in found), default=0)
     for name, type_name, publishers, subscribers in found:
         print(f"{name:{width}}  {type_name}  {publishers} -> {subscribers}" if with_types else name)

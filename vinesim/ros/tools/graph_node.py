@@ -28,6 +28,10 @@ DISCOVERY_TIME = 10.0
 """Longest time in which a named topic or service must appear [s]."""
 SETTLED = 1.0
 """Time without a new topic after which the list of topics counts as complete [s]."""
+SILENCE = 5.0
+"""Time without any topic after which the list of topics counts as empty [s]."""
+OWN_TOPIC = "/parameter_events"
+"""Topic that every node publishes, this one as well."""
 POLL_PERIOD = 0.05
 """Longest time between two checks whether the program is to stop [s]."""
 QUEUE_DEPTH = 100
@@ -77,19 +81,25 @@ class GraphNode:
 
     def topics(self) -> list[tuple[str, str, int, int]]:
         """Returns name, type, number of publishers and number of subscribers of each topic in the namespace, sorted by
-        name, once no topic has appeared for :data:`SETTLED` seconds."""
+        name, once no topic has appeared for :data:`SETTLED` seconds. Topics of actions are left out, as by
+        ``ros2 topic list``."""
         found: dict[str, list[str]] = {}
-        changed = time.monotonic()
-        while time.monotonic() < changed + SETTLED and not self._is_stopped():
-            self.spin()
-            now = dict(self._node.get_topic_names_and_types())
-            if now.keys() - found.keys():
-                changed = time.monotonic()
-            found = now
+        began = changed = time.monotonic()
+        with ProgressLine() as progress:
+            while not self._is_stopped() and time.monotonic() < (changed + SETTLED if found else began + SILENCE):
+                self.spin()
+                now = {
+                    name: types
+                    for name, types in self._node.get_topic_names_and_types()
+                    if name.startswith(f"{self._namespace}/") and name != OWN_TOPIC and "/_action/" not in name
+                }
+                if now.keys() - found.keys():
+                    changed = time.monotonic()
+                found = now
+                progress.show(f"looking for topics: {len(found)} so far")
         return [
             (name, types[0], self._node.count_publishers(name), self._node.count_subscribers(name))
             for name, types in sorted(found.items())
-            if name.startswith(f"{self._namespace}/")
         ]
 
     def subscribe(self, topic: str) -> Iterator[tuple[bytes, dict[str, Any]] | None]:
