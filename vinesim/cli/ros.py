@@ -119,10 +119,12 @@ def topics(namespace: str, with_types: bool) -> int:
     if stop.is_set():
         return 130
     if not found:
-        where = (
-            f"{f'namespace {namespace} of ' if namespace else ''}ROS_DOMAIN_ID {os.environ.get('ROS_DOMAIN_ID', '0')}"
+        where = f"namespace {namespace} of " if namespace else ""
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        print(
+            f"no topics in {where}ROS_DOMAIN_ID {domain}; start a robot, or set the domain of the robot",
+            file=sys.stderr,
         )
-        print(f"no topics in {where}; start a robot, or set the domain of the robot", file=sys.stderr)
     width = max((len(name) for name, *_ in found), default=0)
     for name, type_name, publishers, subscribers in found:
         print(f"{name:{width}}  {type_name}  {publishers} -> {subscribers}" if with_types else name)
@@ -138,11 +140,12 @@ def hz(topic: str, namespace: str, seconds: float | None) -> int:
     stop = stop_at_signals(threading.Event())
     times: deque[int] = deque(maxlen=HZ_WINDOW)
     count = told = 0
-    reported = time.monotonic()
+    reported: float | None = None
     began: float | None = None
     with GraphNode(stop.is_set, namespace) as node:
         for taken in node.subscribe(topic):
             now = time.monotonic()
+            reported = now if reported is None else reported
             if taken is not None:
                 began = now if began is None else began
                 count += 1
