@@ -121,12 +121,16 @@ class Robot:
     def _take_environment(self, message: TFMessage) -> None:
         self.environment = poses_of(message)
 
+    def check(self) -> None:
+        """Raise StopRequest if the program is to end; long computations call this function, too."""
+        if self.stop.is_set():
+            raise StopRequest
+
     def spin(self, seconds: float) -> None:
         """Receive messages for a time [s]. Raises StopRequest if the program is to end."""
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0.0:
-            if self.stop.is_set():
-                raise StopRequest
+            self.check()
             rclpy.spin_once(self.node, timeout_sec=min(left, 0.1))
 
     def until(self, done, timeout: float, what: str) -> None:
@@ -245,6 +249,7 @@ class Arm:
         solutions, it is one near the home positions. Raises RuntimeError if the hand cannot reach the pose."""
         off = np.zeros(6)
         for count in range(60):
+            self.robot.check()
             here, jacobian = self.hand(q)
             off = np.r_[goal[:3, 3] - here[:3, 3], rotation_vector(goal[:3, :3] @ here[:3, :3].T)]
             if np.linalg.norm(off[:3]) < 5e-4 and np.linalg.norm(off[3:]) < 5e-3:
@@ -338,8 +343,10 @@ def bunches_by_room(robot: Robot) -> list[tuple[str, str, np.ndarray, float]]:
     between them and other bunches come first."""
     bunches = {name: frame for name, frame in robot.environment.items() if name.startswith("bunch")}
     middles = np.array([frame[:3, 3] + 0.08 * frame[:3, 0] for frame in bunches.values()])  # x points down the rachis
+    here = robot.base()[:2, 3]
     found = []
     for name, frame in bunches.items():
+        robot.check()
         hold = frame[:3, 3] + DEPTH * frame[:3, 0]
         if not 1.34 < hold[2] < 1.68 or frame[2, 0] > -0.95:
             continue
@@ -351,7 +358,7 @@ def bunches_by_room(robot: Robot) -> list[tuple[str, str, np.ndarray, float]]:
                     local = (middles - hold) @ turn  # in axes of the base
                     beyond = np.maximum(np.array([-0.45, -0.11, -0.15]) - local, local - np.array([0.06, 0.11, 0.15]))
                     apart = np.sort(np.linalg.norm(np.maximum(beyond, 0.0), axis=1))[1]  # the first is the bunch itself
-                    far = np.linalg.norm(place - robot.base()[:2, 3])
+                    far = np.linalg.norm(place - here)
                     found.append((min(apart, 0.12) - 0.01 * far, name, side, place, heading))
     found.sort(key=lambda entry: -entry[0])
     return [entry[1:] for entry in found]
