@@ -2,8 +2,9 @@
 that they end in order (Linux).
 
 The examples run against a real client. A signal comes up to :data:`LONGEST_RUN` after the example has set its handlers,
-so some signals come while ROS starts. A run is clean if the example ends within :data:`BOUND` with exit code 0, and if
-its output has no traceback and no error of ROS.
+so some signals come while ROS starts. A run ends in order if its exit code is 0, and if its output has no traceback and
+no error of ROS. On a machine with many other processes, the wall time until the end measures these processes as well;
+the processor time does not.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from vinesim.scene.values import Measurement
 
 BOUND = 2.0
 """Largest accepted time from the signal to the end of the process [s]."""
+LONGEST_END = 60.0
+"""Time after which an example that still runs is killed [s]."""
 LONGEST_RUN = 4.0
 """Signals come at random moments within this time [s]."""
 UNCLEAN = ("Traceback", "Error", "Exception", "invalid")
@@ -34,8 +37,8 @@ UNCLEAN = ("Traceback", "Error", "Exception", "invalid")
 def example_signals(
     runs: int, seed: int = 1, announce: Callable[[str], None] = lambda _: None, names: Sequence[str] = NAMES
 ) -> Iterator[Measurement]:
-    """Run each example ``runs`` times, half of them with SIGINT, half with SIGTERM. Yields for each example the number
-    of clean runs and the longest time until the end."""
+    """Run each example ``runs`` times, half of them with SIGINT, half with SIGTERM. Yields for each example how many
+    runs ended in order, how many ended within :data:`BOUND`, and the longest times until the end."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ |= {
             "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
@@ -63,9 +66,11 @@ def example_signals(
                         faults.append(f"{number.name} after {delay:.2f} s: {fault}")
                         announce(f"{name}: {faults[-1]}")
                 longest, busiest = (max(column) for column in zip(*ends, strict=True))
-                announce(f"{name}: {runs - len(faults)} of {runs} clean, at most {longest:.2f} s")
-                clean = runs - len(faults)
-                yield Measurement("example_signals", f"{name}: clean ends", clean, "runs", "bar", runs, clean / runs)
+                announce(f"{name}: {runs - len(faults)} of {runs} in order, at most {longest:.2f} s")
+                in_time = sum(took <= BOUND for took, _ in ends)
+                for what, count in ("in order", runs - len(faults)), (f"within {BOUND:g} s", in_time):
+                    case = f"{name}: ends {what}"
+                    yield Measurement("example_signals", case, count, "runs", "bar", runs, count / runs)
                 yield Measurement(
                     "example_signals", f"{name}: longest end", longest, "s", "bar", BOUND, BOUND / max(longest, 1e-9)
                 )
@@ -90,7 +95,7 @@ def end_by_signal(name: str, number: signal.Signals, delay: float, folder: pathl
             sent = time.monotonic()
             example.send_signal(number)
             try:
-                code = example.wait(5.0 * BOUND)
+                code = example.wait(LONGEST_END)
             except subprocess.TimeoutExpired:
                 return time.monotonic() - sent, 0.0, "still runs"
             took = time.monotonic() - sent
@@ -102,7 +107,7 @@ def end_by_signal(name: str, number: signal.Signals, delay: float, folder: pathl
         text = output.read()
     if code != 0 or any(word in text for word in UNCLEAN):
         return took, busy, f"exit code {code}: {' '.join(text.split())[-300:]}"
-    return took, busy, f"took {took:.2f} s" if took > BOUND else ""
+    return took, busy, ""
 
 
 def _processor_time(process: int) -> float:
