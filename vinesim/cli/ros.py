@@ -176,8 +176,6 @@ def echo(topic: str, namespace: str, field: str | None, once: bool, full: bool) 
     """Print the messages of a topic as YAML until Ctrl-C. Returns the exit code."""
     if _is_ros_missing():
         return 3
-    from rclpy.serialization import deserialize_message
-
     from vinesim.ros.tools.graph_node import GraphNode
     from vinesim.ros.tools.plain_values import field_of, to_plain
 
@@ -186,7 +184,7 @@ def echo(topic: str, namespace: str, field: str | None, once: bool, full: bool) 
         for taken in node.subscribe(topic):
             if taken is None:
                 continue
-            message: Any = deserialize_message(taken[0], node.message_type(topic))
+            message = node.message(topic, taken[0])
             print(_yaml(to_plain(field_of(message, field) if field else message, full=full)) + "---", flush=True)
             if once:
                 return 0

@@ -15,6 +15,7 @@ from rclpy.exceptions import InvalidNamespaceException, InvalidServiceNameExcept
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from rclpy.validate_full_topic_name import validate_full_topic_name
 
@@ -62,6 +63,7 @@ class GraphNode:
         middleware.configure(large_messages=False)
         message_packages.ensure_importable(message_packages.available_packages())
         self._is_stopped = is_stopped
+        self._classes: dict[str, type] = {}
         self._context = Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
         try:
@@ -110,7 +112,8 @@ class GraphNode:
         self._await("topic", name, lambda: self._node.count_publishers(name) > 0)
         if self._is_stopped():
             return
-        message = self.message_type(topic)
+        message = _class_of(name, dict(self._node.get_topic_names_and_types())[name])
+        self._classes[name] = message
         offered = self._node.get_publishers_info_by_topic(name)
         subscription = self._node.create_subscription(
             message, name, lambda _: None, offered_qos(offered, QUEUE_DEPTH), raw=True
@@ -122,10 +125,9 @@ class GraphNode:
                 self._sleep_until(lambda: False, 0.2 * POLL_PERIOD)
             yield taken
 
-    def message_type(self, topic: str) -> type:
-        """Returns the class of a topic's messages. The topic must have been discovered."""
-        name = self._full_name(topic)
-        return _class_of(name, dict(self._node.get_topic_names_and_types())[name])
+    def message(self, topic: str, serialised: bytes) -> Any:
+        """Returns a message that :meth:`subscribe` yielded for the topic, deserialised."""
+        return deserialize_message(serialised, self._classes[self._full_name(topic)])
 
     def publish(self, topic: str, make: Callable[[type], Any], rate: float, type_name: str | None) -> Iterator[int]:
         """Publish a message ``rate`` times a second until the program is to stop. Yields the number of messages sent.
