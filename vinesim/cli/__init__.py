@@ -25,7 +25,19 @@ from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
-from vinesim.cli.commands.tools import bench, certs_new, doctor, ros_build_interfaces, ros_play, ros_record
+from vinesim.cli.commands.tools import (
+    bench,
+    certs_new,
+    doctor,
+    ros_build_interfaces,
+    ros_call,
+    ros_echo,
+    ros_hz,
+    ros_play,
+    ros_pub,
+    ros_record,
+    ros_topics,
+)
 from vinesim.cli.commands.tuning import experiment, track, tune
 from vinesim.core import allocator, progress
 
@@ -38,7 +50,7 @@ app = typer.Typer(
     epilog="Start with: vinesim demo",
 )
 scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Vineyards: contents of a scene file.")
-ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
+ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: topics, services, message packages.")
 certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certificates for secured links.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
@@ -50,6 +62,11 @@ scene_app.command("import-plant")(scene_import_plant)
 ros_app.command("build-interfaces")(ros_build_interfaces)
 ros_app.command("record")(ros_record)
 ros_app.command("play")(ros_play)
+ros_app.command("topics")(ros_topics)
+ros_app.command("hz")(ros_hz)
+ros_app.command("echo")(ros_echo)
+ros_app.command("pub")(ros_pub)
+ros_app.command("call")(ros_call)
 certs_app.command("new")(certs_new)
 
 
