@@ -43,8 +43,9 @@ certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certi
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
 app.add_typer(certs_app, name="certs")
-for command in (demo, server, client, record, replay, render, dataset, track, tune, experiment, bench, doctor, examples):
+for command in (demo, server, client, record, replay, render, dataset, track, tune, experiment, bench, doctor):
     app.command()(command)
+app.command()(examples)
 scene_app.command("show")(scene_show)
 scene_app.command("import-plant")(scene_import_plant)
 ros_app.command("build-interfaces")(ros_build_interfaces)

@@ -1,4 +1,4 @@
-"""``vinesim examples``: copies the examples, notebooks and ROS files that ship with vinesim."""
+"""``vinesim examples``: copies the examples, notebooks, ROS files and data files that ship with vinesim."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ CONTENTS = {
     "examples": "scripts for Python and ROS 2, canes, bunches and plants for the commands",
     "notebooks": "longer studies with plots, each ends with a check",
     "ros": "configurations for RViz and Foxglove, launch file, parameters",
+    "data": "scenes, plants, robots and sensors to start from; names such as demo mean vinesim's own files",
 }
 """Folders that the command copies, with their contents."""
 
@@ -43,7 +44,8 @@ def copy(out: pathlib.Path, force: bool) -> int:
             shutil.copyfile(source, target)
     for name in user_folders():
         count = sum(target.is_relative_to(out / name) for _, target in new + differs)
-        print(f"{f'{count} files' if count else 'no change'} in {out / name}: {CONTENTS[name]}")
+        counted = "no change" if count == 0 else "1 file" if count == 1 else f"{count} files"
+        print(f"{counted} in {out / name}: {CONTENTS[name]}")
     print(f"begin with: python {out / 'examples' / 'first_cane.py'}")
     return 0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pathlib
 
 USER_FOLDERS = ("examples", "notebooks", "ros")
-"""Names of the folders that ``vinesim examples`` copies; a wheel contains them in ``vinesim/user_files``."""
+"""Names of the folders for users other than ``data``; a wheel contains them in ``vinesim/user_files``."""
 
 
 class DataFileNotFound(FileNotFoundError):
@@ -19,11 +19,11 @@ def data_dir() -> pathlib.Path:
 
 
 def user_folders() -> dict[str, pathlib.Path]:
-    """Returns the folders of files for users, by name: ``examples``, ``notebooks`` and ``ros``. They are in the folder
-    ``user_files`` of the installed package, or next to the package in a checkout."""
+    """Returns the folders of files for users by name: :data:`USER_FOLDERS` and ``data``. They are inside the installed
+    package, or next to the package in a checkout."""
     package = pathlib.Path(__file__).resolve().parent.parent
     place = package / "user_files" if (package / "user_files").is_dir() else package.parent
-    return {name: place / name for name in USER_FOLDERS}
+    return {name: place / name for name in USER_FOLDERS} | {"data": data_dir()}
 
 
 def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:

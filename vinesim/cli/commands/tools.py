@@ -62,9 +62,10 @@ def examples(
     ] = pathlib.Path(),
     force: Annotated[bool, typer.Option("--force", help="Replace files that differ from those of vinesim.")] = False,
 ) -> None:
-    """Copy the examples, notebooks and ROS files that ship with vinesim, into the folders examples, notebooks and ros.
+    """Copy what ships with vinesim into the folders examples, notebooks, ros and data.
 
-    Pages of the documentation name files of these folders. In a checkout they are already there.
+    Pages of the documentation name files of these folders. In a checkout they are already there. Files of yours are
+    not replaced.
 
     \b
     Examples:
