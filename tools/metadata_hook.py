@@ -15,6 +15,7 @@ def long_description(readme: str, source: str | None) -> str:
     With ``source``, the address of a folder of the checkout on the web, links to files begin with this address. Without
     it they become plain text, and lines and table rows of pictures are left out.
     """
+    readme = re.sub(r"<!-- place: .*? -->\n", "", readme)  # which is for tests of the pages
     if source:
         return LINK.sub(lambda link: f"{link[1]}[{link[2]}]({source.rstrip('/')}/{link[3]})", readme)
     blocks = [block for block in readme.split("\n\n") if not re.search(r"!\[", block)]
@@ -26,6 +27,6 @@ class ReadmeHook(MetadataHookInterface):
 
     def update(self, metadata):
         """Called before a build with the table ``project`` of pyproject.toml, which it completes."""
-        source = (self.config or {}).get("source") # the address, once the repository is public
+        source = (self.config or {}).get("source")  # the address, once the repository is public
         text = long_description((pathlib.Path(self.root) / "README.md").read_text(), source)
         metadata["readme"] = {"content-type": "text/markdown", "text": text}
