@@ -14,7 +14,7 @@ import tomllib
 import pytest
 
 from tests.support import page_runner
-from tests.support.installation import Installation, build
+from tests.support.installation import OF_THE_TESTS, Installation, build
 from tests.support.page_blocks import CHECKOUT, EMPTY, EXAMPLES, NOT_HERE, PAGES, ROOT, Block, all_blocks
 
 LANGUAGES = {"sh", "python", "toml", "json5", "text"}
@@ -148,7 +148,7 @@ def pages_that_run() -> list:
 def test_the_blocks_of_a_page_run(page, tmp_path, installation, request):
     """In their order, as printed, in a folder for each place of the page."""
     environment = installation.environment()
-    bare = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    bare = {name: value for name, value in os.environ.items() if name not in OF_THE_TESTS}
     for number, block in enumerate(block for block in BLOCKS if block.page == page and is_run(block)):
         parts = [dataclasses.replace(block, text=line) for line in block.lines()] if block.alone else [block]
         for row, part in enumerate(parts):
