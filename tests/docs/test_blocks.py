@@ -20,7 +20,7 @@ from tests.support.page_blocks import CHECKOUT, EMPTY, EXAMPLES, NOT_HERE, PAGES
 LANGUAGES = {"sh", "python", "toml", "json5", "text"}
 PROGRAMS = {"vinesim", "python", "python3", "make", "pip", "docker", ".", "ros2", "sudo", "source"}
 """Programs that pages call."""
-SHORT = {"docs/plants.md"}
+SHORT = {"docs/multispectral.md"}
 """Pages whose blocks ``make test`` runs; ``make test-long`` runs the others."""
 
 BLOCKS = all_blocks()
