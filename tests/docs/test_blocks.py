@@ -149,6 +149,7 @@ def test_the_blocks_of_a_page_run(page, tmp_path, installation, request):
     """In their order, as printed, in a folder for each place of the page."""
     environment = installation.environment()
     bare = {name: value for name, value in os.environ.items() if name not in OF_THE_TESTS}
+    bare["PIP_NO_COMPILE"] = "1"  # bytecode of 130 packages, of which little is used
     for number, block in enumerate(block for block in BLOCKS if block.page == page and is_run(block)):
         parts = [dataclasses.replace(block, text=line) for line in block.lines()] if block.alone else [block]
         for row, part in enumerate(parts):
