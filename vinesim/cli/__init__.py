@@ -29,6 +29,7 @@ from vinesim.cli.commands.tools import (
     bench,
     certs_new,
     doctor,
+    examples,
     ros_build_interfaces,
     ros_call,
     ros_echo,
@@ -57,6 +58,7 @@ app.add_typer(ros_app, name="ros")
 app.add_typer(certs_app, name="certs")
 for command in (demo, server, client, record, replay, render, dataset, track, tune, experiment, bench, doctor):
     app.command()(command)
+app.command()(examples)
 scene_app.command("show")(scene_show)
 scene_app.command("import-plant")(scene_import_plant)
 ros_app.command("build-interfaces")(ros_build_interfaces)

@@ -1,4 +1,4 @@
-"""``vinesim bench``, ``vinesim doctor``, ``vinesim ros`` and ``vinesim certs``: their options."""
+"""``vinesim bench``, ``vinesim doctor``, ``vinesim examples``, ``vinesim ros`` and ``vinesim certs``: their options."""
 
 from __future__ import annotations
 
@@ -54,6 +54,27 @@ def doctor(
     from vinesim.cli.doctor.command import run
 
     raise typer.Exit(run(json))
+
+
+def examples(
+    out: Annotated[
+        pathlib.Path, typer.Option(help="Folder into which they are copied; created if it is missing.")
+    ] = pathlib.Path(),
+    force: Annotated[bool, typer.Option("--force", help="Replace files that differ from those of vinesim.")] = False,
+) -> None:
+    """Copy what ships with vinesim into the folders examples, notebooks, ros and data.
+
+    Pages of the documentation name files of these folders. In a checkout they are already there. Files of yours are
+    not replaced.
+
+    \b
+    Examples:
+      vinesim examples
+      vinesim examples --out vineyard
+    """
+    from vinesim.cli.examples import copy
+
+    raise typer.Exit(copy(out, force))
 
 
 def ros_build_interfaces(
