@@ -380,6 +380,7 @@ class Viewer {
   drawLess() {
     this.isSlow = true;
     this.detail = null;
+    this.world.simplify();
     this.setBudget(FEW);
   }
 

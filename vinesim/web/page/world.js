@@ -3,8 +3,8 @@
 import * as THREE from "./vendor/three.module.js";
 import { Batches } from "./batches.js";
 import { boxAround, farthest, outermost } from "./extent.js";
-import { ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
-import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
+import { BALL, ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
+import { VERTEX, vertexForSun, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
 
 const SHAPE_SHIFT = 10,
   SURFACE_SHIFT = 9,
@@ -176,32 +176,71 @@ export class World {
     };
     this.shadowGroup = new THREE.Group();
     this.shadowGroup.rotation.x = -Math.PI / 2;
-    this.draws = MESHES.map(({ name, levels }) =>
-      levels.map((level) => {
-        const batches = new Batches(level),
-          own = { ...uniforms, ...batches.uniforms };
-        const make = (fragmentShader, side) =>
-          new THREE.RawShaderMaterial({
-            glslVersion: THREE.GLSL3,
-            vertexShader: VERTEX[name],
-            fragmentShader,
-            uniforms: own,
-            side,
-          });
-        const seen = make(fragment(name), name === "leaf" ? THREE.DoubleSide : THREE.FrontSide);
-        const cast = make(depthOnly(name), THREE.DoubleSide);
-        for (const [group, geometry, material] of [
-          [this.group, batches.geometry, seen],
-          [this.shadowGroup, batches.shadowGeometry, cast],
-        ]) {
-          const mesh = new THREE.Mesh(geometry, material);
-          mesh.frustumCulled = false;
-          group.add(mesh);
-        }
-        return batches;
-      }),
-    );
+    this.uniforms = uniforms;
+    this.draws = MESHES.map((kind) => this.makeDraws(kind));
     this.group.add(this.makeGround(arrays, common), makeSky(common));
+  }
+
+  /** Returns the lists of primitives of a kind that are drawn, by level of detail. */
+  makeDraws({ name, levels }) {
+    return levels.map((level) => {
+      const batches = new Batches(level),
+        uniforms = { ...this.uniforms, ...batches.uniforms };
+      const add = (group, geometry, vertexShader, fragmentShader, side) => {
+        const material = new THREE.RawShaderMaterial({
+          glslVersion: THREE.GLSL3,
+          vertexShader,
+          fragmentShader,
+          uniforms,
+          side,
+        });
+        const mesh = new THREE.Mesh(geometry, material);
+        mesh.frustumCulled = false;
+        group.add(mesh);
+        return mesh;
+      };
+      const side = name === "leaf" ? THREE.DoubleSide : THREE.FrontSide;
+      batches.mesh = add(this.group, batches.geometry, VERTEX[name], fragment(name), side);
+      const { shadowGeometry } = batches;
+      batches.shadow = add(
+        this.shadowGroup,
+        shadowGeometry,
+        vertexForSun(name),
+        depthOnly(name, true),
+        THREE.DoubleSide,
+      );
+      batches.addDepth = () => {
+        const depth = add(this.group, batches.geometry, VERTEX[name], depthOnly(name, false), side);
+        depth.material.colorWrite = false;
+        depth.renderOrder = -1;
+        batches.mesh.material.depthFunc = THREE.EqualDepth;
+        batches.mesh.material.depthWrite = false;
+      };
+      return batches;
+    });
+  }
+
+  /**
+   * Draw for a browser without a graphics card, for which pixels are dear: spheroids as single triangles with a round
+   * outline, first the depths of all objects and then the light of what is visible, with fewer texels for each pixel.
+   */
+  simplify() {
+    for (const { mesh, shadow } of this.draws[SPHEROID]) {
+      mesh.removeFromParent();
+      shadow.removeFromParent();
+    }
+    this.draws[SPHEROID] = this.makeDraws(BALL);
+    for (const batches of this.draws.flat()) batches.addDepth();
+    for (const { material } of this.group.children) {
+      if (!material?.isRawShaderMaterial) continue;
+      material.defines = { PLAIN: "" };
+      material.needsUpdate = true;
+    }
+    for (const table of [this.common.noises.value, this.uniforms.leaves.value]) {
+      table.minFilter = THREE.LinearMipmapNearestFilter;
+      table.needsUpdate = true;
+    }
+    this.listedAt = null;
   }
 
   makeGround(arrays, common) {
