@@ -31,7 +31,6 @@ out float vSky;               // share of the sky that is visible
 flat out uvec4 vSurface;      // as in surfaces, and the bits of a seed
 flat out vec4 vDetail;
 flat out vec3 vTint;          // linear RGB
-invariant gl_Position;
 
 vec3 turn(vec4 q, vec3 v) { return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v); }
 vec4 texel(sampler2D table, uint i, int shift) {
@@ -242,7 +241,7 @@ const CUT = /* glsl */ `
 /** Vertex shader of a kind for the sun's depth map. */
 export const vertexForSun = (kind) => (kind === "ball" ? ballVertex(true) : VERTEX[kind]);
 
-/** Fragment shader of a kind. With PLAIN defined, a depth map of the picture has cut leaves and balls out already. */
+/** Fragment shader of a kind. */
 export function fragment(kind) {
   const isLeaf = kind === "leaf",
     isBall = kind === "ball";
@@ -254,9 +253,8 @@ export function fragment(kind) {
     (isBall ? BALL : "") +
     `const bool LEAF = ${isLeaf};
 void main() {
-#ifndef PLAIN
 ${CUT}
-#endif` +
+` +
     /* glsl */ `
   uint material = vSurface.y;
   vec3 tint = vTint, place = vPlace, local = vLocal;
@@ -266,7 +264,7 @@ ${CUT}
       ? /* glsl */ `
   vec3 point;
   float ahead;
-  onBall(d, point, ahead);
+  if (!onBall(d, point, ahead)) discard;
   place += ahead * d;
   local.z = dot(point, vAxis.xyz);
   n = normalize(point + vAxis.xyz * local.z * (1.0 / vAxis.w - 1.0));
@@ -301,12 +299,11 @@ ${CUT}
   );
 }
 
-/** Fragment shader for a depth map: the sun's, or the eye's. */
-export function depthOnly(kind, isForSun) {
+/** Fragment shader for the sun's depth map. */
+export function depthOnly(kind) {
   return `precision highp float;
 precision highp sampler2DArray;
 uniform sampler2DArray outlines;
-uniform vec3 eye;
 uniform vec3 sun;
 in vec3 vPlace;
 in vec3 vLocal;
@@ -315,7 +312,7 @@ const bool LEAF = ${kind === "leaf"};
 ${kind === "ball" ? BALL : ""}
 void main() {
 ${CUT}
-${kind === "ball" ? `vec3 point; float ahead; if (!onBall(${isForSun ? "-sun" : "normalize(vPlace - eye)"}, point, ahead)) discard;` : ""}
+${kind === "ball" ? `vec3 point; float ahead; if (!onBall(-sun, point, ahead)) discard;` : ""}
   pixel = vec4(1.0);
 }`;
 }

@@ -40,6 +40,7 @@ export const TRIANGLE_BUDGET = 300_000;
 /** Distance of the eye's motion after which the lists of drawn primitives are rebuilt [m]. */
 const STRIDE = 0.25;
 const SUN_SIZE = 2048,
+  PLAIN_SUN_SIZE = 1024, // without a graphics card
   SUN_REACH = 9,
   SUN_NEAR = 1,
   SUN_FAR = 60;
@@ -206,23 +207,16 @@ export class World {
         this.shadowGroup,
         shadowGeometry,
         vertexForSun(name),
-        depthOnly(name, true),
+        depthOnly(name),
         THREE.DoubleSide,
       );
-      batches.addDepth = () => {
-        const depth = add(this.group, batches.geometry, VERTEX[name], depthOnly(name, false), side);
-        depth.material.colorWrite = false;
-        depth.renderOrder = -1;
-        batches.mesh.material.depthFunc = THREE.EqualDepth;
-        batches.mesh.material.depthWrite = false;
-      };
       return batches;
     });
   }
 
   /**
-   * Draw for a browser without a graphics card, for which pixels are dear: spheroids as single triangles with a round
-   * outline, first the depths of all objects and then the light of what is visible, with fewer texels for each pixel.
+   * Draw for a browser without a graphics card: spheroids are single triangles with a round outline, and a pixel reads
+   * fewer texels.
    */
   simplify() {
     for (const { mesh, shadow } of this.draws[SPHEROID]) {
@@ -230,7 +224,8 @@ export class World {
       shadow.removeFromParent();
     }
     this.draws[SPHEROID] = this.makeDraws(BALL);
-    for (const batches of this.draws.flat()) batches.addDepth();
+    this.sunTarget.setSize(PLAIN_SUN_SIZE, PLAIN_SUN_SIZE);
+    this.common.sunTexel.value = (2 * SUN_REACH) / PLAIN_SUN_SIZE;
     for (const { material } of this.group.children) {
       if (!material?.isRawShaderMaterial) continue;
       material.defines = { PLAIN: "" };
@@ -510,7 +505,7 @@ export class World {
     const sun = this.common.sun.value,
       camera = this.sunCamera;
     if (sun.z < 0.03) return;
-    const step = ((2 * SUN_REACH) / SUN_SIZE) * 64; // whole texels, so that edges of shadows do not crawl
+    const step = 64 * this.common.sunTexel.value; // whole texels, so that edges of shadows do not crawl
     const centre = new THREE.Vector3(Math.round(this.eye.x / step) * step, Math.round(this.eye.y / step) * step, 1);
     camera.position.copy(centre).addScaledVector(sun, 30).applyMatrix4(this.shadowGroup.matrixWorld);
     camera.up.set(0, 1, 0);
