@@ -4,6 +4,7 @@ import * as THREE from "./vendor/three.module.js";
 import { pointAt } from "./aim.js";
 import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
+import { Guide } from "./guide.js";
 import { ARM, Hand } from "./hand.js";
 import { Headset } from "./headset.js";
 import { Absence, isUnusual, say } from "./notices.js";
@@ -103,13 +104,22 @@ class Viewer {
     this.overlays = new Overlays(world);
     this.lateHands = new LateHands(world);
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
-    this.help.hidden = false;
+    this.guide = new Guide(world, this.isPerson, ARM, () => {
+      this.help.hidden = true;
+    });
+    this.help.hidden = this.guide.isOpen;
+    element("steps").addEventListener("click", () => {
+      this.help.hidden = true;
+      this.guide.open();
+      element("steps").blur();
+    });
     this.intention = "";
     this.offerIntentions(world.header.intentions);
     element("follow").hidden = this.isPerson;
     for (const [name, code] of [
       ["follow", "KeyF"],
       ["label", "KeyN"],
+      ["keys", "KeyH"],
     ])
       element(name).addEventListener("click", () => {
         this.press(code);
@@ -265,7 +275,8 @@ class Viewer {
       element("names").hidden = !element("names").hidden;
       element("label").setAttribute("aria-pressed", String(!element("names").hidden));
     }
-    if (code === "KeyH") this.help.hidden = !this.help.hidden;
+    if (code === "KeyH" && this.guide.isOpen) this.guide.close();
+    else if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
 
   /** Returns robots and people: name, and the first body of each. */
@@ -322,6 +333,8 @@ class Viewer {
         facing(pose),
       );
     }
+    if (!this.headset.isWorn)
+      this.guide.update({ eyes: this.eyes, hand: this.hand, actors, isFollowing: this.followed >= 0 });
     this.renderer.info.reset();
     if (now - this.shadowAt > Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
       this.shadowAt = now;
