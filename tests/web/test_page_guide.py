@@ -1,4 +1,4 @@
-"""First steps in the page: a newcomer is told one thing at a time, and is never told again after it was done or closed."""
+"""First steps in the page: a newcomer is told one thing at a time, and not again after all was done or closed."""
 
 import numpy as np
 import pytest

@@ -205,7 +205,8 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
         if one.cut_pixel is not None and np.abs(one.cut_pixel).max() < 20000:
             cv2.circle(image, corner(*one.cut_pixel), 5, (255, 230, 0), -1 if one.cut_seen else 1)
         if one.amodal_pixels * scale * scale > 1500:  # the text would cover a smaller bunch
-            words = f"{one.bunch}: {one.berries_seen} of {one.berries} berries seen, {100.0 * one.occlusion:.0f}% covered by others"
+            seen = f"{one.bunch}: {one.berries_seen} of {one.berries} berries seen"
+            words = f"{seen}, {100.0 * one.occlusion:.0f}% covered by others"
             for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
                 cv2.putText(image, words, (left, max(top - 4, 12)), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick)
     return image

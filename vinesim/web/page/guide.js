@@ -21,7 +21,11 @@ const STEPS = {
       "Walk to a bunch of grapes with <kbd>W</kbd> <kbd>A</kbd> <kbd>S</kbd> <kbd>D</kbd>.",
       "Walk to a bunch of grapes: drag with two fingers.",
     ],
-    ["reach", "Click on the bunch: your right hand reaches for it.", "Tap on the bunch: your right hand reaches for it."],
+    [
+      "reach",
+      "Click on the bunch: your right hand reaches for it.",
+      "Tap on the bunch: your right hand reaches for it.",
+    ],
     ["hold", "Press <kbd>Space</kbd> when the hand is there: it holds the bunch.", "Press 'grasp': the hand holds it."],
     [
       "pick",
@@ -79,6 +83,7 @@ export class Guide {
   /** Close the guide; this browser does not open it again by itself. */
   close() {
     this.panel.hidden = true;
+    // biome-ignore lint/suspicious/noDocumentCookie: the Cookie Store API is missing in browsers of 2022
     document.cookie = `${DONE}; max-age=${YEAR}; path=/; SameSite=Strict`;
     this.ended();
   }
@@ -94,7 +99,7 @@ export class Guide {
     const { start } = this,
       bunch = this.nearestBunch(place);
     const turned = Math.abs(Math.sin((yaw - start.yaw) / 2)) * 2 + Math.abs(pitch - start.pitch);
-    const isReaching = hand !== null && hand.reaching && hand.target?.what === "bunch";
+    const isReaching = hand?.reaching && hand.target?.what === "bunch";
     const done = {
       look: turned > LOOKED,
       move: Math.hypot(...place.map((value, axis) => value - start.place[axis])) > MOVED,
@@ -115,12 +120,16 @@ export class Guide {
       return;
     }
     const robots = actors.filter(({ name }) => name !== this.world.header.person);
-    this.show([
-      ...(["walk", "reach"].includes(this.current.dataset.name) && bunch !== null
-        ? [["nearest bunch", this.world.place(bunch.carrier)]]
-        : []),
-      ...robots.slice(0, 3).map(({ name, carrier }) => [name, this.world.place(carrier)]),
-    ], place, yaw);
+    this.show(
+      [
+        ...(["walk", "reach"].includes(this.current.dataset.name) && bunch !== null
+          ? [["nearest bunch", this.world.place(bunch.carrier)]]
+          : []),
+        ...robots.slice(0, 3).map(({ name, carrier }) => [name, this.world.place(carrier)]),
+      ],
+      place,
+      yaw,
+    );
   }
 
   /** The first step that was not done, or null. */
@@ -171,5 +180,7 @@ export class Guide {
 /** Direction in words of an angle to the left of straight ahead [rad]. */
 function sideOf(angle) {
   const eighths = Math.round((4 * Math.atan2(Math.sin(angle), Math.cos(angle))) / Math.PI);
-  return ["ahead", "ahead left", "left", "behind left", "behind", "behind right", "right", "ahead right"].at(eighths % 8);
+  return ["ahead", "ahead left", "left", "behind left", "behind", "behind right", "right", "ahead right"].at(
+    eighths % 8,
+  );
 }

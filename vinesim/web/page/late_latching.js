@@ -27,10 +27,7 @@ export class LateHands {
       if (!name.startsWith(own)) return;
       const carrier = world.bodies + 1 + k,
         data = world.poses.image.data;
-      const pose = [
-        ...data.subarray(8 * carrier, 8 * carrier + 3),
-        ...data.subarray(8 * carrier + 4, 8 * carrier + 8),
-      ];
+      const pose = [...data.subarray(8 * carrier, 8 * carrier + 3), ...data.subarray(8 * carrier + 4, 8 * carrier + 8)];
       this.parts.push({ name: name.slice(own.length), carrier, pose: matrix(pose) });
       if (name === `${own}head`) this.head = upright(pose);
     });

@@ -336,7 +336,8 @@ class Viewer {
     if (!this.headset.isWorn)
       this.guide.update({ eyes: this.eyes, hand: this.hand, actors, isFollowing: this.followed >= 0 });
     this.renderer.info.reset();
-    if (now - this.shadowAt > Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
+    const rarer = this.isSlow ? 2 : 1;
+    if (now - this.shadowAt > rarer * Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
       this.shadowAt = now;
       this.world.renderShadow(this.renderer);
       this.renderer.info.reset();

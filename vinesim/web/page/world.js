@@ -4,7 +4,16 @@ import * as THREE from "./vendor/three.module.js";
 import { Batches } from "./batches.js";
 import { boxAround, farthest, outermost } from "./extent.js";
 import { BALL, ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
-import { VERTEX, vertexForSun, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
+import {
+  VERTEX,
+  vertexForSun,
+  fragment,
+  depthOnly,
+  GROUND_FRAGMENT,
+  GROUND_VERTEX,
+  SKY_FRAGMENT,
+  SKY_VERTEX,
+} from "./shaders.js";
 
 const SHAPE_SHIFT = 10,
   SURFACE_SHIFT = 9,
@@ -203,13 +212,7 @@ export class World {
       const side = name === "leaf" ? THREE.DoubleSide : THREE.FrontSide;
       batches.mesh = add(this.group, batches.geometry, VERTEX[name], fragment(name), side);
       const { shadowGeometry } = batches;
-      batches.shadow = add(
-        this.shadowGroup,
-        shadowGeometry,
-        vertexForSun(name),
-        depthOnly(name),
-        THREE.DoubleSide,
-      );
+      batches.shadow = add(this.shadowGroup, shadowGeometry, vertexForSun(name), depthOnly(name), THREE.DoubleSide);
       return batches;
     });
   }
