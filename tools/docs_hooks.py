@@ -1,8 +1,9 @@
-"""Hooks of the documentation site (mkdocs.yml) that generate the list of modules and the list of decisions."""
+"""Hooks of the documentation site (mkdocs.yml): its version, the list of modules and the list of decisions."""
 
 from __future__ import annotations
 
 import pathlib
+import runpy
 import sys
 from typing import Any
 
@@ -10,6 +11,13 @@ from mkdocs.structure.files import File
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import list_modules
+
+
+def on_config(config: Any) -> Any:
+    """The configuration, with the version of vinesim in the site's name."""
+    version = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "vinesim/core/version.py"))["__version__"]
+    config.site_name = f"vinesim {version}"
+    return config
 
 
 def on_files(files: Any, *, config: Any) -> Any:
