@@ -22,5 +22,6 @@ def test_a_launch_without_a_device_is_found() -> None:
 
 
 def test_every_launch_names_its_device() -> None:
-    found = {str(path.relative_to(ROOT)): unnamed_launches(path.read_text()) for path in (ROOT / "vinesim").rglob("*.py")}
+    modules = sorted((ROOT / "vinesim").rglob("*.py"))
+    found = {str(path.relative_to(ROOT)): unnamed_launches(path.read_text(encoding="utf-8")) for path in modules}
     assert {name: lines for name, lines in found.items() if lines} == {}
