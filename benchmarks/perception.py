@@ -23,8 +23,8 @@ from vinesim.sensors.primitives.ray_caster import RayCaster, enclosing_primitive
 from vinesim.sensors.primitives.scene_primitives import rest_snapshot
 
 SEED = 23
-"""Seed of scene demo. The filled share of a bunch's hull was tuned on seed 11, and the tolerances of the fits were chosen
-on seed 7, so this vineyard is new to the measurements."""
+"""Seed of scene demo. The filled share of a bunch's hull was tuned on seed 11, and the tolerances of the fits were
+chosen on seed 7, so this vineyard is new to the measurements."""
 BUNCHES = 50
 DISTANCE = 0.55
 """Distance of the camera from the middle of a bunch [m]."""
