@@ -45,6 +45,7 @@ def run(
     seed: int,
     device: str,
     cloud: pathlib.Path | None = None,
+    truth: pathlib.Path | None = None,
 ) -> int:
     """Fit and print the result. Returns the exit code: 0, or 5 if the fit has a fault."""
     require_scipy()
@@ -52,11 +53,17 @@ def run(
 
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     specimen = load_specimen(model)
+    hidden = None if truth is None else load_specimen(truth)
     track = read_trajectory(data)
     if cloud is not None:
         specimen = with_cloud(specimen, cloud)
     found = tune(specimen, track, parameters, release=release, samples=samples, seed=seed, device=device, pushed=push)
-    print(json.dumps(found.as_json()) if as_json else "\n".join(found.lines()))
+    compared = [] if hidden is None else found.compare(hidden)
+    if as_json:
+        more = {} if hidden is None else {"truth": [dataclasses.asdict(one) for one in compared]}
+        print(json.dumps(found.as_json() | more))
+    else:
+        print("\n".join([*found.lines(), *(one.line() for one in compared)]))
     if plot is not None:
         from vinesim.tune.plots import plot_fit
 
@@ -125,22 +132,41 @@ def _read_marker(text: str) -> tuple[str, tuple[int, int, int]]:
     return name.strip() or "tip", (red, green, blue)
 
 
-def plan(experiment: Experiment, model: pathlib.Path, out: pathlib.Path | None, fit: str, as_json: bool) -> int:
-    """Write the track of an experiment and print how exact a fit to it would be. Returns the exit code."""
+def plan(
+    experiment: Experiment,
+    model: pathlib.Path,
+    out: pathlib.Path | None,
+    fit: str,
+    as_json: bool,
+    hidden: pathlib.Path | None = None,
+) -> int:
+    """Write the track of an experiment and print how exact a fit to it would be. Returns the exit code.
+
+    ``hidden``: file for the truth, a specimen that is drawn from the seed; None: the truth is the model.
+    """
     require_scipy()
-    from vinesim.tune import load_specimen, measure
+    from vinesim.core.errors import writing
+    from vinesim.tune import hidden_specimen, load_specimen, measure
     from vinesim.tune.experiment import expected_deviations
+    from vinesim.tune.fit import specimen_toml
 
     specimen = load_specimen(model)
+    if hidden is not None:
+        specimen = hidden_specimen(specimen, experiment.seed)
     track = measure(specimen, experiment)
     target = out or pathlib.Path(f"{experiment.kind}.csv")
     track.write(target)
+    if hidden is not None:
+        with writing(hidden):
+            hidden.write_text(specimen_toml(specimen), encoding="utf-8")
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     expected = expected_deviations(specimen, track, parameters, pushed=experiment.kind == "push")
     if as_json:
         print(json.dumps({"track": str(target), "samples": len(track.time), "deviation": expected}))
         return 0
     print(f"track    {target}: {len(track.time)} samples")
+    if hidden is not None:
+        print(f"truth    {hidden}: drawn from seed {experiment.seed}; for --truth of vinesim tune")
     for name, deviation in expected.items():
         unit = f"{1.645 * deviation:.4f} rad" if name.startswith("bow") else f"{164.5 * deviation:.2f} %"
         print(f"{name:8s} would be known to +- {unit} (90 %)")

@@ -51,6 +51,10 @@ def tune(
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of these draws.")] = 0,
     device: Device = "cpu",
+    truth: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="The true plant of a simulated experiment (its --hidden); printed beside the estimates."),
+    ] = None,
 ) -> None:
     """Fit a cane, or a bunch on its peduncle, to the track of a pull and release, a push, or a shaken base.
 
@@ -66,7 +70,7 @@ def tune(
     """
     from vinesim.cli.tune import run
 
-    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device, cloud))
+    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device, cloud, truth))
 
 
 def track(
@@ -154,6 +158,12 @@ def experiment(
     axes: Annotated[str, typer.Option(help="Axes of the world that are tracked.")] = "xyz",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     fit: Annotated[str, typer.Option(help="Quantities to fit; see vinesim tune.")] = "modulus,damping",
+    hidden: Annotated[
+        pathlib.Path | None,
+        typer.Option(
+            help="Draw the true modulus and damping from the seed, up to twice or half the model's, and write them here."
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout, nothing else.")] = False,
 ) -> None:
     """Simulate a measurement in a laboratory, with noise, and print how well a fit to it would do.
@@ -166,6 +176,7 @@ def experiment(
       vinesim experiment pull-release --model examples/cane.toml
       vinesim experiment pull-release --model examples/cane.toml --rate 120 --duration 2 --axes z
       vinesim experiment pull-release --model examples/cane.toml --force-noise 0.01 --fit modulus,damping,mass
+      vinesim experiment pull-release --model examples/cane.toml --seed 7 --hidden truth.toml
       vinesim experiment push --model examples/cane.toml --out push.csv
       vinesim experiment shake --model examples/cane.toml --amplitude 0.003 --from 2 --to 6 --rate 60
     """
@@ -188,4 +199,4 @@ def experiment(
         axes=axes,
         seed=seed,
     )
-    raise typer.Exit(plan(what, model, out, fit, json))
+    raise typer.Exit(plan(what, model, out, fit, json, hidden))
