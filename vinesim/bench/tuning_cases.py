@@ -81,9 +81,7 @@ def bench_bunch(modulus: float, damping: float) -> Specimen:
 def draw_bunch(seed: int) -> Case:
     """Draw a case of a bunch from a ``seed``: modulus, damping, start values and the time of release."""
     rng = np.random.default_rng(seed)
-    modulus, damping = (
-        middle * math.exp(rng.uniform(-math.log(2.0), math.log(2.0))) for middle in (0.3e9, 0.05)
-    )
+    modulus, damping = (middle * math.exp(rng.uniform(-math.log(2.0), math.log(2.0))) for middle in (0.3e9, 0.05))
     off = np.exp(rng.uniform(-math.log(5.0), math.log(5.0), 2))
     experiment = Experiment(seed=seed, displacement=0.04, hold=0.2 + float(rng.uniform(0.0, 1.0 / 30.0)))
     return Case(bench_bunch(modulus, damping), bench_bunch(modulus * off[0], damping * off[1]), experiment)

@@ -145,9 +145,7 @@ def hidden_specimen(specimen: Specimen, seed: int) -> Specimen:
     them."""
     rng = np.random.default_rng((seed, 1))  # the noise of the track has the seed alone
     factor = np.exp(rng.uniform(-math.log(HIDDEN), math.log(HIDDEN), 2)).tolist()
-    return with_values(
-        specimen, modulus=specimen.modulus.value * factor[0], damping=specimen.damping.value * factor[1]
-    )
+    return with_values(specimen, modulus=specimen.modulus.value * factor[0], damping=specimen.damping.value * factor[1])
 
 
 def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:

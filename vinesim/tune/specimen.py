@@ -9,6 +9,7 @@ import numpy as np
 
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
+from vinesim.scene import plausibility
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.ids import Organ
@@ -72,7 +73,16 @@ def hanging_bends(specimen: Specimen) -> np.ndarray:
 
 
 def build_tree(specimen: Specimen) -> TreeBuilder:
-    """Returns a specimen as a tree: the segments of the rod, then the bunch if there is one."""
+    """Returns a specimen as a tree: the segments of the rod, then the bunch if there is one.
+
+    Numbers that no plant has are not reported here: those of files are reported when they are loaded, and the first
+    guess of a fit may be far off.
+    """
+    with plausibility.unchecked():
+        return _build_tree(specimen)
+
+
+def _build_tree(specimen: Specimen) -> TreeBuilder:
     radius = (0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value)
     bends = hanging_bends(specimen) if specimen.axis else rest_bends(specimen, np.array(specimen.bow))
     if specimen.organ == "cane":

@@ -161,7 +161,7 @@ def experiment(
     hidden: Annotated[
         pathlib.Path | None,
         typer.Option(
-            help="Draw the true modulus and damping from the seed, up to twice or half the model's, and write them here."
+            help="Draw the true modulus and damping from the seed, half to twice the model's, and write them here."
         ),
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout, nothing else.")] = False,
