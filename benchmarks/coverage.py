@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 from vinesim.bench.tuning import recover, recovery_rows
-from vinesim.bench.tuning_cases import draw_bunch, draw_case
+from vinesim.bench.tuning_cases import BUNCH_MODULUS_BAR, MODULUS_BAR, draw_bunch, draw_case
 from vinesim.scene.values import Measurement
 from vinesim.tune import measure
 
-DRAWS = {"cane": draw_case, "bunch": draw_bunch}
+DRAWS = {"cane": (draw_case, MODULUS_BAR), "bunch": (draw_bunch, BUNCH_MODULUS_BAR)}
+"""Function that draws a case from a seed, and largest accepted error of the modulus, of each plant."""
 
 
 def coverage(seeds: int, first: int, plants: str, announce: Callable[[str], None]) -> Iterator[Measurement]:
@@ -22,7 +23,7 @@ def coverage(seeds: int, first: int, plants: str, announce: Callable[[str], None
 
     ``plants``: a key of :data:`DRAWS`, or "both". ``announce`` is called with a line of text about the progress.
     """
-    for plant, draw in DRAWS.items():
+    for plant, (draw, bar) in DRAWS.items():
         if plants not in ("both", plant):
             continue
         cases = []
@@ -32,4 +33,5 @@ def coverage(seeds: int, first: int, plants: str, announce: Callable[[str], None
             tracks.append(measure(cases[-1].truth, cases[-1].experiment))
             if len(cases) % 10 == 0:
                 announce(f"{plant}: {len(cases)} of {seeds} tracks simulated")
-        yield from recovery_rows(f"{plant}, seeds {first} to {first + seeds - 1}", recover(cases, tracks))
+        found = recover(cases, tracks, bar)
+        yield from recovery_rows(f"{plant}, seeds {first} to {first + seeds - 1}", found)

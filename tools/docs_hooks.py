@@ -1,4 +1,5 @@
-"""Hooks of the documentation site (mkdocs.yml) that generate the list of modules and the list of decisions."""
+"""Hooks of the documentation site (mkdocs.yml) that generate the list of modules, the list of decisions, and a page of
+each notebook."""
 
 from __future__ import annotations
 
@@ -10,11 +11,14 @@ from mkdocs.structure.files import File
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import list_modules
+import notebook_pages
 
 
 def on_files(files: Any, *, config: Any) -> Any:
-    """The files of the site, with a page that lists all modules."""
+    """The files of the site, with a page that lists all modules, and the notebooks with a page of each."""
     files.append(File.generated(config, "modules.md", content=list_modules.render()))
+    for name, content in notebook_pages.render().items():
+        files.append(File.generated(config, f"tutorials/{name}", content=content))
     return files
 
 

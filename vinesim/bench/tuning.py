@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from vinesim.bench.mujoco_reference import compile_plants
-from vinesim.bench.tuning_cases import DAMPING_BAR, MODULUS_BAR, Case, draw_bunch, draw_case
+from vinesim.bench.tuning_cases import BUNCH_MODULUS_BAR, DAMPING_BAR, MODULUS_BAR, Case, draw_bunch, draw_case
 from vinesim.bench.tuning_peers import peer_rows, stein_rows
 from vinesim.bench.tuning_pictures import film
 from vinesim.bench.tuning_rods import is_installed, rod_track
@@ -58,15 +58,17 @@ class Recovery:
     """Whether the fit reports that it has failed [seed]."""
     seconds: np.ndarray
     """[seed] Wall time of a fit."""
+    modulus_bar: float = MODULUS_BAR
+    """Largest accepted relative error of a modulus."""
 
     @property
     def silent(self) -> int:
         """Number of fits with errors beyond the bar that do not report a failure."""
-        beyond = (np.abs(self.modulus_error) > MODULUS_BAR) | (np.abs(self.damping_error) > DAMPING_BAR)
+        beyond = (np.abs(self.modulus_error) > self.modulus_bar) | (np.abs(self.damping_error) > DAMPING_BAR)
         return int((beyond & ~self.refused).sum())
 
 
-def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recovery:
+def recover(cases: list[Case], tracks: list[Trajectory] | None = None, modulus_bar: float = MODULUS_BAR) -> Recovery:
     """Fit one track for each case, and return the results. ``tracks``: tracks to fit, by default simulated measurements
     of the cases."""
     rows = []
@@ -75,7 +77,7 @@ def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recove
         begun = time.perf_counter()
         fit = tune(case.guess, track)
         rows.append((*_errors(fit, case.truth), not fit.ok, time.perf_counter() - begun))
-    return Recovery(*map(np.array, zip(*rows, strict=True)))
+    return Recovery(*map(np.array, zip(*rows, strict=True)), modulus_bar)
 
 
 def _errors(fit: Fit, truth: Specimen) -> tuple[float, float, list[bool], list[float]]:
@@ -163,7 +165,8 @@ def tuning(announce: Callable[[str], None], seeds: int = SEEDS) -> Iterator[Meas
     cases = [draw_case(seed) for seed in range(seeds)]
     tracks = [measure(case.truth, case.experiment) for case in cases]
     yield from recovery_rows(f"{seeds} seeds", recover(cases, tracks))
-    yield from recovery_rows(f"{seeds} bunches", recover([draw_bunch(seed) for seed in range(seeds)]))
+    bunches = [draw_bunch(seed) for seed in range(seeds)]
+    yield from recovery_rows(f"{seeds} bunches", recover(bunches, modulus_bar=BUNCH_MODULUS_BAR))
     yield from picture_rows(cases[:PICTURE_SEEDS])
     few = cases[:MUJOCO_SEEDS]
     yield from recovery_rows(f"{len(few)} tracks of MuJoCo", recover(few, [mujoco_track(case) for case in few]))

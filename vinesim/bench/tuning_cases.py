@@ -18,6 +18,8 @@ from vinesim.tune import Experiment
 MODULUS_BAR = 0.03
 DAMPING_BAR = 0.15
 """Largest accepted relative error of a fitted damping; ``MODULUS_BAR`` is for the modulus."""
+BUNCH_MODULUS_BAR = 0.1
+"""Largest accepted relative error of the modulus of a peduncle: the weight of the bunch hides its stiffness."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

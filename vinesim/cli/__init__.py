@@ -25,7 +25,7 @@ from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
-from vinesim.cli.commands.tools import bench, certs_new, doctor, ros_build_interfaces, ros_play, ros_record
+from vinesim.cli.commands.tools import bench, certs_new, doctor, notebooks, ros_build_interfaces, ros_play, ros_record
 from vinesim.cli.commands.tuning import experiment, track, tune
 from vinesim.core import allocator, progress
 
@@ -43,7 +43,21 @@ certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certi
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
 app.add_typer(certs_app, name="certs")
-for command in (demo, server, client, record, replay, render, dataset, track, tune, experiment, bench, doctor):
+for command in (
+    demo,
+    server,
+    client,
+    record,
+    replay,
+    render,
+    dataset,
+    track,
+    tune,
+    experiment,
+    notebooks,
+    bench,
+    doctor,
+):
     app.command()(command)
 scene_app.command("show")(scene_show)
 scene_app.command("import-plant")(scene_import_plant)

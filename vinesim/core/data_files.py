@@ -15,6 +15,12 @@ def data_dir() -> pathlib.Path:
     return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
 
 
+def notebook_dir() -> pathlib.Path:
+    """Returns the folder of notebooks: inside the installed package, or next to the package in a checkout."""
+    package = pathlib.Path(__file__).resolve().parent.parent
+    return next(d for d in (package / "notebooks", package.parent / "notebooks") if d.is_dir())
+
+
 def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:
     """Returns the path ``name`` if that file exists, else ``data/<kind>/<name><suffix>``. Raises
     :class:`DataFileNotFound` if neither exists."""

@@ -38,6 +38,28 @@ def bench(
     raise typer.Exit(run(names, json, row or ()))
 
 
+def notebooks(
+    names: Annotated[list[str] | None, typer.Argument(help="Notebooks to copy; by default all.")] = None,
+    out: Annotated[
+        pathlib.Path | None, typer.Option(help="Folder to copy them into; without it, they are listed.")
+    ] = None,
+) -> None:
+    """List the notebooks that ship with vinesim, or copy them into a folder for Jupyter.
+
+    They contain their results. Jupyter is not part of vinesim; to run them, also install jupyterlab. Existing files
+    are kept.
+
+    \b
+    Examples:
+      vinesim notebooks
+      vinesim notebooks --out my-notebooks
+      vinesim notebooks tune_a_cane tune_a_swing --out my-notebooks
+    """
+    from vinesim.cli.notebooks import run
+
+    raise typer.Exit(run(names or [], out))
+
+
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="All findings as one JSON object.")] = False,
 ) -> None:
