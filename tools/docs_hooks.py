@@ -4,6 +4,7 @@ each notebook."""
 from __future__ import annotations
 
 import pathlib
+import re
 import sys
 from typing import Any
 
@@ -23,7 +24,9 @@ def on_files(files: Any, *, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, *, page: Any, **_: Any) -> str:
-    """The page's text; that of decisions with a link to each decision."""
+    """The page's text; that of decisions with a link to each decision, that of notebooks with a link to each page."""
+    if page.file.src_uri == "tutorials/notebooks.md":
+        return re.sub(r"`notebooks/(\w+)\.py`", r"[`notebooks/\1.py`](\1.md)", markdown)
     if page.file.src_uri != "decisions/README.md":
         return markdown
     folder = pathlib.Path(page.file.abs_src_path).parent
