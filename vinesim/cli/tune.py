@@ -80,21 +80,29 @@ def run(
 def track(
     recording: pathlib.Path,
     markers: list[str],
-    radius: float,
+    radius: float | None,
     out: pathlib.Path,
     image: str | None,
     depth: str | None,
     pose: tuple[float, ...] | None,
     rate: float | None,
+    cane: pathlib.Path | None = None,
+    base: tuple[float, float, float] | None = None,
+    percent: int = 80,
 ) -> int:
-    """Write the track of markers in recorded pictures and print how often each was found. Returns the exit code."""
+    """Write the track of markers, or of a bare cane, in recorded pictures, and print how often each was found. Returns
+    the exit code."""
     require_scipy()
     import numpy as np
 
     from vinesim.sensors.recorded_pictures import read_pictures
-    from vinesim.tune import track_marker
+    from vinesim.tune import load_specimen, track_cane, track_marker
 
-    if not radius > 0.0:
+    if cane is None and (not markers or radius is None or base is not None):
+        raise UsageError("give --marker and --radius of coloured balls, or --cane and --base of a cane without balls")
+    if cane is not None and (markers or radius is not None or base is None):
+        raise UsageError(f"--cane {cane} is followed without balls; give --base X Y Z, and no --marker or --radius")
+    if radius is not None and not radius > 0.0:
         raise UsageError(f"--radius is {radius:g}; give the ball's radius in metres, above 0")
     if rate is not None and not rate > 0.0:
         raise UsageError(f"--rate is {rate:g}; give pictures a second, above 0")
@@ -107,7 +115,11 @@ def track(
         where[3:] /= size
     colours = dict(_read_marker(text) for text in markers)
     pictures = read_pictures(recording, image=image, depth=depth, pose=where, rate=rate)
-    found = track_marker(pictures, colours, radius=radius, source=recording.name)
+    if cane is not None and base is not None:
+        specimen = load_specimen(cane)
+        found = track_cane(pictures, specimen, base=np.array(base), percent=percent, source=recording.name)
+    else:
+        found = track_marker(pictures, colours, radius=radius or 0.0, source=recording.name)
     found = dataclasses.replace(found, time=found.time - found.time[0])
     found.write(out)
     print(f"track    {out}: {len(found.time)} pictures in {found.time[-1]:.2f} s")

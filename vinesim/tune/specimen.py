@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import msgspec
 import numpy as np
@@ -17,6 +18,7 @@ from vinesim.scene.plant_parameters import Specimen
 
 TIP = "tip"
 """Name of the marker at the tip, which every specimen has."""
+_PERCENT = re.compile(r"(\d\d?) percent")
 _DIRECTIONS = {"cane": (1.0, 0.0, 0.0), "bunch": (0.0, 0.0, -1.0)}
 
 
@@ -109,6 +111,11 @@ def _build_tree(specimen: Specimen) -> TreeBuilder:
     return tree
 
 
+def marker_at(percent: int) -> str:
+    """Returns the name of the marker at ``percent`` of a cane's length, which every cane has."""
+    return f"{percent} percent"
+
+
 def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the body [k] of each marker in the specimen's tree, and the marker's position [k, 3] m in that body's
     frame.
@@ -124,10 +131,16 @@ def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarra
             bodies.append(len(tree.bodies) - 1)
             points.append((float(tree.bodies[-1]["length"]), 0.0, 0.0))
             continue
-        if name != TIP and name not in specimen.markers:
+        share = _PERCENT.fullmatch(name) if specimen.organ == "cane" else None
+        if name != TIP and name not in specimen.markers and share is None:
             known = ", ".join([TIP, *specimen.markers])
             raise UsageError(f"marker {name!r} is not in the specimen, which has: {known}; add it to specimen.markers")
-        along = specimen.length.value if name == TIP else specimen.markers[name]
+        if name == TIP:
+            along = specimen.length.value
+        elif name in specimen.markers:
+            along = specimen.markers[name]
+        else:
+            along = 0.01 * int(share[1]) * specimen.length.value if share else 0.0
         body = min(int(along / segment), specimen.segments - 1)
         bodies.append(body)
         points.append((along - body * segment, 0.0, 0.0))

@@ -79,12 +79,22 @@ def track(
         typer.Argument(help="MCAP file of ROS topics, rosbag2 folder of MCAP files, or data set of vinesim dataset."),
     ],
     marker: Annotated[
-        list[str],
+        list[str] | None,
         typer.Option(
             help="Colour R,G,B of the ball at the tip in a picture; NAME=R,G,B for another ball. May be repeated."
         ),
-    ],
-    radius: Annotated[float, typer.Option(help="Radius of the balls [m].")],
+    ] = None,
+    radius: Annotated[float | None, typer.Option(help="Radius of the balls [m].")] = None,
+    cane: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Without balls: the file of this cane, a table [specimen]; the cane itself is followed."),
+    ] = None,
+    base: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="With --cane: X Y Z of its clamp in the world [m].")
+    ] = None,
+    percent: Annotated[
+        int, typer.Option(min=20, max=97, help="With --cane: place of the tracked point, of the cane's length [%].")
+    ] = 80,
     out: Annotated[pathlib.Path, typer.Option(help="The CSV to write, for vinesim tune.")] = pathlib.Path("track.csv"),
     image: Annotated[
         str | None,
@@ -103,20 +113,21 @@ def track(
         float | None, typer.Option(help="Pictures a second, for a data set whose records have no time.")
     ] = None,
 ) -> None:
-    """Track balls of one colour each through recorded RGB-D pictures, into a CSV for vinesim tune.
+    """Track coloured balls, or a bare cane, through recorded RGB-D pictures, into a CSV for vinesim tune.
 
-    No ROS is needed. Pictures in which a ball is hidden are gaps. Needs scipy (extra: tune).
+    No ROS is needed. Pictures in which the ball or that part of the cane is hidden are gaps. Needs scipy (extra: tune).
 
     \b
     Examples:
       vinesim track pull.mcap --marker 224,60,130 --radius 0.012 --out pull.csv
       vinesim track pull.mcap --marker 224,60,130 --marker middle=30,90,220 --radius 0.012
+      vinesim track pull.mcap --cane cane.toml --base -0.5 0.9 0
       vinesim track pull/ --image /camera/color/image_raw --depth /camera/aligned_depth_to_color/image_raw \\
         --marker 224,60,130 --radius 0.012
     """
     from vinesim.cli.tune import track
 
-    raise typer.Exit(track(recording, marker, radius, out, image, depth, pose, rate))
+    raise typer.Exit(track(recording, marker or [], radius, out, image, depth, pose, rate, cane, base, percent))
 
 
 def experiment(
