@@ -24,11 +24,11 @@ import numpy as np
 import warp as wp
 
 from vinesim.bench import scenes
+from vinesim.bench.plants import plain_cane
 from vinesim.contact.resident_contacts import ResidentContacts
 from vinesim.core import frames
 from vinesim.plants.articulation_solver import ArticulationSolver
-from vinesim.scene.builder import RodMaterial, TreeBuilder, assemble
-from vinesim.scene.ids import Organ
+from vinesim.scene.builder import assemble
 from vinesim.scene.model import Model
 from vinesim.scene.physics_parameters import PhysicsParameters
 from vinesim.scene.state import State
@@ -51,25 +51,6 @@ CONTACT_CLOCK = 300
 """Number of ticks after which the canes lie on the bars."""
 
 
-def cane(side: float) -> TreeBuilder:
-    """Returns a horizontal cane along x, at y = ``side`` [m], with a bunch on its tip."""
-    tree = TreeBuilder(frames.pose(np.array([0.0, side, 2.0])))
-    last = tree.add_rod(-1, 1.0, (0.004, 0.004), RodMaterial(5e9, 800.0, 0.006), PER_TREE - 1)[-1]
-    tree.add_body(
-        last,
-        offset=(1 / 16, 0, 0),
-        rest=frames.from_x_axis(np.array([0.0, 0.0, -1.0])),
-        organ=int(Organ.BUNCH),
-        mass=0.5,
-        com=(0.1, 0, 0),
-        inertia=(5e-4, 5e-4, 5e-4),
-        length=0.15,
-        radius=(0.05, 0.05),
-        damping=(0.002, 0.002, 0.002),
-    )
-    return tree
-
-
 def bars() -> dict[str, np.ndarray]:
     """Returns the arrays of :class:`Model` for the level bars that lie across the canes, by name."""
     start = np.array([(x, -1.0, z) for x, z in BARS], np.float32)
@@ -86,7 +67,7 @@ def forest(count: int, spacing: float = 0.5, **fixed: np.ndarray) -> Model:
 
     ``fixed``: arrays of fixed obstacles among the trees, by their names in :class:`Model`.
     """
-    one = assemble([cane(0.0)], **fixed)
+    one = assemble([plain_cane(0.0)], **fixed)
     counts = one.counts()
     model = Model.allocate(**{axis: n * count if axis in ("tree", "body") else n for axis, n in counts.items()})
     for name, dim in Model.array_fields().items():
@@ -177,7 +158,7 @@ def peer_scene(with_contacts: bool, integrator: str) -> Any:
 
     from vinesim.bench.mujoco_reference import MujocoScene, compile_plants
 
-    model = assemble([cane(0.0)], **bars())
+    model = assemble([plain_cane(0.0)], **bars())
     if not with_contacts:
         world = compile_plants(model)
     else:

@@ -1,4 +1,4 @@
-"""vinesim: a simulator of soft vines and grapes that robots, people and sensors meet.
+"""vinesim: a simulator of vineyards, with soft vines and grapes, robots and people that touch them, and sensors.
 
     import vinesim
 
@@ -82,7 +82,7 @@ _MODULES = {
     "reachable_grasps": "api.picking",
     "sweep": "api.sweep",
 }
-"""Module of each public name, below this package."""
+"""Module of each public name, relative to the package ``vinesim``."""
 
 __all__ = [
     "Camera",

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 
 class Client:
-    """One robot in a shared vineyard. A context manager; :meth:`close` leaves the world."""
+    """One robot in a vineyard that is shared with other clients through a server. A context manager; :meth:`close`
+    leaves the shared world."""
 
     def __init__(
         self,
@@ -49,22 +50,23 @@ class Client:
         certificates: pathlib.Path | None = None,
         device: str = "cpu",
     ) -> None:
-        """Join the world.
+        """Join a world, which is a vineyard that several clients of one server simulate together.
 
         Args:
-            scene: scene, which must be equal for all clients of a world, including its seed.
+            scene: a scene, its name in ``data/scenes`` or the path of its file. Scene and seed must be equal for all
+                clients of a world.
             robot: name from ``data/robots``, or the path of a URDF file.
             name: unique name of this actor in the world.
             connect: endpoint of the server such as ``tcp/127.0.0.1:7447``; without it the client is alone in its own
                 world.
             pose: (x, y, yaw) in m and rad, or pose [7] of the base; by default a start place of the scene.
-            spawn: number of that start place.
+            spawn: index of the start place in the scene.
             certificates: folder of this actor's certificate, for a server with TLS.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants.
 
         Raises:
-            NameTaken: the world has an actor of this name. The message gives the remedy.
-            Refused: the server refused the client. The message gives the remedy.
+            NameTaken: the world has an actor of this name. The message explains what to do.
+            Refused: the server refused the client. The message explains what to do.
         """
         self.scene: Scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.model: Model = generate(self.scene)
@@ -105,7 +107,8 @@ class Client:
 
     @property
     def received_bytes(self) -> int:
-        """[B] Bytes received about plants and objects since joining: motion, events and lasting facts.
+        """[B] Bytes received about plants and objects since joining: states of moving ones, events, and lasting records
+        of what was cut, picked or put down.
 
         Poses of actors are not included.
         """
@@ -119,26 +122,27 @@ class Client:
 
     @property
     def remote_actors(self) -> tuple[str, ...]:
-        """Names of the actors of other clients that are in this client's world, sorted."""
+        """Names of the actors (robots and people) of other clients that are in this client's world, sorted."""
         return tuple(sorted(self._client.remote_actors))
 
     def actor_pose(self, name: str) -> np.ndarray:
-        """Pose [7] of the base of this client's robot or of a remote actor; ``KeyError`` for an unknown name."""
+        """Returns the pose [7] (m, quaternion xyzw) of the base of this client's robot or of a remote actor, by its
+        name. Raises ``KeyError`` for an unknown name."""
         if name != self._client.name and name not in self._client.remote_actors:
             raise KeyError(f"no actor {name!r}; there are: {', '.join((self._client.name, *self.remote_actors))}")
         return self._client.physics.rigid.base_state(name)[0]
 
     def step(self, count: int = 1) -> None:
-        """Advance by ``count`` steps of 10 ms: receive, control, step, sense, send. The steps follow each other without
-        waiting for real time."""
+        """Advance by ``count`` steps of 10 ms without waiting for real time. Each step receives messages, controls the
+        robot, steps the physics, passes the result to pages, and sends messages."""
         for _ in range(count):
             self._client.tick()
 
     def run(self, seconds: float) -> None:
-        """Step for ``seconds`` of simulated time at the pace of the world.
+        """Step for ``seconds`` of simulated time at the pace of the world's clock.
 
-        The world is slower than real time if one of its clients cannot follow. It does not wait for a client in Python,
-        because this may pause between two calls.
+        The clock runs slower than real time while a client in another program cannot keep up. It does not wait for a
+        client of this class, because a Python program may pause between two calls.
         """
         loop = paced_loop(self._client, is_shared=self._is_shared)
         for _ in range(round(seconds / loop.dt)):

@@ -16,9 +16,9 @@ class Energy:
 
     kinetic: float
     elastic: float
-    """Energy of joint springs and of ties to wires; 0 if all are slack."""
+    """Energy of the springs of joints and of ties, which hold canes to wires; 0 if all springs are slack."""
     gravitational: float
-    """Potential energy of the centres of mass above z = 0."""
+    """Potential energy of the bodies' weight, relative to z = 0."""
 
     @property
     def total(self) -> float:
@@ -41,9 +41,11 @@ def energy(plants: ArticulationSolver, gravity: float, trees: np.ndarray | None 
     date.
 
     Kinetic energy is the sum of m v^2 / 2 + omega I omega / 2 over the bodies. Elastic energy is the sum of k theta^2 /
-    2 about each joint axis, with theta the rotation vector of the joint, and of k d^2 / 2 for each tie. A tie that
-    deflects a wire by u counts k d (d + u) / 2, which includes its share of the wire. For a root on an arm that is
-    twisted by u, k u (theta - theta as drawn) / 2 is subtracted.
+    2 about each joint axis, with theta the rotation vector of the joint, and of k d^2 / 2 for each tie (spring that
+    holds a cane to a wire) that is stretched by d. A tie that deflects its wire by u counts k d (d + u) / 2, which
+    includes its share of the wire. If a tree grows on an arm (horizontal old wood) that it twists by u, the joint of
+    its root counts less by k u (theta - theta_0) / 2, with theta_0 the rotation in equilibrium
+    (``Model.joint_settled``).
     """
     model = plants.model
     state = plants.state
@@ -76,8 +78,8 @@ def momentum(plants: ArticulationSolver, trees: np.ndarray | None = None) -> Mom
 
 
 def _moving_bodies(plants: ArticulationSolver, trees: np.ndarray | None) -> np.ndarray:
-    """Returns the indices [k] of the simulated bodies of ``trees``; fused berry clusters are part of the body of their
-    bunch."""
+    """Returns the indices [k] of the simulated bodies of ``trees``. Berry clusters that are locked to their bunch are
+    not bodies of their own."""
     model = plants.model
     size = np.where(plants.state.tree_fine, model.tree_size, model.tree_core)
     number = np.arange(len(model.body_mass)) - model.tree_first[model.body_tree]

@@ -14,16 +14,17 @@ from vinesim.web.page_server import PageServer
 class Page:
     """Live view of a client's vineyard in a browser. A notebook shows the view in a cell that ends with this object.
 
-    A page needs the extra ``web`` and a browser on the same machine. It changes only while the client steps.
+    A page needs ``pip install 'vinesim[web]'`` and a browser on the same machine. The view changes only while the
+    client steps.
     """
 
     height = 480
-    """Height of the cell [px]."""
+    """Height of the view in a cell of a notebook [px]."""
 
     def __init__(self, client: Client, port: int = 0) -> None:
-        """Start serving; ``port`` 0: any free port.
+        """Start serving the view of a client; ``port`` 0: any free port.
 
-        :class:`UsageError` if the port is taken or the files of the page are missing.
+        Raises :class:`UsageError` if the port is taken or the files of the page are missing.
         """
         page_files.check()
         world = PageWorld(client)

@@ -31,7 +31,8 @@ _END_PHASE = "drive"
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Grasp:
-    """A grasp of one bunch, from the position where the hand has the most room around it."""
+    """A possible grasp of one bunch: the arm, and the pose of the robot's base at which the open hand of this arm has
+    the most room around it."""
 
     bunch: int
     side: str
@@ -58,10 +59,11 @@ class PickAttempt:
 
 
 def reachable_grasps(scene: Scene | str | pathlib.Path, spawn: int = 0, reach: float = 3.0) -> list[Grasp]:
-    """Returns grasps of bunches within ``reach`` [m] of the scene's start place ``spawn``, most room for the hand
-    first.
+    """Returns a grasp of each bunch that hangs within ``reach`` [m], measured on the ground, of a start place of the
+    scene and that a hand can reach from any pose of the base. The grasp with the most room for the hand comes first.
 
-    The base may move. Bunches that a hand can reach are listed even if the hand has no room around them.
+    ``spawn``: index of the start place. Bunches that a hand can reach are listed even if the hand has no room around
+    them.
     """
     scene = scene if isinstance(scene, Scene) else load_scene(scene)
     found = planning.freest_bases(generate(scene), start_pose(scene, spawn)[:2], reach)

@@ -35,12 +35,13 @@ class Recording:
     """A recording by ``vinesim record``, open for reading."""
 
     def __init__(self, path: str | pathlib.Path) -> None:
-        """Read a file; :class:`~vinesim.net.recording.mcap_reader.InvalidRecording` if it is not a recording."""
+        """Read a file. Raises :class:`~vinesim.net.recording.mcap_reader.InvalidRecording` if it is not a recording."""
         self._recording = read_recording(pathlib.Path(path))
 
     @property
     def info(self) -> dict[str, str]:
-        """Metadata: release, protocol, world, scene, seed, digest."""
+        """Metadata by name: ``release`` of vinesim, ``protocol`` version, ``world``, ``scene``, ``seed``, and the
+        scene's ``digest``."""
         return dict(self._recording.metadata)
 
     @property

@@ -38,12 +38,14 @@ class Camera:
         """Make a camera.
 
         Args:
-            kind: name or path of a camera file; :class:`~vinesim.sensors.spec_file.SensorError` if it cannot be used.
+            kind: name of a file in ``data/cameras``, or path of a camera file.
             size: width and height [px] at the same angle of view; the camera's own size unless given.
             quality: ``"fast"``, ``"full"`` or ``"still"``: cost and quality of the picture. Exact depth and labels do
                 not depend on it.
-            name: determines the noise of the measured depth, together with ``seed``.
+            name: name of the camera. Name and ``seed`` together determine the noise of the measured depth.
             seed: see ``name``.
+
+        Raises :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
         """
         self.spec = rgbd.CameraSpec.load(kind)
         self.info: CameraInfo = resized_intrinsics(self.spec, size)
@@ -62,13 +64,14 @@ class Camera:
         robot: Robot | None = None,
         frame: str | None = None,
     ) -> CameraFrame:
-        """The picture at the simulation's time: ``rgb``, ``depth`` [m], ``labels``, ``exact_depth`` [m].
+        """Returns the picture at the simulation's current time: ``rgb``, ``depth`` [m] with the camera's errors,
+        ``labels``, ``exact_depth`` [m].
 
         Args:
             simulation: the world to look at.
             pose: pose [7] of the optical frame in the world (z forward, x right, y down), as from :func:`look_at`.
-            robot: use the pose of a frame of this robot instead.
-            frame: name of that frame; the frame of the robot's first camera unless given.
+            robot: robot that carries the camera; give either ``robot`` or ``pose``.
+            frame: frame of the robot at which the camera is mounted; the frame of its first camera unless given.
         """
         frame = frame or _first_frame(robot, CameraMount.kind)
         if self._camera is None or self._last is not simulation:
@@ -91,9 +94,10 @@ class Lidar:
     """A spinning lidar described by a file in ``data/lidars`` or another file."""
 
     def __init__(self, kind: str = "vlp16", *, name: str = "lidar", seed: int = 0) -> None:
-        """Make a lidar; ``name`` and ``seed`` determine its noise.
+        """Make a lidar. ``kind``: name of a file in ``data/lidars``, or path of a lidar file. ``name`` and ``seed``
+        together determine its noise.
 
-        :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
+        Raises :class:`~vinesim.sensors.spec_file.SensorError` if the file cannot be used.
         """
         self.spec = lidar.LidarSpec.load(kind)
         self._name = name
@@ -108,13 +112,14 @@ class Lidar:
         robot: Robot | None = None,
         frame: str | None = None,
     ) -> LidarScan:
-        """One revolution while nothing moves: ``xyz`` [point, 3] m in the lidar's frame, ``intensity``, ``labels``.
+        """Returns the scan of one revolution during which nothing moves: ``xyz`` [point, 3] m in the lidar's frame,
+        ``intensity``, ``labels``.
 
         Args:
             simulation: the world to measure.
             pose: pose [7] of the lidar in the world (x forward, z up), or (x, y, yaw) for a lidar on the ground.
-            robot: use the pose of a frame of this robot instead.
-            frame: name of that frame; the frame of the robot's first lidar unless given.
+            robot: robot that carries the lidar; give either ``robot`` or ``pose``.
+            frame: frame of the robot at which the lidar is mounted; the frame of its first lidar unless given.
         """
         frame = frame or _first_frame(robot, LidarMount.kind)
         device = simulation.device

@@ -38,15 +38,17 @@ if TYPE_CHECKING:
     from vinesim.sensors.primitives.scene_primitives import Primitives
 
 Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterable[CaneBuilder | TreeBuilder]
-"""Types that :class:`Simulation` accepts: a model, a scene, the name or path of a scene, one or more canes."""
+"""Types that :class:`Simulation` accepts: a model; a scene; the name of a scene in ``data/scenes`` or the path of a
+scene file; one or more builders of canes or trees."""
 
 
 class Simulation:
     """A world that moves when :meth:`step` is called; nothing runs in the background.
 
-    Trees in equilibrium start asleep, all others awake. A tree falls asleep when it has come to rest (see
-    ``sleep_distance`` and related fields of ``parameters``) and wakes when something touches it. Sleeping trees cost no
-    time.
+    Plants consist of *trees*: kinematic trees of rigid bodies, such as a cane with its leaves and bunches. Trees in
+    equilibrium start asleep, all other trees awake. A sleeping tree does not move and costs no time. A tree falls
+    asleep when it has come to rest (see ``sleep_distance`` and related fields of ``parameters``) and wakes when
+    something touches it.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class Simulation:
             source: see :data:`Source`. A scene provides its physics parameters and its wind.
             dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
             parameters: all numbers of the physics; they replace the parameters of the scene.
-            sleep: whether trees at rest fall asleep; it replaces ``parameters.sleep``.
+            sleep: whether trees at rest fall asleep, which saves time; it replaces ``parameters.sleep``.
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
         """
@@ -81,7 +83,7 @@ class Simulation:
         chosen = parameters or (self.scene.physics if self.scene else PhysicsParameters())
         changes = {name: value for name, value in (("dt", dt), ("sleep", sleep)) if value is not None}
         self.parameters: PhysicsParameters = msgspec.structs.replace(chosen, **changes)
-        """All numbers of the physics; they cannot be changed later."""
+        """All numbers of the physics. They cannot be changed after the simulation was made."""
         self.device = device
         """Device for stepping plants and for sensors."""
         self.physics = Physics(model, parameters=self.parameters, device=device, detachment=detach)
@@ -101,7 +103,8 @@ class Simulation:
     # ------------------------------------------------------------------ time
 
     def step(self, count: int = 1) -> None:
-        """Advance by ``count`` steps of :attr:`dt`. Applied wrenches act in all these steps and then end."""
+        """Advance by ``count`` steps of :attr:`dt`. Wrenches of :meth:`apply_wrench` and :meth:`push_robot` act in all
+        these steps and then end."""
         if not isinstance(count, int | np.integer) or count < 0:
             raise UsageError(f"count is {count}; give a whole number of steps, 0 or more")
         self._detachments = []
@@ -149,12 +152,13 @@ class Simulation:
 
     @property
     def awake(self) -> np.ndarray:
-        """[k] Indices of the awake trees, sorted."""
+        """[k] Indices of the awake trees (the trees that the next step moves), sorted."""
         return self.physics.plants.awake.copy()
 
     @property
     def contacts(self) -> tuple[Contact, ...]:
-        """Contacts of robots, boxes and people with plants in the last step: position [3] m, force [3] N."""
+        """Contacts of robots, boxes and people with plants in the last step, each with position [3] m and force [3]
+        N."""
         return self.physics.contacts
 
     @property
@@ -174,7 +178,8 @@ class Simulation:
         return momentum(self.physics.plants, self._one(tree))
 
     def body_pose(self, body: int) -> np.ndarray:
-        """Returns the pose [7] (m, quaternion xyzw) of a plant's body in the world at the current time."""
+        """Returns the pose [7] (m, quaternion xyzw) of a body of a plant in the world at the current time. ``body``:
+        index in the model."""
         body = self._body(body)
         return self.state.body_q[body].astype(float)
 
@@ -185,8 +190,8 @@ class Simulation:
         return pose[:3] + frames.rotate(pose[3:], np.array([float(self.model.body_length[body]), 0.0, 0.0]))
 
     def tip_body(self, tree: int = 0) -> int:
-        """Returns the index of the last body of a tree's main axis, which follows the first child that is a piece of
-        cane."""
+        """Returns the index of the last body of a tree's main axis. From its root, the main axis continues with the
+        first child of each body that is a segment of cane."""
         bodies = self.model.bodies_of(self._tree(tree))
         body = bodies.start
         while True:
@@ -197,7 +202,8 @@ class Simulation:
             body = bodies.start + int(following[0])
 
     def snapshot(self) -> Snapshot:
-        """Returns the whole world at the current time, for sensors. It does not change when the simulation steps."""
+        """Returns the whole world at the current time, for sensors. The returned snapshot does not change when the
+        simulation steps."""
         return self.physics.snapshot()
 
     # ------------------------------------------------------------------ actions
@@ -217,7 +223,7 @@ class Simulation:
         """Push a plant's body during the next call of :meth:`step`. Several wrenches add up. The body's tree wakes.
 
         Args:
-            body: index in the model.
+            body: index of the body in the model.
             force: [3] N, world axes.
             torque: [3] N m, world axes.
             at: [3] m in the world, the point where the force acts; the body's centre of mass unless given.
@@ -261,12 +267,13 @@ class Simulation:
         self._pushed.add((robot, link))
 
     def cut(self, body: int) -> None:
-        """Cut a cane at the joint of a body; the body and everything that grows on it fall."""
+        """Cut a cane at the joint between a body and its parent; the body and everything that grows on it fall.
+        ``body``: index in the model."""
         body = self._body(body)
         self.physics.cut(body)
 
     def pick(self, bunch: int) -> None:
-        """Detach a bunch from its vine, so that it falls."""
+        """Detach a bunch from its vine, so that it falls. ``bunch``: index in the model."""
         self.physics.pick(checked_index("bunch", bunch, len(self.model.bunch_body), UsageError))
 
     def add_robot(
@@ -307,7 +314,8 @@ class Simulation:
     # ------------------------------------------------------------------ sensors
 
     def primitives(self) -> Primitives:
-        """Returns the visible primitives at the current time, for cameras and lidars. The first call builds them."""
+        """Returns the shapes of the world that cameras and lidars render (cones, ellipsoids, leaves and others), at the
+        current time. The first call builds them."""
         if self._primitives is None:
             from vinesim.sensors.primitives.scene_primitives import Primitives
 

@@ -101,7 +101,11 @@ def client_measurements() -> Iterator[Measurement]:
 
 
 class PushingClient:
-    """A client whose first robot pushes a bunch again and again. A second client may stand behind it."""
+    """A client whose first robot pushes a bunch again and again, with the network in memory.
+
+    With ``has_visitor`` a second client joins the same world. Its robot stands behind the first robot, so that both
+    clients exchange states.
+    """
 
     def __init__(
         self,

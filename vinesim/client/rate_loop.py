@@ -140,7 +140,9 @@ class RateLoop:
         return self.dt / self.clock.factor
 
     def report(self) -> PaceReport:
-        """Returns the time that the steps have reached, and the rate at which they could continue."""
+        """Returns the report of this client to the clock of its world: the world's time that the steps have reached,
+        the largest real-time factor that the client can keep up with, and the part of the client that limits this
+        factor. The clock adapts its real-time factor to the report."""
         return PaceReport(self.next_time, *self.meter.limit())
 
     def begin(self) -> None:

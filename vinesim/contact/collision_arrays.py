@@ -135,8 +135,9 @@ _GEOM_FIELDS = tuple(field.name for field in dataclasses.fields(RigidGeoms) if f
 class RigidArrays:
     """Geoms and degrees of freedom of the rigid world. A new object is made each time the world is compiled.
 
-    The arrays have room for all geoms that the world can list. So their memory stays the same when hands open and close
-    and when dormant bunches get bodies. :meth:`update` writes the geoms that are listed at the time of the call.
+    A geom is *listed* while it can collide with plants; a hand that holds something has no listed geoms, for example.
+    The arrays have room for all geoms of the world. So their memory stays the same when hands open and close and when
+    dormant bunches get bodies. :meth:`update` writes the geoms that are listed at the time of the call.
     """
 
     def __init__(
@@ -212,7 +213,11 @@ class RigidArrays:
         )
 
     def _list(self, rigid: RigidWorld, remote_actors: set[str]) -> None:
-        """Write the geoms and actors that the rigid world lists at present."""
+        """Write the geoms that can collide with plants at present to the first entries of the geom arrays, movable
+        geoms before static ones. Also write the actors to which the movable geoms belong.
+
+        ``remote_actors``: names of the actors that other clients control.
+        """
         listed = self.listed = concatenate(rigid.geoms, rigid.static_geoms)
         count, movable = self.count, self.movable = len(listed.id), len(rigid.geoms.id)
         for name in _GEOM_FIELDS:

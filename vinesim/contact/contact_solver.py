@@ -157,10 +157,11 @@ class ContactSolver:
         self.count = count
 
     def _predict_impacted(self, awake: np.ndarray) -> None:
-        """Integrate trees that are about to suffer an impact with phi = 1 from this step on.
+        """Integrate trees that are about to suffer an impact with backward Euler (phi = 1) from this step on.
 
-        The trapezoidal rule moves a body by the mean of its velocities before and after the step. A body hit from rest
-        would therefore move only half the required distance, overlap with the other body, and be thrown out.
+        The trapezoidal rule (phi = 0.5) moves a body by the mean of its velocities before and after the step. A body
+        hit from rest would therefore move only half the required distance, overlap with the other body, and be thrown
+        out.
         """
         impacted = awake[self.detection.candidates.is_impact[: len(awake)]]
         changed = impacted[self.plants.phi_used[impacted] < 1.0]

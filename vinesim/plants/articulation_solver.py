@@ -10,8 +10,8 @@ again. ``cut()`` detaches a body from its parent; the body becomes a floating ro
 three are called between steps, after ``integrate()`` and before the next ``predict()``.
 
 The scheme (:mod:`vinesim.kernels.plants`) damps as if every joint's beta (damping / stiffness) were larger by
-``(2 phi - 1) dt``, so the solver subtracts that amount from the model's damping, down to zero. The total damping is
-then the model's.
+``(2 phi - 1) dt``, with phi the implicitness of the integrator (0.5 trapezoidal to 1 backward Euler). So the solver
+subtracts that amount from the model's damping, down to zero. The total damping is then the model's.
 """
 
 from __future__ import annotations
@@ -78,17 +78,18 @@ _NO_WRENCHES = np.zeros((0, 6), np.float32)
 class ArticulationSolver:
     """The trees of one model and their state, in memory shared by NumPy and Warp.
 
-    ``predict()`` chooses each tree's phi (the implicitness of the step). phi is 1 while a joint turns faster than
-    ``fast_rate``. After a joint turned faster than a tenth of ``max_rate``, phi stays 1 until all joints have been
-    slower than 0.06 ``max_rate`` for a second. phi is also 1 for the time ``contact_onset_duration`` after contact
-    began. Otherwise it is the argument ``phi``. ``impulse_response()`` and ``integrate()`` use the results of the last
-    ``predict()``.
+    ``predict()`` chooses each tree's phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler). phi is
+    1 while a joint turns faster than ``fast_rate``. After a joint turned faster than a tenth of ``max_rate``, phi stays
+    1 until all joints have been slower than 0.06 ``max_rate`` for a second. phi is also 1 for the time
+    ``contact_onset_duration`` after contact began. Otherwise it is the argument ``phi``. ``impulse_response()`` and
+    ``integrate()`` use the results of the last ``predict()``.
 
     Args:
         model: constants. Raises :class:`ValueError` if a tree cannot be simulated.
         state: its arrays are read and written in place.
         parameters: numbers of the scheme; the arguments that follow replace single numbers and may be infinite.
-        dt, phi: step [s]; 1/2 (trapezoidal, adds no damping) to 1 (backward Euler).
+        dt: duration of a step [s].
+        phi: implicitness of the integrator, 0.5 (trapezoidal, adds no damping) to 1 (backward Euler).
         device: ``"cpu"`` or ``"cuda"``. With a GPU the arrays of ``state`` are replaced by arrays that the GPU can
         reach, so read them from ``state`` after this call. Results agree with the CPU's to rounding, not to the bit.
         fast_rate, max_rate, fault_rate: [rad/s] see ``fast_joint_rate``, ``max_joint_rate`` and ``fault_joint_rate`` of
@@ -194,10 +195,11 @@ class ArticulationSolver:
         trees = len(self.model.tree_first)
         bodies = len(self.model.body_mass)
         self.phi = np.full(trees, phi, np.float32)
-        """[tree] Requested phi of each tree; callers may change it. Trees with a stiff tie (``stiff_tie_mass``) have
-        1."""
+        """[tree] Requested phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler) of each tree;
+        callers may change it. Trees with a stiff tie (``stiff_tie_mass``) have 1."""
         self.phi_used = np.zeros(trees, np.float32)
-        """[tree] phi that the last ``predict()`` of each tree used."""
+        """[tree] Value of :attr:`phi` that the last ``predict()`` of each tree used; 1 where it had to use backward
+        Euler."""
         self.awake_list = np.zeros(trees, np.int32)
         self.awake_count = np.zeros(1, np.int32)
         """[1] Number n of awake trees. The first n entries of ``awake_list`` [tree] are the indices of these trees.
@@ -474,7 +476,8 @@ class ArticulationSolver:
     def predict(self, trees: np.ndarray | None = None) -> None:
         """Compute ``body_q`` and ``body_qd`` at the start of the step, and the motion over the step without contacts.
 
-        ``trees`` [k]: predict only these trees, which were woken or given another phi after all trees were predicted.
+        ``trees`` [k]: repeat the prediction for only these trees, because they were woken, or their phi (implicitness
+        of the integrator, 0.5 trapezoidal to 1 backward Euler) was changed, after all trees were predicted.
         """
         launches = self.launches
         self._runner.list_trees(self._awake)
@@ -576,7 +579,7 @@ class ArticulationSolver:
         self.buffers.synchronize()
 
     def use_backward_euler(self, trees: np.ndarray) -> None:
-        """Use phi = 1 on trees for ``contact_onset_duration``.
+        """Integrate trees with backward Euler (phi = 1) for the time ``contact_onset_duration``.
 
         Call it for trees that are about to be touched. For trees that are already touched, ``integrate()`` does the
         same.
@@ -665,8 +668,9 @@ class ArticulationSolver:
         return self.launches.joint_wrench(bodies)
 
     def damping_floor(self, frequency: float, phi: float | None = None) -> float:
-        """Returns the least damping ratio that a first mode of this frequency f [Hz] can have: pi f (2 phi - 1) dt /
-        substeps."""
+        """Returns the least damping ratio [1] that the integrator permits for a first mode of ``frequency`` f [Hz]:
+        pi f (2 phi - 1) dt / substeps. ``phi``: implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler;
+        the largest one of all trees unless given."""
         phi = float(self.phi.max(initial=0.5)) if phi is None else phi
         return math.pi * frequency * (2.0 * phi - 1.0) * self.dt / substeps_for(frequency, self.dt)
 

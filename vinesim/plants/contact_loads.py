@@ -40,8 +40,8 @@ class ContactLoads:
         body_wrench: [body, 6] N, N m where the sums are written; zero for bodies that are not loaded.
         touched: [tree] list of the touched trees.
         touched_count: [1] number of entries of ``touched``.
-        euler_steps: [tree] steps with phi = 1 that are left; raised to ``onset`` where contact begins.
-        onset: number of steps with phi = 1 at the beginning of a contact.
+        euler_steps: [tree] number of next steps with backward Euler (phi = 1); at least ``onset`` where contact begins.
+        onset: number of steps with backward Euler (phi = 1) at the beginning of a contact.
         then: launches that follow the sum; they apply the summed wrenches to the touched trees.
         """
         self._then = then

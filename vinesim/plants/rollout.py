@@ -12,8 +12,9 @@ A rollout always takes whole steps, while the solver divides the steps of trees 
 A rollout keeps no energy budget (:mod:`vinesim.kernels.plants.energy_budget`).
 
 The gradient is that of the numerical scheme, so it is exact where the scheme is smooth. The scheme is not smooth at the
-tick in which a joint passes ``fast_rate`` (phi becomes 1). Damping below ``(2 phi - 1) dt`` times stiffness has no
-gradient: the scheme itself damps that much, and less damping changes nothing.
+tick in which a joint passes ``fast_rate``: phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler)
+then becomes 1. Damping below ``(2 phi - 1) dt`` times stiffness has no gradient: the scheme itself damps that much, and
+less damping changes nothing.
 """
 
 from __future__ import annotations
@@ -58,7 +59,8 @@ class Trajectory:
     body_qd: np.ndarray
     """[tick + 1, watched, 6] velocity of the origin [m/s] and angular velocity [rad/s], world axes."""
     phi: np.ndarray
-    """[tick, tree] phi with which each tick was stepped: 1 once a joint has turned faster than ``fast_rate``."""
+    """[tick, tree] phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler) with which each tick was
+    stepped: 1 once a joint has turned faster than ``fast_rate``."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -94,8 +96,9 @@ class Rollout:
         watched: bodies [k] whose motion the loss depends on; all moving bodies unless given.
         fine: let the berry clusters of bunches move.
         dt: duration of a tick [s].
-        phi: see :class:`vinesim.plants.articulation_solver.ArticulationSolver`; likewise ``fast_rate``,
-        ``max_rate``, ``fault_rate`` and ``geometric_stiffness``.
+        phi: implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler; see
+            :class:`vinesim.plants.articulation_solver.ArticulationSolver`, likewise for ``fast_rate``, ``max_rate``,
+            ``fault_rate`` and ``geometric_stiffness``.
         checkpoint: number of ticks between two states that the forward pass keeps. Memory is about 1.2 kB for each body
             and tick of one segment, and 56 B for each body and checkpoint.
         device: ``cpu``, ``cuda`` or ``cuda:N``.

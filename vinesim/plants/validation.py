@@ -24,7 +24,10 @@ def checked_trees(trees: np.ndarray | int, count: int) -> np.ndarray:
 
 
 def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
-    """Log one warning if joints have less damping in the model than the scheme adds at ``dt`` [s] and ``phi``."""
+    """Log one warning if joints have less damping in the model than the integrator adds with steps of ``dt`` [s].
+
+    ``phi``: implicitness of the integrator, 0.5 (trapezoidal, adds no damping) to 1 (backward Euler).
+    """
     floor = (2.0 * phi - 1.0) * dt
     stiffness = model.joint_stiffness.astype(float)
     raised = ((stiffness > 0.0) & (model.joint_damping < (1.0 - 1e-3) * floor * stiffness)).any(1)

@@ -25,7 +25,7 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 MAX_CLUSTERS = 8
-"""Largest number of berry clusters of a bunch."""
+"""Largest number of berry clusters of a bunch. A cluster is a group of berries that move as one rigid body."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -44,10 +44,11 @@ class RodMaterial:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class BunchSegments:
-    """Bunches [n] cut across the rachis into a chain of segments of equal length: first the head, then the clusters.
+    """Bunches [n], each cut across its rachis (the stem inside the bunch) into a chain of segments of equal length. The
+    first segment is the head, the other segments are the berry clusters.
 
     The frame of a segment has its origin on the rachis at the beginning of the segment, and the axes of the bunch.
-    ``max`` is the largest number of segments of a bunch. Rows of a bunch beyond its own number are zero.
+    ``max`` is the largest number of segments of a bunch. Entries beyond a bunch's own number of segments are zero.
     """
 
     count: np.ndarray
@@ -67,8 +68,8 @@ class BunchSegments:
     peduncle."""
 
     def compound(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Returns mass [n] kg, centre of mass [n, 3] m and moments of inertia [n, 3] kg m^2 of whole bunches, in the
-        head's frame."""
+        """Returns the properties of whole bunches as rigid bodies: mass [n] kg, centre of mass [n, 3] m, and moments of
+        inertia about it [n, 3] kg m^2, in the frame of the first segment."""
         along = self.length[:, None] * np.arange(self.mass.shape[1])
         centre = self.com + along[..., None] * [1.0, 0.0, 0.0]
         mass = self.mass.sum(1)
@@ -88,14 +89,15 @@ def segment_bunches(
     rachis: plant_parameters.Rachis,
     stem_share: float,
 ) -> BunchSegments:
-    """Cut bunches [n] into a head and four to eight clusters; each segment has the mass of its own berries and stems.
+    """Cut bunches [n] into a head and four to eight berry clusters (rigid groups of berries). Each segment has the mass
+    of its own berries and stems.
 
     Args:
         mass: [n] kg.
         length: [n] m, length of the hull.
         radius: [n] m, radius of the hull.
         berry_count: [n] number of berries.
-        seed: [n] seed that selects the prototype of :mod:`vinesim.scene.berries`.
+        seed: [n] seed that selects the arrangement of berries among the prototypes of :mod:`vinesim.scene.berries`.
         rachis: parameters of the stem inside the bunch.
         stem_share: share of the mass that is stem.
     """
@@ -134,15 +136,17 @@ def segment_bunches(
 
 
 class TreeBuilder:
-    """Builds one tree as a list of bodies, parents before children. The root has number 0.
+    """Builds one kinematic tree of a plant as a list of rigid bodies, parents before children. The root has number 0.
 
-    Berry clusters are in a separate list: :func:`assemble` numbers them after all other bodies of their tree.
+    Berry clusters (rigid groups of berries) are in a separate list, because :func:`assemble` numbers them after all
+    other bodies of their tree.
     """
 
     def __init__(self, pose: np.ndarray, vine: int = -1) -> None:
-        """``pose`` [7]: world pose of the root's joint frame. ``vine``: number of the vine, -1 for none.
+        """Start a tree without bodies. ``pose`` [7] (m, quaternion xyzw): world pose of the frame in which the joint of
+        the root is placed. ``vine``: number of the vine that the tree belongs to, -1 for none.
 
-        :class:`ValueError` if ``pose`` is not a pose.
+        Raises :class:`ValueError` if ``pose`` is not a pose.
         """
         self.pose = frames.checked_pose("tree: pose", pose)
         self.vine = vine
@@ -155,11 +159,16 @@ class TreeBuilder:
     def add_body(
         self, parent: int, *, offset: Any = (0.0, 0.0, 0.0), rest: Any = frames.IDENTITY, **fields: Any
     ) -> int:
-        """Append one body and return its number. ``fields``: its fields of :class:`Model`, named without the prefix
-        ``body_`` or ``joint_``.
+        """Append one body and return its number.
 
-        ``offset`` [3] m and ``rest`` [4] place its joint in the frame of ``parent`` (-1: the tree's root frame).
-        :class:`ValueError` if the parent is not in the list, for an unknown field, or for a number out of range.
+        Args:
+            parent: number of the parent body; -1: the tree's root frame.
+            offset: [3] m, position of the body's joint in the frame of the parent.
+            rest: [4] rest orientation (quaternion xyzw) of the body relative to the parent.
+            **fields: values of the body's fields in :class:`Model`, named without the prefix ``body_`` or ``joint_``,
+                such as ``mass``.
+
+        Raises :class:`ValueError` if the parent is not in the list, for an unknown field, or for a number out of range.
         """
         if not -1 <= parent < len(self.bodies):
             raise ValueError(f"body {len(self.bodies)} names parent {parent}, which does not stand before it")
@@ -184,9 +193,9 @@ class TreeBuilder:
     ) -> list[int]:
         """Append a (tapered) round rod as a chain of ``segments`` bodies and return their numbers.
 
-        The spring of the first joint is half a segment of this rod, in series with the part of the parent between its
-        middle and the joint if the parent is a segment of a rod. Each part damps with its own material.
-        :class:`ValueError` if a number is not positive.
+        The spring of the first joint represents half a segment of this rod. If the parent is a segment of a rod, the
+        part of the parent from its middle to the joint is in series with this spring. Each part damps with its own
+        material. Raises :class:`ValueError` if a number is not positive.
 
         Args:
             parent: body on which the rod grows, -1 for a rod clamped at the root frame.
@@ -196,8 +205,9 @@ class TreeBuilder:
             segments: number of bodies.
             organ: organ of the bodies.
             offset: [3] m, position of the joint in the parent's frame; the parent's tip unless given.
-            rest: [4] rotation of the first segment relative to the parent.
-            bends: [segments, 4] rotation of each segment relative to the one before; straight unless given.
+            rest: [4] rotation (quaternion xyzw) of the first segment relative to the parent.
+            bends: [segments, 4] rotation (quaternion xyzw) of each segment relative to the previous one; straight
+                unless given.
         """
         if not (min(length, *radius, material.modulus, material.density) > 0.0 and segments >= 1):
             raise ValueError(
@@ -269,25 +279,26 @@ class TreeBuilder:
         parameters: plant_parameters.VineParameters | None = None,
         **fields: Any,
     ) -> int:
-        """Hang a bunch on a segment of peduncle and return the number of its body.
+        """Append a bunch that hangs on a segment of peduncle, and return the number of the bunch's body.
 
-        Its size follows from its mass and its berries.
+        Length and radius of the bunch follow from its mass, number of berries and variety.
 
         Args:
             parent: the last segment of the peduncle.
             mass: mass of the bunch [kg].
             count: number of berries, 1 to 140.
-            seed: seed that selects the prototype of :mod:`vinesim.scene.berries`.
+            seed: seed that selects the arrangement of berries among the prototypes of :mod:`vinesim.scene.berries`.
             variety: index into :data:`vinesim.scene.berries.VARIETIES`.
             rest: [4] rotation relative to the parent.
             offset: [3] m, position of the joint in the parent's frame; the parent's tip unless given.
             stiffness: [3] N m/rad, stiffness of the joint; the parent's unless given.
             damping: [3] N m s/rad, damping of the joint; the parent's unless given.
-            clusters: whether the bunch can be refined into berry clusters.
+            clusters: whether the bunch can be divided into berry clusters (rigid groups of berries) while actors are
+                near.
             parameters: parameters of the rachis; ``data/plants/vine.toml`` unless given.
-            **fields: further ``bunch_`` fields of the :class:`Model`.
+            **fields: further ``bunch_`` fields of the :class:`Model`, named without this prefix.
 
-        :class:`ValueError` if the parent is not in the list, or for a number out of range.
+        Raises :class:`ValueError` if the parent is not in the list, or for a number out of range.
         """
         parent = checked_index("body", parent, len(self.bodies))
         variety = checked_index("variety", variety, len(berries.VARIETIES))
@@ -362,8 +373,8 @@ class TreeBuilder:
         return body
 
     def solve_rest_pose(self) -> None:
-        """Choose rest rotations so that the present shape of the tree is in equilibrium; see
-        :func:`solve_rest_pose`."""
+        """Change the rest rotations of the joints so that the tree is in equilibrium under gravity in the shape that it
+        was built with; see :func:`solve_rest_pose`."""
         model = solve_rest_pose(assemble([self]))
         for body, rest, settled in zip(
             [*self.bodies, *self.clusters], model.body_rest, model.joint_settled, strict=True
@@ -403,11 +414,11 @@ def segment_properties(
     density: float,
     shear: float | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Returns mass [...] kg, moments of inertia [..., 3] kg m^2 and the two half springs of tapered round segments of a
-    rod.
+    """Returns the properties of tapered round segments of a rod: mass [...] kg, moments of inertia [..., 3] kg m^2, and
+    the stiffness of the two halves of a segment.
 
-    The two half springs, near the start and near the end, are [..., 3] N m/rad each: torsion, and bending about two
-    axes. Each half has the cross-section at its end of the segment, where the joint is.
+    Each half is a spring [..., 3] N m/rad with torsion and bending about two axes: first the half at the start of the
+    segment, then the half at the end. The spring of a half has the cross-section at that end, where the joint is.
 
     Args:
         length: [...] m.
@@ -432,13 +443,14 @@ def segment_properties(
 
 
 def solve_rest_pose(model: Model) -> Model:
-    """Convert the rest rotations of a model, which describe its *drawn* shape, so that the drawn shape is in
-    equilibrium under gravity.
+    """Change the rest rotations of a model so that its *drawn* shape, the shape that the rest rotations describe at the
+    call, is in equilibrium under gravity.
 
     Each spring must carry the weight of the bodies beyond its joint. So the rest rotation is changed by the rotation
     vector theta at which the gradient of theta^T K theta / 2 equals the torque of this weight, and ``joint_settled`` is
     the opposite rotation: drawn = rest * settled. Writes both fields into ``model`` and returns it. The weight of a
-    bunch with clusters is the weight of its head and its clusters. :class:`ValueError` if a joint has no stiffness.
+    bunch with clusters is the weight of its head and its clusters. Raises :class:`ValueError` if a joint has no
+    stiffness.
     """
     if not (model.joint_stiffness > 0.0).all():
         body = int(np.flatnonzero((model.joint_stiffness <= 0.0).any(1))[0])
@@ -492,8 +504,8 @@ def _without_curvature(theta: np.ndarray, torque: np.ndarray) -> np.ndarray:
 
 
 def assemble(trees: list[TreeBuilder], **others: np.ndarray) -> Model:
-    """Returns one :class:`Model` of all trees, in the given order. ``others``: other arrays of the model, for example
-    ``fixed_start``."""
+    """Returns one :class:`Model` of all trees, in the given order. ``others``: arrays of the model that do not belong
+    to trees, by name, for example ``fixed_start``."""
     counts = {
         "tree": len(trees),
         "body": sum(len(t.bodies) + len(t.clusters) for t in trees),

@@ -28,7 +28,7 @@ _HORIZONTAL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 @dataclasses.dataclass(kw_only=True, eq=False)
 class CaneBuilder:
-    """A cane: a tapered round rod of equal segments, joined by elastic ball joints.
+    """Parameters of a cane: a tapered round rod of segments of equal length, joined by elastic ball joints.
 
     Raises :class:`ValueError` if a number is out of range; the message names the field, its value and the valid range.
     """
@@ -56,11 +56,12 @@ class CaneBuilder:
     base: Literal["clamped", "pinned"] = "clamped"
     """``pinned``: the base joint has no spring, so that the cane swings on it as a pendulum."""
     bends: np.ndarray | None = None
-    """[segments, 3] rad, rotation vector of each segment relative to the segment before it, in the drawn shape. By
+    """[segments, 3] rad, the *drawn shape*: rotation vector of each segment relative to the previous segment. By
     default the cane is straight."""
     shape: Literal["slack", "equilibrium"] = "slack"
-    """State of the drawn shape. ``slack``: all springs are slack in it, and a released cane sags under its weight.
-    ``equilibrium``: the springs balance gravity, and a released cane keeps the drawn shape."""
+    """Meaning of the drawn shape, which ``bends`` gives. ``slack``: all springs are slack in this shape, and a released
+    cane sags under its weight. ``equilibrium``: the springs balance gravity in this shape, and a released cane keeps
+    it."""
 
     @property
     def angular_stiffness(self) -> np.ndarray:

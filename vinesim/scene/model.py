@@ -68,7 +68,8 @@ class Model(StructOfArrays):
     """Joint stiffness about the joint frame's axes: torsion, bending, bending."""
     joint_damping: np.ndarray = array("body", 3, unit="N m s/rad")
     joint_settled: np.ndarray = array("body", 4, unit="1", fill=_UNIT_QUAT)
-    """``joint_q`` in equilibrium under gravity, which is the drawn shape."""
+    """``joint_q`` in the *drawn shape*, the shape that a generator or builder gave the tree. It is the equilibrium
+    under gravity, except for shapes that were given as slack (:attr:`vinesim.scene.cane.CaneBuilder.shape`)."""
 
     # a bunch is a body of organ BUNCH at the end of its peduncle: one compound, filled with berries
     bunch_body: np.ndarray = array("bunch", unit="1", dtype=np.int32)

@@ -1,8 +1,10 @@
 """Parameters of the physics: one frozen struct with the unit and the source of each number.
 
-The struct is in this package because a scene may override it in a table ``[physics]``. Times are in seconds and
-distances in metres, so their meaning does not change with ``dt``. READ: from the source named; DERIVED: computed from
-other numbers; TUNED: chosen by experiment with this solver; GUESSED: nothing better is known.
+The struct is in this package because a scene may override its numbers in a table ``[physics]``. Times are in seconds
+and distances in metres, so their meaning does not change with ``dt``. Grades of numbers: READ from the named source;
+DERIVED from other numbers; TUNED by experiment with this solver; GUESSED because nothing better is known.
+
+Plants consist of *trees*: kinematic trees of rigid bodies on elastic ball joints, such as a cane with its bunches.
 """
 
 from __future__ import annotations
@@ -39,23 +41,27 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[1] Coulomb coefficient of every contact whose pair of materials ``data/materials`` does not list. GUESSED for
     rubber pads, plastic crates and berries alike."""
     sleep: bool = True
-    """Whether plants that are at rest are put to sleep. If not, every plant that was woken stays awake."""
+    """Whether trees (of plants) that are at rest fall asleep, so that steps do not integrate them until something
+    touches them. If not, every tree that was woken stays awake."""
 
     # ------------------------------------------------------------------ articulation solver (plants)
     phi: Annotated[float, msgspec.Meta(ge=0.5, le=1.0)] = 0.55
-    """[1] Implicitness of the integration: 1/2 trapezoidal, 1 backward Euler. TUNED."""
+    """[1] Implicitness of the integrator of plants (the theta of the theta method): 0.5 trapezoidal rule, which adds no
+    damping, to 1 backward Euler. TUNED."""
     fast_joint_rate: Positive = 5.0
-    """[rad/s] A tree with a faster joint is integrated with phi = 1, and a drag slows a body that turns faster.
-    TUNED."""
+    """[rad/s] A tree with a joint faster than this is integrated with backward Euler (:attr:`phi` = 1). A body that
+    turns faster than this is slowed by a drag. TUNED."""
     max_joint_rate: Positive = 50.0
-    """[rad/s] Joint rates are limited to this value. DERIVED: half a radian in a step of 10 ms."""
+    """[rad/s] Limit of the rates of plants' joints. DERIVED: half a radian in a step of 10 ms."""
     fault_joint_rate: Positive = 5000.0
-    """[rad/s] A tree with a joint that would turn faster is stopped and reported as faulty. TUNED."""
+    """[rad/s] A tree with a joint that would turn faster than this is stopped and reported as faulty. TUNED."""
     contact_onset_duration: NotNegative = 0.03
-    """[s] A tree is integrated with phi = 1 for this time after one of its contacts began. TUNED."""
+    """[s] A tree is integrated with backward Euler (:attr:`phi` = 1) for this time after one of its contacts began.
+    TUNED."""
     stiff_tie_mass: Positive = 10.0
-    """[kg] A tree with a tie whose stiffness * dt^2 is larger is integrated with phi = 1. TUNED: with phi below 1 such
-    a tie (1e5 N/m at 10 ms) oscillates and feeds energy into the cane."""
+    """[kg] A tree is integrated with backward Euler (:attr:`phi` = 1) if one of its ties (springs that hold a cane to a
+    wire or a fixed point) has a larger stiffness * dt^2 than this. TUNED: with phi below 1 such a tie (1e5 N/m at 10
+    ms) oscillates and feeds energy into the cane."""
     max_held_bodies: Capacity = 16
     """Largest number of plant bodies that hands hold at once."""
     max_hands_per_body: Capacity = 4
@@ -75,18 +81,22 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ wind
     wind_radius: Positive = 4.0
-    """[m] If robots or people are present, wind is simulated on trees whose foot is closer than this to one of them.
-    DERIVED: trees in gusts never sleep, and a step has time for a few hundred awake trees."""
+    """[m] If robots or people are present, wind is simulated only on trees whose root is closer than this to one of
+    them; the motion of all other trees in the wind is only rendered. DERIVED: trees in gusts never sleep, and a step
+    has time for a few hundred awake trees."""
     wind_wake_load: Positive = 0.05
-    """[1] A sleeping tree wakes when the drag on it has changed by this fraction of its weight. TUNED."""
+    """[1] A sleeping tree wakes when the drag of the wind on it has changed by this fraction of its weight. TUNED."""
     wind_check_period: Positive = 0.32
-    """[s] Period in which the drag on every sleeping tree is checked once, with an equal number in each step. TUNED."""
+    """[s] Period in which the drag of the wind on every sleeping tree is checked once, with an equal number of trees in
+    each step. TUNED."""
 
     # ------------------------------------------------------------------ level of detail of bunches
     detail_duration: Positive = 1.0
-    """[s] Time for which the berry clusters of a bunch keep moving after the last actor has left. TUNED."""
+    """[s] The berry clusters of a bunch move only while an actor is near. They keep moving for at least this time after
+    the last actor has left. TUNED."""
     detail_rate: Positive = 0.05
-    """[rad/s] The clusters of a tree count as at rest while all turn slower than this against their parents. TUNED."""
+    """[rad/s] The berry clusters of a tree count as at rest while all of them turn slower than this relative to their
+    parent bodies. TUNED."""
     detail_rest_duration: Positive = 0.25
     """[s] Time for which the berry clusters of a tree must be at rest before they are locked to their bunches again.
     DERIVED: longer than a swing is slow at its turning point.
@@ -105,31 +115,35 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     contact_damping_time: NotNegative = 0.02
     """[s] Damping of a contact divided by its stiffness. TUNED: two steps of 10 ms."""
     contact_margin: Positive = 0.002
-    """[m] A contact exists if the gap is smaller than this, or smaller than the distance by which it can close in one
-    step. TUNED."""
+    """[m] A contact between a plant and a movable geom exists if the gap is smaller than this, or smaller than the
+    distance by which the gap can close in one step. TUNED."""
     static_contact_margin: Positive = 0.0002
-    """[m] A contact with a static geom or another branch exists if a step brings the gap below this. TUNED."""
+    """[m] A contact of a plant with a static geom (ground, post, wire, old wood) or another branch exists if a step
+    brings the gap below this. TUNED."""
     impact_speed: Positive = 0.3
-    """[m/s] A contact that closes faster is an impact: its tree is integrated with phi = 1. TUNED."""
+    """[m/s] A contact whose gap closes faster than this is an impact: the tree in contact is integrated with backward
+    Euler (:attr:`phi` = 1). TUNED."""
     max_separation_speed: Positive = 1.0
-    """[m/s] Largest speed at which overlap is resolved. TUNED."""
+    """[m/s] Largest speed at which the contact solver separates overlapping bodies. TUNED."""
     contact_capacity: Capacity = 1024
-    """Largest number of contacts solved in one step; if there are more, the deepest are kept."""
+    """Largest number of contacts of plants in one step; if there are more, those with the deepest overlap are kept."""
     max_contacts_per_tree: Capacity = 64
     """Largest number of contacts of one tree."""
     max_static_geoms_per_tree: Capacity = 256
     """Largest number of static geoms near one tree."""
     solver_sweeps: Count = 100
-    """Largest number of Gauss-Seidel sweeps; with warm start and Newton steps, two to five are usual. TUNED."""
+    """Largest number of Gauss-Seidel sweeps of the contact solver in one step; with warm start and Newton steps, two to
+    five are usual. TUNED."""
     solver_newton_steps: Annotated[int, msgspec.Meta(ge=0)] = 6
-    """Number of first sweeps of an island that are each followed by a Newton step. Of the later sweeps, one in ten is
-    followed by a Newton step. TUNED.
+    """Number of first sweeps of the contact solver in an island (bodies coupled by contacts) that are each followed by
+    a Newton step. Of the later sweeps, one in ten is followed by a Newton step. TUNED.
     """
     solver_newton_contacts: Annotated[int, msgspec.Meta(ge=0)] = 16
-    """Islands in which plants couple more contacts than this take no Newton step, whose cost grows with the cube of the
-    number of contacts."""
+    """Largest number of contacts coupled by plants in an island (bodies coupled by contacts) for which the contact
+    solver takes Newton steps. The cost of a Newton step grows with the cube of this number."""
     solver_tolerance: Positive = 1e-6
-    """[1] Sweeps end when no impulse changes by more than this fraction of the largest impulse. TUNED."""
+    """[1] The sweeps of the contact solver end when no contact impulse changes by more than this fraction of the
+    largest one. TUNED."""
     solver_constraint_steps: Count = 10
     """Largest number of times that contacts are solved again because the impulses of plants change MuJoCo's constraints
     (supports, limits). DERIVED: with crates that fall beside canes, 7 of 10 steps need none, 1 of 50 needs more."""
@@ -139,8 +153,8 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
 
     # ------------------------------------------------------------------ free bunches
     bunch_rolling_arm: NotNegative = 0.004
-    """[m] Lever arm of the rolling resistance of a free bunch. GUESSED: the berries on which it lies are 10 mm apart
-    and soft. Without rolling resistance a bunch of spheres keeps rolling."""
+    """[m] Lever arm of the rolling resistance of a free (detached) bunch. GUESSED: the berries on which the bunch lies
+    are 10 mm apart and soft. Without rolling resistance a bunch of spheres keeps rolling."""
     bunch_contact_time: Positive = 0.02
     """[s] Time constant of a free bunch's contacts (MuJoCo's solref). TUNED: with a longer one the bunch never comes to
     rest."""
@@ -148,29 +162,32 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     """[1] Damping ratio of a free bunch's contacts (MuJoCo's solref). TUNED: with 1, a bunch that fell a metre into a
     crate leaves it at up to 110 m/s."""
     bunch_pool_size: Capacity = 12
-    """Number of bodies kept ready for free bunches; when all are used, the world is recompiled (about 10 ms)."""
+    """Number of MuJoCo bodies kept ready for free (detached) bunches; when all are used, MuJoCo's model is recompiled
+    with more (about 10 ms)."""
     dormant_radius: Positive = 2.5
-    """[m] A dormant free bunch gets its body when the horizontal distance to an actor is below this. DERIVED: seconds
-    before an arm can reach the bunch."""
+    """[m] A free (detached) bunch far from all actors is dormant: it is rendered but has no MuJoCo body. It gets its
+    body when the horizontal distance to an actor is below this. DERIVED: seconds before an arm can reach the bunch."""
 
     # ------------------------------------------------------------------ robots
     base_slip: Positive = 0.01
-    """[m or rad] Offset of a robot's base from its target at which the tracks give full effort; beyond it they slip.
-    TUNED."""
+    """[m or rad] Offset of a robot's base from its target at which the tracks exert their full effort. With a larger
+    offset the tracks slip. TUNED."""
     remote_base_slip: Positive = 0.05
-    """[m or rad] Offset of the base of a remote robot's copy from its target at which the tracks give full effort.
-    TUNED.
+    """[m or rad] Offset of a base from its target at which the tracks exert their full effort, for copies of robots
+    that other clients simulate. TUNED.
     """
     base_damping_time: Positive = 0.05
-    """[s] Damping of the base's servos divided by their stiffness. TUNED."""
+    """[s] Damping of the servos that move a robot's base, divided by their stiffness. TUNED."""
 
     # ------------------------------------------------------------------ people
     hand_stiffness: Positive = 100.0
-    """[N/m] Force of a hand in contact per distance from its controller. READ: CANOPIES D6.4, section 3.1.1."""
+    """[N/m] Stiffness of the spring that pulls a person's hand in contact to its tracked controller. READ: CANOPIES
+    D6.4, section 3.1.1."""
     hand_force: Positive = 100.0
-    """[N] Largest force of a hand. READ: CANOPIES D6.4, section 3.1.1."""
+    """[N] Largest force of a person's hand. READ: CANOPIES D6.4, section 3.1.1."""
     hand_torsional_stiffness: Positive = 10.0
-    """[N m/rad] Moment of a hand in contact per angle from its controller. GUESSED."""
+    """[N m/rad] Stiffness of the torsional spring that turns a person's hand in contact to its tracked controller.
+    GUESSED."""
     hand_moment: Positive = 10.0
     """[N m] Largest moment of a hand. GUESSED: the strength of a wrist."""
     hand_mass: Positive = 0.4
@@ -178,35 +195,44 @@ class PhysicsParameters(msgspec.Struct, frozen=True, kw_only=True, forbid_unknow
     hand_inertia: Positive = 0.02
     """[kg m^2] Moment of inertia of a hand. GUESSED: the forearm turns with the hand."""
     hand_contact_duration: Positive = 0.05
-    """[s] A hand stays on its spring for this time after its last contact, so that a bounce does not free it. TUNED."""
+    """[s] In contact, a spring pulls a person's hand to its tracked controller; without contact, the hand follows the
+    controller exactly. The spring remains for this time after the last contact, so that a bounce does not free the
+    hand. TUNED."""
     hand_return_time: Positive = 0.1
-    """[s] Time constant with which a free hand returns to its controller. TUNED."""
+    """[s] Time constant with which a person's hand returns to its tracked controller after a contact. TUNED."""
     hand_return_speed: Positive = 1.5
-    """[m/s] Largest speed of a free hand that returns to its controller. TUNED."""
+    """[m/s] Largest speed, relative to the tracked controller, of a person's hand that returns to it after a contact.
+    TUNED."""
     max_body_speed: Positive = 5.0
     """[m/s] Upper limit of the speed of a person's parts in contacts, for higher speeds in tracking data. GUESSED."""
     teleport_distance: Positive = 0.5
-    """[m] A head that moves further than this in a step was teleported: the person's velocity is then set to zero.
-    GUESSED."""
+    """[m] A person whose head moves further than this in a step was teleported: the velocity of the person is then set
+    to zero. GUESSED."""
     grasp_distance: Positive = 0.03
-    """[m] A closing hand grasps objects closer than this to its palm or fingers. GUESSED."""
+    """[m] A person's hand that closes grasps objects closer than this to its palm or fingers. GUESSED."""
     grasp_duration: Positive = 0.2
-    """[s] Time for which a hand that closed without grasping anything still grasps a body that touches it. GUESSED."""
+    """[s] Time for which a person's hand that closed without grasping anything still grasps a body that touches the
+    hand. GUESSED."""
     haptic_period: Positive = 0.05
-    """[s] Period at which a lasting contact is reported to the controller. GUESSED."""
+    """[s] Period at which a lasting contact of a person's hand is reported to its controller as a vibration.
+    GUESSED."""
     haptic_onset_amplitude: Fraction = 0.2
-    """[1] Smallest amplitude at the onset of a contact, strong enough to be felt. GUESSED."""
+    """[1] Smallest amplitude of the vibration at the onset of a contact of a person's hand, strong enough to be felt.
+    GUESSED."""
     haptic_min_amplitude: Fraction = 0.01
-    """[1] Amplitude below which a contact is not reported. GUESSED."""
+    """[1] Amplitude of vibration below which a contact of a person's hand is not reported to its controller.
+    GUESSED."""
 
     # ------------------------------------------------------------------ support of boxes and free bunches
     support_rest_duration: Positive = 0.5
-    """[s] An object is at rest after it has been still on its support for this time. DERIVED: as ``sleep_duration``."""
+    """[s] A box or free bunch is at rest after it has been still relative to its support (ground, box or link of a
+    robot) for this time. DERIVED: as ``sleep_duration``."""
     support_move_speed: Positive = 0.01
-    """[m/s] A box faster than this counts as moving even if it stays near its anchor pose. TUNED."""
+    """[m/s] A box faster than this counts as moving, even if it stays near the pose on its support from which its
+    displacement is measured. TUNED."""
     support_snap_distance: Positive = 0.5
-    """[m] Distance between a copy of an object and its received pose above which the copy is moved there at once.
-    GUESSED."""
+    """[m] Distance between the copy of a box or bunch and the pose received from another client, above which the copy
+    is set to the received pose at once. GUESSED."""
 
     def __post_init__(self) -> None:
         """Check every number, because msgspec checks only values that were read from a file."""

@@ -30,13 +30,15 @@ class State(StructOfArrays):
     joint_xd: np.ndarray = array("body", 3, unit="m/s")
     """World velocity of the origin of a cut body; unused for other bodies."""
     tree_fine: np.ndarray = array("tree", unit="1", dtype=np.bool_)
-    """Whether the berry clusters of the tree's bunches are separate bodies; otherwise each bunch is one compound."""
+    """Whether the berry clusters (groups of berries) of the tree's bunches move as separate bodies; if not, each bunch
+    is one rigid body."""
     tree_awake: np.ndarray = array("tree", unit="1", dtype=np.bool_)
     bunch_attached: np.ndarray = array("bunch", unit="1", dtype=np.bool_, fill=1)
 
     @classmethod
     def at_rest(cls, model: Model) -> State:
-        """Returns the state with all trees asleep in the drawn shape (``Model.joint_settled``), with zero rates."""
+        """Returns the state with all trees asleep and without motion in the shape that their generator or builder
+        gave them (``Model.joint_settled``)."""
         counts = model.counts()
         state = cls.allocate(body=counts["body"], tree=counts["tree"], bunch=counts["bunch"])
         state.joint_q[:] = model.joint_settled

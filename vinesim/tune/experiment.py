@@ -35,7 +35,8 @@ KINDS = {
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Experiment:
-    """Motion and observation of a plant. A number that is None has its default in :data:`KINDS`, see :meth:`number`."""
+    """A laboratory experiment on a plant: how the plant is moved and observed. A number that is None has its default in
+    :data:`KINDS`, see :meth:`number`."""
 
     kind: str = "pull-release"
     """``pull-release``: held aside, then released after :attr:`hold`. ``push``: at rest, then a steady force on its
@@ -62,7 +63,7 @@ class Experiment:
     """[1] Standard deviation of the force gauge relative to its reading; None: no gauge."""
     markers: tuple[str, ...] = (TIP,)
     axes: str = "xyz"
-    """World axes that are tracked."""
+    """World axes along which positions are tracked, such as ``xz``."""
     seed: int = 0
 
     def number(self, name: str) -> float:

@@ -39,7 +39,8 @@ DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Features:
-    """A damped sinusoid, or the response of a damped oscillator, fitted to a track."""
+    """Features of the motion in a track, found without a plant model: the parameters of a damped sinusoid, or, for a
+    shaken base, of a damped oscillator, fitted to the track."""
 
     frequency: float
     """Frequency [Hz]."""
@@ -49,9 +50,10 @@ class Features:
     """[s] Time of the release on the track's clock: the turning point at or before the onset of motion. For a shaken
     base it is the start of the track."""
     rest: np.ndarray
-    """Rest position of each column [column] m."""
+    """[column] m, rest position in each column of the track (axis of a marker)."""
     displacement: np.ndarray
-    """Displacement of the sinusoid from rest at the release, or largest response of the oscillator [column] m."""
+    """[column] m, displacement of the sinusoid from the rest position at the release; for a shaken base, largest
+    response of the oscillator."""
     noise: float
     """Robust standard deviation of the residuals of the curve [m]. The noise of the track is at most this."""
     explained: float
@@ -59,7 +61,7 @@ class Features:
 
     @property
     def log_decrement(self) -> float:
-        """[1] Logarithm of the ratio of two successive maxima."""
+        """[1] Logarithmic decrement: logarithm of the ratio of two successive maxima of the swing."""
         return 2.0 * math.pi * self.damping_ratio / math.sqrt(1.0 - self.damping_ratio**2)
 
 

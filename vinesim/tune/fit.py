@@ -27,28 +27,28 @@ _LOGARITHMIC = ("modulus", "damping", "mass")
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Minimum:
-    """A minimum of the loss other than the best one."""
+    """A minimum of the loss of a fit, other than the best minimum."""
 
     modulus: float
-    """Modulus at this minimum [Pa]."""
+    """Young's modulus of the plant at this minimum [Pa]."""
     loss_ratio: float
     """Ratio of this minimum's loss to the loss of the best minimum [1]."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Estimate:
-    """One fitted number."""
+    """One fitted number of a plant, with its 90 % interval and its prior."""
 
     name: str
     value: float
     low: float
-    """Lower end of the 90 % interval."""
+    """Lower end of the 90 % interval of the number; ``high`` is its upper end."""
     high: float
     unit: str
     prior: str
-    """90 % interval of the prior and its source."""
+    """Text with the 90 % interval of the number before the fit (prior), and the source of this interval."""
     known: bool
-    """Whether the data, and not the prior, determine the number."""
+    """Whether the number is determined by the track rather than by the prior."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -83,34 +83,35 @@ class Fit:
     """The result of :func:`vinesim.tune.tune`."""
 
     specimen: Specimen
-    """The specimen before the fit."""
+    """The measured plant with its numbers before the fit."""
     track: Trajectory
     features: Features
-    """Features of the track without a model, for comparison: frequency and logarithmic decrement."""
+    """Frequency, logarithmic decrement and other features of the track, found without a plant model, for comparison."""
     posterior: Posterior
     sample: Sample | None
-    """Draws from the posterior, if requested."""
+    """Random samples of the posterior; None unless they were requested."""
     noise: float
-    """[m] Robust standard deviation of the residuals of all columns together."""
+    """[m] Robust standard deviation of the residuals (track minus fitted track) of all columns together."""
     column_noise: np.ndarray
-    """Robust standard deviation of the residuals of each column [column] m. Cameras measure distances less exactly than
-    directions."""
+    """[column] m, robust standard deviation of the residuals of each column of the track (axis of a marker). Columns
+    differ, because cameras measure distances less exactly than directions."""
     frequency: float
-    """[Hz] Frequency of the fitted plant."""
+    """[Hz] Frequency of the swing of the fitted plant."""
     damping_ratio: float
-    """[1] Damping ratio of the fitted plant."""
+    """[1] Damping ratio of the swing of the fitted plant."""
     model: np.ndarray
-    """The fitted track in the columns of ``track.tracked`` [sample, column] m; NaN where the data are NaN."""
+    """[sample, column] m, the track as the fitted plant would produce it, with a column for each tracked axis of a
+    marker (:attr:`Trajectory.column_names`); NaN where ``track`` is NaN."""
     jacobian: np.ndarray
-    """[observation, parameter] Derivatives of the fitted track."""
+    """[observation, parameter] Derivatives of the fitted track with respect to the parameters."""
     minima: tuple[Minimum, ...]
-    """Other minima, the best first."""
+    """Minima of the loss other than the best one, sorted by their loss."""
     faults: tuple[str, ...]
     """Reasons not to trust the fit; empty if there are none."""
     dt: float
-    """[s] Step of the simulation."""
+    """[s] Duration of a step of the simulations of the fit."""
     force: tuple[float, float] | None
-    """[N] Reading of the gauge and its standard deviation."""
+    """[N] Force on the tip that the gauge measured, and its standard deviation; None without a reading."""
     priors: dict[str, Prior]
 
     @property
@@ -158,7 +159,7 @@ class Fit:
 
     @property
     def gaps(self) -> int:
-        """Number of missing positions."""
+        """Number of positions that are missing in the track."""
         return int(np.isnan(self.track.position[:, self.track.tracked]).sum())
 
     # ------------------------------------------------------------------ words
@@ -236,7 +237,7 @@ class Fit:
     # ------------------------------------------------------------------ file
 
     def fitted_specimen(self) -> Specimen:
-        """Returns the specimen with the fitted numbers, of grade FITTED."""
+        """Returns the specimen with its fitted numbers, which have the grade FITTED."""
         text = f"{datetime.date.today().isoformat()}, vinesim tune of {self.track.source}"
         changes: dict[str, Any] = {}
         bow = list(self.specimen.bow)

@@ -149,20 +149,23 @@ def _ridges(problem: Problem, data: np.ndarray, prior: np.ndarray) -> tuple[Ridg
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Sample:
-    """Draws from the exact posterior, by importance resampling of draws from Laplace's approximation."""
+    """Random samples of the exact posterior, from samples of a proposal distribution by importance resampling."""
 
     draws: np.ndarray
-    """Draws of the parameters with equal weights [n, parameter]."""
+    """[n, parameter] Sampled parameters; all samples have equal weights."""
     effective: float
-    """Effective number of independent draws (Kish)."""
+    """[1] Effective number of independent samples (Kish)."""
 
 
 def importance_sample(
     problem: Problem, posterior: Posterior, noise: np.ndarray, count: int, seed: int = 0, batch: int = 64
 ) -> Sample:
-    """Draw ``count`` candidates from a proposal, simulate them, and resample them with weights posterior / proposal.
+    """Sample the exact posterior: sample ``count`` parameter sets at random from a proposal distribution, simulate
+    them, and resample them with the weights posterior / proposal.
 
-    The proposal is a Student t distribution with five degrees of freedom and the covariance of ``posterior``.
+    The proposal is a Student t distribution with five degrees of freedom and the mean and covariance of ``posterior``.
+    ``noise``: [column] standard deviation of the track [m]. ``seed``: seed of the random numbers. ``batch``: number of
+    parameter sets that are simulated at once.
     """
     rng = np.random.default_rng(seed)
     size = len(posterior.mean)

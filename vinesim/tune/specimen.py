@@ -39,10 +39,11 @@ def base_pose(specimen: Specimen) -> np.ndarray:
 
 
 def rest_bends(specimen: Specimen, bow: np.ndarray) -> np.ndarray:
-    """Returns rotation vectors [..., segments, 3] rad of each segment relative to the one before, for bows [..., 2]
-    rad.
+    """Returns the slack shape of a specimen as the rotation vector [..., segments, 3] rad of each segment relative to
+    the previous segment.
 
-    The first segment is clamped in the direction of growth. The bow is distributed equally over the other segments.
+    ``bow`` [..., 2] rad: bend from base to tip about the specimen's y and z axes. The first segment is clamped in the
+    direction of growth. The bow is distributed equally over the other segments.
     """
     bends = np.zeros((*np.shape(bow)[:-1], specimen.segments, 3))
     bends[..., 1:, 1:] = np.asarray(bow, float)[..., None, :] / (specimen.segments - 1)
@@ -67,8 +68,11 @@ def _axis_turns(specimen: Specimen) -> np.ndarray:
 
 
 def hanging_bends(specimen: Specimen) -> np.ndarray:
-    """Returns rotation vectors [segments, 3] rad of each segment relative to the one before, along the axis of a
-    specimen."""
+    """Returns the measured shape of a hanging cane as the bend of the chain of segments at the base of each segment:
+    rotation vectors [segments, 3] rad relative to the previous segment.
+
+    The bends follow the points ``Specimen.axis``. The bend at the base of the first segment is zero.
+    """
     turns = _axis_turns(specimen)
     bends = frames.log(frames.multiply(frames.conjugate(turns[:-1]), turns[1:]))
     return np.concatenate([np.zeros((1, 3)), bends])

@@ -25,7 +25,7 @@ _HEADER = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
 
 
 class TrajectoryError(ValueError):
-    """A track cannot be used. The message is one line with file, line, column, value and remedy."""
+    """Raised for a track that cannot be used. The message is one line with file, line, column, value and correction."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -45,7 +45,7 @@ class Trajectory:
     force: np.ndarray | None = None
     """Pull measured by a gauge at the tip [sample] N; NaN without a reading. None without a gauge."""
     source: str = "data"
-    """Name of the file for messages."""
+    """Name of the source of the track, such as its file, for messages."""
     base: np.ndarray | None = None
     """Displacement of the base from its position at the first sample [sample, 3] m; the base does not rotate. None:
     the base did not move."""
@@ -133,7 +133,7 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
     and m, cm or mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which are not allowed in time and base.
     Lines that begin with ``#`` are skipped.
 
-    Raises :class:`TrajectoryError` with line, column, value and remedy if a line does not fit.
+    Raises :class:`TrajectoryError` with line, column, value and correction if a line is invalid.
     """
     path = pathlib.Path(path)
     try:

@@ -58,10 +58,11 @@ def tune(
             all masses equally and needs a force reading; ``rest`` is the slack shape and needs positions relative to
             the base.
         release: time of the release [s]; detected unless given.
-        samples: number of draws from the posterior in addition to Laplace's approximation.
-        seed: seed of those draws.
+        samples: number of random samples of the exact posterior, in addition to Laplace's approximation of it.
+        seed: seed of the random samples.
         device: ``cpu``, ``cuda`` or ``cuda:N``.
-        pushed: the track shows a push: from rest, a steady force begins to act at ``release``.
+        pushed: whether the track shows a push (from rest, a steady force begins to act at ``release``) instead of a
+            pull and release.
 
     Raises :class:`~vinesim.tune.trajectory.TrajectoryError` for a track that cannot belong to the specimen, and
     :class:`~vinesim.core.errors.UsageError` for invalid parameters. A failed fit is returned, with the reasons in

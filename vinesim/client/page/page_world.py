@@ -121,8 +121,9 @@ class PageWorld:
         self._laid_out: dict[str, np.ndarray] = {}
         """Columns of the primitives of rigid bodies, with the values that pages load before lights change."""
         self._has_shone = np.zeros(0, bool)
-        """Whether each primitive of a rigid body has ever differed from ``_laid_out``, because its light has changed
-        [row]."""
+        """[primitive of a rigid body] Whether colour or material of the primitive have differed from ``_laid_out``
+        since pages loaded the primitives. Only indicator lights change these. Every state for a page contains the
+        present colours of the primitives marked here, so that the page also shows when a light goes out."""
         self._visuals: tuple[Any, ...] | None = None
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None

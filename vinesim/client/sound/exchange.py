@@ -99,15 +99,17 @@ class _Speaker:
     def __init__(self) -> None:
         self.waiting: collections.deque[tuple[Codec, bytes, bool]] = collections.deque(maxlen=MAX_WAITING)
         self.next_time: dict[bool, float] = {}
-        """Time at which the next frame begins if the voice continues [s], by kind of frame (True: main, False:
-        extra)."""
+        """Time at which the next frame of sound begins if the voice continues without a pause [s], by kind of frame.
+        True: main frames, in the codec of the page or loudspeaker. False: extra frames, which repeat the same sound in
+        PCM16 for listeners that cannot decode Opus."""
         self.number = 0
 
     def stamp(self, now: float, is_main: bool) -> float | None:
-        """Returns the start time [s] of a frame that has just arrived. Frames of one voice follow without gaps or
-        overlap.
+        """Returns the start time [s] of a frame of sound that has just arrived. Frames of one voice follow without gaps
+        or overlap.
 
-        None if the frame must be dropped, because a page stalled and now sends many frames at once.
+        None if the frame must be dropped, because a page stalled and now sends many frames at once. ``now``: network
+        time [s]. ``is_main``: False for an extra frame, which repeats a sound in PCM16 for listeners without Opus.
         """
         began = now - FRAME
         expected = self.next_time.get(is_main, -np.inf)

@@ -84,7 +84,8 @@ def predict_impacted_trees(
 ):
     """One thread per tree.
 
-    Repeat the prediction with phi = 1 if one of the tree's contacts is an impact and phi was smaller.
+    Repeat the prediction with phi = 1 (implicitness of the integrator: backward Euler) if one of the tree's contacts is
+    an impact and the prediction was made with a smaller phi.
     """
     tree = wp.tid()
     if is_impact[tree] and tree_phi_out[tree] < 1.0:

@@ -1,10 +1,10 @@
 """Articulated trees on ball joints with implicit springs: kinematics, prediction, impulse response, integration.
 
 Featherstone's articulated-body recursion (Rigid Body Dynamics Algorithms, 2008, chapter 7), one thread a tree. The
-springs enter the recursion implicitly: with theta the joint's rotation vector, w its rate and phi in [1/2, 1], the
-torque over one step is about -K (theta + phi dt w_phi) - D w_phi, w_phi = w + phi dt dw/dt, so every joint inertia grows by
-the *metric* phi dt (phi dt K + D) and stiffness cannot make the step unstable. phi = 1 is backward Euler (MuJoCo's
-``discrete`` integrator), phi = 1/2 the trapezoidal rule.
+springs enter the recursion implicitly: with theta the joint's rotation vector, w its rate and phi in [1/2, 1] the
+implicitness of the integrator, the torque over one step is about -K (theta + phi dt w_phi) - D w_phi, w_phi = w + phi
+dt dw/dt, so every joint inertia grows by the *metric* phi dt (phi dt K + D) and stiffness cannot make the step
+unstable. phi = 1 is backward Euler (MuJoCo's ``discrete`` integrator), phi = 1/2 the trapezoidal rule.
 
 K and D are diagonal in a joint's *middle axes*, turned from the joint's by half of its rotation, and the torque is the
 gradient of theta^T K theta / 2 (:func:`vinesim.kernels.plants.forces.spring_torque`).

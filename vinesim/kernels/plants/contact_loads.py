@@ -11,7 +11,8 @@ GIVEN = wp.constant(1)
 TICK = wp.constant(2)
 """Index in ``numbers``: number of this step."""
 ONSET_STEPS = wp.constant(3)
-"""Index in ``numbers``: number of steps with phi = 1 at the beginning of a contact, including the first one."""
+"""Index in ``numbers``: number of steps with backward Euler (phi = 1) at the beginning of a contact, including the
+first one."""
 REFUSED = wp.constant(4)
 """Index in ``numbers``: the first given body that cannot be loaded, counted from 1; 0 if all can be loaded."""
 NUMBERS = 5
@@ -44,8 +45,8 @@ def load_bodies(
     wrench: [k] bodies and their wrenches (N, N m); a body may occur several times. loaded_out: [k] loaded bodies; the
     array holds the bodies of the last call and is overwritten with the bodies of this call. body_wrench_out: [body] N,
     N m sums. touched_out: [j] each tree once; touched_count_out: [1] number of touched trees. last_contact_out: [tree]
-    number of the step with the last contact. tree_euler_steps_out: [tree] number of steps with phi = 1 still to be
-    taken; set to at least ``ONSET_STEPS`` where contact begins.
+    number of the step with the last contact. tree_euler_steps_out: [tree] number of steps with backward Euler (phi = 1)
+    still to be taken; set to at least ``ONSET_STEPS`` where contact begins.
     """
     given = int(numbers_out[GIVEN])
     numbers_out[REFUSED] = wp.int64(0)

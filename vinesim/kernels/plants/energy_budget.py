@@ -2,21 +2,24 @@
 
 The step is linear about its start. In modes that it does not resolve (w dt from 3 to 100: twist, high bending) its
 error adds energy; docs/decisions/integrator.md has the figures. So the kinetic plus potential energy of a tree is
-measured at the end of a step. It may not exceed its least value since the budget began by more than :data:`BAND`. If it
-does, the rates are filtered at fixed pose,
+measured at the end of a step. It may not exceed the tree's limit by more than :data:`BAND`. The limit is the least
+energy that was measured since the budget of the tree *began*. If the energy exceeds the limit by more, the joint rates
+are filtered at fixed pose,
 
     (M + c K) v' = M v,    c = 0.1 dt^2,
 
 which removes 0.9 % of the rate of a mode with w dt = 0.3, half with w dt = 3, and nearly all of modes far beyond. The
 filter can only reduce kinetic energy. Any excess that remains is removed from all rates alike, and the next step is
-taken with phi = 1. If the potential energy alone is too large, the tree is moved back towards its pose at the start of
-the step.
+taken with backward Euler (phi = 1). If the potential energy alone is too large, the tree is moved back towards its pose
+at the start of the step.
 
-The budget begins again whenever an external force does work on the tree: contacts, loads, moving air, moved ties, and
-changes of state or model between steps. Trees with a floating root or on wires have no budget. Without geometric
-stiffness, which is an option for comparisons with other solvers, no tree has a budget.
+A budget begins in :func:`begin_budget`: the present energy becomes the limit. It begins again after every external
+influence that does work on the tree: contacts, loads, moving air, moved ties, and changes of state or model between
+steps. Trees with a floating root or on wires have no budget. Without geometric stiffness, which is an option for
+comparisons with other solvers, no tree has a budget.
 
-Trees that can gain much energy within one step are checked often, other trees seldom; see :func:`choose_budget`.
+Trees that can gain much energy within one step are *watched closely*: their energy is checked often, the energy of
+other trees seldom; see :func:`choose_budget`.
 """
 
 import warp as wp
@@ -65,10 +68,10 @@ FILTER = wp.constant(0.1)
 """c / dt^2 of the filter. TUNED: 0.03 to 1 serve as well"""
 
 CLOSE_STEPS = wp.constant(32)
-"""Number of consecutive steps that are checked after the energy was found to rise or, in a closely watched tree, after
-its budget began.
+"""Number of consecutive steps in which the energy of a tree is checked after its budget began (its present energy
+became the limit that it may not exceed), and after a check found that the energy has risen.
 
-Otherwise one step in :data:`CHECK_PERIOD` is checked. TUNED
+In other steps, one in :data:`CHECK_PERIOD` is checked. TUNED
 """
 
 NO_BUDGET = 0
@@ -77,33 +80,37 @@ NOW_AND_THEN = 2
 """Value of ``tree_budget``: the tree's energy is checked once in :data:`CHECK_PERIOD` launches. When its energy has
 risen, every step is checked until :data:`CLOSE_STEPS` steps have passed without a rise.
 
-With ``NO_BUDGET`` the energy is never checked. With ``CLOSELY`` the budget is kept in every step.
+With ``NO_BUDGET`` the energy is never checked. With ``CLOSELY`` the tree is watched closely: every step is checked in
+which a joint is faster than :data:`CHECK_RATE`, and changes of the state between steps are noticed at once.
 """
 
 CHECK_PERIOD = wp.constant(8)
-"""[launch] Period of checks of a quiet tree. On a CPU there is one launch in eight steps while no tree is watched closely.
+"""[launch] Period in which the energy of a tree is checked while nothing demands more checks, such as a rise of energy.
+On a CPU there is one launch in eight steps while no tree is watched closely (:data:`CLOSELY`).
 TUNED: a check costs as much as a third of a step"""
 
 CHECK_RATE = wp.constant(2.0)
-"""[rad/s] Joint rate above which every step of a closely watched tree is checked. TUNED"""
+"""[rad/s] Joint rate above which the energy of a closely watched tree (:data:`CLOSELY`) is checked in every step.
+TUNED"""
 
 MIN_DAMPING = wp.constant(0.5)
-"""Smallest ratio of damping to stiffness [steps] of the joints of a tree that is checked seldom. MEASURED, like
-:data:`MAX_SAG`: docs/decisions/integrator.md"""
+"""Ratio of damping to stiffness [steps] of a joint below which the energy of the joint's tree is watched closely
+(:data:`CLOSELY`). MEASURED, like :data:`MAX_SAG`: docs/decisions/integrator.md"""
 
 MAX_SAG = wp.constant(4.0)
-"""[rad] Largest sag of a tree that is checked seldom: the sum of joint angles along a path from root to tip, under the
-weight of the tree in its relaxed shape, held level, with linear springs."""
+"""[rad] Sag of a tree above which its energy is watched closely (:data:`CLOSELY`). Sag is the largest sum of joint
+angles along a path from root to tip, under the weight of the tree in its relaxed shape, held level, with linear
+springs."""
 
 MIN_PHI = wp.constant(0.549)
-"""Value of phi below which a tree is watched closely, because the scheme does not damp modes that the step cannot
-resolve."""
+"""Value of phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler) below which the energy of a tree
+is watched closely (:data:`CLOSELY`), because the scheme does not damp modes that the step cannot resolve."""
 
 BACKTRACKS = wp.constant(8)
 """Largest number of times that the joint rotations of a step are halved. DERIVED: 0.4 % of them then remain."""
 
 NO_LIMIT = wp.constant(1.0e30)
-"""[J] Limit of a tree whose budget has not begun."""
+"""[J] Limit of a tree whose energy budget has not begun: no present energy has been stored as its limit yet."""
 
 
 @wp.kernel
@@ -118,8 +125,8 @@ def choose_budget(
     scratch_out: Scratch,
     tree_budget_out: wp.array(dtype=wp.int32),
 ):
-    """One thread per tree. Choose how the tree's energy is watched: closely if its springs are weak or it is hardly
-    damped.
+    """One thread per tree. Choose how often the tree's energy is checked: it is watched closely if the tree's springs
+    are weak or hardly damped.
 
     trees: [thread] index of the tree. tree_budget_out: [tree] :data:`CLOSELY` or :data:`NOW_AND_THEN`, or
     :data:`NO_BUDGET` with a floating root or without geometric stiffness. scratch_out: scratch; later kernels do not
@@ -168,13 +175,15 @@ def choose_budget(
 
 @wp.func
 def is_close(budget: int, phi: float):
-    """Returns whether the energy of a tree with this phi is checked in every step."""
+    """Returns whether the energy of a tree is watched closely: because of its ``budget``, or because its ``phi``
+    (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler) is below :data:`MIN_PHI`."""
     return budget == CLOSELY or phi < MIN_PHI
 
 
 @wp.func
 def is_watched(budget: int, phi: float, tree: int, budgets: EnergyBudget):
-    """Returns whether a tree's budget is kept in this step."""
+    """Returns whether the state of a tree is recorded in this step for its energy budget: the tree is watched closely
+    (:func:`is_close`), its budget has not begun, or its next steps are to be checked."""
     return is_close(budget, phi) or budgets.limit[tree] >= NO_LIMIT or budgets.watch[tree] > 0
 
 
@@ -194,11 +203,13 @@ def begin_budget(
     budget_out: EnergyBudget,
     bodies_out: BodyState,
 ):
-    """One thread per tree, before an integration. Begin the tree's budget if work was done on it since the last step.
+    """One thread per tree, before an integration. Begin the tree's energy budget if an external influence did work on
+    the tree since the last step: store the present energy as the limit that it may not exceed.
 
     trees: [thread] index of the tree; nothing happens with a tree_budget [tree] of :data:`NO_BUDGET`. tree_phi: [tree]
-    requested phi. forces: forces of this step. joints: joints at its start. budget_out: the limit is :data:`NO_LIMIT`
-    while external forces act. bodies_out: scratch.
+    requested phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler). forces: forces of this step.
+    joints: joints at the start of this step. budget_out: the limit is :data:`NO_LIMIT` while external forces act.
+    bodies_out: scratch.
     """
     if wp.tid() >= count[0]:
         return
@@ -300,7 +311,7 @@ def filter_rates(
 def is_due(rate: float, close: bool, tree: int, budget_out: EnergyBudget):
     """Returns whether this step of a tree is to be checked, and counts the step.
 
-    ``rate`` [rad/s]: largest joint rate of the tree. ``close``: whether the tree is watched closely.
+    ``rate`` [rad/s]: largest joint rate of the tree. ``close``: whether the tree is watched closely (:func:`is_close`).
     """
     watch = budget_out.watch[tree] - 1
     due = watch >= 0 or (close and rate > CHECK_RATE)
@@ -406,10 +417,11 @@ def keep_budget(
 
     trees: [thread] index of the tree. Nothing happens if the tree's budget has no limit or its tree_rate [tree] is
     above ``p.fault_rate``.
-    tree_budget: [tree] how its energy is watched. tree_phi: [tree] requested phi. tree_steps: [tree] number of substeps
-    of the step; this launch handles one substep. joints_out: joints at the end of the step, slower where energy was
-    removed. tree_euler_steps_out: [tree] raised to at least 1 where energy was removed. All later arguments are
-    scratch.
+    tree_budget: [tree] how its energy is watched, such as :data:`CLOSELY`. tree_phi: [tree] requested phi
+    (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler). tree_steps: [tree] number of substeps of the
+    step; this launch handles one substep. joints_out: joints at the end of the step, slower where energy was removed.
+    tree_euler_steps_out: [tree] number of next steps with phi = 1; raised to at least 1 where energy was removed. All
+    later arguments are scratch.
     """
     if wp.tid() >= count[0]:
         return

@@ -80,7 +80,8 @@ def spring_torque(stiffness: wp.vec3, q: wp.quat):
 def residual_damping(damping: float, stiffness: float, phi: float, dt: float):
     """Returns the damping [N s/m] of a tie minus the damping that the scheme itself adds, at least 0.
 
-    The scheme damps a spring as if its damping time (damping / stiffness) were larger by (2 phi - 1) dt.
+    The scheme damps a spring as if its damping time (damping / stiffness) were larger by (2 phi - 1) dt, with phi the
+    implicitness of the integrator (0.5 trapezoidal to 1 backward Euler).
     """
     return wp.max(damping - (2.0 * phi - 1.0) * dt * stiffness, 0.0)
 

@@ -11,15 +11,15 @@ from vinesim.kernels.plants.structs import ArticulationModel, JointState, Predic
 wp.set_module_options({"enable_backward": False})
 
 EULER_ON = wp.constant(0.1)
-"""Share of ``max_rate``. A tree with a joint faster than this share keeps phi = 1 until all its joints are slower than
-``EULER_OFF``.
+"""Share of ``max_rate``. A tree with a joint faster than this share is integrated with backward Euler (phi = 1, the
+implicitness of the integrator) until all its joints are slower than ``EULER_OFF``.
 
 With a smaller phi, a chain of weak springs that swings a heavy load would gain energy and never come to rest. TUNED
 """
 
 EULER_OFF = wp.constant(0.06)
-"""Share of ``max_rate`` below which all joints of a tree must stay for ``EULER_DURATION`` before its phi may fall below
-1 again. TUNED"""
+"""Share of ``max_rate`` below which all joints of a tree must stay for ``EULER_DURATION`` before its phi (implicitness
+of the integrator, 0.5 trapezoidal to 1 backward Euler) may fall below 1 again. TUNED"""
 
 EULER_DURATION = wp.constant(1.0)
 """[s] Time for which all joints must be slower than ``EULER_OFF``. TUNED"""
@@ -46,12 +46,13 @@ def integrate(
     """One thread per tree. Move its joints to the end of the step. A faulty tree keeps its state from the start of the
     step.
 
-    trees: [thread] index of the tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] phi that
-    :func:`predict` used. tree_steps: [tree] number of substeps of the step; a tree that is stopped in one substep takes
-    no further substeps. tree_rate_out: [tree] sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed
-    b [m/s] of a floating root; NaN or above ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree]
-    number of steps and substeps still to be taken with phi = 1; this kernel counts it down. joints_out: [body]
-    rotations by the exponential map of the mean rate; may be ``joints``.
+    trees: [thread] index of the tree; nothing happens unless tree_awake [tree]. tree_phi: [tree] phi (implicitness of
+    the integrator, 0.5 trapezoidal to 1 backward Euler) that :func:`predict` used. tree_steps: [tree] number of
+    substeps of the step; a tree that is stopped in one substep takes no further substeps. tree_rate_out: [tree]
+    sqrt(a^2 + b^2) of the fastest joint rate a [rad/s] and the fastest speed b [m/s] of a floating root; NaN or above
+    ``p.fault_rate`` if the tree was stopped. tree_euler_steps_out: [tree] number of steps and substeps still to be
+    taken with phi = 1; this kernel counts it down. joints_out: [body] rotations by the exponential map of the mean
+    rate; may be ``joints``.
     """
     if wp.tid() >= count[0]:
         return

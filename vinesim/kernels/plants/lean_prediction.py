@@ -316,8 +316,8 @@ def predict_lean(
     """One thread per tree. Solve the tree's motion, with the arguments and results of
     :func:`vinesim.kernels.plants.prediction.predict`.
 
-    is_branching: [body] whether a body is the parent of a body other than the next one. Trees with phi = 1/2, which
-    must conserve energy, use the passes of :func:`predict`.
+    is_branching: [body] whether a body is the parent of a body other than the next one. Trees that must conserve
+    energy, because phi = 1/2 (the implicitness of the integrator: trapezoidal rule), use the passes of :func:`predict`.
     """
     if wp.tid() >= count[0]:
         return

@@ -36,8 +36,8 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def is_conservative(p: SolverParameters, phi: float):
-    """Returns whether a step with this phi must conserve energy (phi = 1/2). Such steps include the coupling of bending
-    and twist."""
+    """Returns whether a step must conserve energy: with phi = 1/2, the trapezoidal rule. Such steps include the
+    coupling of bending and twist. ``phi``: implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler."""
     return p.geometric_stiffness > 0.0 and phi == 0.5
 
 
@@ -286,8 +286,8 @@ def accelerate_bodies(
 def chosen_phi(
     p: SolverParameters, model: ArticulationModel, joints: JointState, tree: int, asked: float, euler_steps: int
 ):
-    """Returns phi of this step of a tree: 1 if a joint is faster than ``p.fast_rate`` or ``euler_steps`` is above 0,
-    otherwise ``asked``."""
+    """Returns phi (implicitness of the integrator, 0.5 trapezoidal to 1 backward Euler) for this step of a tree: 1 if a
+    joint is faster than ``p.fast_rate`` or ``euler_steps`` is above 0, otherwise ``asked``."""
     fastest = max_joint_rate(joints.joint_qd, model.tree_first[tree], model.tree_moving[tree], model.pitch)
     phi = asked
     if fastest > p.fast_rate or euler_steps > 0:
@@ -339,11 +339,11 @@ def predict(
 
     The articulated-body algorithm (Featherstone 2008, table 7.1) with implicit springs.
 
-    trees: [thread] index of the tree. tree_phi: [tree] requested phi, 1/2 to 1. tree_phi_out: [tree] phi used, 1 for a
-    tree with a joint faster than ``p.fast_rate`` or with ``tree_euler_steps`` [tree] left. tree_steps: [tree] number of
-    substeps of the step; this launch computes one substep. bodies_out: poses and velocities at the start of the step.
-    prediction_out: accelerations over the step and velocities at its end. scratch_out: scratch; later kernels do not
-    need it.
+    trees: [thread] index of the tree. tree_phi: [tree] requested phi (implicitness of the integrator, 0.5 trapezoidal
+    to 1 backward Euler). tree_phi_out: [tree] phi used, 1 for a tree with a joint faster than ``p.fast_rate`` or with
+    ``tree_euler_steps`` [tree] left. tree_steps: [tree] number of substeps of the step; this launch computes one
+    substep. bodies_out: poses and velocities at the start of the step. prediction_out: accelerations over the step and
+    velocities at its end. scratch_out: scratch; later kernels do not need it.
     """
     if wp.tid() >= count[0]:
         return

@@ -1,10 +1,11 @@
 """The rasteriser for GPUs: primitives are cut into tiles of a few pixels, and a few threads draw each tile.
 
 One leaf may fill the picture while a thousand berries cover one pixel each. With one thread for each primitive the
-whole GPU would wait for that leaf. So a first kernel only bounds primitives and lists tiles (``pieces``): rectangles of
-at most TILE_SIZE x TILE_SIZE pixels that cover each bound. A second kernel draws the tiles, which all take about the
-same work. Intersections are computed as in the ray caster. The host never reads the lengths of the lists: a frame is
-two launches.
+whole GPU would wait for that leaf. So a first kernel, :func:`list_tiles`, only bounds the region of each primitive in
+the picture, and appends the tiles that cover the region to a list in GPU memory. A *tile* is a rectangle of at most
+TILE_SIZE x TILE_SIZE pixels in which one primitive is to be drawn. A second kernel, :func:`draw_tiles`, draws the
+tiles, which all take about the same work. Intersections are computed as in the ray caster. The host never reads the
+lengths of the lists: a frame is two launches.
 """
 
 import warp as wp
@@ -46,7 +47,8 @@ primitive.
 """
 LARGE_PRIMITIVE = wp.constant(256)
 TILE_LISTS = wp.constant(64)
-"""Number of lists of tiles. Several lists reduce contention, because threads append to a list one at a time."""
+"""Number of lists of tiles that :func:`list_tiles` writes. Several lists reduce contention, because threads append to
+a list one at a time."""
 EMPTY_BOUNDS = wp.constant(wp.vec4(1.0e6, -1.0e6, 1.0e6, -1.0e6))
 """Bounds [px] of no pixels, from which bounds of a primitive are extended: lowest and highest x, lowest and highest y.
 """
@@ -236,9 +238,12 @@ def column_span(o: Outline, top: int, bottom: int) -> wp.vec2i:
 
 @wp.func
 def draw_tile(s: Shapes, lens: Pinhole, piece: wp.vec4i, lane: int, lanes: int, keys_out: wp.array(dtype=wp.int64)):
-    """Draw every ``lanes``-th pixel of a tile, from pixel ``lane`` on.
+    """Draw every ``lanes``-th pixel of a tile (a rectangle of pixels that covers a part of one primitive), from pixel
+    ``lane`` on.
 
-    ``piece``: the tile's primitive, upper left pixel (x + 65536 y), size (width + 65536 height), least depth [um].
+    ``piece``: the tile as four integers: index of the primitive, upper left pixel (x + 65536 y), size (width + 65536
+    height), least depth of the primitive [um]. keys_out: [pixel] depth [um] in the upper 32 bits and index of the
+    nearest primitive in the lower bits.
     """
     i = piece[0]
     left = piece[1] & 0xFFFF
@@ -276,11 +281,15 @@ def list_tiles(
     pieces_out: wp.array2d(dtype=wp.vec4i),
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread lists the tiles (rectangles of pixels) of every ``lanes``-th primitive of a cluster of primitives. If
-    the list is full, the thread draws the tile itself.
+    """One thread appends the tiles of every ``lanes``-th primitive of one cluster to a list, for :func:`draw_tiles`.
 
-    ball: [cluster] centre and radius [m]; which: clusters to draw; count: [list] number of tiles; pieces: [list, slot]
-    tiles, see :func:`draw_tile`; keys: [pixel].
+    A tile is a rectangle of pixels that covers a part of one primitive. A cluster is a run of primitives with a common
+    bounding ball. There are :data:`TILE_LISTS` lists of tiles. If the thread's list is full, the thread draws the tile
+    itself.
+
+    ball: [cluster] centre and radius [m] of the bounding ball; which: [k] clusters to draw; count_out: [list] number
+    of tiles in each list; pieces_out: [list, slot] tiles in the format of :func:`draw_tile`; keys_out: [pixel] depth
+    and index of the nearest primitive, written only for tiles that the thread draws.
     """
     k, lane = wp.tid()
     cluster = which[k]
@@ -331,9 +340,11 @@ def draw_tiles(
     # out
     keys_out: wp.array(dtype=wp.int64),
 ):
-    """One thread draws every ``lanes``-th pixel of every ``groups``-th tile of one list.
+    """One thread draws every ``lanes``-th pixel of every ``groups``-th tile in one of the lists that
+    :func:`list_tiles` wrote. A tile is a rectangle of pixels that covers a part of one primitive.
 
-    count: [list] number of tiles; pieces: [list, slot] tiles, see :func:`draw_tile`; keys: [pixel].
+    count: [list] number of tiles in each list; pieces: [list, slot] tiles in the format of :func:`draw_tile`;
+    keys_out: [pixel] depth [um] in the upper 32 bits and index of the nearest primitive in the lower bits.
     """
     group = wp.tid() // lanes
     lane = wp.tid() % lanes

@@ -89,10 +89,11 @@ def cast_rays(
     distance_out: wp.array(dtype=wp.float32),
     primitive_out: wp.array(dtype=wp.int32),
 ):
-    """One thread finds the nearest hit of one ray.
+    """One thread finds the first primitive that one ray hits.
 
-    origin: [ray] m; direction: [ray] vectors of any length; reach: farthest hit that counts, and distance: [ray]
-    nearest hit, both in lengths of the direction; primitive: [ray] index, -2 the ground, -1 no hit.
+    origin: [ray] start of each ray [m]. direction: [ray] vectors of any length. reach: largest distance of a hit, in
+    lengths of ``direction``. distance_out: [ray] distance to the hit, in lengths of ``direction``; FAR without a hit.
+    primitive_out: [ray] index of the primitive that was hit; -2: the ground, -1: no hit.
     """
     i = wp.tid()
     best = first_hit(hierarchies, shapes, origin[i], direction[i], reach, 0.0, direction[i])

@@ -1,4 +1,7 @@
-"""Stereo matching for CPUs: eight pixels of the imager at once, and a second view computed from the first one.
+"""Stereo matching for CPUs: eight pixels of the first imager (image sensor) at once.
+
+Occlusion needs the depth that the stereo camera's second imager has in view. :func:`warp_to_second` can compute this
+depth from the depth of the first imager, which is faster than to render the view of the second imager.
 
 The arithmetic is that of :mod:`vinesim.kernels.stereo.stereo_depth`, which suits GPUs (one pixel a thread); depths are
 equal bit for bit. docs/decisions/raster.md explains how loops must be written to vectorise.

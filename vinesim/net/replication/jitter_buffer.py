@@ -75,10 +75,11 @@ class JitterBuffer:
         return (1.0 - share) * self.rates[before] + share * self.rates[after]
 
     def _between(self, now: float) -> tuple[int, int, float, float]:
-        """Returns the two samples between which the state to show at ``now`` [s] is.
+        """Returns the two samples around the time ``now - delay`` [s], from which the shown state is interpolated: the
+        index of the earlier sample, the index of the later sample, the weight of the later sample (0 to 1), and the
+        time from the earlier sample to ``now - delay`` [s].
 
-        Returns the index of each, the weight of the second one, and the time since the first one [s]. Before the first
-        and after the newest sample, both indices are equal.
+        Before the first and after the newest sample, both indices are those of this one sample, and the weight is 0.
         """
         time = now - self.delay
         after = bisect.bisect_right(self.times, time)

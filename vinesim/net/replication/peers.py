@@ -1,4 +1,6 @@
-"""The peers of one actor: which are live, their hellos, their poses, and the common clock.
+"""The peers of one actor, which are the accepted actors (robots, people, spectators) of other clients in its world:
+which are live, their hellos, their poses, and the common clock. A hello is the message with which an actor introduces
+itself: name, kind, scene.
 
 Keys: the poses of an actor are divided among ``a/<actor>/far``, ``a/<actor>/mid``, ``a/<actor>/near`` and
 ``a/<actor>``. The nearer a peer is, the more of these keys it subscribes to
@@ -41,7 +43,8 @@ class WorldMismatch(RuntimeError):
 
 
 class PeerRegistry:
-    """All peers of one actor in its world. Constructing it joins the world."""
+    """All peers of one actor. A *peer* is an accepted actor (robot, person or spectator) of another client in the same
+    world. Constructing the registry joins the world."""
 
     def __init__(self, bus: Bus, hello: Hello, counters: Counters, jitter_buffer: float = 0.0) -> None:
         """Join the world and offer the own ``hello`` to peers. Raises what :meth:`Bus.join` raises.

@@ -127,7 +127,8 @@ class EarlyMessages:
         return self._messages.pop(sender, [])
 
     def _has_no_room(self, sender: str, size: int) -> bool:
-        """Whether a message of ``size`` [B] would exceed a limit."""
+        """Whether the store has no room for a further message of ``size`` [B] from ``sender``: the message would exceed
+        the number or size of one sender's messages, the number of senders, or the size of all messages."""
         return (
             len(self._messages.get(sender, ())) >= MAX_EARLY_MESSAGES
             or self._sizes.get(sender, 0) + size > MAX_EARLY_BYTES

@@ -125,8 +125,9 @@ class Server:
             raise PortTaken(listen[0], str(error.strerror)) from error
         self._fixed_factor = real_time_factor
         self._start = time.monotonic(), time.time()
-        """Monotonic time at the start, and the time at which all worlds begin [s], which is the time of day. If the
-        time of day is set later, the time of the worlds does not change."""
+        """Readings of ``time.monotonic`` and of ``time.time`` (seconds since 1970) when the server started [s]. The
+        time of every world counts from the second reading and advances by the monotonic clock. So the time of a world
+        does not jump when the date or time of the machine is set."""
         self._clocks: dict[str, WorldClock] = {}
         """Clocks by world."""
         self.pings = 0

@@ -46,7 +46,7 @@ class Robot(RobotInstance):
         """Add the robot to ``rigid`` at ``pose`` [7] (the origin unless given), holding its joints at their home
         positions.
 
-        ``name``: the name in the description unless given. ``index``: number of the robot's instance label.
+        ``name``: the name in the description unless given. ``index``: index of the robot in label images.
         """
         super().__init__(rigid, description, name, index, pose)
         self._joint_index = {drive.joint: i for i, drive in enumerate(description.drives)}
@@ -76,7 +76,8 @@ class Robot(RobotInstance):
 
     @property
     def physics(self) -> Physics:
-        """The world whose plants the grippers act on. Raises :class:`CommandError` before :meth:`fit_cutters`."""
+        """The physics with the plants that the robot's grippers act on. Raises :class:`CommandError` if
+        :meth:`fit_cutters` was not called yet."""
         if self._physics is None:
             raise CommandError(f"{self.name} has no grippers for plants; call fit_cutters(physics) first")
         return self._physics
@@ -208,7 +209,7 @@ class Robot(RobotInstance):
 
     def command_lights(self, pattern: LightPattern, color: Sequence[float] | None = None) -> None:
         """Show a pattern with the indicator lights, see :class:`Lights`. ``color`` [3]: sRGB from 0 to 1; the colour
-        of the pattern unless given. The tone stays on or off as before."""
+        of the pattern unless given. The call does not change whether a tone sounds while the lamps are lit."""
         if color is None:
             self.lights = Lights(pattern, USUAL_COLOR[pattern], self.lights.has_sound)
             return

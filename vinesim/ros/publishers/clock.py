@@ -55,8 +55,12 @@ class ClockPublisher:
         return topic is not None and self._sends and topic.subscription_count > 0
 
     def update(self) -> None:
-        """Search for other publishers of /clock, and start or stop publishing. The node's receiving thread calls this
-        method."""
+        """Every :data:`LOOK_PERIOD`, search for other publishers of /clock, and decide whether this node publishes it.
+
+        The node creates its publisher after :data:`FREE_LOOKS` searches without another publisher, and sends after
+        :data:`CLAIM_LOOKS` further ones. It withdraws its publisher if another one has a smaller identifier. The
+        node's receiving thread calls this method.
+        """
         now = wall.monotonic()
         if now < self._next_look:
             return

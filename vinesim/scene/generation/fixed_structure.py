@@ -1,4 +1,4 @@
-"""Fixed structure as round cones: poles, wires, trunks and arms; and the random stream of each vine."""
+"""Fixed structure as round cones: poles, wires, trunks and arms; and the random number generator of each vine."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from vinesim.scene.spec import Scene
 
 @dataclasses.dataclass
 class FixedStructure:
-    """Vines with their random streams, their trunks and arms, and all fixed parts."""
+    """Vines with their random number generators, their trunks and arms, and all fixed parts."""
 
     foot: np.ndarray
     """[vine, 3] m, position of the trunk's base on the ground."""

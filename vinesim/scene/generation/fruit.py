@@ -1,4 +1,5 @@
-"""Bunches: draws their mass, berries and peduncles, and chooses which of them a vine keeps."""
+"""Bunches: samples the mass, berries and peduncle of two bunches for each shoot at random, and selects the bunches that
+a vine keeps: a random number within the scene's limits, without bunches that touch wood or other bunches."""
 
 from __future__ import annotations
 
@@ -15,8 +16,8 @@ from vinesim.scene.plant_parameters import Range, VineParameters
 from vinesim.scene.spec import Scene
 
 Sampler = Callable[..., np.ndarray]
-"""Function that draws random numbers [shoot, *shape] for a given ``shape``. Each shoot uses the random stream of its
-vine."""
+"""Function that returns random numbers [shoot, *shape] for a given ``shape``. Each shoot uses the random number
+generator of its vine."""
 
 MIN_GAP = 0.02
 """Smallest gap between a bunch and neighbouring bunches, poles and trunks [m]."""
@@ -33,7 +34,17 @@ def sample_fruit(
     uniform: Sampler,
     normal: Sampler,
 ) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Draw two bunches for every shoot at random. :func:`choose_bunches` then selects some of them.
+    """Sample the properties of two bunches for every shoot at random. :func:`choose_bunches` then selects the bunches
+    that the vines keep.
+
+    Args:
+        scene: scene with the varieties and the training system.
+        parameters: distributions of the properties.
+        points: [shoot, AXIS_SEGMENTS + 1, 3] m, points along the main axis of each shoot.
+        nodes: [shoot] number of nodes of each shoot.
+        row: [shoot] row of the vineyard in which each shoot is.
+        uniform: sampler of uniform random numbers from 0 to 1.
+        normal: sampler of standard normal random numbers.
 
     Returns:
         ``fruit``, ``bunch_at``, ``peduncle`` and ``bunch_axis`` as in :class:`~vinesim.scene.generation.shoots.Shoots`,
@@ -102,10 +113,22 @@ def choose_bunches(
     burden: np.ndarray,
     fruit: dict[str, np.ndarray],
 ) -> np.ndarray:
-    """Select the bunches that each vine keeps.
+    """Select the bunches that each vine keeps: at most a random number within ``Scene.fruit.bunches``, in random order.
 
-    A bunch is not kept if it touches a pole, a trunk or a bunch that is already kept, or if its upright shoot would
-    buckle.
+    A bunch is not kept if its gap to a pole, a trunk, the border of its vine's plot or a bunch that is already kept is
+    too small (:data:`MIN_GAP`), or if its upright shoot would buckle.
+
+    Args:
+        scene: scene with the layout and the limits of the number of bunches.
+        structure: vines with their random number generators and trunks.
+        per_vine: number of shoots of each vine.
+        peduncle: [shoot, MAX_BUNCHES, points, 3] m, points along each peduncle; the last one is the bunch's origin.
+        burden: [shoot, MAX_BUNCHES] m g a^2 / EI of each bunch. The sum over the bunches that a shoot keeps is below
+            :data:`MAX_BUCKLING_LOAD`.
+        fruit: properties of the bunches by name, from :func:`sample_fruit`.
+
+    Returns:
+        [shoot, MAX_BUNCHES] bool, whether each bunch is kept.
     """
     layout = scene.layout
     low, high = scene.fruit.bunches

@@ -1,5 +1,5 @@
-"""Bodies of all shoots in one table [shoot, slot]: poses as drawn, masses, inertias, springs. A slot is a column of the
-table, see :mod:`~vinesim.scene.generation.shoot_slots`.
+"""Bodies of all shoots in one table [shoot, slot]: poses as generated, masses, inertias, springs. A slot is a column of
+the table, see :mod:`~vinesim.scene.generation.shoot_slots`.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from vinesim.scene.spec import Scene
 @dataclasses.dataclass
 class Bodies:
     """Table of bodies [shoot, slot] from which the model is built. A slot is a column of the table: a segment, a bunch
-    or a berry cluster. Poses are in the world, as drawn.
+    or a berry cluster. Poses are in the world, as generated.
     """
 
     present: np.ndarray

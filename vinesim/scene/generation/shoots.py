@@ -1,4 +1,5 @@
-"""Draws the shapes of shoots at random: points of main axes and laterals in the world, numbers of nodes."""
+"""Samples the shapes of shoots at random: points of main axes and laterals (side shoots) in the world, and numbers of
+nodes."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Generates the model of a scene. Poles, wires and old wood are fixed; every shoot is a tree with leaves and bunches.
 
 Shoots are rows of a table, all with the same slots (:mod:`~vinesim.scene.generation.shoot_slots`). Slots that a shoot
-does not use are removed at the end. So only the drawing of random numbers loops over plants. Each vine has its own
-random stream, seeded by (seed, row, place), so its numbers do not depend on the number of vines.
+does not use are removed at the end. So only the sampling of random numbers loops over plants. Each vine has its own
+random number generator, seeded by (seed, row, place), so its numbers do not depend on the number of vines.
 """
 
 from __future__ import annotations

@@ -40,11 +40,12 @@ class Wood(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True
     damping: Annotated[Number, "s"]
     drag: Annotated[Number, "1"]
     old_wood: Annotated[Number, "m"]
-    """Wood thicker than this is fixed."""
+    """Diameter above which wood is fixed instead of simulated."""
 
 
 class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """One plant, its base at the origin and z up."""
+    """One plant from a file of another program: skeleton and properties of its wood. The base is at the origin, z
+    up."""
 
     source: str
     """Name and format of the file from which the plant was read."""
@@ -55,7 +56,7 @@ class ImportedPlant(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     notes: tuple[str, ...] = ()
     """What was repaired or left out when the file was read."""
     filled: tuple[int, ...] = ()
-    """Nodes without a diameter in the file; their diameters were filled in."""
+    """Indices of the nodes that had no diameter in the file; their diameters were filled in."""
     nodes: tuple[tuple[int, float, float, float, float], ...]
     """Parent (-1: the base), x, y, z [m] and diameter [m] of each node, parents first."""
     bunches: tuple[tuple[int, float], ...] = ()
@@ -115,7 +116,7 @@ def import_plant(
         plants: file of plant parameters, or its name in ``data/plants``, with the properties of the wood.
         shape: shape given by the points: the plant under its weight (``drawn``) or without weight (``slack``).
         piece: approximate length of the rigid bodies of the wood [m].
-        old_wood: wood thicker than this is fixed [m]; 1.5 times the thickest cane unless given.
+        old_wood: diameter above which wood is fixed instead of simulated [m]; 1.5 times the thickest cane unless given.
 
     Raises:
         PlantFileError: for a file that cannot be used. UsageError: for an argument out of range.

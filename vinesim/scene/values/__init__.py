@@ -1,7 +1,7 @@
 """Values that packages exchange: small frozen dataclasses, so that sibling packages need not import each other.
 
-Times are simulation seconds. Arrays are numpy, poses and velocities as in :mod:`vinesim.core.frames`.
-After a value has been passed to another thread, its arrays are not written.
+Times are in seconds of simulated time. Arrays are NumPy arrays; poses [7] are position [m] and quaternion xyzw, as in
+:mod:`vinesim.core.frames`. After a value has been passed to another thread, its arrays are not written.
 """
 
 from vinesim.scene.values.human import POINT_NAMES, HandSample, Haptic, HumanPose, HumanSpec

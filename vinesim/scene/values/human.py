@@ -11,7 +11,7 @@ import numpy as np
 class HumanPose:
     """Poses of a person's tracked points at one instant, as sent over the network (CANOPIES D6.4, section 5.3).
 
-    All poses [7] are in the world; x is forward and z up for a person who stands upright.
+    All poses [7] (position [m], quaternion xyzw) are in the world. With an upright person, x points forward and z up.
     """
 
     root: np.ndarray
@@ -45,16 +45,17 @@ class HumanPose:
 
     @property
     def points(self) -> np.ndarray:
-        """[7, 7] all poses in the order of :data:`POINT_NAMES`."""
+        """[point, 7] All seven poses, in the order of :data:`POINT_NAMES`."""
         return np.stack([getattr(self, name) for name in POINT_NAMES])
 
     def with_points(self, points: np.ndarray) -> HumanPose:
-        """Returns a copy with the poses ``points`` [7, 7]; the states of hands and fingers stay."""
+        """Returns a copy with the poses ``points`` [point, 7], in the order of :data:`POINT_NAMES`. States of hands and
+        fingers are unchanged."""
         return dataclasses.replace(self, **dict(zip(POINT_NAMES, points, strict=True)))
 
 
 POINT_NAMES = ("root", "head", "left", "right", "hips", "left_foot", "right_foot")
-"""Names of the poses of a :class:`HumanPose`."""
+"""Names of the tracked points whose poses a :class:`HumanPose` contains."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -64,13 +65,14 @@ class HumanSpec:
     name: str
     """The actor's name, which is a prefix of the names of its bodies."""
     index: int
-    """Index of the person in labels of label images."""
+    """Index of the person in label images (:func:`vinesim.scene.ids.label`)."""
     pose: HumanPose
     """Pose at the start."""
     height: float = 1.75
     """[m] Height, which determines the lengths of the limbs."""
     stiffness: float | None = None
-    """Force of a hand in contact per distance from its controller [N/m]; None: ``PhysicsParameters.hand_stiffness``."""
+    """[N/m] Stiffness of the spring that pulls a hand in contact to its controller; None:
+    ``PhysicsParameters.hand_stiffness``."""
     force: float | None = None
     """Largest force of a hand [N]; None: ``PhysicsParameters.hand_force``."""
     outfit: str = ""
@@ -79,12 +81,12 @@ class HumanSpec:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class HandSample:
-    """State of one hand at the end of a tick."""
+    """State of one hand of a person at the end of a tick."""
 
     pose: np.ndarray
-    """[7] pose of the palm in the world."""
+    """[7] Pose of the simulated palm in the world."""
     controller: np.ndarray
-    """[7] pose of the controller in the world."""
+    """[7] Pose in the world of the tracked controller that the palm follows."""
     force: np.ndarray
     """[3] N, force of the hand on its surroundings in this tick, world axes."""
     touching: bool
@@ -94,7 +96,7 @@ class HandSample:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Haptic:
-    """One vibration command for a human's controller."""
+    """Command to vibrate one of the hand-held controllers of a person."""
 
     actor: str
     hand: str

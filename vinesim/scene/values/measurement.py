@@ -7,8 +7,8 @@ import dataclasses
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class Measurement:
-    """One line of ``vinesim bench``: a number measured for vinesim, and for a peer program that runs in the same
-    process on the same scene."""
+    """One line of ``vinesim bench``: a number measured for vinesim, and the same number for a *peer*: another program
+    that runs in the same process on the same scene, for comparison."""
 
     bench: str
     case: str

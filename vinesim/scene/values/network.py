@@ -47,18 +47,20 @@ class HumanUpdate:
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class TreeUpdate:
-    """State of one touched tree as sent over the network."""
+    """State of one tree (kinematic tree of a plant, such as a cane) that an actor has touched, as sent over the
+    network."""
 
     tree: int
     owner: str
     ownership: int
-    """Ownership sequence number, u16 with wraparound; every grab, pick and cut increments it."""
+    """Sequence number (u16 with wraparound) of the owner's claim on the tree; every grab, pick and cut increments it.
+    The client of the owner simulates the tree for all clients."""
     authority: int
-    """Authority sequence number, u16 with wraparound; every touch increments it."""
+    """Second sequence number (u16 with wraparound) of the claim, for equal ownership; every touch increments it."""
     time: float
     resting: bool
-    """Whether the tree is at rest (slow and near its equilibrium). Such an update is the last one for the tree and is
-    sent reliably.
+    """Whether the tree is at rest (slow and near its equilibrium). If so, this update is sent reliably, and no update
+    follows until the tree is touched again.
     """
     touched: bool
     """Whether the owner of the tree, or an object of the owner, is in contact with the tree."""

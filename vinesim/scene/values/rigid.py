@@ -59,8 +59,8 @@ class RigidVisual:
     """One visible rigid body for pictures, scans and the web page: name, organ, index and shapes."""
 
     name: str
-    """Full name, ``actor/link`` or ``box/3``."""
+    """Full name, such as ``robot_0/gripper_link`` (actor and link) or ``box/3``."""
     organ: Organ
     index: int
-    """Index of the robot, human or box in labels of label images."""
+    """Index of the robot, person or box in label images (:func:`vinesim.scene.ids.label`)."""
     shapes: tuple[Shape, ...]

@@ -47,7 +47,7 @@ class RobotSpec:
     name: str
     """The actor's name, which is a prefix of the names of its bodies."""
     index: int
-    """Index of the robot in labels of label images."""
+    """Index of the robot in label images (:func:`vinesim.scene.ids.label`)."""
     urdf: str
     """URDF as text, every mesh by absolute path."""
     base: str
@@ -57,14 +57,16 @@ class RobotSpec:
     drives: tuple[Drive, ...]
     """Drives, in the order of all joint arrays (commands, samples, updates)."""
     home: np.ndarray
-    """[joint] start position."""
+    """[joint] rad or m, position of each joint at the start, in the order of ``drives``."""
     base_effort: tuple[float, float] = (800.0, 400.0)
     """Largest force [N] and moment [N m] with which the tracks hold or drive the base."""
     meshes: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
-    """Corners [face, 3, 3] m of meshes that were received instead of read, by the file name in the URDF."""
+    """Corners [face, 3, 3] m of meshes that were received over the network because this machine lacks their files, by
+    the file name in the URDF."""
     is_copy: bool = False
-    """Whether another client simulates the robot. The links of a copy do not collide with each other and the ground:
-    the received states already include these contacts, and boxes in place of meshes would collide wrongly."""
+    """Whether the robot is a copy of a robot that another client simulates. The links of a copy do not collide with
+    each other and the ground: the received states already include these contacts, and the boxes that replace meshes in
+    a copy would collide wrongly."""
 
 
 class ControllerKind(enum.StrEnum):
@@ -92,14 +94,14 @@ class ControllerSpec:
     joints: tuple[str, ...]
     """Joints in the order of the controller's commands; empty for a gripper without joints, such as a cutter."""
     group: str = ""
-    """Joint group of the gripper, if the controller is one of a gripper."""
+    """Name of the joint group of the gripper; empty if the controller does not control a gripper."""
     gripper: str = ""
     """Kind of the gripper, see :mod:`vinesim.robot.description.grippers`; empty for other controllers."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointSample:
-    """Joints of one robot at one instant, in the order of ``names``."""
+    """Measured state of the joints of one robot at one instant, in the order of ``names``."""
 
     time: float
     names: tuple[str, ...]
@@ -108,15 +110,16 @@ class JointSample:
     velocity: np.ndarray
     """[joint] rad/s or m/s, joint velocities."""
     effort: np.ndarray
-    """[joint] N m or N, effort of the drive; at rest it is the gravity load minus J^T f of the contacts."""
+    """[joint] N m or N, effort of the drive. At rest it is the load by gravity minus J^T f, the load by contact forces
+    f with the contact Jacobian J."""
     contact: np.ndarray
-    """[joint] N m or N, J^T f of the contacts alone."""
+    """[joint] N m or N, load by the contact forces f alone: J^T f with the contact Jacobian J."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class JointReference:
-    """Positions and velocities that a robot's controllers command to its joints in one step, in the order of joint
-    arrays.
+    """Positions and velocities that a robot's controllers command to its joints in one step, in the order of
+    :attr:`RobotSpec.drives`.
     """
 
     position: np.ndarray
@@ -157,7 +160,7 @@ class ElasticSample:
     deflection: np.ndarray
     """[joint] rad or m, deflection of the spring."""
     torque: np.ndarray
-    """[joint] N m or N, stiffness times deflection: the whole load of the joint."""
+    """[joint] N m or N, stiffness times deflection: the effort that the spring transmits to the joint."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -199,13 +202,14 @@ class RobotSample:
     base_qd: np.ndarray
     """[6] velocity of base_footprint, world axes."""
     odom_q: np.ndarray
-    """[7] pose of base_footprint by odometry, in ``odom``."""
+    """[7] pose of base_footprint by odometry, in the frame ``odom``."""
     odom_qd: np.ndarray
     """[6] velocity by odometry, in the axes of base_footprint; 0 along axes that odometry does not measure."""
     odom_covariance: np.ndarray
     """[2, 3, 3] covariances of x, y and yaw by odometry, m and rad: first of ``odom_q``, then of ``odom_qd``."""
     transforms: tuple[tuple[str, str], ...]
-    """(parent frame, child frame) of every moving joint; the same tuple object in every tick."""
+    """Names (parent frame, child frame) of the transform of every moving joint. The same tuple object in every tick, so
+    that it can be compared by identity."""
     transform_q: np.ndarray
     """[transform, 7] pose of the child frame in the parent frame."""
     contacts: tuple[Contact, ...] = ()

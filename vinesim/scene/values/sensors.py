@@ -12,7 +12,7 @@ import numpy as np
 from vinesim.scene.ids import LABEL_STRIDE, Organ, label
 
 MIN_BERRY_PIXELS = 4
-"""Smallest number of visible pixels of a berry that counts as visible."""
+"""Number of visible pixels of a berry from which the berry counts as visible."""
 
 Box = tuple[int, int, int, int]
 """Rectangle of pixels: first column, first row, last column, last row (inclusive)."""
@@ -22,8 +22,8 @@ MAX_CAMERA_SIZE = 4096
 
 
 class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A sensor of a robot, as described by a table of the robot's TOML file: name in topics, link on which it is
-    mounted, data file."""
+    """A sensor on a robot, as described by a table of the robot's TOML file: ``name`` in topics, ``frame`` at which the
+    sensor is mounted, ``type`` (name of the sensor's data file)."""
 
     name: str
     frame: str
@@ -31,7 +31,7 @@ class SensorMount(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class RenderedMount(SensorMount, frozen=True, forbid_unknown_fields=True):
-    """A sensor that is rendered: one of :data:`SENSOR_KINDS`."""
+    """A sensor on a robot whose measurements are rendered, such as a camera or a lidar: one of :data:`SENSOR_KINDS`."""
 
     kind: ClassVar[str]
     """Name of the kind of sensor, a key of :data:`SENSOR_KINDS`."""
@@ -46,10 +46,11 @@ class RenderedMount(SensorMount, frozen=True, forbid_unknown_fields=True):
 
 
 class PictureMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
-    """A sensor that delivers pictures."""
+    """A sensor on a robot that delivers pictures."""
 
     size: tuple[int, int] | None = None
-    """Width and height [px] with the same angle of view; by default those in the sensor's data file."""
+    """Width and height of the picture [px]; by default the size in the sensor's data file. The angle of view does not
+    depend on the size."""
 
     def fault(self) -> tuple[str, str] | None:
         """Returns the name of an invalid field and how to correct it; None if all values are valid."""
@@ -81,7 +82,7 @@ class SensorFrame(Protocol):
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class CameraInfo:
-    """Intrinsics (sensor_msgs/CameraInfo)."""
+    """Intrinsics of a camera in pixels, with the names of sensor_msgs/CameraInfo."""
 
     width: int
     height: int
@@ -90,7 +91,7 @@ class CameraInfo:
     cx: float
     cy: float
     frame_id: str
-    """Optical frame: z forward, x right, y down."""
+    """Name of the camera's optical frame: z forward, x right, y down."""
     distortion: tuple[float, ...] = ()
     """5 or 8 distortion coefficients of the lens (:mod:`vinesim.scene.camera_geometry`); empty for a pinhole."""
 
@@ -124,7 +125,7 @@ class CameraOutput(enum.Flag):
 
     RGB = enum.auto()
     DEPTH = enum.auto()
-    """Depth with the sensor's errors."""
+    """Depth as the sensor would measure it, with its errors. ``EXACT_DEPTH``: depth without errors."""
     EXACT_DEPTH = enum.auto()
     LABELS = enum.auto()
     BUNCHES = enum.auto()
@@ -215,7 +216,8 @@ class CameraFrame:
     depth: np.ndarray
     """[height, width] float32 m along z; NaN: no return, -Inf: too near, +Inf: too far (REP-118)."""
     labels: np.ndarray
-    """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
+    """[height, width] int32, :func:`vinesim.scene.ids.label` of the object in each pixel (organ and index); 0: the
+    sky."""
     exact_depth: np.ndarray | None = None
     """[height, width] float32 m along z, without noise, gaps or range limits; +Inf for the sky."""
     bunches: tuple[BunchTruth, ...] | None = None
@@ -242,12 +244,16 @@ class CameraFrame:
 
     @property
     def organs(self) -> np.ndarray:
-        """[height, width] :class:`~vinesim.scene.ids.Organ` of each pixel; 0 is nothing."""
+        """[height, width] :class:`~vinesim.scene.ids.Organ` (class of the object) in each pixel; 0: the sky."""
         return self.labels // LABEL_STRIDE
 
     @property
     def instances(self) -> np.ndarray:
-        """[height, width] index of the bunch, box, tree or actor of each pixel, counted for each organ from 0."""
+        """[height, width] Index of the object in each pixel among the objects of its kind, from 0: the bunch for a
+        bunch or peduncle; the tree for a cane or leaf; the pole, wire, trunk, arm, box, robot or person.
+
+        Sky and ground have the index 0, too. Use :attr:`organs` to distinguish the kinds.
+        """
         return self.labels % LABEL_STRIDE
 
 
@@ -259,7 +265,7 @@ class LevelLaser:
     """
 
     ring: int
-    """Number of the laser in :attr:`LidarScan.ring`."""
+    """Number of the laser in :attr:`LidarScan.ring`, counted from 0 for the lowest laser."""
     count: int
     """Number of shots in one revolution."""
     delay: float
@@ -289,11 +295,11 @@ class LidarScan:
     intensity: np.ndarray
     """[point] float32, intensity of each echo, 0 to 255."""
     ring: np.ndarray
-    """[point] uint16, number of the laser of each point."""
+    """[point] uint16, number of the laser that measured each point; 0 for the lowest laser."""
     offset: np.ndarray
     """[point] float32 s, time of each point's firing after ``time``."""
     labels: np.ndarray
-    """[point] int32, :func:`vinesim.scene.ids.label` of each point."""
+    """[point] int32, :func:`vinesim.scene.ids.label` (organ and index) of the object that each point is on."""
     level: LevelLaser | None = None
     """The laser nearest to the horizontal, None if unknown."""
     returned: np.ndarray | None = None
@@ -339,7 +345,8 @@ class MultispectralFrame:
     """[band, height, width] float32: radiance divided by that of a level white panel without shadow. It is smaller than
     the surface's reflectance in shadow, and larger on a leaf that faces a low sun."""
     labels: np.ndarray
-    """[height, width] int32, :func:`vinesim.scene.ids.label`; 0 is nothing."""
+    """[height, width] int32, :func:`vinesim.scene.ids.label` of the object in each pixel (organ and index); 0: the
+    sky."""
 
     @property
     def measured(self) -> tuple[np.ndarray, ...]:
@@ -348,7 +355,7 @@ class MultispectralFrame:
 
     @property
     def radiance(self) -> np.ndarray:
-        """[band, height, width] float32 W/(m2 sr nm)."""
+        """[band, height, width] float32 W/(m2 sr nm), spectral radiance of the surface in each pixel."""
         irradiance = np.array([band.irradiance for band in self.bands], np.float32)
         return self.reflectance * (irradiance / np.float32(np.pi))[:, None, None]
 
@@ -359,7 +366,8 @@ class MultispectralFrame:
 
     @property
     def ndvi(self) -> np.ndarray:
-        """[height, width] float32: (nir - red) / (nir + red), 0 where both are dark (Rouse et al. 1974)."""
+        """[height, width] float32, normalised difference vegetation index (nir - red) / (nir + red) of the reflectances
+        in the bands ``nir`` and ``red``; 0 where both are 0 (Rouse et al. 1974)."""
         red = self.band("red")
         nir = self.band("nir")
         total = nir + red
@@ -367,20 +375,21 @@ class MultispectralFrame:
 
 
 class CameraMount(PictureMount, frozen=True, forbid_unknown_fields=True):
-    """An RGB-D camera on a robot, with the quality of its live pictures."""
+    """An RGB-D camera on a robot. ``quality``: quality of its live pictures, see
+    :data:`vinesim.sensors.camera.camera.QUALITIES`."""
 
     kind: ClassVar[str] = "camera"
     quality: Literal["fast", "full", "still"] = "fast"
 
 
 class LidarMount(RenderedMount, frozen=True, forbid_unknown_fields=True):
-    """A spinning lidar."""
+    """A spinning lidar on a robot."""
 
     kind: ClassVar[str] = "lidar"
 
 
 class MultispectralMount(PictureMount, frozen=True, forbid_unknown_fields=True):
-    """A multispectral camera."""
+    """A multispectral camera on a robot."""
 
     kind: ClassVar[str] = "multispectral"
 
@@ -399,7 +408,8 @@ class SensorKind:
     publisher: str
     """Module of vinesim.ros.publishers whose ``PUBLISHER`` is the :class:`vinesim.ros.sensor_node.SensorPublisher`."""
     whole: CameraOutput
-    """Parts that are rendered in lockstep, where all frames are rendered completely."""
+    """Parts of a frame that are rendered in lockstep (:attr:`SensorMode.LOCKSTEP`), where sensors render with and
+    without subscribers."""
     topics: tuple[str, ...]
     """Topics below the sensor's name that a user usually watches. A message on the first one shows that the sensor
     works."""

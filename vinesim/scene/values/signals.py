@@ -25,10 +25,12 @@ class LightPattern(enum.IntEnum):
 
 
 FREQUENCY = {LightPattern.NOTIFICATION: 0.4, LightPattern.WARNING: 0.8, LightPattern.ALARM: 2.0}
-"""[Hz] Flash rate; slow flashing is 0.4 to 0.8 Hz, normal flashing 1.4 to 2.8 Hz (IEC 60073)."""
+"""[Hz] Flash rate of the lamps for each pattern; slow flashing is 0.4 to 0.8 Hz, normal flashing 1.4 to 2.8 Hz (IEC
+60073)."""
 
 TONE = {LightPattern.NOTIFICATION: 600.0, LightPattern.WARNING: 900.0, LightPattern.ALARM: 1500.0}
-"""[Hz] Tone while a lamp with sound is lit, within the 500 to 2500 Hz of danger signals (ISO 7731)."""
+"""[Hz] Frequency of the tone while a lamp with sound is lit, for each pattern; within the 500 to 2500 Hz of danger
+signals (ISO 7731)."""
 
 TONE_LEVEL = 0.5
 """Amplitude of the tone of a lamp within 1 m. GUESSED."""
@@ -39,7 +41,7 @@ USUAL_COLOR: dict[LightPattern, Color] = {
     LightPattern.WARNING: (255, 150, 0),
     LightPattern.ALARM: (255, 0, 0),
 }
-"""Default colours (IEC 60073)."""
+"""Default colour of the lamps for each pattern (IEC 60073)."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)

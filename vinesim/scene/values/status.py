@@ -9,7 +9,8 @@ from typing import Any, Literal
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class ComponentStatus:
-    """Name and state of one part of a client (``simulation``, ``network``, ``sensors``, ...), with its statistics."""
+    """State of one part of a client, for ROS diagnostics: name of the part (``simulation``, ``network``, ``sensors``,
+    ...), level, message, and statistics by name."""
 
     name: str
     level: Literal["ok", "warning", "error"] = "ok"

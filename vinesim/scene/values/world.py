@@ -12,7 +12,8 @@ from vinesim.scene.wind import Wind
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class WindState:
-    """The wind at one instant, and for each tree the share of its sway that is drawn instead of simulated."""
+    """The wind at one instant, and for each tree the share of its sway (motion in the wind) that is added to its
+    rendered pose instead of simulated (:mod:`vinesim.wind.sway`)."""
 
     wind: Wind
     time: float
@@ -22,18 +23,19 @@ class WindState:
     tree_air: np.ndarray
     """[tree, 3] m/s, air velocity that acts on the simulated pose of each tree."""
     tree_drawn: np.ndarray
-    """[tree] Share of the sway that is drawn. 1: the tree is drawn with the full sway; 0: it is drawn in its simulated
-    pose."""
+    """[tree] Share of the sway (motion in the wind) that is added for rendering. 1: the tree is rendered with the full
+    sway; 0: in its simulated pose."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
 class SegmentPoses:
-    """Poses of the displaced segments of wires, see :mod:`vinesim.wires.wire_segments`."""
+    """Poses of the segments of wires that are displaced from their rest poses. A segment is a short straight part of a
+    wire (:mod:`vinesim.wires.wire_segments`)."""
 
     segment: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(0, np.int64))
-    """[k] Numbers of the segments, ascending."""
+    """[k] Indices of the displaced segments among all segments of wires, ascending."""
     q: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros((0, 7), np.float32))
-    """[k, 7] m, 1, poses in the world."""
+    """[k, 7] m, 1, poses of the displaced segments in the world."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -57,8 +59,8 @@ class Snapshot:
     another client has sent.
     """
     wind: WindState | None = None
-    """The wind; None in calm air. In wind ``body_q`` does not contain the sway of trees on which wind is not simulated;
-    see :mod:`vinesim.wind.sway`."""
+    """The wind; None in calm air. Wind is simulated only on trees near actors. ``body_q`` does not contain the sway
+    (motion in the wind) of all other trees, which :mod:`vinesim.wind.sway` adds for rendering."""
     wires: SegmentPoses = dataclasses.field(default_factory=SegmentPoses)
     """Poses of displaced segments of wires; all other segments have their rest poses."""
 
@@ -86,7 +88,7 @@ class Detachment:
     tick: int
     tree: int
     body: int
-    """Body that was detached, together with its descendants."""
+    """Index in the model of the body that was detached, together with its descendants."""
     bunch: int
     """Index of the bunch, -1 for a cane."""
     cause: str

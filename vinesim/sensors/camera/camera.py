@@ -51,7 +51,7 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     """Largest depth that is measured."""
     rate: Annotated[Number, "Hz", (0.01, 1000.0)]
     stereo: StereoSpec | None = None
-    """Model of the depth measurement; None: depth is exact."""
+    """Parameters of the stereo matching that measures depth; None: depth is measured exactly."""
     distortion: Annotated[spec_file.Numbers | None, "1", (-1000.0, 1000.0)] = None
     """Coefficients of the lens distortion, in the order of sensor_msgs/CameraInfo: 5 (plumb_bob) or 8
     (rational_polynomial); None: a pinhole. Colour, depth and labels have equal distortion."""
@@ -81,8 +81,8 @@ class CameraSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     def info(self, frame_id: str, scale: float = 1.0, size: tuple[int, int] | None = None) -> CameraInfo:
         """Returns the intrinsics, with the principal point in the middle of the picture.
 
-        ``scale``: factor on width and height; ``size``: width and height [px] that replace the camera's, with an equal
-        horizontal field of view.
+        ``scale``: factor on width, height and focal lengths. ``size``: width and height [px] instead of the camera's
+        own, with an equal horizontal field of view; ``scale`` is then not used.
         """
         width = round(self.width.value * scale)
         height = round(self.height.value * scale)
@@ -107,7 +107,8 @@ class Quality:
     on them."""
 
     taps: int
-    """Number of samples of the shadow map for each pixel; 0 means a smooth filter of two widths, -1 of one width."""
+    """Number of samples of the shadow map for each pixel. 0: the shadow map is filtered with two widths instead; -1:
+    with one width."""
     block: int
     """Width and height [px] of the blocks of pixels within which each primitive is shaded once."""
     samples: int
@@ -115,8 +116,9 @@ class Quality:
     shadow_texel_divisor: int
     """Divisor of the texel size of the near shadow map; 2 doubles the map's resolution."""
     is_live: bool
-    """Whether, on a CPU, eight points are shaded at once (:mod:`vinesim.sensors.camera.live_light`), and the second
-    view of a stereo camera is computed from the first one instead of rendered."""
+    """Whether two faster methods are used on a CPU: eight points are shaded at once
+    (:mod:`vinesim.sensors.camera.live_light`), and the depth in view of a stereo camera's second imager is computed
+    from the depth of the first imager instead of rendered."""
 
 
 QUALITIES = {
@@ -145,7 +147,8 @@ def load_camera_kernels() -> None:
 
 @dataclasses.dataclass
 class Camera:
-    """One RGB-D camera, which renders frames of the vineyard's primitives from given poses."""
+    """One RGB-D camera, which renders frames of the vineyard's primitives (analytic shapes such as cones and leaves)
+    from given poses."""
 
     spec: CameraSpec
     info: CameraInfo
@@ -153,19 +156,19 @@ class Camera:
     sun: tuple[float, float, float] | SunPath = DEFAULT_SUN
     """Unit vector towards the sun, or a function from simulated time [s] to that vector."""
     quality: str = "full"
-    """Name of one of :data:`QUALITIES`."""
+    """Cost and look of the picture, a key of :data:`QUALITIES`: ``fast``, ``full`` or ``still``."""
     shadow_period: float | None = None
-    """Period [s] at which shadows of moving objects are redrawn; 0: in every frame; None: 0.2, and 0 for quality
-    ``still``."""
+    """Period [s] at which the shadows of moving objects are rendered again; 0: in every frame; None: 0.2, or 0 with the
+    quality ``still``."""
     exposure: float | None = None
     """Fixed exposure, a factor on radiance (0.75 suits a sunny noon); None: automatic exposure."""
     device: str = "cpu"
     threads: int | None = None
-    """Number of CPU threads that draw; None: the number of cores that this process may use, at most four. The picture
-    does not depend on it."""
+    """Number of CPU threads that render; None: the number of cores that this process may use, at most four. The picture
+    does not depend on this number."""
     seed: int = 0
     image_index: int = 0
-    """Index of the next image. The seed, the camera's name and this index determine the noise of a measurement."""
+    """Index of the next image. The seed, the camera's name and this index determine the noise of the measured depth."""
 
     def __post_init__(self) -> None:
         if self.quality not in QUALITIES:
@@ -212,8 +215,9 @@ class Camera:
         return self.spec.rate.value
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> CameraFrame:
-        """Render a frame as :class:`vinesim.sensors.sensor.Sensor` defines it, with the ground truth of the bunches if
-        ``outputs`` contain it."""
+        """Render a frame from ``pose`` [7] of the optical frame in the world, as the interface
+        :class:`vinesim.sensors.sensor.Sensor` defines it. The frame contains the ground truth of the bunches if
+        ``outputs`` contain :attr:`CameraOutput.BUNCHES`."""
         frame = self.render(primitives, pose, snapshot.time, outputs=outputs)
         if CameraOutput.BUNCHES in outputs:
             bunches = visible_bunches(primitives, snapshot, self.info, frame.pose, self.rasterizer)
@@ -301,7 +305,7 @@ class Camera:
         """Render from ``pose`` [7] without lens distortion and return the colours [pixel, 3] on the device.
 
         With a GPU the call returns before rendering ends. Without ``is_lit``, only depth and labels are rendered, and
-        the result is None. ``measures``: draw also the random numbers for a stereo measurement.
+        the result is None. ``measures``: also generate the random numbers for a stereo measurement.
         """
         if self.device == "cpu":
             load_camera_kernels()
@@ -333,8 +337,8 @@ class Camera:
     def update_shadows(
         self, primitives: Primitives, pose: np.ndarray, time: float = 0.0
     ) -> tuple[ShadowMap, ShadowMap]:
-        """Returns the near and the far shadow map, after redrawing each map that is no longer valid at ``time`` [s] for
-        a camera at ``pose`` [7]."""
+        """Returns the near and the far shadow map for a camera at ``pose`` [7] at ``time`` [s]. A map that is no longer
+        valid for this pose and time is rendered again before."""
         forward = frames.rotate(frames.normalize(pose[3:]), np.array([0.0, 0.0, 1.0]))
         return self._sunlight.update(primitives, pose[:3], forward, time)
 

@@ -112,5 +112,5 @@ def shadow_maps(near: ShadowMap, far: ShadowMap, depth: wp.array) -> light_point
 
 def _numbers(vectors: wp.array) -> wp.array:
     """Returns a view of an array of vectors as scalars [vector, component]."""
-    shape = int(np.prod(vectors.shape)), int(vectors.dtype._length_)
+    shape = int(np.prod(vectors.shape)), vectors.numpy().shape[-1]
     return wp.array(ptr=vectors.ptr, dtype=float, shape=shape, device="cpu", copy=False)

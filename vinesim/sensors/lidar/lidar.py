@@ -39,15 +39,18 @@ FOOTPRINT_RANGE = 3.0
 narrower than the real one at shorter range, and wider at longer range."""
 MAX_SHARED_TRANSLATION = 4e-3
 MAX_SHARED_ROTATION = 3.5e-3
-"""Rotation [rad] of the lidar's mount during some firings below which all of them are computed from the pose at the
-middle firing. ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
+"""Rotation [rad] of the lidar's mount during successive firings below which these firings are all computed from the
+pose of the lidar at the middle one. ``MAX_SHARED_TRANSLATION`` [m] is the corresponding distance.
 
-The error is at most half a step of the head, and clusters nearby need not be searched for every firing.
+The error is at most half of the angle by which the head turns between two firings. This saves a search of the nearby
+primitives for every firing.
 """
 _BANDS_PER_THREAD = 2
-"""Average number of bands of firings for each thread. A thread that has finished a band takes the next one."""
+"""Average number of bands (successive firings that one thread computes) for each thread. A thread that has finished a
+band computes the next one."""
 _MIN_BAND = 32
-"""Least number of firings in a band. Every band searches all clusters nearby, so small bands waste time."""
+"""Least number of firings in a band, which one thread computes. Every band searches all clusters of primitives nearby,
+so small bands waste time."""
 _RETURNS = {"strongest": 0, "last": 1, "dual": 2}
 
 
@@ -76,12 +79,12 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     merge: Annotated[Number, "m", (0.0, 10.0)]
     """Distance along the beam below which two surfaces cause one echo."""
     separation: Annotated[Number, "m", (0.0, 10.0)]
-    """Least distance along the beam between two returns of one shot."""
+    """Least distance along the beam between two reported echoes of one shot."""
     returns: Literal["strongest", "last", "dual"] = "strongest"
     """Echoes of a shot that are reported. ``dual``: the strongest and the last one, or the two strongest if the
     strongest is the last."""
     noise: Annotated[Number, "m", (0.0, 1.0)]
-    """Least standard deviation of the range, which strong echoes have."""
+    """Standard deviation of the range of strong echoes."""
     weak_noise: Annotated[Number, "m", (0.0, 1.0)]
     """Standard deviation of the range of the weakest detectable echo; for stronger echoes it decreases with the square
     root of the signal, down to ``noise``."""
@@ -93,7 +96,7 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     flicker: Annotated[Number, "1", (0.0, 2.0)]
     """Standard deviation of the logarithm of the signal, from shot to shot."""
     reflectance: dict[str, Annotated[Number, "1"]]
-    """Diffuse reflectance of each organ, by its name in lower case."""
+    """Diffuse reflectance of each class of object: by name of an :class:`~vinesim.scene.ids.Organ` in lower case."""
 
     @classmethod
     def load(cls, name: str) -> LidarSpec:
@@ -125,8 +128,8 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
         return spec
 
     def ideal(self) -> LidarSpec:
-        """Returns the data sheet of a lidar with equal firings whose beams have no width, measure exactly and detect
-        every echo."""
+        """Returns the data sheet of an ideal lidar with the same firing times and angles: its beams have no width, it
+        measures exactly, and it detects every echo."""
 
         def but(number: Number, value: float) -> Number:
             return msgspec.structs.replace(number, value=value)
@@ -139,15 +142,16 @@ class LidarSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
 
 
 class RayGrid(Protocol):
-    """Interface of an object that finds the surfaces that the rays of a spinning head hit, such as
-    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer`."""
+    """Interface of an object that finds the surfaces that the rays of a spinning lidar head hit, such as
+    :class:`vinesim.sensors.lidar.lidar_rasterizer.LidarRasterizer`. A column has the rays of one firing, a row the
+    rays of one direction relative to the head."""
 
     direction: wp.array
     """[column * row] Unit vectors of the rays, in the head's frame."""
     distance: wp.array
     """[column * row] Distance to the nearest hit of each ray [m]."""
     primitive: wp.array
-    """[column * row] Index of the primitive that each ray hits; -2: the ground, -1: no hit."""
+    """[column * row] Index of the primitive (shape) that each ray hits; -2: the ground, -1: no hit."""
 
     def cast(self, primitives: Primitives, pose: np.ndarray, first: int, count: int, reach: float) -> object:
         """Compute distances and primitives of ``count`` columns from column ``first`` on, with the head at ``pose``
@@ -159,7 +163,7 @@ class RayGrid(Protocol):
 
 
 class Lidar:
-    """One spinning lidar: its table of firings, and the returns of the present revolution."""
+    """One spinning lidar: the times and angles of its shots, and the returns of the present revolution."""
 
     def __init__(
         self,
@@ -172,7 +176,8 @@ class Lidar:
         threads: int | None = None,
         grid: Callable[[np.ndarray, np.ndarray, float, int, str], RayGrid] = LidarRasterizer,
     ) -> None:
-        """``seed`` and ``name`` determine the noise of each revolution.
+        """Make a lidar with the data sheet ``spec``. ``seed`` and ``name`` together determine the noise of each
+        revolution.
 
         ``threads``: number of CPU threads that share the firings, without effect on the result; None: the number of
         cores that this process may use, at most four. ``grid(elevation, azimuth, step, columns, device)`` makes the
@@ -184,7 +189,8 @@ class Lidar:
         self.device = device
         self.seed = seed
         self.is_exact = False
-        """Whether revolutions that begin later measure exactly, without noise and along the middle of each beam."""
+        """Whether the next revolutions measure exactly, without noise and along the axis of each beam. The revolution
+        that has begun already is not affected."""
         self.revolution = 0
         """Index of the present revolution."""
         self.lasers = len(spec.elevation.value)
@@ -199,7 +205,7 @@ class Lidar:
         elevation = np.radians(spec.elevation.value)
         order = np.argsort(np.argsort(elevation, kind="stable"), kind="stable")
         self.ring = np.tile(order, self.firings).astype(np.uint16)
-        """[shot] Ring of each shot; 0 for the lowest laser."""
+        """[shot] Number of the laser of each shot, counted from 0 for the lowest laser."""
         # the head turns clockwise seen from above; the first shot looks forward
         beside = np.radians(spec.azimuth.value) if spec.azimuth else np.zeros(self.lasers)
         azimuth = beside - 2.0 * np.pi * spec.rate.value * within
@@ -222,7 +228,8 @@ class Lidar:
             self.firings,
             device,
         )
-        """Finds the hits of the rays. It has a column for each firing, with all rays of all lasers' shots as rows."""
+        """Object that finds the surfaces that the rays hit. It has a column for each firing, and a row for each ray of
+        each laser."""
         self._workers = ThreadPool((threads or min(usable_cores(), MAX_THREADS)) if device == "cpu" else 1)
         wp.load_module(lidar_echoes, device=device)  # here, because only one thread may load a module at a time
         self._measuring, self._exact = self._receiver_parameters(spec), self._receiver_parameters(spec.ideal())
@@ -235,7 +242,8 @@ class Lidar:
         self._label = wp.full((len(self.offset), kept), -1, dtype=wp.int32, device=device)
 
     def _footprint(self) -> tuple[np.ndarray, np.ndarray]:
-        """Returns the angles [ray] rad across and up of each ray of a shot from the beam's axis.
+        """Returns the angles of the rays that sample one shot, from the beam's axis: [ray] rad sideways and [ray] rad
+        upwards.
 
         The first ray is along the axis, all others are on a ring around it. Each ray represents an equal share of the
         energy of a Gaussian beam.
@@ -276,12 +284,14 @@ class Lidar:
         return self.finish_revolution(pose, time)
 
     def frame(self, primitives: Primitives, snapshot: Snapshot, pose: np.ndarray, outputs: CameraOutput) -> LidarScan:
-        """Compute a frame as :class:`vinesim.sensors.sensor.Sensor` defines it: one revolution in a world that stands
-        still."""
+        """Compute one revolution from ``pose`` [7] of the lidar in a world that stands still, as the interface
+        :class:`vinesim.sensors.sensor.Sensor` defines a frame."""
         return self.scan(primitives, pose, snapshot.time)
 
     def sweep(self, rate: float | None) -> SpinningScan:
-        """Returns a sweep as :class:`vinesim.sensors.sensor.SweptSensor` defines it: revolutions in a moving world."""
+        """Returns an object that measures revolutions in a moving world, as the interface
+        :class:`vinesim.sensors.sensor.SweptSensor` defines it. ``rate``: number of revolutions to deliver per second
+        [Hz], at most the lidar's own rate, which is the default."""
         return SpinningScan(self, rate)
 
     def begin_revolution(self) -> None:
@@ -347,8 +357,8 @@ class Lidar:
         )
 
     def finish_revolution(self, pose: np.ndarray, time: float) -> LidarScan:
-        """Returns the scan since :meth:`begin_revolution`; ``pose`` [7] and ``time`` [s] are those of the first
-        firing."""
+        """Returns the scan of the firings since :meth:`begin_revolution`. ``pose`` [7], ``time`` [s]: pose of the lidar
+        in the world at its first firing, and time of this firing."""
         labels = self._label.numpy()
         shot, which = np.nonzero(labels >= 0)
         self.revolution += 1
