@@ -77,7 +77,7 @@ def recover(cases: list[Case], tracks: list[Trajectory] | None = None, modulus_b
         begun = time.perf_counter()
         fit = tune(case.guess, track)
         rows.append((*_errors(fit, case.truth), not fit.ok, time.perf_counter() - begun))
-    return Recovery(*map(np.array, zip(*rows, strict=True)), modulus_bar)
+    return Recovery(*map(np.array, zip(*rows, strict=True)), modulus_bar=modulus_bar)
 
 
 def _errors(fit: Fit, truth: Specimen) -> tuple[float, float, list[bool], list[float]]:
