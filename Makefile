@@ -9,7 +9,7 @@ PYTEST = .venv/bin/python -m pytest -n $(JOBS) --dist loadgroup
 LINT = .venv-lint/bin
 BIOME = .venv-lint/node_modules/.bin/biome
 
-.PHONY: demo test test-long check lint docs wheel validation setup clean
+.PHONY: demo test test-long check lint docs wheel release validation setup clean
 demo:
 	@PYTHON=$(PYTHON) tools/setup run
 	@.venv/bin/vinesim demo --seconds $(SECONDS) --seed $(SEED) --out $(OUT) $(ARGS)
@@ -40,6 +40,11 @@ docs: setup # the documentation site, into build/site
 
 wheel: # what pip installs, into build/wheel
 	@$(PYTHON) -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir build/wheel .
+
+release: setup # what is published, into build/release: wheel and sdist, checked
+	@rm -rf build/release
+	@.venv/bin/python -m hatchling build --directory build/release
+	@.venv/bin/python -m twine check --strict build/release/*
 
 validation: setup # figures and pictures of docs/validation.md, by the tests' own code
 	@.venv/bin/python -m tests.laws.plots

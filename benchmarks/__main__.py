@@ -40,6 +40,14 @@ def _kill(times: int, seed: int) -> Iterator[Measurement]:
     return _call("kill:kill")(times, seed, _announce)
 
 
+def _example_signals(runs: int, seed: int) -> Iterator[Measurement]:
+    if runs < 1:
+        raise UsageError(f"--runs is {runs}: give 1 or more")
+    if seed < 0:
+        raise UsageError(f"--seed is {seed}: give 0 or more")
+    return _call("example_signals:example_signals")(runs, seed, _announce)
+
+
 def _fuzz(messages: int, false_messages: int) -> Iterator[Measurement]:
     for option, value in (("messages", messages), ("false-messages", false_messages)):
         if value < 0:
@@ -114,6 +122,14 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         {
             "times": {"type": int, "default": 50, "help": "number of programs that are killed"},
             "seed": {"type": int, "default": 1, "help": "seed of the order and the moments"},
+        },
+    ),
+    "example_signals": (
+        _example_signals,
+        "end the ROS examples by SIGINT and SIGTERM at random moments (Linux)",
+        {
+            "runs": {"type": int, "default": 50, "help": "number of runs of each example"},
+            "seed": {"type": int, "default": 1, "help": "seed of the moments"},
         },
     ),
     "soak": (

@@ -2,6 +2,8 @@
 
     python benchmarks/gpu_page.py --record demo.page --scene demo    # where vinesim is installed
     python benchmarks/gpu_page.py --play demo.page                   # where a browser and a graphics card are
+    python benchmarks/gpu_page.py --play demo.page --software        # without a graphics card: a laptop's page only
+    python benchmarks/gpu_page.py --address http://127.0.0.1:8080/ --software    # the page of a running client
 
 A recording holds all messages that a spectator's page receives: the vineyard, the shapes of a robot that pushes a bunch
 and of two people, and the states of some seconds. ``--play`` needs aiohttp, msgspec, numpy and OpenCV. It sends the
@@ -47,6 +49,8 @@ FEWER_TRIANGLES = 150_000
 triangles cost from the time that pixels cost."""
 BARS = {"phone": 30.0, "laptop": 60.0, "headset": 72.0}
 """Smallest acceptable number of pictures a second, by kind of screen [Hz]."""
+SOFTWARE_BAR = 10.0
+"""Smallest acceptable number of pictures a second without a graphics card [Hz]."""
 SECONDS = 5.0
 SETTLING = 10.0
 """Time [s] in which the page finds out how much it can draw, before a measurement."""
@@ -252,6 +256,33 @@ def play(
         yield from _errors(page)
 
 
+def play_without_card(path: pathlib.Path, pictures: pathlib.Path | None) -> Iterator[dict[str, Any]]:
+    """Play the recording at ``path`` to a laptop's page without a graphics card, and yield one result a measurement."""
+    world = Recorded(path)
+    with browser.browser_page(graphics=browser.SOFTWARE) as page, served(world) as address:
+        _open(page, world, address)
+        yield from _measure(page, f"{world.name}, laptop without a graphics card, 1280x720", SOFTWARE_BAR)
+        yield {"case": f"{world.name}, laptop without a graphics card: pixels", "value": page.run(CANVAS), "unit": "1"}
+        _save(page, pictures, f"{world.name}-software")
+        yield from _errors(page)
+
+
+def look_at_client(address: str, graphics: tuple[str, ...], pictures: pathlib.Path | None) -> Iterator[dict[str, Any]]:
+    """Measure the page of a running client at an ``address``: physics and page share the machine."""
+    with browser.browser_page(graphics=graphics) as page:
+        page.resize(1280, 720)
+        page.open(address)
+        _wait(page, "window.vinesim?.viewer !== undefined && vinesim.drawn > 20")
+        yield from _measure(page, "page of a client on this machine, 1280x720", SOFTWARE_BAR)
+        yield {"case": "page of a client on this machine: pixels", "value": page.run(CANVAS), "unit": "1"}
+        _save(page, pictures, "client")
+        yield from _errors(page)
+
+
+CANVAS = "vinesim.viewer.renderer.domElement.width * vinesim.viewer.renderer.domElement.height"
+"""Expression for the number of pixels that a page draws."""
+
+
 def _headset(
     page: browser.Page, world: Recorded, address: str, eyes: tuple[int, int], pictures: pathlib.Path | None
 ) -> Iterator[dict[str, Any]]:
@@ -367,15 +398,22 @@ def main() -> None:
     parser.add_argument("--play", type=pathlib.Path)
     parser.add_argument("--software", action="store_true", help="without a graphics card")
     parser.add_argument("--pictures", type=pathlib.Path, help="folder for what the page shows")
+    parser.add_argument("--address", help="page of a running client")
     parser.add_argument("--query", default="", help="added to the page's address")
     given = parser.parse_args()
     if given.record is not None:
         record(given.record, given.scene)
-    if given.play is not None:
-        graphics = browser.SOFTWARE if given.software else GPU
-        for line in play(given.play, graphics, given.pictures, given.query):
-            sys.stdout.write(json.dumps({"bench": "gpu page", **line}) + "\n")
-            sys.stdout.flush()
+    graphics = browser.SOFTWARE if given.software else GPU
+    lines: Iterator[dict[str, Any]] = iter(())
+    if given.address is not None:
+        lines = look_at_client(given.address, graphics, given.pictures)
+    elif given.play is not None and given.software:
+        lines = play_without_card(given.play, given.pictures)
+    elif given.play is not None:
+        lines = play(given.play, graphics, given.pictures, given.query)
+    for line in lines:
+        sys.stdout.write(json.dumps({"bench": "gpu page", **line}) + "\n")
+        sys.stdout.flush()
 
 
 if __name__ == "__main__":

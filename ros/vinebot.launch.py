@@ -1,6 +1,7 @@
 """Starts a robot of vinesim, and RViz.
 
-ros2 launch ros/vinebot.launch.py
+ros2 launch vinesim_ros vinebot.launch.py              # the installed package
+ros2 launch ros/vinebot.launch.py                      # from the checkout
 ros2 launch ros/vinebot.launch.py scene:=harvest environment:=true rviz:=false
 """
 

@@ -1,10 +1,11 @@
-"""Hooks of the documentation site (mkdocs.yml) that generate the list of modules, the list of decisions, and a page of
+"""Hooks of the documentation site (mkdocs.yml): its version, the list of modules, the list of decisions, and a page of
 each notebook."""
 
 from __future__ import annotations
 
 import pathlib
 import re
+import runpy
 import sys
 from typing import Any
 
@@ -13,6 +14,13 @@ from mkdocs.structure.files import File
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import list_modules
 import notebook_pages
+
+
+def on_config(config: Any) -> Any:
+    """The configuration, with the version of vinesim in the site's name."""
+    version = runpy.run_path(str(pathlib.Path(__file__).parents[1] / "vinesim/core/version.py"))["__version__"]
+    config.site_name = f"vinesim {version}"
+    return config
 
 
 def on_files(files: Any, *, config: Any) -> Any:

@@ -23,7 +23,7 @@ def render() -> dict[str, str | bytes]:
             for output in cell.get("outputs", ()):
                 parts.append(_output(output, files, path.stem))
         title, _, rest = "\n\n".join(parts).partition("\n")
-        source = f"`vinesim notebooks {path.stem} --out .` copies this notebook, or [download it]({path.name})."
+        source = f"`vinesim examples` copies this notebook, or [download it]({path.name})."
         files[f"{path.stem}.md"] = f"{title}\n\n{source}\n{rest}\n"
     return files
 

@@ -1,14 +1,19 @@
 """Turns on a robot's indicator lights when the battery is low, and also their tone when it is nearly empty.
 
-    vinesim client --role robot --name vinebot           # in one terminal
+    vinesim client --role robot --scene harvest          # in one terminal
     python examples/ros/battery_light.py                 # in another
-    ros2 topic pub -r 1 /battery_state sensor_msgs/BatteryState "{percentage: 0.15}"
+    vinesim ros pub /battery_state '{"percentage": 0.15}'       # in a third; or:
+    ros2 topic pub -r 1 /battery_state sensor_msgs/msg/BatteryState '{percentage: 0.15}'
 
 This is an ordinary ROS 2 node. Another node must publish /battery_state, because vinesim simulates no battery.
 """
 
+import signal
+import threading
+
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import Bool, String
 
@@ -22,8 +27,8 @@ class BatteryLight(Node):
     def __init__(self) -> None:
         super().__init__("battery_light")
         self.pattern = "off"
-        self.light = self.create_publisher(String, "/indicator_lights/command", 1)
-        self.sound = self.create_publisher(Bool, "/indicator_lights/sound", 1)
+        self.light = self.create_publisher(String, "/indicator_lights/command", 10)
+        self.sound = self.create_publisher(Bool, "/indicator_lights/sound", 10)
         self.create_subscription(BatteryState, "/battery_state", self.take, 10)
 
     def take(self, message: BatteryState) -> None:
@@ -44,6 +49,20 @@ class BatteryLight(Node):
             print(self.pattern, flush=True)
 
 
+def main() -> None:
+    # Ctrl-C and SIGTERM only set a flag, so that a callback that is running can still publish.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = BatteryLight()
+    try:
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
 if __name__ == "__main__":
-    rclpy.init()
-    rclpy.spin(BatteryLight())
+    main()

@@ -1,14 +1,18 @@
 """Makes a robot's left arm compliant: the arm gives way when something pushes it, and comes back.
 
-    vinesim client --role robot --name vinebot           # in one terminal
+    vinesim client --role robot --scene harvest          # in one terminal
     python examples/ros/compliant_arm.py                 # in another
 
 This is an ordinary ROS 2 node. It holds the arm at its present pose with low stiffness, and prints when a joint gives
 way.
 """
 
+import signal
+import threading
+
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -27,7 +31,7 @@ class CompliantArm(Node):
         self.equilibrium: list[float] = []
         self.is_pushed = False
         self.topics = {
-            what: self.create_publisher(Float64MultiArray, f"/{arm}_impedance_controller/{what}", 1)
+            what: self.create_publisher(Float64MultiArray, f"/{arm}_impedance_controller/{what}", 10)
             for what in ("stiffness", "damping", "equilibrium")
         }
         self.create_subscription(JointState, "/joint_states", self.take, 10)
@@ -51,6 +55,20 @@ class CompliantArm(Node):
         self.is_pushed = away > (BACK if self.is_pushed else PUSHED)
 
 
+def main() -> None:
+    # Ctrl-C and SIGTERM only set a flag, so that a callback that is running can still publish.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = CompliantArm()
+    try:
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
 if __name__ == "__main__":
-    rclpy.init()
-    rclpy.spin(CompliantArm())
+    main()

@@ -1,16 +1,20 @@
 """Finds bunches in a robot's colour and depth images, and prints their positions.
 
-    vinesim client --role robot --scene demo             # in one terminal
+    vinesim client --role robot --scene harvest          # in one terminal
     python examples/ros/find_bunches.py                  # in another
 
 This is an ordinary ROS 2 node. It takes each connected area with the colour of fruit as a bunch. Positions are in the
 camera's optical frame, in metres.
 """
 
+import signal
+import threading
+
 import cv2
 import numpy as np
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image
 
 
@@ -19,7 +23,7 @@ class BunchFinder(Node):
         super().__init__("find_bunches")
         self.parts: dict[str, Image | CameraInfo] = {}
         for kind, topic in ((Image, "rgb/image_raw"), (Image, "depth/image_raw"), (CameraInfo, "rgb/camera_info")):
-            self.create_subscription(kind, f"{camera}/{topic}", lambda m, t=topic: self.take(t, m), 5)
+            self.create_subscription(kind, f"{camera}/{topic}", lambda m, t=topic: self.take(t, m), 10)
 
     def take(self, topic: str, message: Image | CameraInfo) -> None:
         """Store a message. Find bunches once colour, depth and intrinsics with the same header stamp have arrived."""
@@ -54,6 +58,20 @@ def find(picture: np.ndarray, metres: np.ndarray, k: np.ndarray) -> list[np.ndar
     return places
 
 
+def main() -> None:
+    # Ctrl-C and SIGTERM only set a flag, so that a callback that is running can still publish.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = BunchFinder()
+    try:
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
 if __name__ == "__main__":
-    rclpy.init()
-    rclpy.spin(BunchFinder())
+    main()

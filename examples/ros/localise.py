@@ -1,14 +1,16 @@
 """Localises a robot without ground truth, from gyroscope and odometry, and publishes the transform map to odom on /tf.
 
-    vinesim client --role robot --name vinebot           # in one terminal
-    python examples/ros/localise.py vinebot              # in another
+    vinesim client --role robot --scene harvest          # in one terminal
+    python examples/ros/localise.py                      # in another
 
 This is an ordinary ROS 2 node. It integrates the yaw rate of the IMU and the velocity of odometry. It sets a parameter
 so that the robot no longer publishes its true pose. The origin of the map is the pose of the robot at the start.
 """
 
 import math
+import signal
 import sys
+import threading
 
 import rclpy
 from geometry_msgs.msg import TransformStamped
@@ -16,6 +18,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.parameter_client import AsyncParameterClient
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import Imu
 from tf2_msgs.msg import TFMessage
 
@@ -25,12 +28,17 @@ class Localiser(Node):
         super().__init__("localiser")
         self.x = self.y = self.yaw = self.speed = 0.0  # of the base in the map
         self.last: float | None = None
-        settings = AsyncParameterClient(self, robot)
-        settings.wait_for_services()
-        settings.set_parameters([Parameter("publish_map_to_odom", value=False)])
-        self.tf = self.create_publisher(TFMessage, "/tf", 100)
-        self.create_subscription(Imu, "/base_imu", self.turn, 1000)
-        self.create_subscription(Odometry, "/mobile_base_controller/odom", self.travel, 100)
+        self.settings = AsyncParameterClient(self, robot)
+        self.asking = self.create_timer(0.2, self.ask)
+        self.tf = self.create_publisher(TFMessage, "/tf", 10)
+        self.create_subscription(Imu, "/base_imu", self.turn, 10)
+        self.create_subscription(Odometry, "/mobile_base_controller/odom", self.travel, 10)
+
+    def ask(self) -> None:
+        """Ask the robot to publish no true pose, once it is there."""
+        if self.settings.services_are_ready():
+            self.settings.set_parameters([Parameter("publish_map_to_odom", value=False)])
+            self.asking.cancel()
 
     def turn(self, message: Imu) -> None:
         """Integrate yaw and position since the last IMU message."""
@@ -46,6 +54,8 @@ class Localiser(Node):
     def travel(self, message: Odometry) -> None:
         """Publish the transform map to odom, so that the pose of the base in odometry becomes the integrated pose in
         the map."""
+        if not self.asking.is_canceled():
+            return  # the robot still publishes the true transform
         self.speed = message.twist.twist.linear.x
         place = message.pose.pose.position
         q = message.pose.pose.orientation
@@ -60,6 +70,20 @@ class Localiser(Node):
         self.tf.publish(TFMessage(transforms=[odom]))
 
 
+def main() -> None:
+    # Ctrl-C and SIGTERM only set a flag, so that a callback that is running can still publish.
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Localiser(sys.argv[1] if len(sys.argv) > 1 else "robot")
+    try:
+        while not stop.is_set():
+            rclpy.spin_once(node, timeout_sec=0.1)
+    finally:
+        node.destroy_node()
+        rclpy.shutdown()
+
+
 if __name__ == "__main__":
-    rclpy.init()
-    rclpy.spin(Localiser(sys.argv[1] if len(sys.argv) > 1 else "vinebot"))
+    main()

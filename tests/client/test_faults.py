@@ -37,8 +37,24 @@ def test_a_client_without_faults_has_none(client) -> None:
     values = Status(client, RateLoop(0.01)).current()
     assert values["faults"] == {}
     assert status_line(values).endswith("  alone")
-    values |= {"frames_dropped": 3, "sound_dropped": 1}
-    assert status_line(values).endswith("  alone  dropped: 3 pictures and scans, 1 frames of sound")
+    values |= {"frames_dropped": 359, "frame_rate": 29.0, "frame_rate_asked": 30.0}
+    assert status_line(values).endswith("  alone"), "one late picture in a second needs no attention"
+    values |= {"frame_rate": 21.4, "sound_dropped": 1}
+    slow = "  alone  pictures and scans: 21 of the 30 a second that subscribers ask for  dropped: 1 frames of sound"
+    assert status_line(values).endswith(slow)
+
+
+def test_the_rate_of_pictures_is_that_since_the_last_status(client) -> None:
+    sensors = {"frames_delivered": 0, "frames_dropped": 0}
+    loop = RateLoop(0.01)
+    status = Status(client, loop, sensors=lambda: dict(sensors))
+    assert status.current()["frame_rate_asked"] == 0.0
+    sensors |= {"frames_delivered": 20, "frames_dropped": 10}
+    first = status.current()
+    assert first["frame_rate"] == pytest.approx(2 / 3 * first["frame_rate_asked"])
+    sensors |= {"frames_delivered": 30}
+    second = status.current()
+    assert second["frame_rate"] == second["frame_rate_asked"] > 0.0, "of the last second, not of the whole run"
 
 
 def test_a_tree_that_is_stopped_is_counted_shown_and_logged_once(client, caplog) -> None:

@@ -1,41 +1,24 @@
-"""Commands of vinesim in the pages are accepted as they stand there; short ones run, and so does the Python."""
+"""Commands of vinesim in the pages are accepted as they stand there; tests/docs/test_blocks.py runs them."""
 
 import functools
 import pathlib
 import re
 import shlex
-import shutil
-import sys
 
-import numpy as np
 import pytest
 import typer.main
 
-from tests.client.test_recorder import World
-from tests.support import programs
-from tests.support.recorded_pick import record_a_pick
-from tests.support.tuning import hanging, scan
+from tests.support.page_blocks import FENCE, PAGES, blocks_of
 from vinesim.cli import app
 from vinesim.cli.bench import BENCHES
-from vinesim.tune import Experiment, load_specimen, measure
 
 pytestmark = pytest.mark.slow
-
-ROOT = pathlib.Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.S | re.M)
-RUNS = ("certs ", "experiment ", "render ", "replay run.mcap --out ", "replay run.mcap --ros", "scene ", "tune ")
-"""How commands begin that end by themselves, in seconds."""
-ELSEWHERE = {"docs/gradients.md", "docs/sensors.md", "README.md"}
-"""Pages whose Python other tests run: test_gradients, test_reconstruction, test_docs."""
-SHORT = {"README.md", "docs/plants.md"}
-"""Pages whose commands ``make test`` runs; those of the others are tested by the commands' own tests too."""
 
 
 def shell_lines(page: pathlib.Path) -> list[str]:
     """Lines of the blocks of shell in a page, continued ones as one."""
-    blocks = [block for language, block in BLOCK.findall(page.read_text()) if language in ("", "sh", "bash", "console")]
-    return [line for block in blocks for line in block.replace("\\\n", " ").splitlines()]
+    blocks = [block.text for block in blocks_of(page) if block.language == "sh"]
+    return [line for text in blocks for line in text.replace("\\\n", " ").splitlines()]
 
 
 def commands_of(page: pathlib.Path) -> list[str]:
@@ -57,7 +40,7 @@ def commands_in_prose() -> list[str]:
     """What sentences, tables and headings give to ``vinesim``; such a command need not be complete."""
     found = set()
     for page in PAGES:
-        found |= set(re.findall(r"`vinesim\s+([^`]+)`", BLOCK.sub("", page.read_text())))
+        found |= set(re.findall(r"`vinesim\s+([^`]+)`", FENCE.sub("", page.read_text())))
     return sorted(" ".join(line.split()) for line in found if not re.match(r"[.A-Z]", line))
 
 
@@ -120,43 +103,11 @@ def test_no_command_of_a_page_is_overlooked():
     """Every line of shell that runs ``vinesim`` begins with it, so that :func:`commands_of` sees it."""
     for page in PAGES:
         for line in shell_lines(page):
+            if line.startswith("docker "):
+                continue  # the name of an image
             said = shlex.split(line, comments=True) if re.match(r"\s*(\S*/)?vinesim\s", line) else []
             rest = line.partition("#")[0].partition("//")[0] if not said else shlex.join(said[1:])
             assert not re.search(r"(^|[\s;&|/])vinesim\s", rest), f"{page.name}: {line}"
-
-
-def pages_that_run() -> list:
-    """Parameters of a test: pages with short commands; those that publish topics need ROS."""
-    found = []
-    for page in PAGES:
-        lines = [line for line in commands_of(page) if line.startswith(RUNS)]
-        marks = [pytest.mark.ros] if any("--ros" in line for line in lines) else []
-        if lines:
-            name = str(page.relative_to(ROOT))
-            if name not in SHORT:
-                marks.append(pytest.mark.long)
-            found.append(pytest.param(page, id=name, marks=marks))
-    return found
-
-
-@pytest.mark.parametrize("page", pages_that_run())
-def test_the_short_commands_of_a_page_run(page, tmp_path):
-    """In their order, in a folder that has the examples and the files that a reader brings along."""
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
-    shutil.copy(ROOT / "examples/plants/vine.mtg", tmp_path)
-    lines = [line for line in commands_of(page) if line.startswith(RUNS)]
-    cane = load_specimen(ROOT / "examples/cane.toml")
-    track = measure(cane, Experiment(duration=2.0))
-    for name in ("pull.csv", "filmed.csv"):
-        track.write(tmp_path / name)
-    if any("scan.xyz" in line for line in lines):
-        np.savetxt(tmp_path / "scan.xyz", scan(hanging(cane)), "%.5f")
-    if any("run.mcap" in line for line in lines):
-        record_a_pick(tmp_path / "run.mcap")
-    for line in lines:
-        done = programs.run([sys.executable, "-m", "vinesim", *shlex.split(line)], cwd=tmp_path)
-        assert done.returncode == 0, f"{line}: {done.stdout}{done.stderr}"
-        assert "Traceback" not in done.stderr, done.stderr
 
 
 def test_a_wrong_option_would_be_found():
@@ -167,27 +118,3 @@ def test_a_wrong_option_would_be_found():
         with pytest.raises(Exception, match=r"No such|requires an argument") as refused:
             parse(wrong)
         assert "UsageError" in {one.__name__ for one in type(refused.value).__mro__}
-
-
-def python_pages() -> list[pathlib.Path]:
-    return [
-        page
-        for page in PAGES
-        if str(page.relative_to(ROOT)) not in ELSEWHERE
-        and any(language == "python" for language, _ in BLOCK.findall(page.read_text()))
-    ]
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("page", python_pages(), ids=lambda page: str(page.relative_to(ROOT)))
-def test_the_python_of_a_page_runs(page, tmp_path):
-    (tmp_path / "examples").symlink_to(ROOT / "examples")
-    if page.name == "recording.md":
-        world = World(tmp_path / "run.mcap")
-        world.run(0.2)
-        world.recorded()
-    for language, code in BLOCK.findall(page.read_text()):
-        if language == "python":
-            done = programs.run([sys.executable, "-c", code], cwd=tmp_path)
-            assert done.returncode == 0, done.stderr
-            assert done.stdout.strip(), code

@@ -10,9 +10,6 @@ import sys
 
 import pytest
 
-from vinesim.cli.notebooks import run
-from vinesim.core.errors import UsageError
-
 ROOT = pathlib.Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.py"))
 PAGE = ROOT / "docs/tutorials/notebooks.md"
@@ -55,19 +52,6 @@ def test_the_executed_notebook_has_the_cells_of_its_source_and_results(path):
     assert any("image/png" in output.get("data", {}) for output in outputs)
     assert not [output for output in outputs if output["output_type"] == "error"]
     assert "/home/" not in executed.read_text()
-
-
-def test_the_command_copies_notebooks_and_keeps_what_is_there(tmp_path, capsys):
-    assert run([], None) == 0
-    assert capsys.readouterr().out.split() == [path.stem for path in NOTEBOOKS]
-    assert run(["first_steps"], tmp_path / "mine") == 0
-    copied = tmp_path / "mine/first_steps.ipynb"
-    assert copied.read_text() == (ROOT / "notebooks/first_steps.ipynb").read_text()
-    copied.write_text("changed")
-    assert run(["first_steps"], tmp_path / "mine") == 0
-    assert copied.read_text() == "changed"
-    with pytest.raises(UsageError, match="no notebook 'second_steps'; there are: "):
-        run(["second_steps"], tmp_path)
 
 
 @pytest.mark.long

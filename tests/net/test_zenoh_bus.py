@@ -474,6 +474,25 @@ class DatagramRelay:
             socket_.close()
 
 
+def test_a_short_loss_of_the_connection_is_not_reported_and_a_long_one_once(caplog, monkeypatch):
+    """A client that joins must not begin with "lost the server" because a connection was replaced."""
+    with Server("tcp/127.0.0.1:0") as server, ZenohBus("ada", connect=server.endpoint) as ada:
+        lost = ada._lost_endpoints
+        lost.add(ada.endpoint)
+        wait(lambda: ada._lost_since is not None, "the bus to look at its links")
+        lost.clear()
+        wait(lambda: ada._lost_since is None, "the bus to look at its links again")
+        assert ada.status_message == ""
+        assert not [line for line in caplog.messages if "server" in line]
+        monkeypatch.setattr(zenoh_bus, "LOSS_NOTICE", 0.0)
+        lost.add(ada.endpoint)
+        wait(lambda: "is gone" in ada.status_message, "the loss to be reported")
+        lost.clear()
+        wait(lambda: ada.status_message == "", "the bus to look at its links again")
+        told = [line.partition(" at ")[0] for line in caplog.messages if "server" in line]
+        assert told == ["ada: lost the server", "ada: connected to the server"]
+
+
 def test_poses_move_to_the_stream_when_datagrams_stop(caplog, monkeypatch):
     monkeypatch.setattr(zenoh_bus, "SILENCE_TIMEOUT", 1.0)
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as server, CountingRelay(server.endpoint) as relay:

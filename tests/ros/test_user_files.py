@@ -1,4 +1,4 @@
-"""The examples and the folder ``ros/`` against a real robot client, each as its users run it."""
+"""The examples and the folder ``ros/`` against the real client of the robot tutorial, each as its users run it."""
 
 # ruff: noqa: E402 (messages are imported only where ROS is installed)
 from __future__ import annotations
@@ -10,9 +10,12 @@ import pathlib
 import queue
 import re
 import runpy
+import shlex
 import shutil
+import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import types
 from collections.abc import Callable, Iterator
@@ -21,6 +24,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from benchmarks.example_signals import BOUND, UNCLEAN
+from benchmarks.ros_pick import lies_in_a_box
+from benchmarks.support.example_programs import EXAMPLES, NAMES, handles_sigterm, start_example
+from tests.support import programs
 from tests.support.waiting import deadline
 from vinesim.ros import middleware
 
@@ -33,6 +40,8 @@ from action_msgs.msg import GoalStatus
 from geometry_msgs.msg import TwistStamped
 from nav_msgs.msg import Odometry
 from rclpy.action.client import ClientGoalHandle
+from rclpy.parameter import Parameter
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.task import Future
 from sensor_msgs.msg import BatteryState, JointState
@@ -43,6 +52,7 @@ from tests.support.stock_node import StockNode, wait_until
 from vinesim.bench.ros_resets import reset_rows
 from vinesim.bench.ros_topics import action_rows
 from vinesim.client.programs import program_group
+from vinesim.core import frames
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.joint_servos import series_stiffness
 from vinesim.ros.messages import message_packages
@@ -51,7 +61,6 @@ from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 
 ROOT = pathlib.Path(__file__).parents[2]
-EXAMPLES = ROOT / "examples" / "ros"
 FOLDER = ROOT / "ros"
 SLIP = 0.2
 
@@ -75,8 +84,8 @@ def robot(tmp_path_factory) -> Iterator[StockNode]:
             "client",
             "--role",
             "robot",
-            "--name",
-            "vinebot",
+            "--scene",
+            "harvest",
             "--status",
             "none",
             "--robot",
@@ -92,40 +101,145 @@ def robot(tmp_path_factory) -> Iterator[StockNode]:
 
 
 @contextlib.contextmanager
-def example(name: str, *arguments: str) -> Iterator[Callable[[], list[str]]]:
-    """Run an example that knows nothing of vinesim; call what is yielded for the lines that it has printed."""
-    text = (EXAMPLES / name).read_text()
-    assert len(text.splitlines()) < 60
-    assert not re.search(r"^\s*(import|from) vinesim", text, re.MULTILINE)
-    packages = [path for path in sys.path if "interfaces" in path]  # as if they were installed
-    child = subprocess.Popen(
-        [sys.executable, str(EXAMPLES / name), *arguments],
-        stdout=subprocess.PIPE,
-        text=True,
-        cwd="/",
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(packages)},
+def example(name: str, *arguments: str, number: signal.Signals = signal.SIGINT) -> Iterator[Callable[[], list[str]]]:
+    """Run an example where vinesim cannot be imported; call what is yielded for the lines that it has printed.
+
+    At the end it gets a signal, and must end in order."""
+    with tempfile.TemporaryDirectory() as folder:
+        child = start_example(name, *arguments, folder=pathlib.Path(folder), output=subprocess.PIPE)
+        printed: queue.SimpleQueue[str] = queue.SimpleQueue()
+        lines: list[str] = []
+
+        def read() -> None:
+            for line in child.stdout:
+                printed.put(line.strip())
+
+        def take() -> None:
+            while not printed.empty():
+                lines.append(printed.get())
+
+        def heard() -> list[str]:
+            has_ended = child.poll() is not None
+            take()
+            assert not has_ended, f"{name} has ended: {lines}"
+            return lines
+
+        reader = threading.Thread(target=read)
+        reader.start()
+        try:
+            yield heard
+            if child.poll() is None:
+                assert handles_sigterm(child.pid)
+                child.send_signal(number)
+            assert child.wait(deadline(BOUND)) == 0
+        finally:
+            child.kill()
+            child.wait()
+            reader.join()
+            child.stdout.close()
+        take()
+        assert not [line for line in lines if any(word in line for word in UNCLEAN)]
+
+
+def test_the_examples_import_nothing_of_vinesim_and_name_the_client_of_the_tutorial() -> None:
+    client = "vinesim client --role robot --scene harvest"
+    assert client in (ROOT / "docs" / "tutorials" / "robot.md").read_text().splitlines()
+    assert {"battery_light.py", "compliant_arm.py", "find_bunches.py", "localise.py", "pick_a_bunch.py"} == set(NAMES)
+    for name in NAMES:
+        text = (EXAMPLES / name).read_text()
+        assert not re.search(r"^\s*(import|from) vinesim", text, re.MULTILINE)
+        assert re.search(rf"^    {client} +# in one terminal$", text, re.MULTILINE), name
+        depths = re.findall(r"create_(?:subscription|publisher)\(.*, (\w+)\)$", text, re.MULTILINE)
+        assert set(depths) <= {"10", "latched"}, name  # rclpy's default QoS; a latched topic needs its own
+
+
+def test_bunches_are_found_where_they_are(robot: StockNode) -> None:
+    """Every place that the example prints is in the picture, next to a bunch of the truth."""
+    from vision_msgs.msg import Detection3DArray
+
+    truth: dict[str, np.ndarray] = {}
+
+    def take(message: Detection3DArray) -> None:
+        for one in message.detections:
+            at = one.bbox.center.position
+            truth[one.id] = np.array([at.x, at.y, at.z])
+
+    subscription = robot.node.create_subscription(Detection3DArray, "/head_front_camera/detections_3d", take, 5)
+    with example("find_bunches.py", number=signal.SIGTERM) as printed:
+        wait_until(lambda: len(printed()) >= 8 and truth, lambda: robot.spin(0.05), "bunches")
+        lines = list(printed())
+    robot.node.destroy_subscription(subscription)
+    found = [np.array([float(number) for number in re.findall(r"[xyz] (-?\d+\.\d+)", line)]) for line in lines]
+    assert len({tuple(place.round(1)) for place in found}) >= 3
+    for place in found:  # the middle of the side that faces the camera
+        assert min(np.linalg.norm(place - middle) for middle in truth.values()) < 0.15, place
+
+
+def arm_of_the_example(side: str) -> tuple[Any, Any]:
+    """The arm of ``pick_a_bunch.py``, without a robot, and vinesim's description."""
+    given = runpy.run_path(str(EXAMPLES / "pick_a_bunch.py"), run_name="example")
+    description = load_description("vinebot")
+    robot = types.SimpleNamespace(
+        urdf=[(ROOT / "data" / "robots" / "vinebot.urdf").read_text()],
+        joints=dict.fromkeys(description.joints, 0.1),
+        check=lambda: None,
     )
-    printed: queue.SimpleQueue[str] = queue.SimpleQueue()
-    lines: list[str] = []
+    return given["Arm"](robot, side), description
 
-    def read() -> None:
-        for line in child.stdout:
-            printed.put(line.strip())
 
-    def heard() -> list[str]:
-        assert child.poll() is None, f"{name} has ended"
-        while not printed.empty():
-            lines.append(printed.get())
-        return lines
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_kinematics_of_the_picker_are_those_of_the_urdf(side: str) -> None:
+    """Poses against vinesim's, the Jacobian against differences, and a solution that reaches its goal."""
+    arm, description = arm_of_the_example(side)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        q = rng.uniform(arm.lower, arm.upper)
+        here, jacobian = arm.hand(q)
+        positions = {**arm.robot.joints, **dict(zip(arm.names, q, strict=True))}
+        links = description.link_poses(np.array([positions[name] for name in description.joints]))
+        expected = links[f"gripper_{side}_grasping_link"]
+        np.testing.assert_allclose(here[:3, 3], expected[:3], atol=1e-9)
+        np.testing.assert_allclose(here[:3, :3], frames.to_matrix(expected[3:]), atol=1e-9)
+        step = 1e-6 * rng.standard_normal(len(q))
+        there, _ = arm.hand(q + step)
+        np.testing.assert_allclose(there[:3, 3] - here[:3, 3], jacobian[:3] @ step, atol=1e-10)
+    near = np.clip(q + 0.1, arm.lower, arm.upper)
+    reached, _ = arm.hand(arm.solve(arm.hand(near)[0], q))
+    np.testing.assert_allclose(reached, arm.hand(near)[0], atol=6e-3)
 
-    reader = threading.Thread(target=read)
-    reader.start()
-    try:
-        yield heard
-    finally:
-        child.kill()
-        child.wait()
-        reader.join()
+
+def test_the_picker_stops_the_robot_at_sigterm(robot: StockNode) -> None:
+    """The base drives to a bunch; at the end of the program it comes to rest."""
+    odometry: list[Odometry] = []
+    subscription = robot.node.create_subscription(Odometry, "/mobile_base_controller/odom", odometry.append, 10)
+
+    def speed() -> float:
+        twist = odometry[-1].twist.twist if odometry else None
+        return 0.0 if twist is None else abs(twist.linear.x) + abs(twist.angular.z)
+
+    with example("pick_a_bunch.py", number=signal.SIGTERM) as printed:
+        wait_until(lambda: (printed(), speed() > 0.05)[1], lambda: robot.spin(0.05), "a robot that drives")
+        assert re.fullmatch(r"bunch_\d+: (left|right) hand, from \(.*\)", printed()[-1])
+    wait_until(lambda: speed() < 1e-3, lambda: robot.spin(0.05), "rest")
+    robot.node.destroy_subscription(subscription)
+
+
+@pytest.mark.long
+def test_a_bunch_is_picked_and_put_into_a_box(robot: StockNode) -> None:
+    """The simulation says where the bunch is at the end."""
+    with tempfile.TemporaryDirectory() as folder:
+        output = pathlib.Path(folder) / "output"
+        with output.open("w") as file:
+            child = start_example("pick_a_bunch.py", folder=pathlib.Path(folder), output=file)
+        try:
+            wait_until(lambda: child.poll() is not None, lambda: robot.spin(0.05), "a bunch in a box")
+        finally:
+            child.kill()
+        lines = output.read_text().splitlines()
+    assert child.wait() == 0, lines
+    bunch, said = lines[-1].split(": ")
+    assert said == "in the box"
+    assert lies_in_a_box(bunch)
 
 
 def test_poles_and_elastic_elements_are_those_of_the_scene_and_the_drives(robot: StockNode) -> None:
@@ -151,7 +265,7 @@ def test_poles_and_elastic_elements_are_those_of_the_scene_and_the_drives(robot:
     wait_until(lambda: static and len(links.keys() & springs.keys()) >= 5, lambda: robot.spin(0.05), "springs")
     for one in subscriptions:
         robot.node.destroy_subscription(one)
-    model = generate(load_scene("demo"))
+    model = generate(load_scene("harvest"))
     poles = model.fixed_start[model.fixed_organ == Organ.POLE]
     told = {one.child_frame_id: one.transform.translation for one in static[-1].transforms}
     assert list(told) == [f"pole_{i:04d}" for i in range(len(poles))]
@@ -280,11 +394,11 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
     wait_until(ask.service_is_ready, lambda: robot.spin(0.05), "the simulation")
 
     def true_yaw() -> float:
-        future = ask.call_async(GetEntityState.Request(entity="vinebot"))
+        future = ask.call_async(GetEntityState.Request(entity="robot"))
         wait_until(future.done, lambda: robot.spin(0.05), "a state")
         return yaw(future.result().state.pose.orientation)
 
-    with example("localise.py", "vinebot") as printed:
+    with example("localise.py", number=signal.SIGTERM) as printed:
         wait_until(lambda: own and others and "odom" not in own[-1], lambda: (printed(), robot.spin(0.05)), "tf")
         before = true_yaw()
         start = yaw(odometry[-1].pose.pose.orientation)
@@ -306,6 +420,9 @@ def test_a_robot_is_localised_without_truth(robot: StockNode) -> None:
         wait_until(lambda: abs(turned(found(), truth())) < 0.04, lambda: drive(0.0, 0.0), "the true turn")
         wait_until(lambda: abs(counted() - truth() / (1.0 - SLIP)) < 0.04, lambda: drive(0.0, 0.0), "odometry")
         assert abs(turned(found(), truth())) < 0.04
+    settings = AsyncParameterClient(robot.node, "robot")
+    restored = settings.set_parameters([Parameter("publish_map_to_odom", value=True)])
+    wait_until(restored.done, lambda: robot.spin(0.05), "the true pose")
     for one in subscriptions:
         robot.node.destroy_subscription(one)
 
@@ -368,7 +485,7 @@ def test_steps_of_the_paused_robot_are_told_of_and_cancelled(robot: StockNode) -
         assert answer.result.result == Result.RESULT_OK
 
     def steps_done() -> int:
-        stamp = wait_for(state.call_async(GetEntityState.Request(entity="vinebot"))).state.header.stamp
+        stamp = wait_for(state.call_async(GetEntityState.Request(entity="robot"))).state.header.stamp
         return stamp.sec * 100 + round(stamp.nanosec / 10**7)
 
     def send(steps: int, heard: list[int]) -> ClientGoalHandle:
@@ -407,6 +524,73 @@ def test_a_robot_without_a_server_shows_no_area_of_interest(robot: StockNode) ->
     wait_until(lambda: heard, lambda: robot.spin(0.05), "markers")
     robot.node.destroy_subscription(subscription)
     assert {one.ns for one in heard[-1].markers} == {"contacts"}
+
+
+# ---------------------------------------------------------------- the commands vinesim ros
+
+
+def tutorial_commands() -> dict[str, list[str]]:
+    """What the tutorial gives to ``vinesim ros``, by the command's name and its first argument."""
+    found = {}
+    for line in (ROOT / "docs" / "tutorials" / "robot.md").read_text().splitlines():
+        if re.match("vinesim ros (topics|hz|echo|pub|call) ", line):
+            words = shlex.split(line, comments=True)[2:]
+            found[" ".join(words[:2])] = words
+    return found
+
+
+@contextlib.contextmanager
+def ros_command(words: list[str], number: signal.Signals = signal.SIGINT) -> Iterator[programs.Popen]:
+    """Run ``vinesim ros`` with these words, and end it by a signal, as users do: in order, with exit code 0."""
+    with programs.Popen(
+        [sys.executable, "-m", "vinesim", "ros", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as command:
+        try:
+            yield command
+            command.send_signal(number)
+            _, said = command.communicate(timeout=deadline(30.0))
+            assert (command.returncode, "Traceback" in said) == (0, False), said
+        finally:
+            command.kill()
+
+
+def test_the_commands_of_the_tutorial_do_what_it_says(robot: StockNode) -> None:
+    """They list and measure topics, print and publish messages, and call a service of the running robot."""
+    commands = tutorial_commands()
+    assert {name.split()[0] for name in commands} == {"topics", "hz", "echo", "pub", "call"}
+
+    def run(name: str) -> str:
+        command = [sys.executable, "-m", "vinesim", "ros", *commands[name]]
+        done = programs.run(command, timeout=deadline(60.0))
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    listed = run("topics --types")
+    assert re.search(r"^/joint_states +sensor_msgs/msg/JointState  1 -> \d+$", listed, re.MULTILINE)
+    place = yaml.safe_load(run("echo /mobile_base_controller/odom").removesuffix("---\n"))
+    assert place.keys() == {"x", "y", "z"}
+    state = yaml.safe_load(run("call /get_entity_state"))
+    assert state["result"]["result"] == 1
+    assert state["state"]["pose"]["position"]["x"] == pytest.approx(5.0, abs=3.0)  # in the alley
+    with ros_command(commands["hz /joint_states"]) as command:
+        while (line := command.stdout.readline()) == "no new messages\n":
+            pass
+        rate = re.match(r"(\d+\.\d\d) Hz  gaps \d+\.\d to \d+\.\d ms, standard deviation", line)
+        assert rate, line
+        assert 1.0 < float(rate[1]) < 120.0  # 100 on an idle machine
+    odometry: list[Odometry] = []
+    subscription = robot.node.create_subscription(Odometry, "/mobile_base_controller/odom", odometry.append, 10)
+    with ros_command(commands["pub /mobile_base_controller/cmd_vel"], signal.SIGTERM) as command:
+        assert command.stdout.readline() == "publishing to /mobile_base_controller/cmd_vel at 10 Hz; Ctrl-C ends it\n"
+        wait_until(
+            lambda: odometry and odometry[-1].twist.twist.linear.x > 0.15,
+            lambda: robot.spin(0.05),
+            "a robot that drives",
+        )
+    wait_until(lambda: abs(odometry[-1].twist.twist.linear.x) < 1e-3, lambda: robot.spin(0.05), "rest")
+    robot.node.destroy_subscription(subscription)
+    with example("battery_light.py") as printed, ros_command(commands["pub /battery_state"]):
+        wait_until(lambda: printed() == ["warning"], lambda: robot.spin(0.05), "a warning")
 
 
 # ---------------------------------------------------------------- the folder ros/
@@ -470,15 +654,13 @@ def test_files_name_topics_that_there_are(robot: StockNode) -> None:
 
 
 def test_the_parameter_file_names_parameters_that_there_are(robot: StockNode) -> None:
-    from rclpy.parameter_client import AsyncParameterClient
-
     def names(values: dict, above: str = "") -> Iterator[str]:
         for key, value in values.items():
             yield from names(value, f"{above}{key}.") if isinstance(value, dict) else [above + key]
 
     wanted = set(names(yaml.safe_load((FOLDER / "parameters.yaml").read_text())["/**"]["ros__parameters"]))
     declared: set[str] = set()
-    for node in ("vinebot", "vinebot_sensors"):
+    for node in ("robot", "robot_sensors"):
         client = AsyncParameterClient(robot.node, node)
         wait_until(client.services_are_ready, lambda: robot.spin(0.05), node)
         future = client.list_parameters()

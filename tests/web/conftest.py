@@ -22,3 +22,4 @@ def page(browser: Page) -> Iterator[Page]:
     yield browser
     browser.open("about:blank")
     browser.call("Emulation.clearDeviceMetricsOverride")
+    browser.call("Network.clearBrowserCookies")  # a page remembers by a cookie that its user knows the first steps

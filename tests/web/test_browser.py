@@ -578,13 +578,13 @@ def test_controls_fit_on_desktops_and_phones_and_are_reached_by_keys(page, is_pe
         controls = page.run(f"{CONTROLS}.length")
         folded = page.run("[...document.querySelectorAll('details')].filter((one) => one.checkVisibility()).length")
         assert folded == 1 + is_person, "overlays and intentions"
-        assert controls == folded + 5 + is_person * 3, "hear, speak, timeline; hand and shears"
+        assert controls == folded + 6 + is_person * 3, "first steps, hear, speak, timeline; hand and shears"
         for _ in range(2):
             page.run("document.querySelectorAll('details').forEach((one) => { one.open = !one.open; })")
             assert page.run(MISPLACED) == [], "folded and not"
         page.run("document.querySelectorAll('details').forEach((one) => { one.open = true; })")
         controls = page.run(f"{CONTROLS}.length")
-        assert controls == folded + 10 + is_person * (1 + len(INTENTIONS)), "with overlays and intentions"
+        assert controls == folded + 13 + is_person * (1 + len(INTENTIONS)), "with overlays and intentions"
         for _ in range(controls):
             page.call("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
             page.run("document.activeElement.isReached = true")

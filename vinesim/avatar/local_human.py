@@ -24,6 +24,8 @@ class LocalHuman:
         """``source(time)`` returns the pose at the end of the step that begins at simulation ``time`` [s]."""
         self.physics = physics
         self.name = spec.name
+        self.height = spec.height
+        """Height of the person [m]."""
         self.source = source
         physics.add_human(spec)
         self.pose = spec.pose

@@ -25,7 +25,20 @@ from vinesim.cli.commands.demo import demo
 from vinesim.cli.commands.images import dataset, render, scene_import_plant, scene_show
 from vinesim.cli.commands.recording import record, replay
 from vinesim.cli.commands.server import server
-from vinesim.cli.commands.tools import bench, certs_new, doctor, notebooks, ros_build_interfaces, ros_play, ros_record
+from vinesim.cli.commands.tools import (
+    bench,
+    certs_new,
+    doctor,
+    examples,
+    ros_build_interfaces,
+    ros_call,
+    ros_echo,
+    ros_hz,
+    ros_play,
+    ros_pub,
+    ros_record,
+    ros_topics,
+)
 from vinesim.cli.commands.tuning import experiment, track, tune
 from vinesim.core import allocator, progress
 
@@ -38,32 +51,24 @@ app = typer.Typer(
     epilog="Start with: vinesim demo",
 )
 scene_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Vineyards: contents of a scene file.")
-ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: set-up and state.")
+ros_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="ROS 2: topics, services, message packages.")
 certs_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Certificates for secured links.")
 app.add_typer(scene_app, name="scene")
 app.add_typer(ros_app, name="ros")
 app.add_typer(certs_app, name="certs")
-for command in (
-    demo,
-    server,
-    client,
-    record,
-    replay,
-    render,
-    dataset,
-    track,
-    tune,
-    experiment,
-    notebooks,
-    bench,
-    doctor,
-):
+for command in (demo, server, client, record, replay, render, dataset, track, tune, experiment, bench, doctor):
     app.command()(command)
+app.command()(examples)
 scene_app.command("show")(scene_show)
 scene_app.command("import-plant")(scene_import_plant)
 ros_app.command("build-interfaces")(ros_build_interfaces)
 ros_app.command("record")(ros_record)
 ros_app.command("play")(ros_play)
+ros_app.command("topics")(ros_topics)
+ros_app.command("hz")(ros_hz)
+ros_app.command("echo")(ros_echo)
+ros_app.command("pub")(ros_pub)
+ros_app.command("call")(ros_call)
 certs_app.command("new")(certs_new)
 
 

@@ -137,7 +137,14 @@ def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
     awaited = [part for status in statuses for part in status["sensors_awaited"]]
     counts = {
         key: sum(status[key] for status in statuses)
-        for key in ("frames_dropped", "messages_dropped", "sound_lost", "sensor_restarts", "ros_restarts")
+        for key in (
+            "frames_delivered",
+            "frames_dropped",
+            "messages_dropped",
+            "sound_lost",
+            "sensor_restarts",
+            "ros_restarts",
+        )
     }
     return {
         "sensors_ready": not awaited,

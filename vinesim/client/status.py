@@ -17,6 +17,7 @@ from vinesim.robot.tasks.task import Task
 _WITHOUT_SENSORS = {
     "sensors_ready": True,
     "sensors_awaited": [],
+    "frames_delivered": 0,
     "frames_dropped": 0,
     "messages_dropped": 0,
     "sound_lost": 0,
@@ -50,6 +51,8 @@ class Status:
         self._before: dict[str, int] = {}
         self._before_time = 0.0
         self._before_ticks = 0
+        self._frames_before = (0, 0)
+        """Numbers of delivered and dropped frames at the last call of :meth:`current`."""
 
     def current(self) -> dict[str, Any]:
         """Returns the present values, for JSON. Rates of topics and recent values cover the time since the last call.
@@ -69,6 +72,10 @@ class Status:
         p50, p99 = loop.work_ms(50, 99)
         faults = count_faults(client, loop.dropped)
         recent_faults = self._fault_log.update(faults, time)
+        sensors = _WITHOUT_SENSORS | self._sensors()
+        frames = sensors["frames_delivered"], sensors["frames_dropped"]
+        delivered, missed = (now - before for now, before in zip(frames, self._frames_before, strict=True))
+        self._frames_before = frames
         force = np.sum([np.linalg.norm(c.force) for c in client.physics.contacts if c.actor == client.name] or [0.0])
         return {
             "name": client.name,
@@ -100,8 +107,9 @@ class Status:
             "phase": "" if self._task is None else self._task.phase,
             "others": sorted(client.remote_actors),
             "topics": rates,
-            **_WITHOUT_SENSORS,
-            **self._sensors(),
+            "frame_rate": delivered / span,
+            "frame_rate_asked": (delivered + missed) / span,
+            **sensors,
         }
 
     def report(self) -> dict[str, Any]:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import pathlib
 
+USER_FOLDERS = ("examples", "notebooks", "ros")
+"""Names of the folders for users other than ``data``; a wheel contains them in ``vinesim/user_files``."""
+
 
 class DataFileNotFound(FileNotFoundError):
     """Raised when a name is neither an existing file nor a data file of vinesim. The message lists the known names."""
@@ -15,10 +18,12 @@ def data_dir() -> pathlib.Path:
     return next(d for d in (package / "data", package.parent / "data") if d.is_dir())
 
 
-def notebook_dir() -> pathlib.Path:
-    """Returns the folder of notebooks: inside the installed package, or next to the package in a checkout."""
+def user_folders() -> dict[str, pathlib.Path]:
+    """Returns the folders of files for users by name: :data:`USER_FOLDERS` and ``data``. They are inside the installed
+    package, or next to the package in a checkout."""
     package = pathlib.Path(__file__).resolve().parent.parent
-    return next(d for d in (package / "notebooks", package.parent / "notebooks") if d.is_dir())
+    place = package / "user_files" if (package / "user_files").is_dir() else package.parent
+    return {name: place / name for name in USER_FOLDERS} | {"data": data_dir()}
 
 
 def find_data_file(kind: str, name: str, suffix: str) -> pathlib.Path:

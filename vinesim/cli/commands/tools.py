@@ -1,4 +1,4 @@
-"""``vinesim bench``, ``vinesim doctor``, ``vinesim ros`` and ``vinesim certs``: their options."""
+"""``vinesim bench``, ``vinesim doctor``, ``vinesim examples``, ``vinesim ros`` and ``vinesim certs``: their options."""
 
 from __future__ import annotations
 
@@ -38,28 +38,6 @@ def bench(
     raise typer.Exit(run(names, json, row or ()))
 
 
-def notebooks(
-    names: Annotated[list[str] | None, typer.Argument(help="Notebooks to copy; by default all.")] = None,
-    out: Annotated[
-        pathlib.Path | None, typer.Option(help="Folder to copy them into; without it, they are listed.")
-    ] = None,
-) -> None:
-    """List the notebooks that ship with vinesim, or copy them into a folder for Jupyter.
-
-    They contain their results. Jupyter is not part of vinesim; to run them, also install jupyterlab. Existing files
-    are kept.
-
-    \b
-    Examples:
-      vinesim notebooks
-      vinesim notebooks --out my-notebooks
-      vinesim notebooks tune_a_cane tune_a_swing --out my-notebooks
-    """
-    from vinesim.cli.notebooks import run
-
-    raise typer.Exit(run(names or [], out))
-
-
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="All findings as one JSON object.")] = False,
 ) -> None:
@@ -76,6 +54,27 @@ def doctor(
     from vinesim.cli.doctor.command import run
 
     raise typer.Exit(run(json))
+
+
+def examples(
+    out: Annotated[
+        pathlib.Path, typer.Option(help="Folder into which they are copied; created if it is missing.")
+    ] = pathlib.Path(),
+    force: Annotated[bool, typer.Option("--force", help="Replace files that differ from those of vinesim.")] = False,
+) -> None:
+    """Copy what ships with vinesim into the folders examples, notebooks, ros and data.
+
+    Pages of the documentation name files of these folders. In a checkout they are already there. Files of yours are
+    not replaced.
+
+    \b
+    Examples:
+      vinesim examples
+      vinesim examples --out vineyard
+    """
+    from vinesim.cli.examples import copy
+
+    raise typer.Exit(copy(out, force))
 
 
 def ros_build_interfaces(
@@ -135,6 +134,107 @@ def ros_play(
     from vinesim.cli.ros import play
 
     raise typer.Exit(play(path, rate))
+
+
+Namespace = Annotated[str, typer.Option(help="Namespace of relative names, such as joint_states.")]
+
+
+def ros_topics(
+    types: Annotated[
+        bool, typer.Option("--types", help="Also print types and numbers of publishers and subscribers.")
+    ] = False,
+    namespace: Namespace = "",
+) -> None:
+    """List the topics of the domain ROS_DOMAIN_ID, as ros2 topic list does. With --namespace only those in it.
+
+    \b
+    Examples:
+      vinesim ros topics
+      vinesim ros topics --types
+    """
+    from vinesim.cli.ros import topics
+
+    raise typer.Exit(topics(namespace, types))
+
+
+def ros_hz(
+    topic: Annotated[str, typer.Argument(help="Name of the topic.")],
+    seconds: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop this time after the first message [s]; by default at Ctrl-C.")
+    ] = None,
+    namespace: Namespace = "",
+) -> None:
+    """Print the rate of a topic's messages, as ros2 topic hz does, by the time at which they arrive.
+
+    \b
+    Examples:
+      vinesim ros hz /joint_states
+      vinesim ros hz /lidar/points --seconds 5
+    """
+    from vinesim.cli.ros import hz
+
+    raise typer.Exit(hz(topic, namespace, seconds))
+
+
+def ros_echo(
+    topic: Annotated[str, typer.Argument(help="Name of the topic.")],
+    once: Annotated[bool, typer.Option("--once", help="Stop after the first message.")] = False,
+    field: Annotated[
+        str | None, typer.Option(help="Print only this field, such as pose.pose.position or position[2].")
+    ] = None,
+    full: Annotated[bool, typer.Option("--full", help="Print long lists and texts completely.")] = False,
+    namespace: Namespace = "",
+) -> None:
+    """Print the messages of a topic as YAML, as ros2 topic echo does. The QoS is that of the publishers.
+
+    \b
+    Examples:
+      vinesim ros echo /joint_states --once
+      vinesim ros echo /mobile_base_controller/odom --field pose.pose.position
+    """
+    from vinesim.cli.ros import echo
+
+    raise typer.Exit(echo(topic, namespace, field, once, full))
+
+
+def ros_pub(
+    topic: Annotated[str, typer.Argument(help="Name of the topic.")],
+    message: Annotated[str, typer.Argument(help="Fields of the message as JSON or YAML.")],
+    type: Annotated[
+        str | None, typer.Option(help="Type of the message; by default that of the topic's subscribers.")
+    ] = None,
+    rate: Annotated[float, typer.Option(min=0.01, max=1000.0, help="Messages per second.")] = 1.0,
+    once: Annotated[bool, typer.Option("--once", help="Publish one message.")] = False,
+    namespace: Namespace = "",
+) -> None:
+    """Publish a message on a topic until Ctrl-C, as ros2 topic pub does.
+
+    \b
+    Examples:
+      vinesim ros pub /indicator_lights/command '{"data": "warning"}' --once
+      vinesim ros pub /mobile_base_controller/cmd_vel '{"twist": {"linear": {"x": 0.2}}}' --rate 10
+    """
+    from vinesim.cli.ros import publish
+
+    raise typer.Exit(publish(topic, message, namespace, type, rate, once))
+
+
+def ros_call(
+    service: Annotated[str, typer.Argument(help="Name of the service.")],
+    request: Annotated[str, typer.Argument(help="Fields of the request as JSON or YAML.")] = "{}",
+    timeout: Annotated[float, typer.Option(min=0.0, help="Longest time until the response [s].")] = 30.0,
+    namespace: Namespace = "",
+) -> None:
+    """Call a service and print its response as YAML, as ros2 service call does.
+
+    \b
+    Examples:
+      vinesim ros call /get_simulation_state
+      vinesim ros call /get_entity_state '{"entity": "robot"}'
+    """
+    from vinesim.cli.ros import call
+
+    raise typer.Exit(call(service, request, namespace, timeout))
 
 
 def certs_new(

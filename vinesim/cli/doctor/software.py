@@ -54,7 +54,7 @@ def packages(requirements: Iterable[str] | None = None) -> Finding:
     needed = [one for one in wanted if one.marker is None or one.marker.evaluate({"extra": ""})]
     faults = [fault for one in needed if (fault := _fault(one))]
     if faults:
-        return Finding("packages", ERROR, ", ".join(faults), "pip install --upgrade vinesim, in this environment")
+        return Finding("packages", ERROR, ", ".join(faults), "pip install vinesim, in this environment")
     states = []
     for extra, purpose in EXTRAS.items():
         parts = [one for one in wanted if one.marker is not None and one.marker.evaluate({"extra": extra})]

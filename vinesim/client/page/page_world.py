@@ -9,6 +9,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any, Protocol
 
+import msgspec
 import numpy as np
 
 from vinesim.avatar.gestures import OPEN_HAND
@@ -18,7 +19,7 @@ from vinesim.client.page.first_view import first_view
 from vinesim.client.spectator import Spectator
 from vinesim.kernels.shading import materials
 from vinesim.rigid.human_posture import SIDES
-from vinesim.scene.appearance import load_shears
+from vinesim.scene.appearance import load_human_model, load_shears
 from vinesim.scene.ids import Organ, object_name
 from vinesim.scene.model import Model
 from vinesim.scene.values import INTENTIONS, CameraMount, Contact, Haptic, RigidVisual, SegmentPoses, Snapshot
@@ -255,6 +256,7 @@ class PageWorld:
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
                 "mouth": None if self._person is None else load_shears().mouth[:3].tolist(),
+                "limbs": None if self._person is None else self._limbs(),
                 "replay": None if self._replay is None else self._replay.status(),
                 "intentions": [] if self._person is None else list(INTENTIONS[1:]),
                 "gestures": {} if self._person is None else dict(self._person.gestures.poses),
@@ -273,6 +275,10 @@ class PageWorld:
             }
             | ({} if self._person is None else _within_reach(model)),
         )
+
+    def _limbs(self) -> dict[str, Any]:
+        """Returns joints and lengths of the person's limbs [m], as :class:`vinesim.scene.appearance.human.Limbs`."""
+        return msgspec.to_builtins(load_human_model(self._client.humans[self._client.name].height).limbs)
 
     def plants(self, place: np.ndarray) -> bytes:
         """Returns a message with the primitives of plants and ground around ``place`` [3] m.

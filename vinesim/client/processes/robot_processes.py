@@ -140,6 +140,7 @@ class RobotProcesses:
         return {
             "sensors_ready": not awaited,
             "sensors_awaited": awaited,
+            "frames_delivered": sum(report["frames"].values()),
             "frames_dropped": sum(report["frames_dropped"].values()),
             "messages_dropped": sum(self.dropped_messages().values()),
             "sound_lost": 0 if self.ros is None else self.ros.sound_lost,

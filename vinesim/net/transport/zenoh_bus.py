@@ -55,6 +55,10 @@ CONNECT = "tcp/127.0.0.1:7447"
 WATCH_PERIOD = 0.5
 """Time between two checks of the links, like whether datagrams still arrive [s]."""
 
+LOSS_NOTICE = 1.0
+"""Time after which a lost connection to the server is reported [s]. Shorter losses, like a connection that is replaced
+while a client joins, need no attention."""
+
 SILENCE_TIMEOUT = 3.0
 """Time without datagrams, while the stream works, after which poses move to the stream [s]."""
 
@@ -116,6 +120,9 @@ class ZenohBus:
         self._names = NameHolders(frozenset((name,) if live else ()))
         self._lost_endpoints: set[str] = set()
         """Endpoints whose connection is lost now."""
+        self._lost_since: float | None = None
+        self._is_loss_reported = False
+        """Whether the server is lost and the user was told so."""
         self._datagram_endpoint = links.live
         self._silent_since: float | None = None
         self._pose_watch: object = None
@@ -189,12 +196,27 @@ class ZenohBus:
 
     def _watch_links(self) -> None:
         """Check datagrams, the server and certificates. The bus's own thread calls this once a :data:`WATCH_PERIOD`."""
+        self._watch_server()
         self._watch_datagrams()
         self._admission.watch()
         if (watch := self._certificate_watch) is not None:
             if watch.has_changed():  # Zenoh reads the files at each connection
                 log.warning("%s: its certificates changed: the next connection uses the new ones", self.name)
             watch.warn()
+
+    def _watch_server(self) -> None:
+        """Report that the connection to the server has been lost for :data:`LOSS_NOTICE`, and that it works again."""
+        if self.endpoint not in self._lost_endpoints:
+            if self._is_loss_reported:
+                log.warning("%s: connected to the server at %s again", self.name, self.endpoint)
+            self._lost_since = None
+            self._is_loss_reported = False
+            return
+        now = time.monotonic()
+        self._lost_since = self._lost_since or now
+        if not self._is_loss_reported and now - self._lost_since >= LOSS_NOTICE:
+            self._is_loss_reported = True
+            log.warning("%s: lost the server at %s; simulates alone and tries to reconnect", self.name, self.endpoint)
 
     def _watch_datagrams(self) -> None:
         """Move poses to the stream if datagrams stop arriving while the stream works, and back if they arrive again."""
@@ -281,18 +303,15 @@ class ZenohBus:
     # ------------------------------------------------------------ called by Zenoh's threads
 
     def _watch_connection(self, session: zenoh.Session, endpoint: str) -> object:
-        """Declare a listener that notes and logs when the connection of a session is lost or restored, and return
-        it."""
+        """Declare a listener that notes when the connection of a session is lost or restored, and return it."""
 
         def on_event(event: zenoh.TransportEvent) -> None:
             if session.is_closed() or session not in (self._session, self._pose_session):
                 return  # the bus itself closed this session: no loss
             if event.kind == zenoh.SampleKind.PUT:
                 self._lost_endpoints.discard(endpoint)
-                log.info("%s: connected to %s again", self.name, endpoint)
             else:
                 self._lost_endpoints.add(endpoint)
-                log.warning("%s: lost the server at %s; simulates alone and tries to reconnect", self.name, endpoint)
 
         return session.info.declare_transport_events_listener(on_event)
 
@@ -329,8 +348,10 @@ class ZenohBus:
     def status_message(self) -> str:
         if self._admission.rejection:
             return self._admission.rejection
-        for endpoint in sorted(self._lost_endpoints):
-            return f"the server at {endpoint} is gone; the local simulation goes on and reconnects by itself"
+        if self._is_loss_reported:
+            return f"the server at {self.endpoint} is gone; the local simulation goes on and reconnects by itself"
+        if self._lost_endpoints == {str(self._datagram_endpoint)}:
+            return f"datagrams from the server at {self._datagram_endpoint} have stopped; messages still pass"
         if not self._admission.is_served:
             return (
                 f"behind {self.endpoint} the server that keeps world {self.world!r} is gone; retained records "

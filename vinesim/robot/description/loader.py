@@ -124,7 +124,7 @@ def _locate(name: str) -> pathlib.Path:
     if name == "tiago_pro":
         found = find_installed("example-robot-data/robots/tiago_pro_description/robots/tiago_pro.urdf")
         if found is None:
-            raise DescriptionError("tiago_pro: its files are not installed; pip install vinesim[tiago]")
+            raise DescriptionError("tiago_pro: its files are not installed; type: pip install 'vinesim[tiago]'")
         return found
     try:
         return data_files.find_data_file("robots", name, ".urdf").resolve()

@@ -186,7 +186,8 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
     """Returns the picture ``rgb`` with the ground truth drawn on it.
 
     Visible boxes are green, amodal boxes that differ are white, cut points are yellow discs (rings where hidden). Text
-    at each bunch: index, visible and total number of berries, hidden share.
+    at each bunch: index, visible and total number of berries, and share of the bunch's outline that other things cover
+    (the bunch's own front berries, which hide the berries behind them, do not count).
     """
     scale = max(1, round(1280 / rgb.shape[1]))
     image = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
@@ -204,7 +205,8 @@ def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
         if one.cut_pixel is not None and np.abs(one.cut_pixel).max() < 20000:
             cv2.circle(image, corner(*one.cut_pixel), 5, (255, 230, 0), -1 if one.cut_seen else 1)
         if one.amodal_pixels * scale * scale > 1500:  # the text would cover a smaller bunch
-            words = f"{one.bunch}: {one.berries_seen}/{one.berries}, {100.0 * one.occlusion:.0f}% hidden"
+            seen = f"{one.bunch}: {one.berries_seen} of {one.berries} berries seen"
+            words = f"{seen}, {100.0 * one.occlusion:.0f}% covered by others"
             for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
                 cv2.putText(image, words, (left, max(top - 4, 12)), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick)
     return image

@@ -151,5 +151,11 @@ export const MESHES = [
   { name: "triangle", levels: [{ points: [0, 0, 0, 1, 0, 0, 2, 0, 0], faces: [0, 1, 2] }] },
 ];
 
+/** A triangle around the circle of radius 1, for spheroids whose round shape a pixel's shader finds. */
+export const BALL = {
+  name: "ball",
+  levels: [{ points: [0, 2, 0, -Math.sqrt(3), -1, 0, Math.sqrt(3), -1, 0], faces: [0, 1, 2] }],
+};
+
 /** Numbers of kinds. */
 export const [, SPHEROID, LEAF, BOX, ELLIPSOID, , TRIANGLE] = MESHES.keys();

@@ -1,5 +1,6 @@
 // GLSL of the cameras' light (vinesim/kernels/shading) with the same tables: reflection and transmission of the light of
-// sun, sky, canopy and ground, and tone mapping. Linear RGB.
+// sun, sky, canopy and ground, and tone mapping. Linear RGB. With PLAIN defined, for browsers without a graphics card, a
+// pixel reads few texels: such browsers execute both sides of every condition.
 
 export const LIGHT = /* glsl */ `
 precision highp float;
@@ -45,10 +46,14 @@ float sunShare(vec3 place, vec3 normal, float sky) {
   if (max(edge.x, edge.y) > 0.49 || at.z > 1.0) return sky > 0.7 ? 1.0 : sky;
   vec2 size = vec2(textureSize(sunDepth, 0)), f = fract(at.xy * size - 0.5);
   ivec2 corner = ivec2(floor(at.xy * size - 0.5));
+#ifdef PLAIN
+  return step(at.z, texelFetch(sunDepth, corner + ivec2(step(0.5, f)), 0).x);
+#else
   vec4 lit;
   for (int k = 0; k < 4; ++k)
     lit[k] = step(at.z, texelFetch(sunDepth, corner + ivec2(k & 1, k >> 1), 0).x);
   return mix(mix(lit.x, lit.y, f.x), mix(lit.z, lit.w, f.x), f.y);
+#endif
 }
 
 // Cool sky through the gaps, green light through leaves, warm bounce from the ground.
@@ -60,15 +65,19 @@ vec3 ambient(vec3 n, float sky) {
 
 // Reflection in a glossy surface along r: gaps of sky in a dark canopy above, ground below.
 vec3 mirrored(vec3 r, float sky) {
+#ifdef PLAIN
+  float hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, 0.5 + 0.12 * (r.x - r.y));
+#else
   float hole = smoothstep(0.50 - 0.30 * sky, 0.78 - 0.30 * sky, noiseAt(vec2(r.x * 0.16 + r.z * 0.09, r.y * 0.16 - r.z * 0.07)).y);
+#endif
   vec3 above = mix(canopyColour * 0.4, skyColour * 1.3, hole);
   return mix(groundColour * 0.8, above, smoothstep(-0.25, 0.25, r.z));
 }
 
 // Highlight of the sun and reflection of the surroundings against the unit ray d.
 vec3 glossed(Surface s, bool isLeaf, vec3 d, vec3 n, float facing, float lit) {
-  float grazing = 1.0 - max(-dot(n, d), 0.0);
-  float fresnel = s.specular + (1.0 - s.specular) * pow(grazing, 5.0) * min(s.specular * 14.0, 1.0) * 0.8;
+  float grazing = 1.0 - max(-dot(n, d), 0.0), squared = grazing * grazing;
+  float fresnel = s.specular + (1.0 - s.specular) * squared * squared * grazing * min(s.specular * 14.0, 1.0) * 0.8;
   float peak = 1.0 - max(dot(n, normalize(sun - d)), 0.0);
   vec3 colour = sunColour * fresnel * exp(-s.shininess * peak) * (s.shininess * 0.14 + 0.4) * lit * max(facing + 0.05, 0.0);
   vec3 r = reflect(d, n);
@@ -97,11 +106,16 @@ vec3 leaving(Surface s, vec3 plain, vec3 place, bool isLeaf, bool isBerry) {
   return mix(colour, hazeColour, 0.6 * (1.0 - exp(-length(place - eye) * 0.006)));
 }
 
-// Tone mapping: the filmic curve of Narkowicz (2015), then sRGB.
+// Tone mapping: the filmic curve of Narkowicz (2015), then sRGB. PLAIN: sRGB by square roots, within 1/255.
 vec3 display(vec3 light) {
   vec3 x = min(light * gain, 3.0);
   vec3 film = clamp(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0);
+#ifdef PLAIN
+  vec3 root = sqrt(film), fourth = sqrt(root);
+  return max(0.662002687 * root + 0.684122060 * fourth - 0.323583601 * sqrt(fourth) - 0.0225411470 * film, 0.0);
+#else
   return mix(12.92 * film, 1.055 * pow(film, vec3(1.0 / 2.4)) - 0.055, step(0.0031308, film));
+#endif
 }
 `;
 
@@ -120,7 +134,11 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
   s.transmission = vec3(0.95, 0.76, 0.12) * pale + vec3(0.26, 0.03, 0.012) * red + vec3(0.03, 0.003, 0.004);
   float bloom = 0.46 - 0.32 * pale - 0.10 * red, seed = local.x;
   vec4 wide = noiseAt(vec2(n.x * 0.20 + seed * 7.1, n.y * 0.20 + n.z * 0.31 + seed * 3.3));
+#ifdef PLAIN
+  vec4 fine = wide.zwxy;
+#else
   vec4 fine = noiseAt(vec2(n.x * 1.1 + n.z * 0.6 + seed, n.y * 1.1 - n.z * 0.4));
+#endif
   s.albedo *= 0.86 + 0.28 * wide.y;
   s.albedo = mix(s.albedo, vec3(0.46, 0.30, 0.06), pale * 0.35 * smoothstep(0.5, 0.8, wide.x + 0.15 * n.z));
   s.albedo *= 1.0 + pale * (0.14 * fine.z - 0.07) + red * 0.22 * step(0.82, fine.w);
@@ -165,7 +183,11 @@ Surface blade(vec3 plain, vec3 tint, float sky, vec3 local, float seed, vec4 det
   vec3 rib = normalize(detail.xyz), side = cross(rib, plain);
   s.normal = normalize(plain - (side * (table.y - 0.5) + rib * (table.z - 0.5)) * 1.2 * clear);
   s.albedo *= mix(1.0, 0.72 + 0.5 * table.w, isNear);
+#ifdef PLAIN
+  float edge = 0.06;
+#else
   float edge = (255.0 * texture(outlines, vec3(uv, local.z)).x - 128.0) * 0.0025;
+#endif
   s.albedo = autumn(s.albedo, local.xy, edge, seed, detail.w);
   s.transmission = s.albedo * vec3(2.3, 2.0, 0.75) * (1.0 - 0.7 * vein);
   if (dot(plain, d) > 0.0) { // from below: paler, felted, veins stand out
@@ -184,6 +206,29 @@ Surface blade(vec3 plain, vec3 tint, float sky, vec3 local, float seed, vec4 det
 
 /** Wood and manufactured objects: grain is the position across (x, y) and along (z) the grain [m]. */
 export const SOLIDS = /* glsl */ `
+#ifdef PLAIN
+// Wood and manufactured objects with one noise for all materials.
+void grained(inout Surface s, uint material, vec3 grain, float seed, float height) {
+  bool isCane = material == CANE, isBark = material == BARK, isPost = material == POST;
+  bool isWood = isCane || isBark || isPost, isShiny = material == WIRE || material == METAL;
+  bool isGlossy = material == PLASTIC || material == PAINT || material == GLASS || material == REFLEX;
+  vec3 scale = isCane ? vec3(9.0, 7.0, 1.6) : isBark ? vec3(4.0, 4.0, 0.4) : vec3(1.7, 1.3, 0.5);
+  vec4 t = noiseAt(vec2(grain.x * scale.x + grain.y * scale.y + seed, grain.z * scale.z + seed * 3.1));
+  float rough = isWood ? 0.5 : material == CLOTH ? 0.6 : 0.0;
+  vec3 bark = mix(vec3(0.085, 0.063, 0.045), vec3(0.23, 0.175, 0.125), smoothstep(0.25, 0.80, t.z));
+  float dirt = isPost ? 1.0 - 0.45 * (1.0 - smoothstep(0.0, 0.35, height)) * t.x : 1.0;
+  float tone = isWood ? 0.55 + 0.9 * t.z : material == CLOTH ? 0.78 + 0.45 * t.x : material == METAL ? 0.55 : 0.85 + 0.3 * t.y * float(isGlossy);
+  s.albedo = isBark ? bark : s.albedo * tone * dirt;
+  s.albedo = mix(s.albedo, vec3(0.20, 0.10, 0.045), isCane ? 0.5 * smoothstep(0.45, 0.7, t.x) : 0.0);
+  s.normal = normalize(s.normal + (t.yzw - 0.5) * rough);
+  s.wrap = material == SKIN ? vec3(0.35, 0.15, 0.10) : vec3(material == CLOTH ? 0.15 : 0.0);
+  s.specular = isShiny ? 0.4 : isGlossy ? 0.05 : isWood || material == CLOTH ? 0.015 : s.specular;
+  s.shininess = isShiny ? 35.0 : isGlossy ? 70.0 : s.shininess;
+  s.reflectivity = isShiny ? 0.6 : isGlossy ? 0.5 : 0.0;
+  s.emission = material == LAMP ? 3.0 : 0.0;
+  s.transmission = material == STEM ? s.albedo * 0.3 : material == STRAW ? s.albedo * 0.25 : vec3(0.0);
+}
+#else
 void wood(inout Surface s, uint material, vec3 grain, float seed, float height) {
   if (material == CANE) {
     vec4 t = noiseAt(vec2(grain.x * 9.0 + grain.y * 7.0 + seed, grain.z * 1.6 + seed * 3.1));
@@ -231,10 +276,16 @@ void made(inout Surface s, uint material, vec3 grain, float seed) {
   else if (material == STEM) s.transmission = s.albedo * 0.3;
 }
 
+#endif
+
 Surface solid(vec3 n, vec3 tint, float sky, uint material, vec3 grain, float seed, float height) {
   Surface s = diffuse(n, tint, sky);
+#ifdef PLAIN
+  grained(s, material, grain, seed, height);
+#else
   if (material == CANE || material == BARK || material == POST) wood(s, material, grain, seed, height);
   else made(s, material, grain, seed);
+#endif
   if (material != WIRE) s.occlusion *= 0.55 + 0.45 * smoothstep(0.0, 0.35, height + max(n.z, 0.0) * 0.35);
   return s;
 }
@@ -252,7 +303,12 @@ Surface soil(vec2 p) {
   float inside = smoothstep(0.0, 3.0, beyond), outside = 1.0 - inside;
   float sky = beyond > 0.0 ? texture(groundSky, (cell + 0.5) / size).x : 0.75;
   // clods and sod by the noise of all materials; far away both appear in steps of 8-bit colours
-  vec4 coarse = noiseAt(p * 0.21), near = noiseAt(p * 0.8), fields = noiseAt(p * 0.011 + vec2(0.0, 0.37));
+  vec4 coarse = noiseAt(p * 0.21), near = noiseAt(p * 0.8);
+#ifdef PLAIN
+  vec4 fields = vec4(0.5);
+#else
+  vec4 fields = noiseAt(p * 0.011 + vec2(0.0, 0.37));
+#endif
   float tone = 0.54 + 0.6 * (near.z - 0.5) + 0.4 * (near.w - 0.5), sod = 0.5 + 0.9 * (near.w - 0.5) + 0.5 * (near.z - 0.5);
   float lane = (p.y - rows.x) / rows.y, away = abs(lane - round(lane)) * rows.y, track = abs(away - 0.5 * rows.y + 0.7);
   float greenness = 0.16 - 0.26 * (1.0 - smoothstep(0.25, 0.65, away)) - 0.14 * (1.0 - smoothstep(0.08, 0.22, track));

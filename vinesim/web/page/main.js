@@ -4,13 +4,14 @@ import * as THREE from "./vendor/three.module.js";
 import { pointAt } from "./aim.js";
 import { decode, load } from "./arrays.js";
 import { FlyingEyes } from "./fly.js";
+import { Guide } from "./guide.js";
 import { ARM, Hand } from "./hand.js";
 import { Headset } from "./headset.js";
 import { Absence, isUnusual, say } from "./notices.js";
 import { Overlays } from "./overlays.js";
 import { LateHands } from "./late_latching.js";
 import { Pace, WalkingEyes } from "./person.js";
-import { Detail, FirstPictures, TRIANGLES } from "./rate.js";
+import { Detail, FirstPictures, SLOW_PIXELS, TRIANGLES } from "./rate.js";
 import { Shears } from "./shears.js";
 import { Timeline } from "./timeline.js";
 import { Voice } from "./voice.js";
@@ -31,11 +32,13 @@ const FARTHEST = 3; // m: the hand ignores tapped objects that are further away
 // sizes of the names of distant and near actors [px], distance of near ones and gap above heads [m]
 const NAME = { far: 11, near: 16, from: 2, gap: 0.04 };
 /** A browser whose first pictures have a median rate below SLOW [Hz] then draws less: FEW triangles (as a share
- * of a phone's) and FEW_PIXELS. A browser without a graphics card does so from the start. */
+ * of a phone's) and at most FEW_PIXELS; their number is adapted, so that pictures seldom take more than 1.4 periods of
+ * FEW_RATE [Hz]. A browser without a graphics card does so from the start. */
 const SLOW = 5,
   FIRST_PICTURES = 12,
-  FEW = 0.3,
-  FEW_PIXELS = 250_000;
+  FEW = 0.2,
+  FEW_PIXELS = 250_000,
+  FEW_RATE = 14;
 const SOFTWARE = /swiftshader|llvmpipe|softpipe|software|basic render/i;
 /** Rate of pictures on a screen to which the number of triangles is adapted [Hz]. */
 const RATE = 60;
@@ -101,13 +104,22 @@ class Viewer {
     this.overlays = new Overlays(world);
     this.lateHands = new LateHands(world);
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
-    this.help.hidden = false;
+    this.guide = new Guide(world, this.isPerson, ARM, () => {
+      this.help.hidden = true;
+    });
+    this.help.hidden = this.guide.isOpen;
+    element("steps").addEventListener("click", () => {
+      this.help.hidden = true;
+      this.guide.open();
+      element("steps").blur();
+    });
     this.intention = "";
     this.offerIntentions(world.header.intentions);
     element("follow").hidden = this.isPerson;
     for (const [name, code] of [
       ["follow", "KeyF"],
       ["label", "KeyN"],
+      ["keys", "KeyH"],
     ])
       element(name).addEventListener("click", () => {
         this.press(code);
@@ -133,6 +145,7 @@ class Viewer {
     this.shortest = 0; // smallest time between two pictures on a screen [s]
     this.frame = 1 / 60; // time of a frame, smoothed [s]
     this.first = new FirstPictures(FIRST_PICTURES);
+    this.pixels = null; // of a slow browser: share of the rows and columns that are drawn
     if (this.isSlow) this.drawLess();
     this.labels = new Map();
     addEventListener("resize", () => this.resize());
@@ -262,7 +275,8 @@ class Viewer {
       element("names").hidden = !element("names").hidden;
       element("label").setAttribute("aria-pressed", String(!element("names").hidden));
     }
-    if (code === "KeyH") this.help.hidden = !this.help.hidden;
+    if (code === "KeyH" && this.guide.isOpen) this.guide.close();
+    else if (code === "KeyH") this.help.hidden = !this.help.hidden;
   }
 
   /** Returns robots and people: name, and the first body of each. */
@@ -284,7 +298,10 @@ class Viewer {
     this.lastFrame = now;
     this.frame += Math.min(1, 0.05 + passed) * (passed - this.frame);
     if (page.drawn > 0) this.first.add(passed);
-    if (this.isAdvised && !this.headset.isWorn && this.detail?.add(passed, RATE)) this.setBudget(this.detail.value);
+    if (this.isAdvised && !this.headset.isWorn) {
+      if (this.detail?.add(passed, RATE)) this.setBudget(this.detail.value);
+      if (this.pixels?.add(passed, FEW_RATE)) this.resize();
+    }
     const actors = this.actors();
     if (this.eyes.update(seconds)) this.followed = -1;
     element("follow").setAttribute("aria-pressed", String(this.followed >= 0));
@@ -316,8 +333,11 @@ class Viewer {
         facing(pose),
       );
     }
+    if (!this.headset.isWorn)
+      this.guide.update({ eyes: this.eyes, hand: this.hand, actors, isFollowing: this.followed >= 0 });
     this.renderer.info.reset();
-    if (now - this.shadowAt > Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
+    const rarer = this.isSlow ? 2 : 1;
+    if (now - this.shadowAt > rarer * Math.max(SHADOW_PERIOD, 1000 * SHADOW_PICTURES * this.frame)) {
       this.shadowAt = now;
       this.world.renderShadow(this.renderer);
       this.renderer.info.reset();
@@ -380,6 +400,8 @@ class Viewer {
   drawLess() {
     this.isSlow = true;
     this.detail = null;
+    this.pixels = new Detail(SLOW_PIXELS);
+    this.world.simplify();
     this.setBudget(FEW);
   }
 
@@ -488,7 +510,7 @@ class Viewer {
 
   resize() {
     const few = Math.min(1, Math.sqrt(FEW_PIXELS / (innerWidth * innerHeight)));
-    this.renderer.setPixelRatio(this.isSlow ? few : Math.min(devicePixelRatio, 2));
+    this.renderer.setPixelRatio(this.isSlow ? few * (this.pixels?.value ?? 1) : Math.min(devicePixelRatio, 2));
     this.renderer.setSize(innerWidth, innerHeight, false);
     this.camera.aspect = innerWidth / innerHeight;
     this.camera.updateProjectionMatrix();

@@ -64,5 +64,7 @@ export class Detail {
 
 /** Amount for a headset: share of the rows and columns of pixels. */
 export const PIXELS = { least: 0.5, most: 1, less: 0.85, more: 1.06, calm: 20 };
+/** Amount for a screen without a graphics card: share of the rows and columns of the pixels that it may draw. */
+export const SLOW_PIXELS = { least: 0.7, most: 1, less: 0.85, more: 1.06, calm: 20 };
 /** Amount for a screen: number of triangles relative to a phone. */
 export const TRIANGLES = { least: 0.4, most: 4, less: 0.7, more: 1.4, calm: 3 };

@@ -19,6 +19,8 @@ uniform mat4 modelViewMatrix;
 uniform float leafExtent[24]; // of each outline: largest |u|, lowest and highest v, unused
 uniform usampler2D listed;    // rows of the primitives that are drawn; largest number: none
 uniform int copies;           // of the mesh in an instance
+uniform vec3 eye;
+uniform vec3 sun;
 in vec3 position;
 in uint copy;
 uint row;                     // of the primitive
@@ -28,6 +30,7 @@ out vec3 vLocal;              // of leaves: u, v, outline; of berries: seed, dep
 out float vSky;               // share of the sky that is visible
 flat out uvec4 vSurface;      // as in surfaces, and the bits of a seed
 flat out vec4 vDetail;
+flat out vec3 vTint;          // linear RGB
 
 vec3 turn(vec4 q, vec3 v) { return v + 2.0 * cross(q.xyz, cross(q.xyz, v) + q.w * v); }
 vec4 texel(sampler2D table, uint i, int shift) {
@@ -68,8 +71,39 @@ void main() {
   vDetail = vec4(0.0);
   vLocal = vec3(0.0);
   vSky = float(vSurface.x >> 24) / 255.0;
+  vTint = pow(vec3(vSurface.x & 255u, (vSurface.x >> 8) & 255u, (vSurface.x >> 16) & 255u) / 255.0, vec3(2.2));
   vSurface.w = floatBitsToUint(shape(2).y);
 `;
+
+/** Vertex shader of a triangle that faces the eye, or the sun, and stands for a spheroid. */
+function ballVertex(isForSun) {
+  return (
+    COMMON +
+    /* glsl */ `
+flat out vec4 vBall;
+flat out vec4 vAxis;
+` +
+    START +
+    /* glsl */ `
+  vec4 pose = texel(poses, vSurface.z * 2u + 1u, 9);
+  vec3 origin = texel(poses, vSurface.z * 2u, 9).xyz, centre = origin + turn(pose, a.xyz);
+  float widest = a.w * max(b.w, 1.0);
+  vec3 way = ${isForSun ? "sun" : "eye - centre"};
+  float away = max(length(way), 1.05 * widest);
+  vec3 side = across(way / away), up = cross(way / away, side);
+  float outline = widest * ${isForSun ? "1.0" : "away / sqrt(away * away - widest * widest)"};
+  vBall = vec4(centre, a.w);
+  vAxis = vec4(turn(pose, b.xyz), b.w);
+  vDetail = shape(3);
+  vDetail.xyz = turn(pose, vDetail.xyz);
+  vLocal = vec3(shape(2).xy, 0.0);
+  vNormal = way;
+  vPlace = centre + outline * (side * position.x + up * position.y);
+  gl_Position = projectionMatrix * modelViewMatrix * vec4(vPlace, 1.0);
+}
+`
+  );
+}
 
 /** Vertex shaders by the name of the kind. */
 export const VERTEX = {
@@ -116,6 +150,8 @@ export const VERTEX = {
   vLocal = vec3(shape(2).xy, along);
 ` +
     FINISH,
+  // a triangle around the outline of a spheroid; position: x y in units of the outline's radius
+  ball: ballVertex(false),
   ellipsoid:
     COMMON +
     START +
@@ -175,7 +211,24 @@ in vec3 vLocal;
 in float vSky;
 flat in uvec4 vSurface;
 flat in vec4 vDetail;
+flat in vec3 vTint;
 out vec4 pixel;
+`;
+
+/** Finds the point of a spheroid behind a pixel of the triangle that stands for the spheroid. */
+const BALL = /* glsl */ `
+flat in vec4 vBall; // centre [m], radius [m]
+flat in vec4 vAxis; // axis, ratio of the lengths along and across it
+
+/** Point on the sphere of radius 1 to which the spheroid is scaled; w: along the ray, from the triangle [m]; 0: missed. */
+bool onBall(vec3 d, out vec3 point, out float along) {
+  vec3 squeeze = vAxis.xyz * (1.0 / vAxis.w - 1.0), from = vPlace - vBall.xyz;
+  vec3 ray = d + squeeze * dot(d, vAxis.xyz), start = from + squeeze * dot(from, vAxis.xyz);
+  float a = dot(ray, ray), b = dot(start, ray), inside = b * b - a * (dot(start, start) - vBall.w * vBall.w);
+  along = -(b + sqrt(max(inside, 0.0))) / a;
+  point = (start + along * ray) / vBall.w;
+  return inside >= 0.0;
+}
 `;
 
 const CUT = /* glsl */ `
@@ -185,43 +238,59 @@ const CUT = /* glsl */ `
   }
 `;
 
+/** Vertex shader of a kind for the sun's depth map. */
+export const vertexForSun = (kind) => (kind === "ball" ? ballVertex(true) : VERTEX[kind]);
+
 /** Fragment shader of a kind. */
 export function fragment(kind) {
-  const isLeaf = kind === "leaf";
+  const isLeaf = kind === "leaf",
+    isBall = kind === "ball";
   return (
     LIGHT +
     MATERIALS +
     (isLeaf ? LEAVES : BERRIES + SOLIDS) +
     VARYINGS +
-    `const bool LEAF = ${isLeaf};` +
-    /* glsl */ `
+    (isBall ? BALL : "") +
+    `const bool LEAF = ${isLeaf};
 void main() {
+${CUT}
 ` +
-    CUT +
     /* glsl */ `
-  uint packed = vSurface.x, material = vSurface.y;
-  vec3 tint = pow(vec3(packed & 255u, (packed >> 8) & 255u, (packed >> 16) & 255u) / 255.0, vec3(2.2));
+  uint material = vSurface.y;
+  vec3 tint = vTint, place = vPlace, local = vLocal;
   vec3 n = normalize(vNormal), d = normalize(vPlace - eye);
+` +
+    (isBall
+      ? /* glsl */ `
+  vec3 point;
+  float ahead;
+  if (!onBall(d, point, ahead)) discard;
+  place += ahead * d;
+  local.z = dot(point, vAxis.xyz);
+  n = normalize(point + vAxis.xyz * local.z * (1.0 / vAxis.w - 1.0));
+`
+      : "") +
+    /* glsl */ `
   float away = dot(n, d) + 0.15;
   if (!LEAF && away > 0.0) n = normalize(n - d * away); // at rims of coarse meshes normals point away from the eye
   float seed = uintBitsToFloat(vSurface.w);
 ` +
     (isLeaf
       ? /* glsl */ `
-  Surface s = blade(n, tint, vSky, vLocal, seed, vDetail, material, d);
-  vec3 light = leaving(s, n, vPlace, true, false);
+  Surface s = blade(n, tint, vSky, local, seed, vDetail, material, d);
+  vec3 light = leaving(s, n, place, true, false);
 `
-      : kind === "spheroid"
+      : kind === "spheroid" || isBall
         ? /* glsl */ `
   bool isBerry = material == BERRY;
   Surface s;
-  if (isBerry) s = berry(n, tint, vSky, vLocal, vDetail);
-  else s = solid(n, tint, vSky, material, vLocal, seed, vPlace.z);
-  vec3 light = leaving(s, n, vPlace, false, isBerry);
+  if (isBerry) s = berry(n, tint, vSky, local, vDetail);
+  else s = solid(n, tint, vSky, material, local, seed, place.z);
+  vec3 light = leaving(s, n, place, false, isBerry);
 `
         : /* glsl */ `
-  Surface s = solid(n, tint, vSky, material, vLocal, seed, vPlace.z);
-  vec3 light = leaving(s, n, vPlace, false, false);
+  Surface s = solid(n, tint, vSky, material, local, seed, place.z);
+  vec3 light = leaving(s, n, place, false, false);
 `) +
     /* glsl */ `
   pixel = vec4(display(light), 1.0);
@@ -235,11 +304,15 @@ export function depthOnly(kind) {
   return `precision highp float;
 precision highp sampler2DArray;
 uniform sampler2DArray outlines;
+uniform vec3 sun;
+in vec3 vPlace;
 in vec3 vLocal;
 out vec4 pixel;
 const bool LEAF = ${kind === "leaf"};
+${kind === "ball" ? BALL : ""}
 void main() {
 ${CUT}
+${kind === "ball" ? `vec3 point; float ahead; if (!onBall(-sun, point, ahead)) discard;` : ""}
   pixel = vec4(1.0);
 }`;
 }

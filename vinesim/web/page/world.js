@@ -3,8 +3,17 @@
 import * as THREE from "./vendor/three.module.js";
 import { Batches } from "./batches.js";
 import { boxAround, farthest, outermost } from "./extent.js";
-import { ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
-import { VERTEX, fragment, depthOnly, GROUND_FRAGMENT, GROUND_VERTEX, SKY_FRAGMENT, SKY_VERTEX } from "./shaders.js";
+import { BALL, ELLIPSOID, LEAF, MESHES, SPHEROID, TRIANGLE } from "./geometry.js";
+import {
+  VERTEX,
+  vertexForSun,
+  fragment,
+  depthOnly,
+  GROUND_FRAGMENT,
+  GROUND_VERTEX,
+  SKY_FRAGMENT,
+  SKY_VERTEX,
+} from "./shaders.js";
 
 const SHAPE_SHIFT = 10,
   SURFACE_SHIFT = 9,
@@ -40,6 +49,7 @@ export const TRIANGLE_BUDGET = 300_000;
 /** Distance of the eye's motion after which the lists of drawn primitives are rebuilt [m]. */
 const STRIDE = 0.25;
 const SUN_SIZE = 2048,
+  PLAIN_SUN_SIZE = 1024, // without a graphics card
   SUN_REACH = 9,
   SUN_NEAR = 1,
   SUN_FAR = 60;
@@ -176,32 +186,59 @@ export class World {
     };
     this.shadowGroup = new THREE.Group();
     this.shadowGroup.rotation.x = -Math.PI / 2;
-    this.draws = MESHES.map(({ name, levels }) =>
-      levels.map((level) => {
-        const batches = new Batches(level),
-          own = { ...uniforms, ...batches.uniforms };
-        const make = (fragmentShader, side) =>
-          new THREE.RawShaderMaterial({
-            glslVersion: THREE.GLSL3,
-            vertexShader: VERTEX[name],
-            fragmentShader,
-            uniforms: own,
-            side,
-          });
-        const seen = make(fragment(name), name === "leaf" ? THREE.DoubleSide : THREE.FrontSide);
-        const cast = make(depthOnly(name), THREE.DoubleSide);
-        for (const [group, geometry, material] of [
-          [this.group, batches.geometry, seen],
-          [this.shadowGroup, batches.shadowGeometry, cast],
-        ]) {
-          const mesh = new THREE.Mesh(geometry, material);
-          mesh.frustumCulled = false;
-          group.add(mesh);
-        }
-        return batches;
-      }),
-    );
+    this.uniforms = uniforms;
+    this.draws = MESHES.map((kind) => this.makeDraws(kind));
     this.group.add(this.makeGround(arrays, common), makeSky(common));
+  }
+
+  /** Returns the lists of primitives of a kind that are drawn, by level of detail. */
+  makeDraws({ name, levels }) {
+    return levels.map((level) => {
+      const batches = new Batches(level),
+        uniforms = { ...this.uniforms, ...batches.uniforms };
+      const add = (group, geometry, vertexShader, fragmentShader, side) => {
+        const material = new THREE.RawShaderMaterial({
+          glslVersion: THREE.GLSL3,
+          vertexShader,
+          fragmentShader,
+          uniforms,
+          side,
+        });
+        const mesh = new THREE.Mesh(geometry, material);
+        mesh.frustumCulled = false;
+        group.add(mesh);
+        return mesh;
+      };
+      const side = name === "leaf" ? THREE.DoubleSide : THREE.FrontSide;
+      batches.mesh = add(this.group, batches.geometry, VERTEX[name], fragment(name), side);
+      const { shadowGeometry } = batches;
+      batches.shadow = add(this.shadowGroup, shadowGeometry, vertexForSun(name), depthOnly(name), THREE.DoubleSide);
+      return batches;
+    });
+  }
+
+  /**
+   * Draw for a browser without a graphics card: spheroids are single triangles with a round outline, and a pixel reads
+   * fewer texels.
+   */
+  simplify() {
+    for (const { mesh, shadow } of this.draws[SPHEROID]) {
+      mesh.removeFromParent();
+      shadow.removeFromParent();
+    }
+    this.draws[SPHEROID] = this.makeDraws(BALL);
+    this.sunTarget.setSize(PLAIN_SUN_SIZE, PLAIN_SUN_SIZE);
+    this.common.sunTexel.value = (2 * SUN_REACH) / PLAIN_SUN_SIZE;
+    for (const { material } of this.group.children) {
+      if (!material?.isRawShaderMaterial) continue;
+      material.defines = { PLAIN: "" };
+      material.needsUpdate = true;
+    }
+    for (const table of [this.common.noises.value, this.uniforms.leaves.value]) {
+      table.minFilter = THREE.LinearMipmapNearestFilter;
+      table.needsUpdate = true;
+    }
+    this.listedAt = null;
   }
 
   makeGround(arrays, common) {
@@ -471,7 +508,7 @@ export class World {
     const sun = this.common.sun.value,
       camera = this.sunCamera;
     if (sun.z < 0.03) return;
-    const step = ((2 * SUN_REACH) / SUN_SIZE) * 64; // whole texels, so that edges of shadows do not crawl
+    const step = 64 * this.common.sunTexel.value; // whole texels, so that edges of shadows do not crawl
     const centre = new THREE.Vector3(Math.round(this.eye.x / step) * step, Math.round(this.eye.y / step) * step, 1);
     camera.position.copy(centre).addScaledVector(sun, 30).applyMatrix4(this.shadowGroup.matrixWorld);
     camera.up.set(0, 1, 0);
