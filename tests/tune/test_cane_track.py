@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 
 from tests.support.tuning import cane
+from tests.tune.test_track_command import write_bag
+from vinesim.cli.tune import track
 from vinesim.core import frames
 from vinesim.scene.camera_geometry import project_points
 from vinesim.scene.values import CameraFrame, CameraInfo
-from vinesim.tune import TrajectoryError, track_cane
+from vinesim.tune import TrajectoryError, read_trajectory, track_cane
+from vinesim.tune.fit import specimen_toml
 from vinesim.tune.specimen import place_markers
 
 INFO = CameraInfo(320, 240, 300.0, 300.0, 159.5, 119.5, "optical")
@@ -70,3 +73,19 @@ def test_a_clamp_in_a_wrong_place_is_one_clear_line() -> None:
     pictures = [picture(i / 30.0, 0.1) for i in range(12)]
     with pytest.raises(TrajectoryError, match="none of 12 pictures has depth of a cane up to 80 % of its"):
         track_cane(pictures, cane(), base=BASE + np.array([0.0, 3.0, 0.0]))
+
+
+def test_a_recording_of_a_bare_cane_becomes_a_track_by_the_command_of_the_page(tmp_path, capsys) -> None:
+    """``vinesim track pull.mcap --cane examples/cane.toml --base``, as in docs/tuning.md."""
+    time = np.arange(24) / 30.0
+    bends = 0.25 * np.cos(np.linspace(0.0, 9.0, 24))
+    drawn = [picture(t, bend) for t, bend in zip(time, bends, strict=True)]
+    write_bag(tmp_path / "pull.mcap", time, [(one.rgb, one.depth) for one in drawn])
+    (tmp_path / "cane.toml").write_text(specimen_toml(cane()))
+    files = tmp_path / "pull.mcap", [], None, tmp_path / "filmed.csv"
+    assert track(*files, None, None, None, None, tmp_path / "cane.toml", (-0.5, 1.0, 0.0)) == 0
+    assert "80 percent found in 24, the others are gaps" in capsys.readouterr().out
+    found = read_trajectory(tmp_path / "filmed.csv")
+    assert found.markers == ("80 percent",)
+    off = found.position[:, 0] - np.array([curve(bend)[800] for bend in bends])
+    assert 1e3 * np.std(off[:, 2]) < 0.4
