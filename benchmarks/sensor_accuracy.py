@@ -2,7 +2,7 @@
 
 Four things are measured: depth error and fill rate of a D435 against range (plane, leaves, bunches), compared with the
 maker's formula; ranges of lidars; the share of berries that are visible against the hidden share of their bunch; and
-the renderers, compared with the ray caster. Everything is seeded: the figures are the same every time.
+the rasteriser, compared with the ray caster. Everything is seeded: the figures are the same every time.
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from vinesim.sensors.lidar.lidar import Lidar, LidarSpec
 from vinesim.sensors.primitives.ray_caster import RayCaster
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 from vinesim.sensors.raster.camera_rasterizer import CameraRasterizer, pinhole
-from vinesim.sensors.raster.renderer_selection import RendererUnavailable
 
 RANGES = (0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0)
 """Ranges at which depth is measured [m]; pixels within a tenth of a range count for it."""
@@ -38,8 +37,8 @@ LIDARS = ("vlp16", "os1_64")
 MIXED_RETURN_ERROR = 0.05
 """A return counts as mixed if its range differs by more than this from the range on the axis of its beam [m]."""
 SEED = 7
-RENDERER_VIEW = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
-"""Camera position and target [m] for the comparison of renderers."""
+RASTERIZER_VIEW = np.array([1.15, 0.95, 1.45]), np.array([2.1, 0.6, 1.72])
+"""Camera position and target [m] for the comparison of rasteriser and ray caster."""
 
 
 @dataclasses.dataclass
@@ -189,25 +188,17 @@ class PixelView:
     primitive: np.ndarray
 
 
-def compare_renderers(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dict[str, PixelView]:
-    """Returns one view by every renderer that runs on this CPU, and by the ray caster, which is the reference."""
+def compare_with_rays(spec: CameraSpec, model: Model, snapshot: Snapshot) -> dict[str, PixelView]:
+    """Returns one view by the rasteriser, ``warp``, and by the ray caster, ``rays``, which is the reference."""
     info = spec.info("optical")
-    pose = look_at(*RENDERER_VIEW)
+    pose = look_at(*RASTERIZER_VIEW)
     lens = pinhole(info, pose)
-    found = {}
-    for name in ("warp", "taichi"):
-        try:
-            primitives = Primitives(model, renderer=name)
-        except RendererUnavailable:
-            continue
-        primitives.update(snapshot)
-        seen = CameraRasterizer(info.width, info.height)
-        seen.draw(primitives, lens)
-        depth, primitive = (a.numpy().reshape(info.height, info.width) for a in (seen.depth, seen.primitive))
-        found[name] = PixelView(depth, primitive)
-        if name == "warp":
-            cast = PixelView(*RayCaster(primitives).cast_camera(lens))
-    return found | {"rays": cast}
+    primitives = Primitives(model)
+    primitives.update(snapshot)
+    seen = CameraRasterizer(info.width, info.height)
+    seen.draw(primitives, lens)
+    depth, primitive = (a.numpy().reshape(info.height, info.width) for a in (seen.depth, seen.primitive))
+    return {"warp": PixelView(depth, primitive), "rays": PixelView(*RayCaster(primitives).cast_camera(lens))}
 
 
 def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
@@ -235,27 +226,24 @@ def sensors(plot: pathlib.Path | None = None) -> Iterator[Measurement]:
         if mine.any():
             case = f"berries seen, bunch hidden by {100 * low:.0f} to {100 * high:.0f} %"
             yield Measurement("sensors", case, float(np.median(seen[mine, 1])), "1")
-    pictures = compare_renderers(spec, model, snapshot)
-    cast = pictures["rays"].primitive
-    for name, look in pictures.items():
-        if name != "rays":
-            same = float((look.primitive == cast).mean())
-            yield Measurement("sensors", f"{name}: pixels that see what their rays meet", same, "1")
+    pictures = compare_with_rays(spec, model, snapshot)
+    same = float((pictures["warp"].primitive == pictures["rays"].primitive).mean())
+    yield Measurement("sensors", "warp: pixels that see what their rays meet", same, "1")
     if plot is not None:
         _draw(plot, spec, depths, scans, seen)
         _compare(plot, pictures)
 
 
 def _compare(folder: pathlib.Path, pictures: dict[str, PixelView]) -> None:
-    """Write ``sensors-backends.png``: depth by each renderer, magenta where the primitive differs from the ray
-    caster's."""
+    """Write ``sensors-rasterizer.png``: depth by the rasteriser, magenta where the primitive differs from the ray
+    caster's, then depth by the ray caster."""
     tiles = []
     for look in pictures.values():
         image = depth_colours(look.depth, 5.0)
         wrong = (look.primitive != pictures["rays"].primitive).astype(np.uint8)
         image[cv2.dilate(wrong, np.ones((5, 5), np.uint8)) > 0] = (255, 0, 255)
         tiles.append(cv2.resize(image, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA))
-    write_png(folder / "sensors-backends.png", np.hstack(tiles))
+    write_png(folder / "sensors-rasterizer.png", np.hstack(tiles))
 
 
 def _draw(

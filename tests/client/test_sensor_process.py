@@ -28,6 +28,7 @@ from vinesim.core import frames
 from vinesim.core.errors import WriteError
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.rigid.human_posture import standing_pose
+from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.builder import assemble
 from vinesim.scene.spec import load_scene
@@ -234,12 +235,19 @@ def test_a_fault_in_the_process_does_not_end_the_loop(robot, caplog):
     assert "TypeError" in caplog.text
 
 
+def unmeasurable_vinebot() -> RobotDescription:
+    """A vinebot whose sensor process cannot start: it carries a camera of a model that does not exist."""
+    vinebot = load_description("vinebot")
+    mount = MultispectralMount("bands", vinebot.sensors[0].frame, "pencil")
+    return dataclasses.replace(vinebot, sensors=(*vinebot.sensors, mount))
+
+
 def test_a_process_that_cannot_start_is_an_error_in_one_line(tmp_path):
     scene = load_scene("demo")
-    vinebot = load_description("vinebot")
+    vinebot = unmeasurable_vinebot()
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
     client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
-    with SensorProcess("robot", scene, model, vinebot, ros=False, renderer="pencil") as sensors:
+    with SensorProcess("robot", scene, model, vinebot, ros=False) as sensors:
         with pytest.raises(WorkerError, match=r"the sensor process of robot failed: .*pencil") as caught:
             sensors.attach(client)
         assert "\n" not in str(caught.value)
@@ -257,10 +265,10 @@ def test_without_waiting_the_client_steps_and_the_sensors_join_it():
 
 def test_without_waiting_the_error_of_a_process_that_cannot_start_ends_the_steps():
     scene = load_scene("demo")
-    vinebot = load_description("vinebot")
+    vinebot = unmeasurable_vinebot()
     model = assemble([cane((50.0, 5.0, 1.0), radius=0.005)])
     client = Client(scene, model, vinebot, MemoryHub().bus("robot"), name="robot", pose=spawn_pose(scene, 0))
-    with SensorProcess("robot", scene, model, vinebot, ros=False, renderer="pencil") as sensors:
+    with SensorProcess("robot", scene, model, vinebot, ros=False) as sensors:
         sensors.attach(client, wait=False)
         with pytest.raises(WorkerError, match=r"the sensor process of robot failed: .*pencil"):
             wait(lambda: client.tick(), "the failure")

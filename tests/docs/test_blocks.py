@@ -18,7 +18,7 @@ from tests.support.installation import OF_THE_TESTS, Installation, build
 from tests.support.page_blocks import CHECKOUT, EMPTY, EXAMPLES, NOT_HERE, PAGES, ROOT, Block, all_blocks
 
 LANGUAGES = {"sh", "python", "toml", "json5", "text"}
-PROGRAMS = {"vinesim", "python", "python3", "make", "pip", "docker", ".", "ros2", "sudo", "source"}
+PROGRAMS = {"vinesim", "python", "python3", "make", "pip", "docker", ".", "ros2", "rosdep", "colcon", "sudo", "source"}
 """Programs that pages call."""
 SHORT = {"docs/multispectral.md"}
 """Pages whose blocks ``make test`` runs; ``make test-long`` runs the others."""

@@ -30,7 +30,6 @@ def options(folder: pathlib.Path, out: str, **more: object) -> dict:
         "size": "80x60",
         "workers": None,
         "actors": 0.0,
-        "renderer": "warp",
         "device": "cpu",
     }
     return given | more

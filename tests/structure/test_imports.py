@@ -7,7 +7,7 @@ import pytest
 
 from vinesim.client.processes.worker_process import ROS_MODULES
 
-HEAVY = ("warp", "mujoco", "zenoh", "rclpy", "taichi", "cv2", "numpy", "open3d")
+HEAVY = ("warp", "mujoco", "zenoh", "rclpy", "cv2", "numpy", "open3d")
 
 
 def modules_after(statement):

@@ -12,7 +12,7 @@ from typing import Annotated, get_type_hints
 
 import typer
 
-from vinesim.cli.commands.options import Pose, RealTimeFactor, Renderer, Scene, Seconds, Seed, StatusFormat, World
+from vinesim.cli.commands.options import Pose, RealTimeFactor, Scene, Seconds, Seed, StatusFormat, World
 from vinesim.core.errors import UsageError
 
 ROLES = ("robot", "human", "spectator")
@@ -154,7 +154,6 @@ class ClientOptions:
         typer.Option(min=0.01, max=1000.0, help="Least rate of live sensors in simulated time [Hz]; by default 5."),
     ] = None
     """None: the rate that the robot's file gives."""
-    renderer: Annotated[Renderer, OF_CAMERAS] = "warp"
     tick_log: Annotated[
         pathlib.Path | None, typer.Option(hidden=True, help="Write the start and the duration of each tick (.npz).")
     ] = None
@@ -246,10 +245,8 @@ def check_options(options: ClientOptions) -> None:
         raise UsageError(f"--params-file {options.params_file}: there is no such file; give a ROS 2 parameter file")
     from vinesim.plants.device_buffers import find_device
     from vinesim.scene import appearance
-    from vinesim.sensors.raster import renderer_selection
 
     if options.outfit is not None and options.outfit not in appearance.outfit_names():
         known = ", ".join(appearance.outfit_names())
         raise UsageError(f"--outfit {options.outfit}: there is no such outfit; give one of {known}")
     find_device(options.device)
-    renderer_selection.check_renderer(options.renderer, options.device)

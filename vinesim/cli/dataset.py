@@ -25,7 +25,6 @@ from vinesim.scene.spec import load_scene
 from vinesim.sensors.export import dataset
 from vinesim.sensors.export.dataset import DatasetError, DatasetPlan
 from vinesim.sensors.export.files import remove_partial_files
-from vinesim.sensors.raster import renderer_selection
 
 CONNECT_TIMEOUT = 10.0
 """Time limit for connecting to a scheduler [s]."""
@@ -58,7 +57,6 @@ def run(
     size: str | None,
     workers: int | None,
     actors: float,
-    renderer: str,
     device: str,
     scheduler: str | None = None,
     sensor: Sequence[str] | None = None,
@@ -81,7 +79,6 @@ def run(
         camera,
         None if size is None else parse_size(size),
         randomizer,
-        renderer_selection.check_renderer(renderer, device),
         device,
         parse_sensors(sensor or (), None if size is None else parse_size(size)),
     )

@@ -61,7 +61,6 @@ def run(
     crates: Sequence[str] = (),
     hour: float | None = None,
     time: float = 0.0,
-    renderer: str = "warp",
     device: str = "cpu",
     sensors: Sequence[str] = (),
 ) -> int:
@@ -84,9 +83,7 @@ def run(
     from vinesim.sensors.export.dataset import resized_intrinsics
     from vinesim.sensors.primitives.ray_caster import RayCaster
     from vinesim.sensors.primitives.scene_primitives import Primitives
-    from vinesim.sensors.raster import renderer_selection
 
-    renderer_selection.check_renderer(renderer, device)
     spec = CameraSpec.load(camera)
     info = resized_intrinsics(spec, None if size is None else parse_size(size))
     mounts = parse_sensors(sensors, None if size is None else parse_size(size))
@@ -101,7 +98,7 @@ def run(
         from vinesim.wind.sway import windblown  # loading the kernels of plants takes half a second
 
         view = windblown(model, view, wind, time)
-    primitives = Primitives(model, renderer=renderer, device=device)
+    primitives = Primitives(model, device=device)
     primitives.update(view)
     for viewpoint in viewpoints:
         _check_not_enclosed(primitives, viewpoint)

@@ -98,7 +98,6 @@ def _start_sensors(
             sensor_hz=options.sensor_hz,
             params_file=options.params_file,
             clock=i == 0,
-            renderer=options.renderer,
             device=options.device,
             pacing=_pacing(options, description),
             standby=options.standby,

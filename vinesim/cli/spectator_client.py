@@ -35,7 +35,6 @@ def run(options: ClientOptions) -> int:
                 spectator,
                 options.out,
                 1.0 / (options.sensor_hz or 1.0),
-                options.renderer,
                 options.device,
             )
         session.show_page(spectator)

@@ -103,7 +103,6 @@ class PictureWriter:
         spectator: Spectator,
         folder: pathlib.Path,
         period: float = 1.0,
-        renderer: str = "warp",
         device: str = "cpu",
     ) -> None:
         """Write one picture every ``period`` [s] of simulated time into ``folder``, which must exist."""
@@ -120,7 +119,7 @@ class PictureWriter:
         self._camera = Camera(
             CameraSpec.load("pinhole"), info, "viewpoint", sun, quality="full", shadow_period=0.0, device=device
         )
-        self._primitives = Primitives(spectator.model, renderer=renderer, device=device)
+        self._primitives = Primitives(spectator.model, device=device)
         self._sway = Sway(spectator.model)
         self._moved = np.zeros(len(spectator.model.tree_first), bool)
         self._every = max(round(period / spectator.physics.dt), 1)

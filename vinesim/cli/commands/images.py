@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import Camera, Device, ImageSize, Renderer, Scene, Seed, Sensors
+from vinesim.cli.commands.options import Camera, Device, ImageSize, Scene, Seed, Sensors
 
 
 def scene_show(
@@ -96,7 +96,6 @@ def render(
         list[str] | None, typer.Option(help="X,Y[,YAW[,FILL]]: a crate, filled with bunches from 0 to 1.")
     ] = None,
     sensor: Sensors = None,
-    renderer: Renderer = "warp",
     device: Device = "cpu",
 ) -> None:
     """Render pictures with their ground truth: ids, masks, boxes, berries, cut points.
@@ -126,7 +125,6 @@ def render(
         time=time,
         seed=seed,
         out=out,
-        renderer=renderer,
         device=device,
         robots=robot or (),
         people=person or (),
@@ -158,7 +156,6 @@ def dataset(
             help="Address of a Dask scheduler whose workers render; they must have access to OUT. Needs vinesim[dask]."
         ),
     ] = None,
-    renderer: Renderer = "warp",
     device: Device = "cpu",
     actors: Annotated[
         float, typer.Option(help="Share of the images with people, robots, crates and wind; 0: vines only.")

@@ -9,9 +9,6 @@ import typer
 
 Seed = Annotated[int | None, typer.Option(help="Seed of the vineyard, instead of the scene's own.")]
 Scene = Annotated[str, typer.Option(help="A scene file, or the name of a shipped scene: demo, harvest, tendone, vsp.")]
-Renderer = Annotated[
-    str, typer.Option(help="Rasterizer: warp, taichi (all cores) or taichi-gpu (Vulkan, Metal); needs vinesim[taichi].")
-]
 Device = Annotated[str, typer.Option(help="cpu, cuda or cuda:N (an NVIDIA GPU).")]
 Camera = Annotated[str, typer.Option(help="A camera file, or d435, pinhole.")]
 ImageSize = Annotated[

@@ -91,7 +91,6 @@ class SensorConfig:
     """Whether the best picture of the first camera is kept. If so, pictures are rendered even without subscribers."""
     sensor_hz: float | None
     """Rate of all sensors [Hz]. None: each sensor has its own rate."""
-    renderer: str = "warp"
     device: str = "cpu"
     """Device on which the sensors compute. If a GPU has failed, the next run computes on the CPU."""
     pacing: SensorPacing = LIVE
@@ -325,7 +324,7 @@ class SensorWorker(Worker):
             )
             for mount in config.description.sensors
         ]
-        primitives = Primitives(config.model, renderer=config.renderer, device=device)
+        primitives = Primitives(config.model, device=device)
         return SensorScheduler(
             config.model, sensors, primitives=primitives, pacing=config.pacing, on_taken=self._publish_pace
         )

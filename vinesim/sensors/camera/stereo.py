@@ -218,6 +218,7 @@ class Stereo:
                     end - first,
                     inputs=[self._parameters, self._pixels, lens, second, self._disparity, first],
                     outputs=[self._second_depth],
+                    device=self.device,
                 )
             arrays = [self._disparity, self._grey, self._second_depth, int(warped), self._noise, first]
             wp.launch(
@@ -225,6 +226,7 @@ class Stereo:
                 end - first,
                 inputs=[self._parameters, self._pixels, lens, second, *arrays],
                 outputs=[self._depth],
+                device=self.device,
             )
 
         bounds = [rows * i // self._workers.size for i in range(self._workers.size + 1)]

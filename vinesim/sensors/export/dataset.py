@@ -119,7 +119,6 @@ class DatasetPlan:
     """Width and height of the pictures [px]; None: those of the camera."""
     snapshot_source: SnapshotSource | None = None
     """Generator of scenes with actors and wind; None: all plants hang at rest."""
-    renderer: str = "warp"
     device: str = "cpu"
     sensors: tuple[RenderedMount, ...] = ()
     """Further sensors, which are rendered from the camera's pose."""
@@ -133,7 +132,6 @@ class DatasetPlan:
             "seed": self.seed,
             "camera": self.camera,
             "size": [info.width, info.height],
-            "renderer": self.renderer,
             "device": self.device.partition(":")[0],  # without the index, because all GPUs render equal images
             "life": None if self.snapshot_source is None else self.snapshot_source.settings(),
             "sensors": {m.name: {"kind": m.kind} | msgspec.to_builtins(m) for m in self.sensors} or None,
@@ -160,7 +158,7 @@ class VineyardRenderer:
             raise DatasetError(f"scene {self.scene.name!r} bears no bunch to look at; raise fruit.bunches")
         self.rest: Snapshot = rest_snapshot(self.model)
         self.ripeness = Ripeness.random(len(self.model.bunch_body), self.scene.seed)
-        self.primitives = Primitives(self.model, ripeness=self.ripeness, renderer=plan.renderer, device=plan.device)
+        self.primitives = Primitives(self.model, ripeness=self.ripeness, device=plan.device)
         self.primitives.update(self.rest)
         self.caster = RayCaster(self.primitives)
         self.spec = CameraSpec.load(plan.camera)

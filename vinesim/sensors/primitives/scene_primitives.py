@@ -36,8 +36,7 @@ from vinesim.sensors.primitives.static_primitives import (
     trellis_batches,
     wire_batch,
 )
-from vinesim.sensors.raster import renderer_selection
-from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF
+from vinesim.sensors.raster.primitive_arrays import CONE, KINDS, LEAF, PrimitiveRasterizer
 from vinesim.wires.wire_segments import wire_segments
 
 _SKY_OF_RIGID = 0.7
@@ -85,18 +84,19 @@ class Primitives:
         grass: float = 90.0,
         device: str = "cpu",
         ripeness: Ripeness | None = None,
-        renderer: str = "warp",
     ) -> None:
         """``grass``: tufts per square metre around the vines, 0 for bare ground without fallen leaves; ``ripeness``:
-        ripeness of the fruit, None for ripe fruit; ``renderer``: name of a renderer, see
-        :mod:`~vinesim.sensors.raster.renderer_selection`.
-        """
+        ripeness of the fruit, None for ripe fruit."""
         self.model = model
         self.device = device
         self._ripeness = ripeness
-        self.rasterizer = renderer_selection.create_rasterizer(renderer, device)
+        self.rasterizer: PrimitiveRasterizer | None = None
         """Rasteriser that finds the primitive in each pixel of a camera; None: the CPU kernels of
         :class:`~vinesim.sensors.raster.camera_rasterizer.CameraRasterizer`."""
+        if device != "cpu":  # programs on a CPU do not load the kernels for GPUs
+            from vinesim.sensors.raster.cuda_rasterizer import CudaRasterizer
+
+            self.rasterizer = CudaRasterizer(device)
         self._bodies = len(model.body_mass)
         self._wires = wire_segments(model)
         self._static_carrier = self._bodies + len(self._wires)

@@ -1,4 +1,4 @@
-"""Camera rasteriser: primitive, depth and label of every pixel, by CPU kernels or by another renderer of the scene."""
+"""Camera rasteriser: primitive, depth and label of every pixel, by CPU kernels or by the scene's CUDA rasteriser."""
 
 from __future__ import annotations
 
