@@ -63,6 +63,14 @@ def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measuremen
     return _call("soak:soak")(minutes, real_time_factor, _announce)
 
 
+def _coverage(seeds: int, first: int, plants: str) -> Iterator[Measurement]:
+    if seeds < 1:
+        raise UsageError(f"--seeds is {seeds}: give 1 or more")
+    if first < 0:
+        raise UsageError(f"--first is {first}: give 0 or more")
+    return _call("coverage:coverage")(seeds, first, plants, _announce)
+
+
 def _later(path: str) -> Callable[..., Iterator[Measurement]]:
     return lambda **options: _call(path)(**options)
 
@@ -84,6 +92,15 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
         _later("replication_delay:sync"),
         "effect of network delay on contacts and copies, in simulated time",
         {"plot": {"type": pathlib.Path, "help": "PNG file to draw"}},
+    ),
+    "coverage": (
+        _coverage,
+        "share of fits whose 90 % interval contains the true value, for canes and bunches",
+        {
+            "seeds": {"type": int, "default": 50, "help": "number of fits of each plant"},
+            "first": {"type": int, "default": 0, "help": "first seed"},
+            "plants": {"default": "both", "choices": ["both", "cane", "bunch"], "help": "plants that are fitted"},
+        },
     ),
     "traffic": (_later("traffic:traffic"), "bytes that a client of a full vineyard receives and sends", {}),
     "load": (_later("router_load:load"), "many clients on one router, and on two linked routers", {}),

@@ -17,7 +17,7 @@ import mujoco
 import numpy as np
 
 from vinesim.bench.mujoco_reference import compile_plants
-from vinesim.bench.tuning_cases import DAMPING_BAR, MODULUS_BAR, Case, draw_case
+from vinesim.bench.tuning_cases import BUNCH_MODULUS_BAR, DAMPING_BAR, MODULUS_BAR, Case, draw_bunch, draw_case
 from vinesim.bench.tuning_peers import peer_rows, stein_rows
 from vinesim.bench.tuning_pictures import film
 from vinesim.bench.tuning_rods import is_installed, rod_track
@@ -52,19 +52,23 @@ class Recovery:
     damping_error: np.ndarray
     covered: np.ndarray
     """Whether the 90 % interval of modulus and of damping contains the true value [seed, 2]."""
+    score: np.ndarray
+    """Errors of the logarithms of modulus and damping, in standard deviations of the posterior [seed, 2]."""
     refused: np.ndarray
     """Whether the fit reports that it has failed [seed]."""
     seconds: np.ndarray
     """[seed] Wall time of a fit."""
+    modulus_bar: float = MODULUS_BAR
+    """Largest accepted relative error of a modulus."""
 
     @property
     def silent(self) -> int:
         """Number of fits with errors beyond the bar that do not report a failure."""
-        beyond = (np.abs(self.modulus_error) > MODULUS_BAR) | (np.abs(self.damping_error) > DAMPING_BAR)
+        beyond = (np.abs(self.modulus_error) > self.modulus_bar) | (np.abs(self.damping_error) > DAMPING_BAR)
         return int((beyond & ~self.refused).sum())
 
 
-def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recovery:
+def recover(cases: list[Case], tracks: list[Trajectory] | None = None, modulus_bar: float = MODULUS_BAR) -> Recovery:
     """Fit one track for each case, and return the results. ``tracks``: tracks to fit, by default simulated measurements
     of the cases."""
     rows = []
@@ -73,19 +77,17 @@ def recover(cases: list[Case], tracks: list[Trajectory] | None = None) -> Recove
         begun = time.perf_counter()
         fit = tune(case.guess, track)
         rows.append((*_errors(fit, case.truth), not fit.ok, time.perf_counter() - begun))
-    modulus, damping, *covered, refused, seconds = map(np.array, zip(*rows, strict=True))
-    return Recovery(modulus, damping, np.stack(covered, -1), refused, seconds)
+    return Recovery(*map(np.array, zip(*rows, strict=True)), modulus_bar=modulus_bar)
 
 
-def _errors(fit: Fit, truth: Specimen) -> tuple[float, float, bool, bool]:
-    modulus = fit.estimate("modulus")
-    damping = fit.estimate("damping")
-    return (
-        modulus.value / truth.modulus.value - 1.0,
-        damping.value / truth.damping.value - 1.0,
-        modulus.low <= truth.modulus.value <= modulus.high,
-        damping.low <= truth.damping.value <= damping.high,
-    )
+def _errors(fit: Fit, truth: Specimen) -> tuple[float, float, list[bool], list[float]]:
+    """Returns the first four fields of a :class:`Recovery` for one fit."""
+    found = [fit.estimate("modulus"), fit.estimate("damping")]
+    true = [truth.modulus.value, truth.damping.value]
+    off = [one.value / value for one, value in zip(found, true, strict=True)]
+    covered = [one.low <= value <= one.high for one, value in zip(found, true, strict=True)]
+    score = [math.log(x) / deviation for x, deviation in zip(off, fit.posterior.deviation[:2].tolist(), strict=True)]
+    return off[0] - 1.0, off[1] - 1.0, covered, score
 
 
 # ---------------------------------------------------------------------- another simulator as the truth
@@ -134,6 +136,8 @@ def recovery_rows(name: str, found: Recovery) -> Iterator[Measurement]:
         yield Measurement(
             "tune", f"{name}: {part} in its 90 % interval", 100.0 * float(found.covered[:, i].mean()), "%"
         )
+        size = float(np.sqrt(np.mean(found.score[:, i] ** 2)))
+        yield Measurement("tune", f"{name}: {part}, RMS error in standard deviations", size, "1")
     yield Measurement("tune", f"{name}: fits beyond a bar, silent", found.silent, "1")
     yield Measurement("tune", f"{name}: fits that say they failed", int(found.refused.sum()), "1")
     yield Measurement("tune", f"{name}: wall time of a fit, median", float(np.median(found.seconds)), "s")
@@ -161,6 +165,8 @@ def tuning(announce: Callable[[str], None], seeds: int = SEEDS) -> Iterator[Meas
     cases = [draw_case(seed) for seed in range(seeds)]
     tracks = [measure(case.truth, case.experiment) for case in cases]
     yield from recovery_rows(f"{seeds} seeds", recover(cases, tracks))
+    bunches = [draw_bunch(seed) for seed in range(seeds)]
+    yield from recovery_rows(f"{seeds} bunches", recover(bunches, modulus_bar=BUNCH_MODULUS_BAR))
     yield from picture_rows(cases[:PICTURE_SEEDS])
     few = cases[:MUJOCO_SEEDS]
     yield from recovery_rows(f"{len(few)} tracks of MuJoCo", recover(few, [mujoco_track(case) for case in few]))

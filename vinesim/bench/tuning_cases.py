@@ -1,7 +1,8 @@
-"""Synthetic laboratories of ``vinesim bench tune``: canes, start values, and times of release.
+"""Synthetic laboratories of ``vinesim bench tune``: canes and bunches, start values, and times of release.
 
-Canes of 1 m (9 to 6 mm, 900 kg/m^3), modulus 2 to 9 GPa, damping ratio 0.01 to 0.1, pulled by 10 cm; 30 pictures a
-second for 3 s with 2 mm of noise in each axis; start values up to five times off.
+Canes of 1 m (9 to 6 mm, 900 kg/m^3), modulus 2 to 9 GPa, damping ratio 0.01 to 0.1, pulled by 10 cm. Bunches of 0.5 kg
+on a peduncle of 8 cm (4.5 mm), modulus 0.15 to 0.6 GPa, damping 25 to 100 ms, pulled by 4 cm. 30 pictures a second for
+3 s with 2 mm of noise in each axis; start values up to five times off.
 """
 
 from __future__ import annotations
@@ -17,6 +18,8 @@ from vinesim.tune import Experiment
 MODULUS_BAR = 0.03
 DAMPING_BAR = 0.15
 """Largest accepted relative error of a fitted damping; ``MODULUS_BAR`` is for the modulus."""
+BUNCH_MODULUS_BAR = 0.1
+"""Largest accepted relative error of the modulus of a peduncle: the weight of the bunch hides its stiffness."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -56,3 +59,31 @@ def draw_case(seed: int) -> Case:
     off = np.exp(rng.uniform(-math.log(5.0), math.log(5.0), 2))
     experiment = Experiment(seed=seed, hold=0.2 + float(rng.uniform(0.0, 1.0 / 30.0)))
     return Case(bench_cane(modulus, damping), bench_cane(modulus * off[0], damping * off[1]), experiment)
+
+
+def bench_bunch(modulus: float, damping: float) -> Specimen:
+    """Returns the bunch of this benchmark; ``modulus`` [Pa], ``damping`` [s]."""
+
+    def number(value: float, unit: str) -> Number:
+        return Number(value, unit, "GUESSED", "benchmark")
+
+    return Specimen(
+        organ="bunch",
+        length=number(0.08, "m"),
+        base_diameter=number(0.0045, "m"),
+        tip_diameter=number(0.0045, "m"),
+        modulus=number(modulus, "Pa"),
+        density=number(1000.0, "kg/m^3"),
+        damping=number(damping, "s"),
+        tip_mass=number(0.5, "kg"),
+        segments=4,
+    )
+
+
+def draw_bunch(seed: int) -> Case:
+    """Draw a case of a bunch from a ``seed``: modulus, damping, start values and the time of release."""
+    rng = np.random.default_rng(seed)
+    modulus, damping = (middle * math.exp(rng.uniform(-math.log(2.0), math.log(2.0))) for middle in (0.3e9, 0.05))
+    off = np.exp(rng.uniform(-math.log(5.0), math.log(5.0), 2))
+    experiment = Experiment(seed=seed, displacement=0.04, hold=0.2 + float(rng.uniform(0.0, 1.0 / 30.0)))
+    return Case(bench_bunch(modulus, damping), bench_bunch(modulus * off[0], damping * off[1]), experiment)

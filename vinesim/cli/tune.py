@@ -45,6 +45,7 @@ def run(
     seed: int,
     device: str,
     cloud: pathlib.Path | None = None,
+    truth: pathlib.Path | None = None,
 ) -> int:
     """Fit and print the result. Returns the exit code: 0, or 5 if the fit has a fault."""
     require_scipy()
@@ -52,11 +53,17 @@ def run(
 
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     specimen = load_specimen(model)
+    hidden = None if truth is None else load_specimen(truth)
     track = read_trajectory(data)
     if cloud is not None:
         specimen = with_cloud(specimen, cloud)
     found = tune(specimen, track, parameters, release=release, samples=samples, seed=seed, device=device, pushed=push)
-    print(json.dumps(found.as_json()) if as_json else "\n".join(found.lines()))
+    compared = [] if hidden is None else found.compare(hidden)
+    if as_json:
+        more = {} if hidden is None else {"truth": [dataclasses.asdict(one) for one in compared]}
+        print(json.dumps(found.as_json() | more))
+    else:
+        print("\n".join([*found.lines(), *(one.line() for one in compared)]))
     if plot is not None:
         from vinesim.tune.plots import plot_fit
 
@@ -73,21 +80,29 @@ def run(
 def track(
     recording: pathlib.Path,
     markers: list[str],
-    radius: float,
+    radius: float | None,
     out: pathlib.Path,
     image: str | None,
     depth: str | None,
     pose: tuple[float, ...] | None,
     rate: float | None,
+    cane: pathlib.Path | None = None,
+    base: tuple[float, float, float] | None = None,
+    percent: int = 80,
 ) -> int:
-    """Write the track of markers in recorded pictures and print how often each was found. Returns the exit code."""
+    """Write the track of markers, or of a bare cane, in recorded pictures, and print how often each was found. Returns
+    the exit code."""
     require_scipy()
     import numpy as np
 
     from vinesim.sensors.recorded_pictures import read_pictures
-    from vinesim.tune import track_marker
+    from vinesim.tune import load_specimen, track_cane, track_marker
 
-    if not radius > 0.0:
+    if cane is None and (not markers or radius is None or base is not None):
+        raise UsageError("give --marker and --radius of coloured balls, or --cane and --base of a cane without balls")
+    if cane is not None and (markers or radius is not None or base is None):
+        raise UsageError(f"--cane {cane} is followed without balls; give --base X Y Z, and no --marker or --radius")
+    if radius is not None and not radius > 0.0:
         raise UsageError(f"--radius is {radius:g}; give the ball's radius in metres, above 0")
     if rate is not None and not rate > 0.0:
         raise UsageError(f"--rate is {rate:g}; give pictures a second, above 0")
@@ -100,7 +115,11 @@ def track(
         where[3:] /= size
     colours = dict(_read_marker(text) for text in markers)
     pictures = read_pictures(recording, image=image, depth=depth, pose=where, rate=rate)
-    found = track_marker(pictures, colours, radius=radius, source=recording.name)
+    if cane is not None and base is not None:
+        specimen = load_specimen(cane)
+        found = track_cane(pictures, specimen, base=np.array(base), percent=percent, source=recording.name)
+    else:
+        found = track_marker(pictures, colours, radius=radius or 0.0, source=recording.name)
     found = dataclasses.replace(found, time=found.time - found.time[0])
     found.write(out)
     print(f"track    {out}: {len(found.time)} pictures in {found.time[-1]:.2f} s")
@@ -125,22 +144,41 @@ def _read_marker(text: str) -> tuple[str, tuple[int, int, int]]:
     return name.strip() or "tip", (red, green, blue)
 
 
-def plan(experiment: Experiment, model: pathlib.Path, out: pathlib.Path | None, fit: str, as_json: bool) -> int:
-    """Write the track of an experiment and print how exact a fit to it would be. Returns the exit code."""
+def plan(
+    experiment: Experiment,
+    model: pathlib.Path,
+    out: pathlib.Path | None,
+    fit: str,
+    as_json: bool,
+    hidden: pathlib.Path | None = None,
+) -> int:
+    """Write the track of an experiment and print how exact a fit to it would be. Returns the exit code.
+
+    ``hidden``: file for the truth, a specimen that is drawn from the seed; None: the truth is the model.
+    """
     require_scipy()
-    from vinesim.tune import load_specimen, measure
+    from vinesim.core.errors import writing
+    from vinesim.tune import hidden_specimen, load_specimen, measure
     from vinesim.tune.experiment import expected_deviations
+    from vinesim.tune.fit import specimen_toml
 
     specimen = load_specimen(model)
+    if hidden is not None:
+        specimen = hidden_specimen(specimen, experiment.seed)
     track = measure(specimen, experiment)
     target = out or pathlib.Path(f"{experiment.kind}.csv")
     track.write(target)
+    if hidden is not None:
+        with writing(hidden):
+            hidden.write_text(specimen_toml(specimen), encoding="utf-8")
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     expected = expected_deviations(specimen, track, parameters, pushed=experiment.kind == "push")
     if as_json:
         print(json.dumps({"track": str(target), "samples": len(track.time), "deviation": expected}))
         return 0
     print(f"track    {target}: {len(track.time)} samples")
+    if hidden is not None:
+        print(f"truth    {hidden}: drawn from seed {experiment.seed}; for --truth of vinesim tune")
     for name, deviation in expected.items():
         unit = f"{1.645 * deviation:.4f} rad" if name.startswith("bow") else f"{164.5 * deviation:.2f} %"
         print(f"{name:8s} would be known to +- {unit} (90 %)")

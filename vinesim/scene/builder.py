@@ -16,7 +16,7 @@ import numpy as np
 
 from vinesim.core import frames, portable_math
 from vinesim.core.errors import checked_index
-from vinesim.scene import berries, plant_parameters
+from vinesim.scene import berries, plant_parameters, plausibility
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 
@@ -213,6 +213,10 @@ class TreeBuilder:
             raise ValueError(
                 f"rod of length {length} m, radius {radius} m, {segments} segments, {material}: all must be positive"
             )
+        place = f"rod of {organ.name.lower()} on body {parent}"
+        plausibility.check_rod(place, radius)
+        plausibility.check(place, "density", material.density)
+        plausibility.check(place, "modulus", material.modulus)
         h = length / segments
         edges = radius[0] + (radius[1] - radius[0]) * np.arange(segments + 1) / segments
         masses, inertias, near, far = segment_properties(
@@ -301,6 +305,7 @@ class TreeBuilder:
         most = berries.PROTOTYPE_BERRIES[-1]
         if not 0.0 < mass < np.inf or not 1 <= count <= most:
             raise ValueError(f"bunch of {mass} kg, {count} berries; give a finite mass above 0 and 1 to {most} berries")
+        plausibility.check(f"bunch on body {parent}", "mass", mass)
         parameters = plant_parameters.load_plant("vine") if parameters is None else parameters
         above = self.bodies[parent]
         berry = berries.VARIETIES[variety]

@@ -17,10 +17,12 @@ from typing import Literal
 import numpy as np
 
 from vinesim.core import frames
-from vinesim.scene import builder
+from vinesim.scene import builder, plausibility
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.model import Model
 
+MODE_SEGMENTS = 64
+"""Largest number of segments for which the frequency of a cane is checked; the check takes 0.3 ms for 64."""
 _HORIZONTAL = (0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -71,7 +73,8 @@ class CaneBuilder:
         tree = TreeBuilder(np.asarray(self.pose, float))
         material = RodMaterial(self.youngs_modulus, self.density)
         turns = None if self.bends is None else frames.exp(np.asarray(self.bends, float))
-        tree.add_rod(-1, self.length, self._radii, material, self.segments, bends=turns)
+        with plausibility.unchecked():  # tree() checks the numbers under the user's names
+            tree.add_rod(-1, self.length, self._radii, material, self.segments, bends=turns)
         if self.tip_mass > 0.0:
             _add_point_mass(tree.bodies[-1], self.tip_mass)
         if self.base == "pinned":
@@ -109,6 +112,7 @@ class CaneBuilder:
         """Returns the cane as a :class:`~vinesim.scene.builder.TreeBuilder`, to which branches and bunches can be
         added."""
         self._check()
+        self._check_plausibility()
         beta = self.beta or 0.0
         if self.damping_ratio is not None:
             beta = 2.0 * self.damping_ratio / self.first_mode()
@@ -154,6 +158,16 @@ class CaneBuilder:
         frames.checked_pose("cane: pose", self.pose)
         if self.bends is not None and np.shape(self.bends) != (self.segments, 3):
             raise ValueError(f"cane: bends has the shape {np.shape(self.bends)}; give [{self.segments}, 3]")
+
+    def _check_plausibility(self) -> None:
+        """Log a line for each number that no cane has."""
+        plausibility.check_rod("cane", self._radii)
+        plausibility.check("cane", "density", self.density)
+        plausibility.check("cane", "modulus", self.youngs_modulus, "youngs_modulus")
+        if self.tip_mass > 0.0:
+            plausibility.check("cane", "mass", self.tip_mass, "tip_mass")
+        if self.base == "clamped" and self.segments <= MODE_SEGMENTS:
+            plausibility.check("cane", "frequency", self.first_mode() / (2.0 * np.pi), "frequency of its first mode")
 
 
 def _is_finite(value: object) -> bool:

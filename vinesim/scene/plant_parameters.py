@@ -14,6 +14,7 @@ import msgspec
 
 from vinesim.core.data_files import find_data_file
 from vinesim.core.toml_loader import DataError, load_toml
+from vinesim.scene import plausibility
 
 AXIS_LENGTH = 0.05
 """[1] Largest relative difference between the length of the axis (points along a measured cane) of a specimen and its
@@ -221,6 +222,8 @@ def load_plant(name: str) -> VineParameters:
     path = find_data_file("plants", name, ".toml")
     vine = load_toml(path, VineParameters)
     _check_units(vine, str(path))
+    for part in ("cane", "peduncle", "bunch", "rachis", "arm", "trunk"):
+        _check_plausibility(getattr(vine, part), f"{path}: {part}")
     return vine
 
 
@@ -250,6 +253,7 @@ def load_specimen(path: str | pathlib.Path) -> Specimen:
     if found.specimen is None:
         raise DataError(f"{path}: specimen is missing; add a table [specimen], the plant that was measured")
     _check_specimen(found.specimen, str(path))
+    _check_plausibility(found.specimen, f"{path}: specimen")
     return found.specimen
 
 
@@ -273,6 +277,16 @@ def _check_specimen(specimen: Specimen, path: str) -> None:
                 f"{path}: specimen.markers.{name} is {place}; give its distance from the base, "
                 f"above 0 and up to {specimen.length.value} m"
             )
+
+
+def _check_plausibility(part: msgspec.Struct, place: str) -> None:
+    """Log a line for each number that no vine has."""
+    for name in part.__struct_fields__:
+        value = getattr(part, name)
+        quantity = name.removesuffix("_range").rpartition("_")[2]  # base_diameter, woody_modulus, tip_mass, mass_range
+        if quantity in plausibility.RANGES and isinstance(value, Number | Range):
+            for one in value.value if isinstance(value, Range) else (value.value,):
+                plausibility.check(place, quantity, one, name)
 
 
 def _check_axis(specimen: Specimen, path: str) -> None:

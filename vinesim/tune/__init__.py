@@ -12,7 +12,8 @@ docs/tuning.md has examples. This package needs scipy: ``pip install 'vinesim[tu
 from __future__ import annotations
 
 from vinesim.scene.plant_parameters import Specimen, load_specimen
-from vinesim.tune.experiment import Experiment, measure
+from vinesim.tune.cane_track import track_cane
+from vinesim.tune.experiment import Experiment, hidden_specimen, measure
 from vinesim.tune.features import Features, extract_features
 from vinesim.tune.fit import Fit
 from vinesim.tune.marker_track import track_marker
@@ -29,9 +30,11 @@ __all__ = [
     "Trajectory",
     "TrajectoryError",
     "extract_features",
+    "hidden_specimen",
     "load_specimen",
     "measure",
     "read_trajectory",
+    "track_cane",
     "track_marker",
     "tune",
     "with_cloud",

@@ -13,7 +13,7 @@ from vinesim.core.errors import UsageError
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.base_motion import Sweep
 from vinesim.tune.candidates import COLUMNS, Candidates
-from vinesim.tune.specimen import TIP
+from vinesim.tune.specimen import TIP, with_values
 from vinesim.tune.trajectory import Trajectory
 from vinesim.tune.tuning import tune
 
@@ -21,6 +21,8 @@ TRUTH_STEP = 1e-3
 """[s] Step of the simulation that represents the real plant."""
 TRUTH_SEGMENTS = 64
 """Smallest number of segments in the simulation that represents the real plant."""
+HIDDEN = 2.0
+"""[1] Largest ratio of the modulus and damping of a hidden specimen to those of its model, and the reverse."""
 MAX_SHARE = 0.3
 """[1] Largest ratio of the shaking frequency to the picture rate; beyond it samples do not determine acceleration."""
 KINDS = {
@@ -136,6 +138,15 @@ def measure(
         if "xyz"[axis] not in e.axes:
             position[..., axis] = np.nan
     return Trajectory(time, position, e.markers, force, f"{e.kind} of seed {e.seed}", base)
+
+
+def hidden_specimen(specimen: Specimen, seed: int) -> Specimen:
+    """Returns a specimen whose modulus and damping are drawn from a ``seed``: up to :data:`HIDDEN` times more or less
+    than those of ``specimen``, with logarithms of equal probability. A fit that begins at ``specimen`` has to find
+    them."""
+    rng = np.random.default_rng((seed, 1))  # the noise of the track has the seed alone
+    factor = np.exp(rng.uniform(-math.log(HIDDEN), math.log(HIDDEN), 2)).tolist()
+    return with_values(specimen, modulus=specimen.modulus.value * factor[0], damping=specimen.damping.value * factor[1])
 
 
 def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:

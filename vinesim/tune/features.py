@@ -97,13 +97,15 @@ def _gross_outliers(column: np.ndarray) -> np.ndarray:
 def find_onset(track: Trajectory) -> float:
     """Returns the last time [s] before the motion, which is the first sample unless the track begins with a hold."""
     values = columns_of(track)
-    time = track.time
+    seen = np.isfinite(values).any(1)
+    values = values[seen]
+    time = track.time[seen]
     noise = max(_hold_noise(values), 1e-9)
     start = np.nanmedian(values[: max(3, min(5, len(values) // 8))], axis=0)
     off = np.max(np.abs(np.nan_to_num(values - start)), axis=1)
     span = float(np.nanmax(np.nanquantile(values, 0.98, axis=0) - np.nanquantile(values, 0.02, axis=0)))
     moved = np.flatnonzero(off > max(6.0 * noise, STANDS_OUT * span))
-    return float(time[max(0, int(moved[0]) - 1)]) if len(moved) else float(time[0])
+    return float(time[max(0, int(moved[0]) - 1)] if len(moved) else track.time[0])
 
 
 def _hold_noise(values: np.ndarray) -> float:

@@ -51,6 +51,33 @@ class Estimate:
     """Whether the number is determined by the track rather than by the prior."""
 
 
+@dataclasses.dataclass(frozen=True, slots=True)
+class Comparison:
+    """A fitted number beside its true value, which only simulated experiments have."""
+
+    name: str
+    truth: float
+    value: float
+    low: float
+    """Lower end of the 90 % interval."""
+    high: float
+    unit: str
+
+    @property
+    def inside(self) -> bool:
+        """Whether the 90 % interval contains the truth."""
+        return self.low <= self.truth <= self.high
+
+    def line(self) -> str:
+        """Returns the comparison as one line of text."""
+        off = f"{100.0 * (self.value / self.truth - 1.0):+.2f} %" if self.truth else f"{self.value:+.4f} {self.unit}"
+        where = "inside" if self.inside else "outside"
+        return (
+            f"truth    {self.name} {_short(self.truth)} {self.unit}; estimate {_short(self.value)} ({off}), {where} "
+            f"the 90 % interval {_short(self.low)} to {_short(self.high)}"
+        )
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Fit:
     """The result of :func:`vinesim.tune.tune`."""
@@ -101,6 +128,13 @@ class Fit:
     def estimate(self, name: str) -> Estimate:
         """Returns the fitted number of this name."""
         return next(estimate for estimate in self.estimates if estimate.name == name)
+
+    def compare(self, truth: Specimen) -> list[Comparison]:
+        """Returns the plant's fitted numbers beside those of ``truth``."""
+        true = {"modulus": truth.modulus.value, "damping": truth.damping.value}
+        true |= {"mass": truth.density.value / self.specimen.density.value}
+        true |= {"bow_y": truth.bow[0], "bow_z": truth.bow[1]}
+        return [Comparison(e.name, true[e.name], e.value, e.low, e.high, e.unit) for e in self.estimates]
 
     def _estimate(self, name: str, known: bool) -> Estimate:
         low, high = self.posterior.interval(name)

@@ -7,6 +7,7 @@ import dataclasses
 import math
 
 import numpy as np
+from scipy.special import stdtrit
 
 from vinesim.tune.problem import SOFT, Evaluation, Problem
 
@@ -15,6 +16,8 @@ Z90 = 1.6448536269514722
 DECIDED = 3.0
 """Ratio of the data's information (1 / variance) along a direction to the prior's from which the data determine the
 direction [1]."""
+LEVERAGE_ROUNDS = 3
+"""Number of rounds in which the degrees of freedom of the columns and the covariance are computed from each other."""
 _CORRELATED = 3.0
 
 
@@ -41,6 +44,11 @@ class Posterior:
     ridges: tuple[Ridge, ...]
     correlation_time: float
     """Correlation time of the residuals in samples, 1 if they are independent. Its square root widens the intervals."""
+    freedom: np.ndarray
+    """[parameter] Degrees of freedom of the estimated noise (Satterthwaite 1946). The intervals are those of Student's
+    t distribution."""
+    weight: np.ndarray
+    """[column] Factor on the loss of a column with which the loss has the curvature of this distribution [1]."""
 
     @property
     def deviation(self) -> np.ndarray:
@@ -50,7 +58,7 @@ class Posterior:
     def interval(self, name: str) -> tuple[float, float]:
         """Returns the 90 % interval of one parameter."""
         i = self.names.index(name)
-        half = Z90 * float(self.deviation[i])
+        half = float(stdtrit(self.freedom[i], 0.95)) * float(self.deviation[i])
         return float(self.mean[i]) - half, float(self.mean[i]) + half
 
 
@@ -58,26 +66,51 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
     """Returns the posterior around a minimum ``theta`` with the evaluation ``found``, for a ``noise`` [column] m.
 
     The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so outliers and heavy tails widen it.
-    Correlated residuals count as a smaller number of independent residuals.
+    The spread of the residuals is estimated for each column, since usually one column determines the plant. Correlated
+    residuals count as a smaller number of independent residuals.
     """
     table = problem.residuals(found.model) / noise
-    residual = table[problem.seen]
-    z = residual**2 / SOFT**2
-    weighted = found.jacobian / np.broadcast_to(noise, table.shape)[problem.seen][:, None]
-    slope = float(np.mean((1.0 + z) ** -1.5))
-    free = max(len(residual) - len(theta), 1)
-    spread = float((residual**2 / (1.0 + z)).sum()) / free
     correlation_time = _correlation_time(table)
-    data = slope**2 / (spread * correlation_time) * weighted.T @ weighted
+    slope, squares, count = _residual_sums(table)
+    weighted = np.zeros((*table.shape, len(theta)))
+    weighted[problem.seen] = found.jacobian
+    weighted /= noise[:, None]
+    information = np.einsum("scp,scq->cpq", weighted, weighted) / correlation_time
     readings = sum(math.isfinite(prior.deviation) for prior in problem.priors)
-    data += found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # rows of the force reading
+    gauge = found.extra_jacobian[readings:].T @ found.extra_jacobian[readings:]  # rows of the force reading
     prior = np.array([1.0 / p.deviation**2 for p in problem.priors])  # 0 without prior knowledge
-    size = 1.0 / np.sqrt(np.maximum(np.diag(data) + prior, 1e-12))
-    scaled = (data + np.diag(prior)) * size * size[:, None]
-    covariance = np.linalg.pinv(scaled, rcond=1e-12, hermitian=True) * size * size[:, None]
+    fitted = np.zeros(len(count))  # number of parameters that each column determines
+    for _ in range(LEVERAGE_ROUNDS):
+        columns = (slope**2 * np.maximum(count - fitted, 1.0) / squares)[:, None, None] * information
+        covariance = _inverse(columns.sum(0) + gauge + np.diag(prior))
+        fitted = np.einsum("pq,cqp->c", covariance, columns)
+    parts = np.einsum("ip,cpq,qi->ci", covariance, columns, covariance)
+    freedom = parts.sum(0) ** 2 / np.maximum((parts**2 / np.maximum(count - fitted, 1.0)[:, None]).sum(0), 1e-300)
     return Posterior(
-        problem.names, theta.copy(), covariance, len(problem.fitted), _ridges(problem, data, prior), correlation_time
+        problem.names,
+        theta.copy(),
+        covariance,
+        len(problem.fitted),
+        _ridges(problem, columns.sum(0) + gauge, prior),
+        correlation_time,
+        np.maximum(freedom, 1.0),
+        slope * np.maximum(count - fitted, 1.0) / squares / correlation_time,
     )
+
+
+def _residual_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns of each column of residuals [sample, column] in standard deviations: the mean second derivative of the
+    soft L1 loss, the sum of its squared first derivatives, and the number of residuals, each [column]."""
+    z = (table / SOFT) ** 2
+    count = np.isfinite(table).sum(0).astype(float)
+    squares = np.nansum(table**2 / (1.0 + z), axis=0)
+    return np.nansum((1.0 + z) ** -1.5, axis=0) / count, np.maximum(squares, 1e-12 * count), count
+
+
+def _inverse(matrix: np.ndarray) -> np.ndarray:
+    """Returns the pseudoinverse of a symmetric matrix whose rows have different units."""
+    size = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-12))
+    return np.linalg.pinv(matrix * size * size[:, None], rcond=1e-12, hermitian=True) * size * size[:, None]
 
 
 def _correlation_time(residuals: np.ndarray) -> float:
@@ -147,7 +180,9 @@ def importance_sample(
         some = thetas[first : first + batch]
         rows = np.array([problem.row(theta) for theta in some])
         x, _ = problem.samples(some, rows)
-        log_weight[first : first + batch] -= [problem.loss(t, y, noise) for t, y in zip(some, x, strict=True)]
+        log_weight[first : first + batch] -= [
+            problem.loss(t, y, noise, posterior.weight) for t, y in zip(some, x, strict=True)
+        ]
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     chosen = np.searchsorted(np.cumsum(weight), (rng.random() + np.arange(count)) / count)

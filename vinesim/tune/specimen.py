@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import re
 
 import msgspec
 import numpy as np
 
 from vinesim.core import frames
 from vinesim.core.errors import UsageError
+from vinesim.scene import plausibility
 from vinesim.scene.builder import RodMaterial, TreeBuilder
 from vinesim.scene.cane import CaneBuilder
 from vinesim.scene.ids import Organ
@@ -16,6 +18,7 @@ from vinesim.scene.plant_parameters import Specimen
 
 TIP = "tip"
 """Name of the marker at the tip, which every specimen has."""
+_PERCENT = re.compile(r"(\d\d?) percent")
 _DIRECTIONS = {"cane": (1.0, 0.0, 0.0), "bunch": (0.0, 0.0, -1.0)}
 
 
@@ -76,7 +79,16 @@ def hanging_bends(specimen: Specimen) -> np.ndarray:
 
 
 def build_tree(specimen: Specimen) -> TreeBuilder:
-    """Returns a specimen as a tree: the segments of the rod, then the bunch if there is one."""
+    """Returns a specimen as a tree: the segments of the rod, then the bunch if there is one.
+
+    Numbers that no plant has are not reported here: those of files are reported when they are loaded, and the first
+    guess of a fit may be far off.
+    """
+    with plausibility.unchecked():
+        return _build_tree(specimen)
+
+
+def _build_tree(specimen: Specimen) -> TreeBuilder:
     radius = (0.5 * specimen.base_diameter.value, 0.5 * specimen.tip_diameter.value)
     bends = hanging_bends(specimen) if specimen.axis else rest_bends(specimen, np.array(specimen.bow))
     if specimen.organ == "cane":
@@ -103,6 +115,11 @@ def build_tree(specimen: Specimen) -> TreeBuilder:
     return tree
 
 
+def marker_at(percent: int) -> str:
+    """Returns the name of the marker at ``percent`` of a cane's length, which every cane has."""
+    return f"{percent} percent"
+
+
 def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the body [k] of each marker in the specimen's tree, and the marker's position [k, 3] m in that body's
     frame.
@@ -118,10 +135,16 @@ def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarra
             bodies.append(len(tree.bodies) - 1)
             points.append((float(tree.bodies[-1]["length"]), 0.0, 0.0))
             continue
-        if name != TIP and name not in specimen.markers:
+        share = _PERCENT.fullmatch(name) if specimen.organ == "cane" else None
+        if name != TIP and name not in specimen.markers and share is None:
             known = ", ".join([TIP, *specimen.markers])
             raise UsageError(f"marker {name!r} is not in the specimen, which has: {known}; add it to specimen.markers")
-        along = specimen.length.value if name == TIP else specimen.markers[name]
+        if name == TIP:
+            along = specimen.length.value
+        elif name in specimen.markers:
+            along = specimen.markers[name]
+        else:
+            along = 0.01 * int(share[1]) * specimen.length.value if share else 0.0
         body = min(int(along / segment), specimen.segments - 1)
         bodies.append(body)
         points.append((along - body * segment, 0.0, 0.0))

@@ -51,6 +51,10 @@ def tune(
     ] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of these draws.")] = 0,
     device: Device = "cpu",
+    truth: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="The true plant of a simulated experiment (its --hidden); printed beside the estimates."),
+    ] = None,
 ) -> None:
     """Fit a cane, or a bunch on its peduncle, to the track of a pull and release, a push, or a shaken base.
 
@@ -66,7 +70,7 @@ def tune(
     """
     from vinesim.cli.tune import run
 
-    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device, cloud))
+    raise typer.Exit(run(data, model, fit, out, json, plot, release, push, samples, seed, device, cloud, truth))
 
 
 def track(
@@ -75,12 +79,22 @@ def track(
         typer.Argument(help="MCAP file of ROS topics, rosbag2 folder of MCAP files, or data set of vinesim dataset."),
     ],
     marker: Annotated[
-        list[str],
+        list[str] | None,
         typer.Option(
             help="Colour R,G,B of the ball at the tip in a picture; NAME=R,G,B for another ball. May be repeated."
         ),
-    ],
-    radius: Annotated[float, typer.Option(help="Radius of the balls [m].")],
+    ] = None,
+    radius: Annotated[float | None, typer.Option(help="Radius of the balls [m].")] = None,
+    cane: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Without balls: the file of this cane, a table [specimen]; the cane itself is followed."),
+    ] = None,
+    base: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="With --cane: X Y Z of its clamp in the world [m].")
+    ] = None,
+    percent: Annotated[
+        int, typer.Option(min=20, max=97, help="With --cane: place of the tracked point, of the cane's length [%].")
+    ] = 80,
     out: Annotated[pathlib.Path, typer.Option(help="The CSV to write, for vinesim tune.")] = pathlib.Path("track.csv"),
     image: Annotated[
         str | None,
@@ -99,20 +113,21 @@ def track(
         float | None, typer.Option(help="Pictures a second, for a data set whose records have no time.")
     ] = None,
 ) -> None:
-    """Track balls of one colour each through recorded RGB-D pictures, into a CSV for vinesim tune.
+    """Track coloured balls, or a bare cane, through recorded RGB-D pictures, into a CSV for vinesim tune.
 
-    No ROS is needed. Pictures in which a ball is hidden are gaps. Needs scipy (extra: tune).
+    No ROS is needed. Pictures in which the ball or that part of the cane is hidden are gaps. Needs scipy (extra: tune).
 
     \b
     Examples:
       vinesim track pull.mcap --marker 224,60,130 --radius 0.012 --out pull.csv
       vinesim track pull.mcap --marker 224,60,130 --marker middle=30,90,220 --radius 0.012
+      vinesim track pull.mcap --cane cane.toml --base -0.5 0.9 0
       vinesim track pull/ --image /camera/color/image_raw --depth /camera/aligned_depth_to_color/image_raw \\
         --marker 224,60,130 --radius 0.012
     """
     from vinesim.cli.tune import track
 
-    raise typer.Exit(track(recording, marker, radius, out, image, depth, pose, rate))
+    raise typer.Exit(track(recording, marker or [], radius, out, image, depth, pose, rate, cane, base, percent))
 
 
 def experiment(
@@ -154,6 +169,12 @@ def experiment(
     axes: Annotated[str, typer.Option(help="Axes of the world that are tracked.")] = "xyz",
     seed: Annotated[int, typer.Option(min=0, help="Seed of the noise.")] = 0,
     fit: Annotated[str, typer.Option(help="Quantities to fit; see vinesim tune.")] = "modulus,damping",
+    hidden: Annotated[
+        pathlib.Path | None,
+        typer.Option(
+            help="Draw the true modulus and damping from the seed, half to twice the model's, and write them here."
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object on stdout, nothing else.")] = False,
 ) -> None:
     """Simulate a measurement in a laboratory, with noise, and print how well a fit to it would do.
@@ -166,6 +187,7 @@ def experiment(
       vinesim experiment pull-release --model examples/cane.toml
       vinesim experiment pull-release --model examples/cane.toml --rate 120 --duration 2 --axes z
       vinesim experiment pull-release --model examples/cane.toml --force-noise 0.01 --fit modulus,damping,mass
+      vinesim experiment pull-release --model examples/cane.toml --seed 7 --hidden truth.toml
       vinesim experiment push --model examples/cane.toml --out push.csv
       vinesim experiment shake --model examples/cane.toml --amplitude 0.003 --from 2 --to 6 --rate 60
     """
@@ -188,4 +210,4 @@ def experiment(
         axes=axes,
         seed=seed,
     )
-    raise typer.Exit(plan(what, model, out, fit, json))
+    raise typer.Exit(plan(what, model, out, fit, json, hidden))
