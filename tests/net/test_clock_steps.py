@@ -84,6 +84,7 @@ ALLOWED = {
     "client/recording/recorder.py": "first estimate of the network clock",
     "client/recording/replay.py": "first estimate of the network clock",
     "cli/record.py": "when a recording was made",
+    "cli/ros.py": "times of reception, which rclpy takes from the same clock",
     "core/disk_cache.py": "age of files",
     "kernels/compilation.py": "age of files",
     "ros/dead_segments.py": "age of files",
