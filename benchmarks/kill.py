@@ -45,7 +45,7 @@ class Round:
     took: float
     """Time from the last kill until all programs worked, the killed ones included [s]."""
     missing: list[str]
-    """Descriptions of what did not work in time."""
+    """One text for each program or function that did not work again in time, such as "ada: steps"."""
     sensor_restart: float | None = None
     """Time from the start of a new sensor process until it was ready [s]."""
 

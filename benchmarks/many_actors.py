@@ -199,7 +199,7 @@ class Crowd:
         self.until(self._all_at_rest, REST_LIMIT)
 
     def moved(self) -> list[int]:
-        """Returns the ids of the objects that were moved: those of which any client has a retained record."""
+        """Returns the ids of the moved objects. An object counts as moved if a client has a retained record of it."""
         kinds = (ObjectKind.BUNCH, ObjectKind.BOX)
         every = [object_id(kind, number) for kind in kinds for number in range(self.count)]
         return [number for number in every if any(client.replicator.record(number) for client in self.clients)]

@@ -121,7 +121,7 @@ class FuzzWorld:
         self._home = self._base()
 
     def _declare_server(self) -> None:
-        """Start the server's part: a store that takes every record, whoever sent it, a clock, and snapshots."""
+        """Start what a server offers: a clock, snapshots, and a store, which accepts records from every sender."""
         self._server = self.hub.bus("server", live=False)
         self._server.subscribe("fact/**", KEEP_ALL)
         self._server.declare_queryable("clock/*", lambda asked: encode_time(decode_time(asked)[0], self.now))

@@ -174,7 +174,10 @@ class Vineyard:
         return now
 
     def missing(self, moment: float) -> list[str]:
-        """Returns descriptions of what does not go on after a kill at a ``moment`` [s, monotonic]."""
+        """Returns one text for each program or function that has not worked since a kill, such as "ada: steps".
+
+        ``moment`` [s, monotonic]: time of the kill.
+        """
         missing = []
         for name in ROBOTS:
             missing += [f"{name}: {what}" for what in self._missing_of_robot(name, moment)]

@@ -417,30 +417,30 @@ def test_a_set_point_replaces_the_older_and_nonsense_is_refused():
 def test_a_command_of_another_type_is_told_of_once_with_the_remedy(caplog):
     """As teleop_twist_keyboard and Nav2 publish it by default; DDS delivers nothing of it and says nothing."""
     diagnostics: list[DiagnosticArray] = []
-    with RobotNode("vinebot", URDF, namespace="farm", controllers=CONTROLLERS) as node, StockNode() as peer:
+    with RobotNode("vinebot", URDF, namespace="north", controllers=CONTROLLERS) as node, StockNode() as peer:
         peer.node.create_subscription(DiagnosticArray, "/diagnostics", diagnostics.append, 10)
 
-        def level(part: str = "/farm/vinebot: ros") -> bytes | None:
+        def level(part: str = "/north/vinebot: ros") -> bytes | None:
             node.publish_diagnostics(0.0, [])
             peer.spin()
             return next((one.level for array in diagnostics[-1:] for one in array.status if one.name == part), None)
 
         wait_until(lambda: level() == DiagnosticStatus.OK)
-        wrong = peer.node.create_publisher(Twist, "/farm/mobile_base_controller/cmd_vel", 10)
+        wrong = peer.node.create_publisher(Twist, "/north/mobile_base_controller/cmd_vel", 10)
         wait_until(lambda: level() == DiagnosticStatus.WARN)
         assert diagnostics[-1].status[0].message == (
-            "/farm/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist"
+            "/north/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist"
         )
         peer.node.destroy_publisher(wrong)
         wait_until(lambda: level() == DiagnosticStatus.OK)
-        other = peer.node.create_publisher(String, "/farm/forward_position_controller/commands", 10)
+        other = peer.node.create_publisher(String, "/north/forward_position_controller/commands", 10)
         wait_until(lambda: level() == DiagnosticStatus.WARN)
         peer.node.destroy_publisher(other)
     assert [record.getMessage() for record in caplog.records] == [
-        "/farm/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist, which this robot cannot "
+        "/north/mobile_base_controller/cmd_vel is published as geometry_msgs/msg/Twist, which this robot cannot "
         "receive; publish geometry_msgs/msg/TwistStamped "
         "(teleop_twist_keyboard: -p stamped:=true; Nav2: enable_stamped_cmd_vel: true)",
-        "/farm/forward_position_controller/commands is published as std_msgs/msg/String, which this robot cannot "
+        "/north/forward_position_controller/commands is published as std_msgs/msg/String, which this robot cannot "
         "receive; publish std_msgs/msg/Float64MultiArray",
     ]
 

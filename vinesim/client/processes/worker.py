@@ -6,6 +6,7 @@ module imports nothing large.
 
 from __future__ import annotations
 
+import abc
 import contextlib
 import gc
 import importlib
@@ -136,7 +137,7 @@ class NodeWithParameters(Protocol):
         ...
 
 
-class Worker:
+class Worker(abc.ABC):
     """The work of one process: a loop that takes messages of the client, works and reports to the client.
 
     A subclass has the loop, and overrides :meth:`_take` and :meth:`_statistics`.
@@ -149,13 +150,13 @@ class Worker:
         self._reported_parameters: dict[str, Any] = {}
         self._next_statistics = 0.0
 
+    @abc.abstractmethod
     def _take(self, kind: str, value: Any) -> None:
-        """Take a message of the client: any but "stop"."""
-        raise NotImplementedError
+        """Handle a message from the client. Called for every message except "stop"."""
 
+    @abc.abstractmethod
     def _statistics(self) -> dict[str, dict[str, int]]:
         """Returns the counts of this run: kind of count -> sensor or topic -> number."""
-        raise NotImplementedError
 
     def _take_messages(self) -> bool:
         """Take the messages that the client has sent. Returns False after a "stop"."""
