@@ -565,8 +565,8 @@ def test_the_commands_of_the_tutorial_do_what_it_says(robot: StockNode) -> None:
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    listed = run("topics --types")
-    assert re.search(r"^/joint_states +sensor_msgs/msg/JointState  1 -> \d+$", listed, re.MULTILINE)
+    line = re.compile(r"^/joint_states +sensor_msgs/msg/JointState  1 -> \d+$", re.MULTILINE)
+    wait_until(lambda: line.search(run("topics --types")), name="the list of topics")  # busy nodes are discovered late
     place = yaml.safe_load(run("echo /mobile_base_controller/odom").removesuffix("---\n"))
     assert place.keys() == {"x", "y", "z"}
     state = yaml.safe_load(run("call /get_entity_state"))

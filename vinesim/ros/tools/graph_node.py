@@ -27,8 +27,11 @@ from vinesim.ros.tools.subscribing import message_class, offered_qos
 
 DISCOVERY_TIME = 10.0
 """Longest time in which a named topic or service must appear [s]."""
-SETTLED = 1.0
-"""Time without a new topic after which the list of topics counts as complete [s]."""
+SETTLED = 3.5
+"""Time without a new topic after which the list of topics counts as complete [s].
+
+DERIVED: a participant of Fast DDS announces itself every 3 s, and its first announcements can be lost on a busy machine.
+"""
 SILENCE = 5.0
 """Time without any topic after which the list of topics counts as empty [s]."""
 OWN_TOPIC = "/parameter_events"
