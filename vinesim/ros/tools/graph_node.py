@@ -30,7 +30,8 @@ DISCOVERY_TIME = 10.0
 SETTLED = 3.5
 """Time without a new topic after which the list of topics counts as complete [s].
 
-DERIVED: a participant of Fast DDS announces itself every 3 s, and its first announcements can be lost on a busy machine.
+DERIVED: a participant of Fast DDS announces itself every 3 s, and its first announcements can be lost on a busy
+machine.
 """
 SILENCE = 5.0
 """Time without any topic after which the list of topics counts as empty [s]."""
