@@ -7,6 +7,7 @@
 # This track is synthetic, so that the true values are known. Your own track comes from `read_trajectory("pull.csv")`.
 
 # %%
+import importlib.util
 import pathlib
 import tempfile
 
@@ -49,6 +50,40 @@ track = read_trajectory(FOLDER / "pull.csv")
 features = extract_features(track)
 print(f"{features.frequency:.3f} Hz, damping ratio {features.damping_ratio:.4f}")
 print(f"log decrement {features.log_decrement:.3f}")
+
+# %% [markdown]
+# ## By hand
+#
+# Where ipywidgets is installed (`pip install ipywidgets`), two sliders change the model. The modulus sets the frequency,
+# the damping the decay.
+
+# %%
+
+
+def compare(modulus: float = 5.9, damping: float = 4.0) -> None:
+    """Draw the measured track of the tip and that of a model: ``modulus`` [GPa], ``damping`` [ms]."""
+    model = measure(with_values(guess, modulus=1e9 * modulus, damping=1e-3 * damping), Experiment(), exact=True)
+    plt.figure(figsize=(8, 3))
+    plt.plot(track.time, 1e3 * track.position[:, 0, 2], ".", markersize=3, label="track")
+    plt.plot(model.time, 1e3 * model.position[:, 0, 2], label=f"model: {modulus:g} GPa, {damping:g} ms")
+    plt.xlabel("time [s]")
+    plt.ylabel("height of the tip [mm]")
+    plt.legend()
+    plt.show()
+
+
+compare()
+
+# %%
+if importlib.util.find_spec("ipywidgets"):
+    from ipywidgets import FloatSlider, interact
+
+    late = {"continuous_update": False}  # a new curve takes about a second
+    interact(
+        compare,
+        modulus=FloatSlider(5.9, min=2.0, max=8.0, step=0.1, description="GPa", **late),
+        damping=FloatSlider(4.0, min=1.0, max=10.0, step=0.5, description="ms", **late),
+    )
 
 # %% [markdown]
 # ## The fit

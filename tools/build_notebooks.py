@@ -91,8 +91,8 @@ def _keep(output: Any) -> Any:
         return output if output.name == "stdout" else None  # progress goes to stderr
     if "data" not in output:
         return output
-    if "text/html" in output.data:  # a page of a running client, whose text is its address
-        return None
+    if {"text/html", "application/vnd.jupyter.widget-view+json"} & output.data.keys():
+        return None  # a page of a running client, or sliders: both live only while the notebook runs
     output.data = {form: value for form, value in output.data.items() if form in KEPT}
     output.metadata = {}
     if "image/png" in output.data:

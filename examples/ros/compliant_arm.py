@@ -62,6 +62,7 @@ def main() -> None:
         signal.signal(number, lambda *_: stop.set())
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = CompliantArm()
+    print("waiting for the controller of the arm", flush=True)
     try:
         while not stop.is_set():
             rclpy.spin_once(node, timeout_sec=0.1)

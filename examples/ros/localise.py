@@ -31,6 +31,7 @@ class Localiser(Node):
         self.settings = AsyncParameterClient(self, robot)
         self.asking = self.create_timer(0.2, self.ask)
         self.tf = self.create_publisher(TFMessage, "/tf", 10)
+        self.create_timer(1.0, self.report)
         self.create_subscription(Imu, "/base_imu", self.turn, 10)
         self.create_subscription(Odometry, "/mobile_base_controller/odom", self.travel, 10)
 
@@ -39,6 +40,12 @@ class Localiser(Node):
         if self.settings.services_are_ready():
             self.settings.set_parameters([Parameter("publish_map_to_odom", value=False)])
             self.asking.cancel()
+
+    def report(self) -> None:
+        if self.last is None:
+            print("waiting for /base_imu", flush=True)
+        else:
+            print(f"x {self.x:.3f} m, y {self.y:.3f} m, yaw {self.yaw:.3f} rad", flush=True)
 
     def turn(self, message: Imu) -> None:
         """Integrate yaw and position since the last IMU message."""

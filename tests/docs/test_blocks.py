@@ -37,7 +37,9 @@ def test_pages_have_no_fence_outside_a_block():
         fences = re.findall(r"^ *(?:```|~~~)", page.read_text(), re.M)
         assert len(fences) == 2 * sum(block.page == name for block in BLOCKS), name
         places = re.findall(r"<!-- place:", page.read_text())
-        marked = [block for block in BLOCKS if block.page == name and (block.place != EMPTY or block.alone)]
+        marked = [
+            block for block in BLOCKS if block.page == name and (block.place != EMPTY or block.alone or block.beside)
+        ]
         assert len(places) == len(marked), f"{name}: a place is not directly before a block, or is the default"
 
 
@@ -46,6 +48,12 @@ def test_every_block_has_a_language_and_a_known_place():
         assert block.language in LANGUAGES, f"{block}: language {block.language!r}"
         known = block.place in (EMPTY, EXAMPLES, CHECKOUT, *NOT_HERE)
         assert known or block.place.startswith("tests/"), f"{block}: place {block.place!r}"
+
+
+def test_the_page_names_commands_that_run_beside_a_block_before_it():
+    for block in BLOCKS:
+        before = "\n".join((ROOT / block.page).read_text().splitlines()[: block.line - 2])
+        assert all(command in before for command in block.beside), block
 
 
 def test_every_reason_not_to_run_a_block_is_needed():

@@ -26,7 +26,10 @@ NOT_HERE = {
 """Places from which no test runs a block, with the reason. A place may also be the path of the test that runs it."""
 
 ALONE = ", each line alone"
-"""End of a place: the block is a list, from which a reader picks one line."""
+"""Behind a place: the block is a list, from which a reader picks one line."""
+
+BESIDE = ", beside "
+"""Behind a place, before the commands that run in other terminals at that time, separated by semicolons."""
 
 FENCE = re.compile(r"(?:<!-- place: ([^\n]*?) -->\n)?^( *)```([^\n]*)\n(.*?)^\2```$", re.S | re.M)
 
@@ -46,6 +49,8 @@ class Block:
     """Where the block runs: one of the constants above, a key of :data:`NOT_HERE`, or the path of a test."""
     alone: bool
     """Whether each line runs alone, in a folder of its own."""
+    beside: tuple[str, ...]
+    """Commands that run meanwhile, each in a terminal of its own."""
 
     def __str__(self) -> str:
         return f"{self.page}:{self.line}"
@@ -61,11 +66,13 @@ def blocks_of(page: pathlib.Path) -> list[Block]:
     text = page.read_text()
     found = []
     for match in FENCE.finditer(text):
-        place = match[1] or EMPTY
+        place, _, commands = (match[1] or EMPTY).partition(BESIDE)
+        beside = tuple(filter(None, commands.split("; ")))
         line = text.count("\n", 0, match.start(2)) + 1
         name = str(page.relative_to(ROOT))
         content = textwrap.dedent(match[4])
-        found.append(Block(name, line, match[3], content, place.removesuffix(ALONE), place.endswith(ALONE)))
+        alone = place.endswith(ALONE)
+        found.append(Block(name, line, match[3], content, place.removesuffix(ALONE), alone, beside))
     return found
 
 

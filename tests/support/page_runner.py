@@ -15,11 +15,16 @@ from tests.support.reader_files import bring
 from tests.support.waiting import deadline
 
 LASTS = re.compile(
-    r"vinesim (?:server|client|record (?!.*--seconds)|ros record|replay (?!.*--out)(?!.*--ros)|dataset .*--images 1000)"
+    r"vinesim (?:server|client|record (?!.*--seconds)|replay (?!.*--out)(?!.*--ros)|dataset .*--images 1000)"
+    r"|vinesim ros (?:record|hz|echo (?!.*--once)|pub (?!.*--once))|python examples/ros/"
 )
 """Commands that a reader ends."""
 
-READY = re.compile(r"listening on|\d Hz|\bin a browser: |recording (?:world|into)|\b[1-9]\d* of 1000")
+READY = re.compile(
+    r"listening on|\d Hz|\bin a browser: |publishing to |recording (?:world|into)|\b[1-9]\d* of 1000"
+    r"|^waiting for /battery_state$|^soft$|\bbunch at x |^x \S+ m, y |^bunch_\d+: \w+ hand, from ",
+    re.M,
+)
 """What a lasting command prints when it does its work."""
 
 HERE = {"HOST": "127.0.0.1", "10.0.0.1": "127.0.0.1"}
@@ -115,6 +120,8 @@ def run_shell(block: Block, folder: pathlib.Path, environment: Mapping[str, str]
     lines = block.lines()
     own_server = any("vinesim server" in line for line in lines)
     with contextlib.ExitStack() as running:
+        for line in block.beside:
+            running.enter_context(_started(line, folder, environment))
         if not own_server and any("--connect" in line for line in lines):
             running.enter_context(_started("vinesim server", folder, environment))
         for printed in lines:
