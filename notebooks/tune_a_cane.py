@@ -54,8 +54,8 @@ print(f"log decrement {features.log_decrement:.3f}")
 # %% [markdown]
 # ## By hand
 #
-# Where ipywidgets is installed (`pip install ipywidgets`), two sliders change the model. The modulus sets the frequency,
-# the damping the decay.
+# Where ipywidgets is installed (`pip install ipywidgets`), two sliders change the model. The modulus sets the
+# frequency, the damping the decay.
 
 # %%
 
