@@ -58,11 +58,12 @@ print(f"log decrement {features.log_decrement:.3f}")
 # frequency, the damping the decay.
 
 # %%
+pull = Experiment()  # as in the laboratory, without noise
 
 
 def compare(modulus: float = 5.9, damping: float = 4.0) -> None:
     """Draw the measured track of the tip and that of a model: ``modulus`` [GPa], ``damping`` [ms]."""
-    model = measure(with_values(guess, modulus=1e9 * modulus, damping=1e-3 * damping), Experiment(), exact=True)
+    model = measure(with_values(guess, modulus=1e9 * modulus, damping=1e-3 * damping), pull, exact=True)
     plt.figure(figsize=(8, 3))
     plt.plot(track.time, 1e3 * track.position[:, 0, 2], ".", markersize=3, label="track")
     plt.plot(model.time, 1e3 * model.position[:, 0, 2], label=f"model: {modulus:g} GPa, {damping:g} ms")
