@@ -7,13 +7,14 @@
 
 # %%
 import pathlib
+import tempfile
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 import vinesim
 
-FOLDER = pathlib.Path("grapes")
+FOLDER = pathlib.Path(tempfile.mkdtemp())
 SEEDS = {"train": (0, 1), "test": (2,)}
 camera = vinesim.Camera("pinhole", size=(240, 180), quality="fast")
 

@@ -149,4 +149,6 @@ assert len(ridge.posterior.ridges) == 1
 assert not weighed.posterior.ridges
 assert held_out.noise < 1.2 * 2e-3
 assert np.isfinite(fit.posterior.covariance).all()
+off = {name: fit.estimate(name).value / true - 1.0 for name, true in (("modulus", 4.2e9), ("damping", 0.0065))}
+print(", ".join(f"{name} {share:+.1%} from the truth" for name, share in off.items()))
 plt.close("all")

@@ -74,4 +74,6 @@ assert abs(fit.estimate("damping").value / 0.03 - 1.0) < 0.15
 assert abs(fit.frequency / fit.features.frequency - 1.0) < 0.01
 assert fit.sample.effective > 100
 assert held_out.noise < 1.2 * 2e-3
+off = {name: fit.estimate(name).value / true - 1.0 for name, true in (("modulus", 0.45e9), ("damping", 0.03))}
+print(", ".join(f"{name} {share:+.1%} from the truth" for name, share in off.items()))
 plt.close("all")

@@ -6,13 +6,15 @@
 
 # %%
 import pathlib
+import tempfile
 
 import matplotlib.pyplot as plt
 import numpy as np
 
 import vinesim
 
-pathlib.Path("hedge.toml").write_text(
+FILE = pathlib.Path(tempfile.mkdtemp()) / "hedge.toml"
+FILE.write_text(
     """
 name = "hedge"
 seed = 1
@@ -39,7 +41,7 @@ x = 3.0
 y = -1.3
 """
 )
-scene = vinesim.load_scene("hedge.toml")
+scene = vinesim.load_scene(FILE)
 places = {"ada": (3.0, -0.7, np.pi / 2), "bob": (1.5, -3.4, np.pi / 2), "eve": (28.0, -0.7, np.pi / 2)}
 
 
@@ -105,4 +107,5 @@ assert abs(moved["ada"][body] - moved["bob"][body]) < 0.02
 assert heard["bob"] > 0
 assert heard["eve"] == 0
 assert moved["eve"].max() < 1e-3
-print("Bob's copy has moved, Eve has received nothing")
+apart = 1e3 * abs(moved["ada"][body] - moved["bob"][body])
+print(f"Bob's copy has moved as far as Ada's, within {apart:.1f} mm; Eve has received nothing")

@@ -8,6 +8,7 @@
 This is an ordinary ROS 2 node. Another node must publish /battery_state, because vinesim simulates no battery.
 """
 
+import argparse
 import signal
 import threading
 
@@ -54,6 +55,7 @@ def main() -> None:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = BatteryLight()
     print("waiting for /battery_state", flush=True)

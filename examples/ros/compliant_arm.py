@@ -7,6 +7,7 @@ This is an ordinary ROS 2 node. It holds the arm at its present pose with low st
 way.
 """
 
+import argparse
 import signal
 import threading
 
@@ -60,6 +61,7 @@ def main() -> None:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = CompliantArm()
     print("waiting for the controller of the arm", flush=True)

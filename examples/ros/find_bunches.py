@@ -7,6 +7,7 @@ This is an ordinary ROS 2 node. It takes each connected area with the colour of 
 camera's optical frame, in metres.
 """
 
+import argparse
 import signal
 import threading
 
@@ -32,6 +33,8 @@ class BunchFinder(Node):
             rgb, depth, info = (self.parts[t] for t in ("rgb/image_raw", "depth/image_raw", "rgb/camera_info"))
             picture = np.frombuffer(rgb.data, np.uint8).reshape(rgb.height, rgb.width, 3)
             metres = np.frombuffer(depth.data, np.float32).reshape(depth.height, depth.width)
+            stamp = rgb.header.stamp
+            print(f"picture at {stamp.sec}.{stamp.nanosec // 10**7:02d} s", flush=True)
             for x, y, z in find(picture, metres, np.reshape(info.k, (3, 3))):
                 print(f"{rgb.header.frame_id}: bunch at x {x:.2f} y {y:.2f} z {z:.2f} m", flush=True)
 
@@ -63,8 +66,10 @@ def main() -> None:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = BunchFinder()
+    print("waiting for pictures of /head_front_camera", flush=True)
     try:
         while not stop.is_set():
             rclpy.spin_once(node, timeout_sec=0.1)

@@ -7,9 +7,9 @@ This is an ordinary ROS 2 node. It integrates the yaw rate of the IMU and the ve
 so that the robot no longer publishes its true pose. The origin of the map is the pose of the robot at the start.
 """
 
+import argparse
 import math
 import signal
-import sys
 import threading
 
 import rclpy
@@ -40,6 +40,12 @@ class Localiser(Node):
         if self.settings.services_are_ready():
             self.settings.set_parameters([Parameter("publish_map_to_odom", value=False)])
             self.asking.cancel()
+
+    def restore(self) -> None:
+        """Ask the robot to publish its true pose again, and wait for the answer for at most a second."""
+        if self.asking.is_canceled():
+            answer = self.settings.set_parameters([Parameter("publish_map_to_odom", value=True)])
+            rclpy.spin_until_future_complete(self, answer, timeout_sec=1.0)
 
     def report(self) -> None:
         if self.last is None:
@@ -82,11 +88,15 @@ def main() -> None:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("robot", nargs="?", default="robot", help="node of the robot")
+    robot = parser.parse_args().robot
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-    node = Localiser(sys.argv[1] if len(sys.argv) > 1 else "robot")
+    node = Localiser(robot)
     try:
         while not stop.is_set():
             rclpy.spin_once(node, timeout_sec=0.1)
+        node.restore()
     finally:
         node.destroy_node()
         rclpy.shutdown()

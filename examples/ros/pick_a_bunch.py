@@ -10,6 +10,7 @@ the real one. The driving assumes the alley of the scene harvest. Ctrl-C cancels
 
 from __future__ import annotations
 
+import argparse
 import signal
 import sys
 import threading
@@ -113,7 +114,16 @@ class Robot:
         node.create_subscription(TFMessage, "/tf_environment", self._take_environment, 10)
         self.velocity = node.create_publisher(TwistStamped, "/mobile_base_controller/cmd_vel", 10)
         print("waiting for the topics of a robot", flush=True)
-        self.until(lambda: self.urdf and self.joints and "odom" in self.frames and self.environment, 60.0, "topics")
+        needs = {
+            "/robot_description": lambda: self.urdf,
+            "/joint_states": lambda: self.joints,
+            "transform from odom to base_footprint": lambda: "base_footprint" in self.frames,
+            "transform from map to odom": lambda: "odom" in self.frames,
+            "/tf_environment": lambda: self.environment,
+        }
+        for what, is_there in needs.items():
+            self.until(is_there, 60.0, what)
+        self.home = dict(self.joints)
 
     def _take_joints(self, message: JointState) -> None:
         self.joints = dict(zip(message.name, message.position, strict=True))
@@ -215,7 +225,7 @@ class Arm:
         self.lower = np.array([joint.lower for joint in moving]) + 0.01
         self.upper = np.array([joint.upper for joint in moving]) - 0.01
         self.velocity = np.array([joint.velocity for joint in moving])
-        self.home = self.positions()
+        self.home = np.array([robot.home[name] for name in self.names])
 
     def positions(self) -> np.ndarray:
         """Returns the present positions of the joints [m, rad]."""
@@ -280,15 +290,23 @@ class Arm:
             path.append(self.solve(goal, path[-1]))
         steps = np.diff(path, axis=0)
         duration = max(duration, (np.abs(steps) / self.velocity).max() * len(steps) * 1.3)
-        times = shares * duration
-        velocities = np.gradient(np.array(path), np.r_[0.0, times], axis=0)
+        self.follow(np.array(path), np.r_[0.0, shares * duration])
+
+    def move_home(self) -> None:
+        """Move the joints to their positions at the start of the program."""
+        path = np.array([self.positions(), self.home])
+        self.follow(path, np.array([0.0, max((np.abs(path[1] - path[0]) / self.velocity).max() * 2.0, 0.5)]))
+
+    def follow(self, path: np.ndarray, times: np.ndarray) -> None:
+        """Move the joints through the positions [point, joint] at ``times`` [point] s, from the present position on."""
+        velocities = np.gradient(path, times, axis=0)
         velocities[-1] = 0.0
         goals = []
         for group, joints in self.parts.items():
             columns = [self.names.index(name) for name in joints]
             goal = FollowJointTrajectory.Goal()
             goal.trajectory.joint_names = list(joints)
-            for t, place, rate in zip(times, path[1:], velocities[1:], strict=True):
+            for t, place, rate in zip(times[1:], path[1:], velocities[1:], strict=True):
                 point = JointTrajectoryPoint(positions=place[columns].tolist(), velocities=rate[columns].tolist())
                 point.time_from_start.sec, point.time_from_start.nanosec = divmod(round(t * 1e9), 10**9)
                 goal.trajectory.points.append(point)
@@ -298,29 +316,36 @@ class Arm:
                 raise RuntimeError(result.error_string)
 
 
+def command(robot: Robot, linear: float, angular: float, seconds: float = 0.04) -> None:
+    """Command a velocity of the base [m/s, rad/s] and wait for a time."""
+    twist = TwistStamped()
+    twist.twist.linear.x = linear
+    twist.twist.angular.z = angular
+    robot.velocity.publish(twist)
+    robot.spin(seconds)
+
+
+def back_off(robot: Robot) -> None:
+    """Drive backwards for two seconds, 0.6 m."""
+    for _ in range(40):
+        command(robot, -0.3, 0.0, 0.05)
+
+
 def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None:
     """Turn towards a place [2] m, drive there, and turn to a heading [rad]. Raises RuntimeError if the base is
     stuck."""
     seen: list[np.ndarray] = []
 
-    def command(linear: float, angular: float, seconds: float = 0.04) -> None:
-        twist = TwistStamped()
-        twist.twist.linear.x = linear
-        twist.twist.angular.z = angular
-        robot.velocity.publish(twist)
-        robot.spin(seconds)
-
     def advance(linear: float, angular: float) -> None:
-        command(linear, angular)
+        command(robot, linear, angular)
         seen.append(robot.base()[:2, 3])
         if len(seen) > 100 and np.linalg.norm(seen[-1] - seen[-100]) < 0.01:
-            for _ in range(40):
-                command(-0.3, 0.0, 0.05)
+            back_off(robot)
             raise RuntimeError("something is in the way of the base")
 
     def turn_to(course: float) -> None:
         while abs(error := wrap(course - yaw_of(robot.base()))) > 0.01:
-            command(0.0, float(np.clip(1.5 * error, -0.4, 0.4)))
+            command(robot, 0.0, float(np.clip(1.5 * error, -0.4, 0.4)))
 
     if place is not None and np.linalg.norm(place - robot.base()[:2, 3]) > 0.03:
         turn_to(float(np.arctan2(*(place - robot.base()[:2, 3])[::-1])))
@@ -332,7 +357,7 @@ def drive(robot: Robot, place: np.ndarray | None, heading: float | None) -> None
     if heading is not None:
         turn_to(heading)
     for _ in range(10):
-        command(0.0, 0.0)
+        command(robot, 0.0, 0.0)
 
 
 # ---------------------------------------------------------------- the task
@@ -422,6 +447,11 @@ def put_into_box(robot: Robot, side: str) -> None:
     if not robot.grip(side, OPEN).reached_goal:
         raise RuntimeError("the hand does not open")
     arm.move(over, down)
+    arm.move(over, level)
+    arm.move(np.array(DRAWN_IN) * [1.0, -ahead, 1.0], level)
+    arm.move_home()
+    back_off(robot)
+    drive(robot, np.array([robot.base()[0, 3], 0.5 * (ALLEY[0] + ALLEY[1])]), None)
 
 
 def harvest(robot: Robot) -> int:
@@ -442,11 +472,12 @@ def harvest(robot: Robot) -> int:
         except RuntimeError as failure:
             print(f"{name}: {failure}", flush=True)
             if len(tried) == 6:
-                return 1
+                break
             continue
         print(f"{name}: in the box", flush=True)
         return 0
-    print("no bunch is within reach of the alley: is this the scene harvest?")
+    if not tried:
+        print("no bunch is within reach of the alley: is this the scene harvest?")
     return 1
 
 
@@ -455,6 +486,7 @@ def main() -> int:
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())
+    argparse.ArgumentParser(description=__doc__.splitlines()[0]).parse_args()
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("picker")
     try:

@@ -147,7 +147,7 @@ class GraphNode:
                 known.update(self._node.get_topic_names_and_types())
                 return name in known
 
-            self._await("topic", name, has_appeared)
+            self._await("subscriber", name, has_appeared)
             if self._is_stopped():
                 return
             message_type = _class_of(name, known[name])
@@ -238,14 +238,17 @@ class GraphNode:
                 if time.monotonic() > end:
                     raise UsageError(self._not_found(what, name))
                 self.spin()
-                progress.show(f"waiting for the {what} {name}")
+                progress.show(f"waiting for the {what} {'of ' if what == 'subscriber' else ''}{name}")
 
     def _not_found(self, what: str, name: str) -> str:
-        is_topic = what == "topic"
+        is_topic = what != "service"
         names = self._node.get_topic_names_and_types() if is_topic else self._node.get_service_names_and_types()
         close = [one for one in difflib.get_close_matches(name, [one for one, _ in names]) if one != name]
-        remedy = "vinesim ros topics lists all topics" if is_topic else "start its node, or set the domain of the node"
-        gone = "publishes the topic" if is_topic else "offers the service"
+        gone, remedy = {
+            "topic": ("publishes the topic", "vinesim ros topics lists all topics"),
+            "service": ("offers the service", "start its node, or set the domain of the node"),
+            "subscriber": ("subscribes to the topic", "start the subscriber first, or give the type by --type"),
+        }[what]
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         return f"nobody {gone} {name} in ROS_DOMAIN_ID {domain}; {f'do you mean {close[0]}?' if close else remedy}"
 
