@@ -196,7 +196,7 @@ def test_errors_name_what_is_wrong(
         attempt(lambda node: next(node.subscribe("/joint_state")))
     with pytest.raises(UsageError, match="nobody offers the service /switch in"):
         attempt(lambda node: node.call("/switch", SetBool.Request, 1.0))
-    with pytest.raises(UsageError, match="nobody subscribes to the topic /charge in .*; start the subscriber first"):
+    with pytest.raises(UsageError, match=r"nobody subscribes to the topic /charge in .*; start the subscriber first"):
         attempt(lambda node: next(node.publish("/charge", lambda kind: kind(), 1.0, None)))
     with pytest.raises(UsageError, match="'a b' is no name of a topic"):
         attempt(lambda node: next(node.subscribe("a b")))
