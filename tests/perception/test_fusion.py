@@ -10,6 +10,7 @@ import pytest
 
 import vinesim
 from tests.support import programs
+from tests.support.recorded_pick import record_a_pick
 from tests.support.waiting import deadline
 from vinesim.cli.perception import fuse as fuse_tour
 from vinesim.cli.perception import view
@@ -19,6 +20,7 @@ from vinesim.perception import TourError, fuse, open_tour, wood_distance
 from vinesim.perception.truth import _cone_distance
 from vinesim.perception.viewing import NoDisplay, Shape, draw, read_shape
 from vinesim.scene.ids import LABEL_STRIDE, Organ
+from vinesim.sensors.recorded_pictures import RecordedPicturesError
 
 VIEWPOINTS = [(x, y, 1.55, x + 0.05, y + way, 1.75) for x in (0.6, 0.8) for y, way in ((-0.3, 0.5), (0.7, -0.5))]
 STEMS = (Organ.CANE, Organ.PEDUNCLE)
@@ -95,6 +97,13 @@ def test_the_commands_write_a_surface_and_a_picture_of_it(tour, tmp_path, capsys
         with pytest.raises(UsageError, match=message):
             fuse_tour(tour, out=tmp_path / out, ids=False, **given)
         assert not (tmp_path / out).exists()
+
+
+def test_a_recording_without_pictures_is_one_line(tmp_path):
+    """A recording of a world, by ``vinesim record``."""
+    record_a_pick(tmp_path / "run.mcap")
+    with pytest.raises(RecordedPicturesError, match=r"run\.mcap: has no topic of sensor_msgs/msg/Image; give raw"):
+        read_shape(tmp_path / "run.mcap")
 
 
 def test_pictures_of_two_vineyards_or_moments_are_not_fused(tour, tmp_path):

@@ -143,7 +143,8 @@ def test_a_build_shows_how_many_packages_are_done(tmp_path, monkeypatch, caplog)
 
 @pytest.mark.long
 def test_a_client_shows_the_build_and_starts_its_processes_afterwards(tmp_path):
-    usual_caches = {"WARP_CACHE_PATH": str(disk_cache.user_folder() / "warp"), "VINESIM_CACHE": str(disk_cache.folder())}
+    kernels = str(disk_cache.user_folder() / "warp")
+    usual_caches = {"WARP_CACHE_PATH": kernels, "VINESIM_CACHE": str(disk_cache.folder())}
     ran = subprocess.run(
         [sys.executable, "-m", "vinesim", "client", "--role", "robot", "--seconds", "1"],
         env=usual_caches | os.environ | {"XDG_CACHE_HOME": str(tmp_path), "ROS_DOMAIN_ID": str(1 + os.getpid() % 100)},

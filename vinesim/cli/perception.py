@@ -74,6 +74,8 @@ def view(
     at: str | None,
     look: str | None,
     size: str | None,
+    image: str | None = None,
+    depth: str | None = None,
 ) -> int:
     """Show a file in Open3D's viewer, or write a picture of it. Returns the exit code."""
     if len(files) != 1:
@@ -92,7 +94,7 @@ def view(
         raise UsageError(f"--size is {size!r}; give width and height from 16 to 4096 px")
     if out is None and not viewing.has_display():
         raise viewing.NoDisplay("there is no display for Open3D's viewer; give --out picture.png, or set DISPLAY")
-    shape = viewing.read_shape(file, picture)
+    shape = viewing.read_shape(file, picture, image, depth)
     print(f"{file}: {shape.text}", flush=True)
     if out is None:
         viewing.show(shape, f"vinesim: {file.name}")

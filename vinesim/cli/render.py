@@ -76,7 +76,12 @@ def run(
         from vinesim.plants.device_buffers import find_device
 
         find_device(device)
+    from vinesim.sensors.camera.camera import CameraSpec
+    from vinesim.sensors.export.dataset import resized_intrinsics
+
     pixels = None if size is None else parse_size(size)
+    spec = CameraSpec.load(camera)
+    info = resized_intrinsics(spec, pixels)
     mounts = parse_sensors(sensors, pixels)
     staged = parse_composition(robots, people, crates)
     from vinesim.scene.spec import load_scene, with_seed
@@ -85,7 +90,7 @@ def run(
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
     actors = {"robots": list(robots), "people": list(people), "crates": list(crates)}
-    work = _Work(out, viewpoints, path is not None, mounts, plan, camera, pixels, time, device, actors)
+    work = _Work(out, viewpoints, path is not None, mounts, plan, camera, spec, info, time, device, actors)
     try:
         work.do(staged)
     except KeyboardInterrupt:
@@ -111,7 +116,9 @@ class _Work:
     """Further sensors that measure from the camera's place."""
     plan: Scene
     camera: str
-    size: tuple[int, int] | None
+    """File or name of the camera, as the user gave it."""
+    spec: CameraSpec
+    info: CameraInfo
     time: float
     """Simulated time, which determines wind and sun [s]."""
     device: str
@@ -123,16 +130,12 @@ class _Work:
         from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
         from vinesim.scene.generation.vineyard import generate
         from vinesim.scene.wind import wind_of
-        from vinesim.sensors.camera.camera import CameraSpec
         from vinesim.sensors.export import tour_folder
-        from vinesim.sensors.export.dataset import resized_intrinsics
         from vinesim.sensors.primitives.ray_caster import RayCaster
         from vinesim.sensors.primitives.scene_primitives import Primitives
 
-        spec = CameraSpec.load(self.camera)
-        info = resized_intrinsics(spec, self.size)
         if self.is_tour:
-            tour_folder.check(self.out, self.settings(info))
+            tour_folder.check(self.out, self.settings())
         compile_kernels(SENSOR_PACKAGES, self.device)
         model = generate(self.plan)
         view = staged.compose(model, self.plan.physics)
@@ -145,11 +148,20 @@ class _Work:
         for viewpoint in self.viewpoints:
             _check_not_enclosed(primitives, viewpoint)
         if self.is_tour:
-            tour_folder.begin(self.out, self.settings(info))
+            tour_folder.begin(self.out, self.settings())
         else:
             self.out.mkdir(parents=True, exist_ok=True)
         stage = _Stage(
-            self.plan, model, staged, view, primitives, RayCaster(primitives), spec, info, self.time, self.sensors
+            self.plan,
+            model,
+            staged,
+            view,
+            primitives,
+            RayCaster(primitives),
+            self.spec,
+            self.info,
+            self.time,
+            self.sensors,
         )
         done = self.done()
         if done:
@@ -189,7 +201,7 @@ class _Work:
             self.out.rmdir()
         return f"stopped; no new picture is in {self.out}"
 
-    def settings(self, info: CameraInfo) -> dict[str, Any]:
+    def settings(self) -> dict[str, Any]:
         """Returns all settings that determine the pictures, for JSON."""
         from vinesim.core.version import __version__
 
@@ -197,7 +209,7 @@ class _Work:
             "vinesim": __version__,
             "seed": self.plan.seed,
             "camera": self.camera,
-            "size": [info.width, info.height],
+            "size": [self.info.width, self.info.height],
             "time": self.time,
             "device": self.device.partition(":")[0],  # all GPUs render equal pictures
             **self.actors,

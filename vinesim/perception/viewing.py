@@ -60,20 +60,22 @@ class Shape:
         return f"{kind}, {extent} m"
 
 
-def read_shape(path: pathlib.Path, number: int = 0) -> Shape:
+def read_shape(path: pathlib.Path, number: int = 0, image: str | None = None, depth: str | None = None) -> Shape:
     """Returns the cloud or mesh of a file.
 
     Args:
         path: a file that Open3D reads, or RGB-D pictures: an MCAP file, or a folder of rosbag2, ``vinesim render`` or
             ``vinesim dataset``.
         number: index of the picture whose cloud is returned, with depth as it was measured.
+        image: topic of the colours in a recording that has several.
+        depth: topic of the depth in a recording that has several.
 
     Raises :class:`UsageError` if the file contains no points.
     """
     if not path.exists():
         raise UsageError(f"{path} is not there; give a file {', '.join(SUFFIXES)} or .mcap")
     if path.is_dir() or path.suffix.lower() == ".mcap":
-        return _picture_shape(path, number)
+        return _picture_shape(path, number, image, depth)
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{path} has the suffix {path.suffix!r}; give a file {', '.join(SUFFIXES)} or .mcap")
     o3d = load_open3d()
@@ -160,10 +162,13 @@ def has_display() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _picture_shape(path: pathlib.Path, number: int) -> Shape:
-    """Returns the cloud of one RGB-D picture of a recording."""
+def _picture_shape(path: pathlib.Path, number: int, image: str | None, depth: str | None) -> Shape:
+    """Returns the cloud of one RGB-D picture of a recording, tour or data set."""
     is_tour = (path / "camera.json").exists() or any(path.glob("*/camera.json"))
-    pictures = (one.read() for one in open_tour(path)) if is_tour else read_pictures(path, rate=1.0)
+    if is_tour:
+        pictures = (one.read() for one in open_tour(path))
+    else:
+        pictures = read_pictures(path, image=image, depth=depth, rate=1.0)
     for frame in itertools.islice(pictures, number, None):
         return _cloud_shape(frame, path)
     raise UsageError(f"{path} has no picture number {number}; give a smaller --picture")

@@ -46,6 +46,12 @@ def view(
     ],
     out: Annotated[pathlib.Path | None, typer.Option(help="Write this PNG file instead of opening a window.")] = None,
     picture: Annotated[int, typer.Option(min=0, help="Index of the picture in a recording, tour or data set.")] = 0,
+    image: Annotated[
+        str | None, typer.Option(help="Topic of the colours in a recording; by default the only one of its kind.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="Topic of the depth in a recording; by default the only one of its kind.")
+    ] = None,
     at: Annotated[
         str | None,
         typer.Option(help="With --out: position of the camera, X,Y,Z [m]; by default the shape fills the picture."),
@@ -68,4 +74,4 @@ def view(
     """
     from vinesim.cli.perception import view as run
 
-    raise typer.Exit(run(files, out=out, picture=picture, at=at, look=look, size=size))
+    raise typer.Exit(run(files, out=out, picture=picture, at=at, look=look, size=size, image=image, depth=depth))

@@ -12,7 +12,7 @@ import numpy as np
 
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import distortion_model, intrinsic_matrix
-from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
+from vinesim.scene.ids import ObjectKind, object_id, object_name
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
 from vinesim.sensors.ground_truth import PixelBuffers
 
@@ -25,8 +25,10 @@ _LINE = 15
 MIN_ANNOTATED_PIXELS = 16
 """Least number of visible pixels of an annotated bunch (COCO, YOLO); JSON records contain also smaller bunches."""
 
-CATEGORIES = [{"id": int(Organ.BUNCH), "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
-"""List of categories for COCO files; the ids are numbers of :class:`Organ`."""
+CATEGORY = 1
+"""Id of the only category, bunches, in COCO files, whose ids begin with 1 by convention."""
+CATEGORIES = [{"id": CATEGORY, "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
+"""List of categories for COCO files."""
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:
@@ -162,7 +164,7 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
     return {
         "id": number,
         "image_id": image["image"],
-        "category_id": int(Organ.BUNCH),
+        "category_id": CATEGORY,
         "iscrowd": 0,
         "bbox": bunch["box"],
         "area": bunch["pixels"],
