@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tests.support.long_rows import long
-from vinesim.cli.render import run
+from vinesim.cli.render import _Stage, run
 from vinesim.core.errors import UsageError, WriteError
 
 HEADER = "x,y,z,look_x,look_y,look_z\n"
@@ -37,7 +37,7 @@ def test_each_viewpoint_of_a_path_gives_the_picture_that_it_gives_alone(kind: st
         names = HEADER.strip().split(",")
         path.write_bytes(msgspec.json.encode([dict(zip(names, p, strict=True)) for p in points]))
     assert render(tmp_path / "tour", path=path) == 0
-    assert sorted(f.name for f in (tmp_path / "tour").iterdir()) == ["0000", "0001", "0002"]
+    assert sorted(f.name for f in (tmp_path / "tour").iterdir()) == ["0000", "0001", "0002", "tour.json"]
     for number, point in enumerate(points[:2]):
         at, look = (",".join(map(str, part)) for part in (point[:3], point[3:]))
         render(tmp_path / "alone", at=at, look=look)
@@ -50,9 +50,9 @@ def test_each_viewpoint_of_a_path_gives_the_picture_that_it_gives_alone(kind: st
     ("text", "words"),
     [
         (HEADER, "no viewpoint"),
-        ("x,y,z\n1,2,3\n", "KeyError 'look_x'"),
-        (HEADER + "1,2,three,4,5,6\n", "three"),
-        (HEADER + "1,2\n", "columns x, y, z"),
+        ("x,y,z\n1,2,3\n", "viewpoint 0 has no look_x; give a CSV file with the columns x, y, z"),
+        (HEADER + "1,2,1,4,5,6\n1,2,three,4,5,6\n", "viewpoint 1 has the z 'three'"),
+        (HEADER + "1,2\n", "viewpoint 0 has no z"),
         (HEADER + "1,2,1.5,1,2,1.5\n", "viewpoint 0 looks at the position of the camera"),
         (HEADER + "0,0.5,1,2,2,1\n1,2,-1.5,1,2,1.5\n", "viewpoint 1 is below the ground"),
         (HEADER + "nan,2,1,1,2,1.5\n", "position [nan, 2.0, 1.0]"),
@@ -66,6 +66,45 @@ def test_a_wrong_path_is_named_before_anything_is_rendered(text: str, words: str
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_an_interrupted_tour_is_continued_and_no_other_is_mixed_with_it(tmp_path, monkeypatch, capsys) -> None:
+    """The interruption comes with the second picture."""
+    path = tmp_path / "tour.csv"
+    path.write_text(HEADER + "0.4,1.2,1.3,3,1,1.7\n1,1.3,1.2,3,1,1.7\n")
+    whole = tmp_path / "whole"
+    tour = tmp_path / "tour"
+    small = {"path": path, "size": "64x48"}
+    render(whole, **small)
+    rendered = []
+    once = _Stage.render
+
+    def interrupted(stage, viewpoint):
+        rendered.append(viewpoint)
+        if len(rendered) == 2:
+            raise KeyboardInterrupt
+        return once(stage, viewpoint)
+
+    monkeypatch.setattr(_Stage, "render", interrupted)
+    assert render(tour, **small) == 130
+    assert f"stopped with 1 of 2 pictures in {tour}; run the same command to continue" in capsys.readouterr().out
+    assert sorted(f.name for f in tour.iterdir()) == ["0000", "tour.json"]
+    assert render(tour, **small) == 0
+    assert len(rendered) == 3
+    for name in ("0000", "0001"):
+        assert files(tour / name) == files(whole / name)
+
+    for options, words in (({"seed": 5}, r"a tour with seed \d+, not 5; give"), ({"time": 1.0}, "time 0.0, not 1.0")):
+        with pytest.raises(UsageError, match=words):
+            render(tour, **small, **options)
+    path.write_text(HEADER + "0.4,1.2,1.3,3,1,1.7\n")
+    with pytest.raises(UsageError, match="a tour with another path"):
+        render(tour, **small)
+    with pytest.raises(UsageError, match="pictures that are not of this tour"):
+        render(tour / "0000", **small)
+    rendered[:] = rendered[:1]
+    assert render(tmp_path / "none", at="0.4,1.2,1.3", look="3,1,1.7", size="64x48") == 130
+    assert not (tmp_path / "none").exists()
 
 
 def test_a_sensor_looks_as_well_and_leaves_the_picture_as_it_is(tmp_path: pathlib.Path) -> None:
@@ -107,7 +146,10 @@ def test_a_viewpoint_is_needed_and_only_once(tmp_path: pathlib.Path) -> None:
     with pytest.raises(UsageError, match=r"tour\.json cannot be read: No such file"):
         render(tmp_path, path=tmp_path / "tour.json")
     (tmp_path / "tour.json").write_text('{"x": 1}')
-    with pytest.raises(UsageError, match=r"tour\.json: TypeError"):
+    with pytest.raises(UsageError, match=r"tour\.json is no list; give"):
+        render(tmp_path, path=tmp_path / "tour.json")
+    (tmp_path / "tour.json").write_text('["x"]')
+    with pytest.raises(UsageError, match=r"viewpoint 0 has no x; give"):
         render(tmp_path, path=tmp_path / "tour.json")
 
 

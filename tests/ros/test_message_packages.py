@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import logging
 import os
 import shutil
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import pytest
 
 from tests.support.waiting import deadline
+from vinesim.core import disk_cache, progress
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
 
@@ -125,3 +127,34 @@ def test_a_changed_definition_changes_the_key(tmp_path, monkeypatch):
     folder.mkdir(parents=True)
     (folder / "TFMessage.msg").write_text("geometry_msgs/TransformStamped[] transforms\nuint8 more\n")
     assert message_packages.key("tf2_msgs") != before
+
+
+def test_a_build_shows_how_many_packages_are_done(tmp_path, monkeypatch, caplog):
+    names = message_packages.available_packages()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(progress, "PERIOD", 0.0)
+    monkeypatch.setattr(progress.log, "propagate", True)
+    monkeypatch.setattr(message_packages, "_build", lambda _: tmp_path)
+    with caplog.at_level(logging.INFO, "vinesim.core.progress"):
+        message_packages.build(names)
+    count = len(names)
+    assert f"building ROS message packages, only once: {count} of {count} done" in caplog.messages
+
+
+@pytest.mark.long
+def test_a_client_shows_the_build_and_starts_its_processes_afterwards(tmp_path):
+    kernels = str(disk_cache.user_folder() / "warp")
+    usual_caches = {"WARP_CACHE_PATH": kernels, "VINESIM_CACHE": str(disk_cache.folder())}
+    ran = subprocess.run(
+        [sys.executable, "-m", "vinesim", "client", "--role", "robot", "--seconds", "1"],
+        env=usual_caches | os.environ | {"XDG_CACHE_HOME": str(tmp_path), "ROS_DOMAIN_ID": str(1 + os.getpid() % 100)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=deadline(600.0),
+        check=False,
+    )
+    assert ran.returncode == 0, ran.stderr
+    assert "vinesim: building ROS message packages, only once: " in ran.stderr
+    built = {place.name.rsplit("-", 1)[0] for place in (tmp_path / "vinesim" / "interfaces").iterdir()}
+    assert built == set(message_packages.available_packages())

@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import json
+import logging
 import os
 import pathlib
 import resource
@@ -21,9 +22,11 @@ from pycocotools.coco import COCO
 
 from tests.support import programs
 from tests.support.waiting import deadline
+from vinesim.cli.dataset import _progress
 from vinesim.cli.render import run as render
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.client.composition.scene_composer import PlacementError
+from vinesim.core import progress
 from vinesim.core.data_files import DataFileNotFound
 from vinesim.core.errors import UsageError, WriteError
 from vinesim.robot.description.urdf import DescriptionError
@@ -112,6 +115,16 @@ def test_stopped_killed_and_gone_on_with_it_is_the_same_data_set(
     assert _files(out) == _files(whole)
 
 
+def test_progress_in_a_log_file_is_a_line_every_few_seconds(monkeypatch, caplog, capsys) -> None:
+    monkeypatch.setattr(progress, "PERIOD", 0.0)
+    monkeypatch.setattr(progress.log, "propagate", True)
+    with caplog.at_level(logging.INFO, "vinesim.core.progress"), _progress(20, 5) as advance:
+        advance(1)
+        advance(2)
+    assert caplog.messages == ["6 of 20 images are there", "8 of 20 images are there", ""]
+    assert capsys.readouterr().out == ""
+
+
 @pytest.mark.long
 def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
     scene: pathlib.Path, whole: pathlib.Path, tmp_path: pathlib.Path
@@ -123,7 +136,7 @@ def test_a_killed_worker_is_one_line_and_the_same_command_goes_on(
         os.kill(worker, signal.SIGKILL)
         errors = run.communicate(timeout=deadline())[1]
     assert run.returncode == 5
-    assert [line for line in errors.splitlines() if line.strip()] == [
+    assert [line for line in errors.splitlines() if line.strip() and "images are there" not in line] == [
         "vinesim: a worker was killed by SIGKILL; finished images are kept; run the same command to continue"
     ]
     last = programs.run(_command(scene, out, 1), timeout=deadline())
@@ -142,6 +155,7 @@ def test_pycocotools_reads_it(whole: pathlib.Path, capsys: pytest.CaptureFixture
     capsys.readouterr()
     assert read.getImgIds() == list(range(IMAGES))
     assert [c["name"] for c in read.loadCats(read.getCatIds())] == ["bunch"]
+    assert read.getCatIds() == [1]  # ids begin with 1 by convention
     assert len(read.anns) > IMAGES
     for one in read.loadAnns(read.getAnnIds()):
         image = read.loadImgs(one["image_id"])[0]

@@ -8,6 +8,7 @@ from tests.support import sensor_scenes
 from vinesim.scene.ids import Organ
 from vinesim.sensors.camera.camera import Camera
 from vinesim.sensors.export import images
+from vinesim.sensors.export.annotations import label_places
 from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 
 
@@ -60,3 +61,21 @@ def test_a_portrait_shows_sky_leaves_fruit_and_ground(tmp_path) -> None:
 def test_what_cannot_be_a_png_is_named(tmp_path) -> None:
     with pytest.raises((ValueError, cv2.error)):
         images.write_png(tmp_path / "x.png", np.zeros((2, 2, 5), np.uint8))
+
+
+def test_labels_are_inside_the_picture_and_cover_no_other():
+    rng = np.random.default_rng(4)
+    picture = 640, 480
+    corners = [tuple(map(int, one)) for one in rng.integers((-50, -50), (700, 520), (60, 2))]
+    sizes = [tuple(map(int, one)) for one in rng.integers((40, 15), (140, 31), (60, 2))]
+    places = label_places(corners, sizes, picture)
+    covered = np.zeros(picture[::-1], int)
+    for place, (width, height) in zip(places, sizes, strict=True):
+        if place is not None:
+            assert min(place) >= 0
+            assert place[0] + width <= picture[0]
+            assert place[1] + height <= picture[1]
+            covered[place[1] : place[1] + height, place[0] : place[0] + width] += 1
+    assert covered.max() == 1
+    assert places[0] is not None
+    assert None in places

@@ -213,6 +213,8 @@ def test_an_ideal_camera_measures_exactly() -> None:
         ("width = { value = 640", "width = { value = 640000", r"width is 640000 px; give 1 to 8192 px"),
         ("farthest = { value = 10.0", "farthest = { value = 0.1", "an empty range; give 0 <= nearest < farthest"),
         ('focal = { value = 399.4, unit = "px"', 'focal = { value = 1.9, unit = "mm"', r"stereo\.focal\.unit is 'mm'"),
+        ("window = ", "windw = ", r"stereo\.windw is not a field; did you mean 'window'\?"),
+        ("saturation = ", "rate = ", r"stereo\.rate is not a field; it belongs to no table: write it above"),
     ],
 )
 def test_absurd_values_are_refused_in_one_line(tmp_path, old: str, new: str, says: str) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import collections
+import contextlib
 import importlib.util
 import multiprocessing
 import os
 import pathlib
 import signal
+import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any
@@ -19,6 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from vinesim.cli.render import parse_sensors, parse_size
 from vinesim.client.composition.domain_randomizer import SceneRandomizer
 from vinesim.core.errors import UsageError, WriteError
+from vinesim.core.progress import ProgressLine
 from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
 from vinesim.plants.device_buffers import find_device
 from vinesim.scene.spec import load_scene
@@ -82,24 +85,21 @@ def run(
         device,
         parse_sensors(sensor or (), None if size is None else parse_size(size)),
     )
-    columns = TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     running: list[Worker] = []
     try:
         dataset.prepare_folder(plan, out, images)
         compile_kernels(SENSOR_PACKAGES, device)
         wanted = dataset.missing_images(out, images)
         if scheduler is not None:
-            with Progress(*columns) as progress:
-                task = progress.add_task("images", total=images, completed=images - len(wanted))
-                _render_on_cluster(scheduler, plan, out, wanted, lambda done: progress.advance(task, done))
+            with _progress(images, images - len(wanted)) as advance:
+                _render_on_cluster(scheduler, plan, out, wanted, advance)
             return _finish(out, images, len(wanted))
         # With a GPU, the cores only generate vineyards, write files and compute the truth; all workers share the GPU.
         cores = os.cpu_count() or 2
         shares = _shares(wanted, workers or max(cores // 2 if device == "cpu" else cores, 1))
         running += [_start_worker(plan, out, share) for share in shares]
-        with Progress(*columns) as progress:
-            task = progress.add_task("images", total=images, completed=images - len(wanted))
-            _wait_for(running, lambda: progress.advance(task))
+        with _progress(images, images - len(wanted)) as advance:
+            _wait_for(running, lambda: advance(1))
     except KeyboardInterrupt:
         _stop_workers(running, out)
         done = images - len(dataset.missing_images(out, images))
@@ -108,6 +108,25 @@ def run(
     finally:
         _stop_workers(running, out)
     return _finish(out, images, len(wanted))
+
+
+@contextlib.contextmanager
+def _progress(images: int, done: int) -> Iterator[Callable[[int], None]]:
+    """Context manager that shows how many of ``images`` are done: a bar on a terminal, otherwise a line every few
+    seconds. Yields a function that is called with the number of new images."""
+    if sys.stdout.isatty():
+        with Progress(TextColumn("images"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()) as bar:
+            task = bar.add_task("images", total=images, completed=done)
+            yield lambda new: bar.advance(task, new)
+        return
+    with ProgressLine() as line:
+
+        def show(new: int) -> None:
+            nonlocal done
+            done += new
+            line.show(f"{done} of {images} images are there")
+
+        yield show
 
 
 def _finish(out: pathlib.Path, images: int, new: int) -> int:

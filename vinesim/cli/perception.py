@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import pathlib
+import re
 import time
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,6 +17,9 @@ from vinesim.perception.open3d_library import load_open3d
 from vinesim.perception.tour import open_tour
 from vinesim.sensors.export.images import write_png
 
+_OPTIONS = {"voxel": "--voxel", "farthest": "--far", "least_views": "--views"}
+"""Option of each argument of :func:`vinesim.perception.fuse` that its errors name."""
+
 
 def fuse(
     tour: pathlib.Path, *, out: pathlib.Path, voxel: float, far: float, depth: str, ids: bool, views: int | None
@@ -24,38 +29,64 @@ def fuse(
         raise UsageError(f"--depth is {depth!r}; give exact or measured")
     if out.suffix.lower() != ".ply":
         raise UsageError(f"--out is {out}; give a file with the suffix .ply")
-    if not out.absolute().parent.is_dir():
-        raise UsageError(f"--out is {out}: its folder is not there; make it first")
-    load_open3d()  # before the first picture is read
-    pictures = open_tour(tour)
+    _check_folder_of(out)
     began = time.monotonic()
-    with ProgressLine() as line:
-        surface = fusion.fuse(
-            pictures,
-            voxel=voxel,
-            farthest=far,
-            exact=depth == "exact",
-            ids=ids,
-            least_views=views,
-            advance=lambda done: line.show(f"fused {done} of {len(pictures)} pictures"),
-        )
-    with writing(out):
-        surface.write(out)
+    try:
+        load_open3d()  # before the first picture is read
+        pictures = open_tour(tour)
+        count = f"{len(pictures)} picture{'s' if len(pictures) > 1 else ''}"
+        with ProgressLine() as line:
+            surface = fusion.fuse(
+                pictures,
+                voxel=voxel,
+                farthest=far,
+                exact=depth == "exact",
+                ids=ids,
+                least_views=views,
+                advance=lambda done: line.show(f"fused {done} of {count}"),
+            )
+        with writing(out):
+            surface.write(out)
+    except KeyboardInterrupt:
+        print(f"stopped; {out} was not written")
+        return 130
+    except UsageError as bad:
+        raise UsageError(
+            re.sub(r"\b(voxel|farthest|least_views)\b", lambda name: _OPTIONS[name[1]], str(bad))
+        ) from None
     print(
-        f"{out}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles of {len(pictures)} pictures, "
+        f"{out}: {len(surface.vertices)} vertices, {len(surface.triangles)} triangles of {count}, "
         f"voxels of {1000.0 * voxel:g} mm, {time.monotonic() - began:.0f} s"
     )
     return 0
 
 
+def _check_folder_of(out: pathlib.Path) -> None:
+    if not out.absolute().parent.is_dir():
+        raise UsageError(f"--out is {out}: its folder is not there; make it first")
+
+
 def view(
-    file: pathlib.Path, *, out: pathlib.Path | None, picture: int, at: str | None, look: str | None, size: str | None
+    files: Sequence[pathlib.Path],
+    *,
+    out: pathlib.Path | None,
+    picture: int,
+    at: str | None,
+    look: str | None,
+    size: str | None,
+    image: str | None = None,
+    depth: str | None = None,
 ) -> int:
     """Show a file in Open3D's viewer, or write a picture of it. Returns the exit code."""
+    if len(files) != 1:
+        raise UsageError(f"view shows one file, not {len(files)}; call it once for each")
+    (file,) = files
     if out is None and (at is not None or look is not None or size is not None):
         raise UsageError("--at, --look and --size belong to a picture; give --out picture.png, too")
     if out is not None and out.suffix.lower() != ".png":
         raise UsageError(f"--out is {out}; give a file with the suffix .png")
+    if out is not None:
+        _check_folder_of(out)
     eye: np.ndarray | None = None if at is None else parse_point("--at", at)
     target: np.ndarray | None = None if look is None else parse_point("--look", look)
     width, height = (960, 720) if size is None else parse_size(size)
@@ -63,7 +94,7 @@ def view(
         raise UsageError(f"--size is {size!r}; give width and height from 16 to 4096 px")
     if out is None and not viewing.has_display():
         raise viewing.NoDisplay("there is no display for Open3D's viewer; give --out picture.png, or set DISPLAY")
-    shape = viewing.read_shape(file, picture)
+    shape = viewing.read_shape(file, picture, image, depth)
     print(f"{file}: {shape.text}", flush=True)
     if out is None:
         viewing.show(shape, f"vinesim: {file.name}")

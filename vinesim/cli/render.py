@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import concurrent.futures
+import contextlib
 import csv
 import dataclasses
 import pathlib
@@ -68,59 +69,154 @@ def run(
 
     Each of ``sensors`` measures from the viewpoint as well and writes ``<sensor>_<image>.png`` and ``<sensor>.json``.
     The viewpoint is ``at`` and ``look``. Viewpoints of a ``path`` file go to the folders ``0000``, ``0001``, ... of
-    ``out``.
+    ``out``. Pictures of the same tour that are there already are not rendered again. Returns the exit code.
     """
     viewpoints = _viewpoints(at, look, path)
     if device != "cpu":  # the imports for a GPU cost half a second
         from vinesim.plants.device_buffers import find_device
 
         find_device(device)
-    from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
-    from vinesim.scene.generation.vineyard import generate
-    from vinesim.scene.spec import load_scene, with_seed
-    from vinesim.scene.wind import wind_of
     from vinesim.sensors.camera.camera import CameraSpec
     from vinesim.sensors.export.dataset import resized_intrinsics
-    from vinesim.sensors.primitives.ray_caster import RayCaster
-    from vinesim.sensors.primitives.scene_primitives import Primitives
 
+    pixels = None if size is None else parse_size(size)
     spec = CameraSpec.load(camera)
-    info = resized_intrinsics(spec, None if size is None else parse_size(size))
-    mounts = parse_sensors(sensors, None if size is None else parse_size(size))
-    plan = with_seed(load_scene(scene), seed)
+    info = resized_intrinsics(spec, pixels)
+    mounts = parse_sensors(sensors, pixels)
     staged = parse_composition(robots, people, crates)
+    from vinesim.scene.spec import load_scene, with_seed
+
+    plan = with_seed(load_scene(scene), seed)
     if hour is not None:
         plan = msgspec.structs.replace(plan, sun=msgspec.structs.replace(plan.sun, hour=hour))
-    compile_kernels(SENSOR_PACKAGES, device)
-    model = generate(plan)
-    view = staged.compose(model, plan.physics)
-    if (wind := wind_of(plan)) is not None:
-        from vinesim.wind.sway import windblown  # loading the kernels of plants takes half a second
-
-        view = windblown(model, view, wind, time)
-    primitives = Primitives(model, device=device)
-    primitives.update(view)
-    for viewpoint in viewpoints:
-        _check_not_enclosed(primitives, viewpoint)
-    stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info, time, mounts)
+    actors = {"robots": list(robots), "people": list(people), "crates": list(crates)}
+    work = _Work(out, viewpoints, path is not None, mounts, plan, camera, spec, info, time, device, actors)
     try:
-        with concurrent.futures.ThreadPoolExecutor(1, "png") as writer:
-            written: list[concurrent.futures.Future[None]] = []
-            for number, viewpoint in enumerate(viewpoints):
-                folder = out if path is None else out / f"{number:04d}"
-                folder.mkdir(parents=True, exist_ok=True)
-                picture, sight = stage.render(viewpoint)
-                written.append(writer.submit(picture.write, folder))  # written while the next picture is rendered
-                if number:
-                    written[number - 1].result()
-                print(f"{folder}: {sight}")
-            written[-1].result()
+        work.do(staged)
+    except KeyboardInterrupt:
+        print(work.stopped())
+        return 130
     except OSError as bad:
         raise WriteError(
             f"--out {out} cannot be written: {bad.strerror or bad}; free some space or give another folder, and "
             "render again"
         ) from None
     return 0
+
+
+@dataclasses.dataclass(frozen=True, slots=True, eq=False)
+class _Work:
+    """Pictures to render, and the folders for them."""
+
+    out: pathlib.Path
+    viewpoints: list[Viewpoint]
+    is_tour: bool
+    """Whether each viewpoint has a folder of its own."""
+    sensors: tuple[RenderedMount, ...]
+    """Further sensors that measure from the camera's place."""
+    plan: Scene
+    camera: str
+    """File or name of the camera, as the user gave it."""
+    spec: CameraSpec
+    info: CameraInfo
+    time: float
+    """Simulated time, which determines wind and sun [s]."""
+    device: str
+    actors: dict[str, list[str]]
+    """Robots, people and crates as the user gave them."""
+
+    def do(self, staged: SceneComposer) -> None:
+        """Render and write the missing pictures. Raises OSError if they cannot be written."""
+        from vinesim.kernels.compilation import SENSOR_PACKAGES, compile_kernels
+        from vinesim.scene.generation.vineyard import generate
+        from vinesim.scene.wind import wind_of
+        from vinesim.sensors.export import tour_folder
+        from vinesim.sensors.primitives.ray_caster import RayCaster
+        from vinesim.sensors.primitives.scene_primitives import Primitives
+
+        if self.is_tour:
+            tour_folder.check(self.out, self.settings())
+        compile_kernels(SENSOR_PACKAGES, self.device)
+        model = generate(self.plan)
+        view = staged.compose(model, self.plan.physics)
+        if (wind := wind_of(self.plan)) is not None:
+            from vinesim.wind.sway import windblown  # loading the kernels of plants takes half a second
+
+            view = windblown(model, view, wind, self.time)
+        primitives = Primitives(model, device=self.device)
+        primitives.update(view)
+        for viewpoint in self.viewpoints:
+            _check_not_enclosed(primitives, viewpoint)
+        if self.is_tour:
+            tour_folder.begin(self.out, self.settings())
+        else:
+            self.out.mkdir(parents=True, exist_ok=True)
+        stage = _Stage(
+            self.plan,
+            model,
+            staged,
+            view,
+            primitives,
+            RayCaster(primitives),
+            self.spec,
+            self.info,
+            self.time,
+            self.sensors,
+        )
+        done = self.done()
+        if done:
+            print(f"{self.out}: {len(done)} of {len(self.viewpoints)} pictures are there")
+        with concurrent.futures.ThreadPoolExecutor(1, "png") as writer:
+            written: concurrent.futures.Future[None] | None = None
+            for number, viewpoint in enumerate(self.viewpoints):
+                if number in done:
+                    continue
+                picture, sight = stage.render(viewpoint)
+                if written is not None:
+                    written.result()
+                folder = self.folder(number)
+                written = writer.submit(picture.write, folder)  # written while the next picture is rendered
+                print(f"{folder}: {sight}", flush=True)
+            if written is not None:
+                written.result()
+
+    def folder(self, number: int) -> pathlib.Path:
+        """Returns the folder of a picture."""
+        return self.out / f"{number:04d}" if self.is_tour else self.out
+
+    def done(self) -> set[int]:
+        """Returns the numbers of the pictures of this tour that are written. A single picture is always rendered."""
+        last = f"{self.sensors[-1].name if self.sensors else 'truth'}.json"  # the last file that _Picture writes
+        numbers = range(len(self.viewpoints) if self.is_tour else 0)
+        return {number for number in numbers if (self.folder(number) / last).exists()}
+
+    def stopped(self) -> str:
+        """Returns the text for the user after an interruption, and removes the folder if it is empty."""
+        if self.is_tour:
+            return (
+                f"stopped with {len(self.done())} of {len(self.viewpoints)} pictures in {self.out}; run the same "
+                "command to continue"
+            )
+        with contextlib.suppress(OSError):  # it has files, or is not there
+            self.out.rmdir()
+        return f"stopped; no new picture is in {self.out}"
+
+    def settings(self) -> dict[str, Any]:
+        """Returns all settings that determine the pictures, for JSON."""
+        from vinesim.core.version import __version__
+
+        return {
+            "vinesim": __version__,
+            "seed": self.plan.seed,
+            "camera": self.camera,
+            "size": [self.info.width, self.info.height],
+            "time": self.time,
+            "device": self.device.partition(":")[0],  # all GPUs render equal pictures
+            **self.actors,
+            "sensors": [msgspec.to_builtins(mount) for mount in self.sensors],
+            "path": [[*one.eye.tolist(), *one.target.tolist()] for one in self.viewpoints],
+            "scene": msgspec.to_builtins(self.plan),
+        }
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -136,6 +232,7 @@ class _Picture:
         from vinesim.sensors.export import images as picture
         from vinesim.sensors.export.files import write_files
 
+        folder.mkdir(parents=True, exist_ok=True)
         files = {folder / f"{name}.png": [picture.encode_png(image)] for name, image in self.images.items()}
         files |= {folder / f"{name}.json": [formats.json_text(one).encode()] for name, one in self.records.items()}
         write_files(files)
@@ -162,6 +259,7 @@ class _Stage:
         """Returns the picture from a viewpoint, and a text with the numbers of visible bunches, berries and cut
         points."""
         from vinesim.scene.camera_geometry import depth_millimetres
+        from vinesim.scene.wind import wind_of
         from vinesim.sensors import ground_truth
         from vinesim.sensors.camera.camera import Camera
         from vinesim.sensors.export import annotations as formats
@@ -194,6 +292,8 @@ class _Stage:
             "scene": self.plan.name,
             "seed": self.plan.seed,
             "digest": self.model.digest(),
+            "time": self.time,
+            "wind": None if wind_of(self.plan) is None else msgspec.to_builtins(self.plan.wind),
             "actors": actors,
         }
         records = {
@@ -244,17 +344,34 @@ def _read_path(path: pathlib.Path) -> list[Viewpoint]:
         text = path.read_text()
     except (OSError, UnicodeDecodeError) as bad:
         raise UsageError(f"--path {path} cannot be read: {getattr(bad, 'strerror', None) or bad}") from None
+    form = (
+        f"give a CSV file with the columns {', '.join(_COLUMNS)} in metres, or a JSON list of objects with these keys"
+    )
     try:
         rows = msgspec.json.decode(text) if path.suffix == ".json" else list(csv.DictReader(text.splitlines()))
-        points = [np.array([float(row[name]) for name in _COLUMNS]) for row in rows]
-    except (msgspec.DecodeError, csv.Error, KeyError, TypeError, ValueError) as bad:
-        raise UsageError(
-            f"--path {path}: {type(bad).__name__} {bad}; give a CSV file with the columns {', '.join(_COLUMNS)} in "
-            "metres, or a JSON list of objects with these keys"
-        ) from None
+    except (msgspec.DecodeError, csv.Error) as bad:
+        raise UsageError(f"--path {path}: {bad}; {form}") from None
+    if not isinstance(rows, list):
+        raise UsageError(f"--path {path} is no list; {form}")
+    points = []
+    for number, row in enumerate(rows):
+        values = [row.get(name) if isinstance(row, dict) else None for name in _COLUMNS]
+        for name, value in zip(_COLUMNS, values, strict=True):
+            if not _is_number(value):
+                what = f"has no {name}" if value is None else f"has the {name} {value!r}"
+                raise UsageError(f"--path {path}, viewpoint {number} {what}; {form}")
+        points.append(np.array(values, float))
     if not points:
         raise UsageError(f"--path {path} has no viewpoint")
     return [Viewpoint(p[:3], p[3:], f"--path {path}, viewpoint {i}") for i, p in enumerate(points)]
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:

@@ -75,6 +75,8 @@ def _explain(message: str, data: Any, kind: Any) -> str:
         known = _fields(kind, steps)
         near = difflib.get_close_matches(quoted[0], known, 1, 0.5)
         hint = f"did you mean {near[0]!r}?" if near else "remove it"
+        if steps and quoted[0] in _fields(kind, []):
+            hint = "it belongs to no table: write it above the first [...] of the file"
         return f"{named}{quoted[0]} is not a field; {hint} (known: {', '.join(known)})"
     if "missing required field" in what:
         return f"{named}{quoted[0]} is missing; add it: {quoted[0]} = ..."
@@ -92,7 +94,7 @@ def _explain(message: str, data: Any, kind: Any) -> str:
 
 def _step_in(kind: Any, steps: list[Any]) -> Any:
     """Returns the msgspec type at the path ``steps`` inside ``kind``."""
-    at: Any = msgspec.inspect.type_info(kind)
+    at: Any = _present(msgspec.inspect.type_info(kind))
     for step in steps:
         if isinstance(at, msgspec.inspect.StructType):
             at = next(f.type for f in at.fields if f.encode_name == step)
@@ -102,7 +104,15 @@ def _step_in(kind: Any, steps: list[Any]) -> Any:
             at = at.item_types[step]
         else:
             at = at.item_type
+        at = _present(at)
     return at
+
+
+def _present(kind: Any) -> Any:
+    """Returns what an optional msgspec type has if it is there, and any other type itself."""
+    if not isinstance(kind, msgspec.inspect.UnionType):
+        return kind
+    return next(one for one in kind.types if not isinstance(one, msgspec.inspect.NoneType))
 
 
 def _fields(kind: Any, steps: list[Any]) -> list[str]:

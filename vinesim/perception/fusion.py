@@ -13,7 +13,7 @@ from vinesim.core import frames
 from vinesim.core.errors import UsageError
 from vinesim.perception.clouds import as_matrix, depth_of
 from vinesim.perception.open3d_library import load_open3d
-from vinesim.perception.tour import TourPicture
+from vinesim.perception.tour import TourPicture, check_one_vineyard
 from vinesim.scene.camera_geometry import intrinsic_matrix, project_points
 from vinesim.scene.values import CameraFrame
 from vinesim.sensors.export.files import write_files
@@ -94,12 +94,17 @@ def fuse(
             2, or 1 for a single picture.
         advance: called with the number of pictures that are done, after each.
 
-    Raises :class:`UsageError` if nothing can be fused, or if the voxels would need more than :data:`MAX_MEMORY`.
+    Raises :class:`UsageError` if nothing can be fused, or if the voxels would need more than :data:`MAX_MEMORY`, and
+    :class:`.TourError` if pictures of a tour show different vineyards.
     """
+    check_one_vineyard([one for one in pictures if isinstance(one, TourPicture)])
     if not MIN_VOXEL <= voxel <= 1.0:
         raise UsageError(f"voxel is {voxel:g} m; give {MIN_VOXEL:g} to 1")
     if least_views is not None and not 1 <= least_views <= len(pictures):
-        raise UsageError(f"least_views is {least_views}; give 1 to {len(pictures)}, the number of pictures")
+        most = (
+            f"1 to {len(pictures)}, the number of pictures" if len(pictures) > 1 else "1, because there is one picture"
+        )
+        raise UsageError(f"least_views is {least_views}; give {most}")
     if not farthest > 0.0:
         raise UsageError(f"farthest is {farthest:g} m; give more than 0")
     o3d = load_open3d()
@@ -126,19 +131,19 @@ def fuse(
             if size > MAX_MEMORY:
                 raise UsageError(
                     f"voxels of {voxel:g} m need more than {MAX_MEMORY / 1e9:g} GB at picture {number + 1} of "
-                    f"{len(pictures)}; give a larger voxel or a smaller farthest depth ({farthest:g} m)"
+                    f"{len(pictures)}; give a larger voxel, or a farthest below {farthest:g} m"
                 )
             grid.integrate(blocks, image, colour, inner, inner, outer, **limits)
         if advance is not None:
             advance(number + 1)
     if grid.hashmap().size() == 0:
         kind = "exact" if exact else "measured"
-        raise UsageError(f"no picture has {kind} depth nearer than {farthest:g} m; give a larger farthest depth")
+        raise UsageError(f"no picture has {kind} depth nearer than {farthest:g} m; give a larger farthest")
     least = min(2, len(pictures)) if least_views is None else least_views
     mesh = grid.extract_triangle_mesh(weight_threshold=least - 0.5)
     if "positions" not in mesh.vertex or not len(mesh.vertex.positions):
         raise UsageError(
-            f"the pictures contain no surface that {least} of them see; give --views 1, or pictures that overlap"
+            f"the pictures contain no surface that {least} of them see; give least_views 1, or pictures that overlap"
         )
     vertices = mesh.vertex.positions.numpy()
     colours = np.clip(np.round(mesh.vertex.colors.numpy() * 255.0), 0, 255).astype(np.uint8)

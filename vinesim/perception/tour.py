@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import pathlib
+from collections.abc import Sequence
 from typing import Any
 
 import cv2
@@ -18,6 +19,16 @@ class TourError(ValueError):
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
+class Vineyard:
+    """What determines the shape of a vineyard in a picture."""
+
+    digest: str
+    seed: int
+    motion: str
+    """Wind and simulated time as JSON; empty in calm air."""
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
 class TourPicture:
     """Files of one picture of a tour."""
 
@@ -25,6 +36,20 @@ class TourPicture:
     """JSON file with intrinsics and pose: ``camera.json``, or the record of a data set's image."""
     files: dict[str, pathlib.Path]
     """PNG files: ``rgb``, ``depth`` (exact, mm), ``measured`` (mm) and ``labels``."""
+
+    def vineyard(self) -> Vineyard | None:
+        """Returns the vineyard that the picture shows; None if no file says so. Raises :class:`TourError`."""
+        file = self.record.with_name("truth.json") if self.record.name == "camera.json" else self.record
+        if not file.exists():
+            return None
+        try:
+            record = json.loads(file.read_text("utf-8"))
+            scene = record if "digest" in record else record["scene"]
+            wind = record.get("wind")
+            motion = "" if wind is None else json.dumps([wind, record.get("time")])
+            return Vineyard(scene["digest"], scene["seed"], motion)
+        except (OSError, ValueError, KeyError, TypeError, AttributeError) as bad:
+            raise TourError(f"{file}: no scene with digest and seed: {bad!r}") from None
 
     def read(self) -> CameraFrame:
         """Returns the picture. Raises :class:`TourError` if a file is missing or invalid."""
@@ -84,6 +109,24 @@ def open_tour(folder: str | pathlib.Path) -> list[TourPicture]:
         what = "is not there" if not folder.exists() else "has neither */camera.json nor records/"
         raise TourError(f"{folder} {what}; write a tour by: vinesim render SCENE --path FILE --out {folder}")
     return found
+
+
+def check_one_vineyard(pictures: Sequence[TourPicture]) -> None:
+    """Raise :class:`TourError` if two pictures show different vineyards, or one vineyard in different wind."""
+    first: tuple[TourPicture, Vineyard] | None = None
+    for picture in pictures:
+        shown = picture.vineyard()
+        if shown is None:
+            continue
+        first = first or (picture, shown)
+        if shown != first[1]:
+            what = f"vineyards (seeds {first[1].seed} and {shown.seed})"
+            if shown.digest == first[1].digest:
+                what = "moments of the wind"
+            raise TourError(
+                f"{first[0].record} and {picture.record} show different {what}; write a tour of one vineyard by: "
+                "vinesim render SCENE --path FILE --out FOLDER"
+            )
 
 
 def _metres(millimetres: np.ndarray) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import pathlib
 import sys
@@ -13,6 +14,7 @@ from vinesim.core import frames
 from vinesim.core.errors import UsageError
 from vinesim.perception.clouds import as_matrix, picture_cloud
 from vinesim.perception.open3d_library import load_open3d
+from vinesim.perception.tour import open_tour
 from vinesim.scene.camera_geometry import intrinsic_matrix
 from vinesim.scene.values import CameraFrame, CameraInfo
 from vinesim.sensors.export.images import look_at
@@ -22,6 +24,8 @@ SUFFIXES = (".ply", ".pcd", ".xyz", ".pts", ".stl", ".obj")
 """Suffixes of files that Open3D reads."""
 FIELD_OF_VIEW = np.radians(60.0)
 """Horizontal field of view of pictures without a window [rad]."""
+FILLED = 0.95
+"""Share of the width or height of a picture without a window that the shape fills, unless the user chooses a view."""
 BACKGROUND = (245, 245, 245)
 """Colour of pictures without a window where nothing is seen, sRGB."""
 
@@ -56,19 +60,22 @@ class Shape:
         return f"{kind}, {extent} m"
 
 
-def read_shape(path: pathlib.Path, number: int = 0) -> Shape:
+def read_shape(path: pathlib.Path, number: int = 0, image: str | None = None, depth: str | None = None) -> Shape:
     """Returns the cloud or mesh of a file.
 
     Args:
-        path: a file that Open3D reads, or RGB-D pictures of an MCAP file or a rosbag2 folder.
-        number: index of the picture in a recording of pictures, whose cloud is returned.
+        path: a file that Open3D reads, or RGB-D pictures: an MCAP file, or a folder of rosbag2, ``vinesim render`` or
+            ``vinesim dataset``.
+        number: index of the picture whose cloud is returned, with depth as it was measured.
+        image: topic of the colours in a recording that has several.
+        depth: topic of the depth in a recording that has several.
 
     Raises :class:`UsageError` if the file contains no points.
     """
     if not path.exists():
         raise UsageError(f"{path} is not there; give a file {', '.join(SUFFIXES)} or .mcap")
     if path.is_dir() or path.suffix.lower() == ".mcap":
-        return _picture_shape(path, number)
+        return _picture_shape(path, number, image, depth)
     if path.suffix.lower() not in SUFFIXES:
         raise UsageError(f"{path} has the suffix {path.suffix!r}; give a file {', '.join(SUFFIXES)} or .mcap")
     o3d = load_open3d()
@@ -96,17 +103,33 @@ def draw(
         shape: the shape to draw.
         width: columns of the picture [px].
         height: rows of the picture [px].
-        eye: position [3] m of the camera; by default in front of the shape (-y) and a little above.
+        eye: position [3] m of the camera; by default in front of the shape (-y), a little above, and so far away that
+            the shape fills the picture.
         target: point [3] m that the camera looks at; by default the middle of the shape.
     """
-    low, high = np.quantile(shape.points, (0.01, 0.99), axis=0)
-    middle = 0.5 * (low + high) if target is None else target
     focal = 0.5 * width / np.tan(0.5 * FIELD_OF_VIEW)
-    away = 0.45 * float(np.linalg.norm(high - low)) * 2.0 * focal / min(width, height)
-    start = middle + max(away, 0.01) * np.array([0.25, -0.9, 0.35]) if eye is None else eye
     info = CameraInfo(width, height, focal, focal, 0.5 * (width - 1), 0.5 * (height - 1), "optical")
-    pose = look_at(start, middle)
+    start, middle = _fitting_view(shape.points, info)
+    if target is not None:
+        start, middle = start + target - middle, target
+    pose = look_at(start if eye is None else eye, middle)
     return _draw_mesh(shape, info, pose) if shape.triangles.size else _draw_points(shape, info, pose)
+
+
+def _fitting_view(points: np.ndarray, info: CameraInfo) -> tuple[np.ndarray, np.ndarray]:
+    """Returns position and target [3] m of a camera in front of points [n, 3] m, in whose picture 99 % of them just
+    fit."""
+    turn = look_at(np.zeros(3), np.array([-0.25, 0.9, -0.35]))[3:]
+    seen = frames.rotate(frames.conjugate(turn), points.astype(float))  # columns: right, down, away
+    middle = np.quantile(seen, (0.005, 0.995), axis=0).mean(axis=0)
+    slopes = 0.5 * FILLED * np.array([info.width / info.fx, info.height / info.fy])
+    away = 0.0
+    for _ in range(8):  # near parts look larger, so the middle of the picture is found step by step
+        aside = seen - middle
+        away = max(np.quantile((np.abs(aside[:, :2]) / slopes).max(axis=1) - aside[:, 2], 0.99), 0.01)
+        projected = aside[:, :2] / np.maximum(aside[:, 2] + away, 0.01 * away)[:, None]
+        middle[:2] += away * np.quantile(projected, (0.005, 0.995), axis=0).mean(axis=0)
+    return frames.rotate(turn, middle - [0.0, 0.0, away]), frames.rotate(turn, middle)
 
 
 def show(shape: Shape, title: str) -> None:
@@ -139,11 +162,15 @@ def has_display() -> bool:
     return sys.platform != "linux" or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def _picture_shape(path: pathlib.Path, number: int) -> Shape:
-    """Returns the cloud of one RGB-D picture of a recording."""
-    for index, frame in enumerate(read_pictures(path, rate=1.0)):
-        if index == number:
-            return _cloud_shape(frame, path)
+def _picture_shape(path: pathlib.Path, number: int, image: str | None, depth: str | None) -> Shape:
+    """Returns the cloud of one RGB-D picture of a recording, tour or data set."""
+    is_tour = (path / "camera.json").exists() or any(path.glob("*/camera.json"))
+    if is_tour:
+        pictures = (one.read() for one in open_tour(path))
+    else:
+        pictures = read_pictures(path, image=image, depth=depth, rate=1.0)
+    for frame in itertools.islice(pictures, number, None):
+        return _cloud_shape(frame, path)
     raise UsageError(f"{path} has no picture number {number}; give a smaller --picture")
 
 

@@ -10,7 +10,7 @@ import enum
 
 
 class Organ(enum.IntEnum):
-    """Class of an object: its class in label images, its COCO category and its row in the table of materials."""
+    """Class of an object: its class in label images and its row in the table of materials."""
 
     NOTHING = 0
     GROUND = 1

@@ -173,6 +173,10 @@ def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[st
         if given not in images:
             raise RecordedPicturesError(f"{name}: no topic {given} of images; there are: {', '.join(images) or 'none'}")
         return given
+    if not images:
+        raise RecordedPicturesError(
+            f"{name}: has no topic of {IMAGE}; give raw colour and depth, as vinesim ros record writes them"
+        )
     found = [topic for topic in images if any(word in topic for word in words)]
     if words != ("depth",):
         found = [topic for topic in found if "depth" not in topic]
@@ -182,7 +186,7 @@ def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[st
         count = "several topics" if found else "no topic"
         raise RecordedPicturesError(
             f"{name}: {count} of images with {' or '.join(words)} in the name; name one with {option}, of: "
-            f"{', '.join(found or images) or 'none (record raw images, not compressed ones)'}"
+            f"{', '.join(found or images)}"
         )
     return found[0]
 

@@ -100,8 +100,10 @@ def render(
 ) -> None:
     """Render pictures with their ground truth: ids, masks, boxes, berries, cut points.
 
-    Writes rgb.png, depth.png (16 bits, mm), labels.png (id = R + 256 G + 65536 B), overlay.png, camera.json and
-    truth.json; with --path into folders 0000, 0001, ... Bunches in a crate were picked from the nearest vines.
+    Writes rgb.png, depth.png (exact depth, 16 bits, mm), measured.png (depth as the camera measures it), labels.png
+    (id = R + 256 G + 65536 B), overlay.png, camera.json and truth.json; with --path into folders 0000, 0001, ...
+    After an interruption the same command with --path continues. Bunches in a crate were picked from the nearest
+    vines.
 
     \b
     Examples:
@@ -165,8 +167,8 @@ def dataset(
 
     Seed of the vines, leaves, varieties, ripeness, hour and season of the sun, actors and the viewpoint are random.
     After an interruption the same command continues, and renders deleted or truncated images again. A later run may
-    ask for more images; fewer are refused. The five images of a vineyard are in one split: train, val or test
-    (8 : 1 : 1).
+    ask for more images; fewer are refused. The five images of a vineyard are in one split. Of every ten
+    vineyards the second is for validation and the third for tests; the others are for training.
 
     \b
     Examples:

@@ -7,8 +7,6 @@ from typing import Annotated
 
 import typer
 
-from vinesim.cli.commands.options import ImageSize
-
 
 def fuse(
     tour: Annotated[
@@ -38,15 +36,32 @@ def fuse(
 
 
 def view(
-    file: Annotated[
-        pathlib.Path,
-        typer.Argument(help="PLY, PCD, XYZ, PTS, STL or OBJ file; MCAP file or rosbag2 folder with RGB-D pictures."),
+    files: Annotated[
+        list[pathlib.Path],
+        typer.Argument(
+            metavar="FILE",
+            help="PLY, PCD, XYZ, PTS, STL or OBJ file. Or RGB-D pictures: MCAP file, rosbag2 folder, or folder of "
+            "vinesim render or vinesim dataset.",
+        ),
     ],
     out: Annotated[pathlib.Path | None, typer.Option(help="Write this PNG file instead of opening a window.")] = None,
-    picture: Annotated[int, typer.Option(min=0, help="Index of the picture in a recording.")] = 0,
-    at: Annotated[str | None, typer.Option(help="With --out: position of the camera, X,Y,Z [m].")] = None,
-    look: Annotated[str | None, typer.Option(help="With --out: the point it looks at, X,Y,Z [m].")] = None,
-    size: ImageSize = None,
+    picture: Annotated[int, typer.Option(min=0, help="Index of the picture in a recording, tour or data set.")] = 0,
+    image: Annotated[
+        str | None, typer.Option(help="Topic of the colours in a recording; by default the only one of its kind.")
+    ] = None,
+    depth: Annotated[
+        str | None, typer.Option(help="Topic of the depth in a recording; by default the only one of its kind.")
+    ] = None,
+    at: Annotated[
+        str | None,
+        typer.Option(help="With --out: position of the camera, X,Y,Z [m]; by default the shape fills the picture."),
+    ] = None,
+    look: Annotated[
+        str | None, typer.Option(help="With --out: the point it looks at, X,Y,Z [m]; by default the shape's middle.")
+    ] = None,
+    size: Annotated[
+        str | None, typer.Option(help="With --out: width and height of the picture, WxH [px]; by default 960x720.")
+    ] = None,
 ) -> None:
     """Show a point cloud or a surface in Open3D's viewer, or draw it without a display. Needs vinesim[perception].
 
@@ -54,8 +69,9 @@ def view(
     Examples:
       vinesim view vine.ply
       vinesim view vine.ply --out vine.png
+      vinesim view tour --picture 3
       vinesim view pictures.mcap --picture 10 --out cloud.png
     """
     from vinesim.cli.perception import view as run
 
-    raise typer.Exit(run(file, out=out, picture=picture, at=at, look=look, size=size))
+    raise typer.Exit(run(files, out=out, picture=picture, at=at, look=look, size=size, image=image, depth=depth))

@@ -17,6 +17,7 @@ from vinesim.net.pace import describe
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.ros import middleware
+from vinesim.ros.messages import message_packages
 from vinesim.scene.model import Model
 from vinesim.scene.spec import Scene
 from vinesim.scene.values import ComponentStatus, SensorPacing
@@ -67,6 +68,9 @@ class RobotProcesses:
         if ros and (reason := middleware.unavailable_reason()) is not None:
             log.warning("running without ROS 2: %s", reason)
             ros = False
+        if ros:
+            # Built here, once for both processes, with a message to the user and without a limit on the time.
+            message_packages.build(message_packages.unbuilt_packages())
         with contextlib.ExitStack() as stack:
             self.sensors = stack.enter_context(
                 SensorProcess(

@@ -41,7 +41,8 @@ from vinesim.scene.values.signals import Color
 log = logging.getLogger(__name__)
 
 START_TIMEOUT = 120.0
-"""Longest time in which the process starts [s]. A first run builds message packages."""
+"""Longest time in which the process starts [s]. Message packages are built before
+(:class:`.RobotProcesses`)."""
 FREE_BACKLOG = 0.2
 """Share of the queue of step records that may be occupied before the world slows down."""
 RATE_PERIOD = 0.5

@@ -27,6 +27,8 @@ import tempfile
 import zipfile
 from collections.abc import Iterable
 
+from vinesim.core.progress import PERIOD, ProgressLine
+
 KINDS = ("msg", "srv", "action")
 """Kinds of definitions: their folders and file name extensions."""
 TYPESUPPORTS = ("rosidl_typesupport_fastrtps_c", "rosidl_typesupport_introspection_c")
@@ -285,6 +287,8 @@ TOOLCHAIN = (
 class InterfacesError(RuntimeError):
     """A message package can neither be imported nor built. The message gives the remedy."""
 
+    exit_code = 3
+
 
 def ensure_importable(packages: Iterable[str]) -> None:
     """Make message packages importable: the official package if it is installed, else vinesim's own build, which is
@@ -330,12 +334,27 @@ def is_built(package: str) -> bool:
     return _place(package).is_dir()
 
 
+def unbuilt_packages() -> list[str]:
+    """Returns the names of the packages that can neither be imported nor are in the cache: those that a build makes."""
+    return [
+        package
+        for package in available_packages()
+        if place_of_official(package) is None and not is_installed(package) and not is_built(package)
+    ]
+
+
 def build(packages: Iterable[str]) -> dict[str, pathlib.Path]:
-    """Build the packages that are not in the cache, in parallel. Returns the folder to put on ``sys.path``, by
-    package."""
-    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool:
-        wanted = list(packages)
-        return dict(zip(wanted, pool.map(_build, wanted), strict=True))
+    """Build the packages that are not in the cache, in parallel, and show the progress
+    (:mod:`vinesim.core.progress`). Returns the folder to put on ``sys.path``, by package."""
+    wanted = list(packages)
+    count = sum(package not in available_packages() or not is_built(package) for package in wanted)
+    with concurrent.futures.ThreadPoolExecutor(os.cpu_count()) as pool, ProgressLine() as line:
+        builds = {package: pool.submit(_build, package) for package in wanted}
+        waiting = set(builds.values())
+        while waiting:
+            _, waiting = concurrent.futures.wait(waiting, PERIOD, concurrent.futures.FIRST_COMPLETED)
+            line.show(f"building ROS message packages, only once: {max(count - len(waiting), 0)} of {count} done")
+        return {package: future.result() for package, future in builds.items()}
 
 
 def _build(package: str) -> pathlib.Path:

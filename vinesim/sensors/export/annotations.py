@@ -4,7 +4,7 @@ look at."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import cv2
@@ -12,17 +12,23 @@ import numpy as np
 
 from vinesim.scene.berries import VARIETIES
 from vinesim.scene.camera_geometry import distortion_model, intrinsic_matrix
-from vinesim.scene.ids import ObjectKind, Organ, object_id, object_name
+from vinesim.scene.ids import ObjectKind, object_id, object_name
 from vinesim.scene.values import MIN_BERRY_PIXELS, Box, BunchTruth, CameraInfo
 from vinesim.sensors.ground_truth import PixelBuffers
 
 _EXTRA_FIELDS = ("occlusion", "bunch", "tree", "variety", "ripeness", "attached", "berries", "berries_seen")
 """Fields of an annotated bunch in COCO files, in addition to the fields that COCO defines."""
+_FONT = (cv2.FONT_HERSHEY_SIMPLEX, 0.42)
+"""Font and scale of the text of an overlay."""
+_LINE = 15
+"""Height of a line of this text [px]."""
 MIN_ANNOTATED_PIXELS = 16
 """Least number of visible pixels of an annotated bunch (COCO, YOLO); JSON records contain also smaller bunches."""
 
-CATEGORIES = [{"id": int(Organ.BUNCH), "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
-"""List of categories for COCO files; the ids are numbers of :class:`Organ`."""
+CATEGORY = 1
+"""Id of the only category, bunches, in COCO files, whose ids begin with 1 by convention."""
+CATEGORIES = [{"id": CATEGORY, "name": "bunch", "supercategory": "vine", "keypoints": ["cut"], "skeleton": []}]
+"""List of categories for COCO files."""
 
 
 def encode_mask(mask: np.ndarray) -> dict[str, Any]:
@@ -158,7 +164,7 @@ def _annotation(number: int, image: dict[str, Any], bunch: dict[str, Any]) -> di
     return {
         "id": number,
         "image_id": image["image"],
-        "category_id": int(Organ.BUNCH),
+        "category_id": CATEGORY,
         "iscrowd": 0,
         "bbox": bunch["box"],
         "area": bunch["pixels"],
@@ -185,31 +191,64 @@ def encode_berry_numbers(seen: PixelBuffers) -> np.ndarray:
 def draw_overlay(rgb: np.ndarray, truths: Iterable[BunchTruth]) -> np.ndarray:
     """Returns the picture ``rgb`` with the ground truth drawn on it.
 
-    Visible boxes are green, amodal boxes that differ are white, cut points are yellow discs (rings where hidden). Text
-    at each bunch: index, visible and total number of berries, and share of the bunch's outline that other things cover
-    (the bunch's own front berries, which hide the berries behind them, do not count).
+    A small picture is enlarged by a whole factor, to about 1280 px. Visible boxes are green, amodal boxes that differ
+    are white, cut points are yellow discs (rings where hidden). Text at the large bunches: index, visible and total
+    number of berries, and share of the bunch's outline that other things cover (the bunch's own front berries, which
+    hide the berries behind them, do not count). Where texts would overlap, only that of the largest bunch is drawn.
     """
     scale = max(1, round(1280 / rgb.shape[1]))
     image = cv2.resize(rgb, None, fx=scale, fy=scale, interpolation=cv2.INTER_NEAREST)
-    truths = [one for one in truths if one.visible_box is not None]
+    shown = [(one, one.visible_box) for one in truths if one.visible_box is not None]
+    shown.sort(key=lambda pair: pair[0].pixels)
 
     def corner(column: float, row: float) -> tuple[int, int]:
         return round((column + 0.5) * scale), round((row + 0.5) * scale)
 
-    for one in sorted(truths, key=lambda t: t.pixels):  # large bunches come last, on top
-        if one.amodal_box != one.visible_box:
+    for one, box in shown:  # large bunches come last, on top
+        if one.amodal_box != box:
             cv2.rectangle(image, corner(*one.amodal_box[:2]), corner(*one.amodal_box[2:]), (255, 255, 255), 1)
-        assert one.visible_box is not None
-        left, top = corner(*one.visible_box[:2])
-        cv2.rectangle(image, (left, top), corner(*one.visible_box[2:]), (60, 255, 60), 1)
+        cv2.rectangle(image, corner(*box[:2]), corner(*box[2:]), (60, 255, 60), 1)
         if one.cut_pixel is not None and np.abs(one.cut_pixel).max() < 20000:
             cv2.circle(image, corner(*one.cut_pixel), 5, (255, 230, 0), -1 if one.cut_seen else 1)
+    texts = []
+    corners = []
+    for one, box in reversed(shown):
         if one.amodal_pixels * scale * scale > 1500:  # the text would cover a smaller bunch
-            seen = f"{one.bunch}: {one.berries_seen} of {one.berries} berries seen"
-            words = f"{seen}, {100.0 * one.occlusion:.0f}% covered by others"
-            for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-                cv2.putText(image, words, (left, max(top - 4, 12)), cv2.FONT_HERSHEY_SIMPLEX, 0.42, colour, thick)
+            texts.append(
+                (f"{one.bunch}: {one.berries_seen}/{one.berries} berries", f"{100.0 * one.occlusion:.0f}% covered")
+            )
+            corners.append(corner(*box[:2]))
+    sizes = [(max(cv2.getTextSize(line, *_FONT, 1)[0][0] for line in lines), len(lines) * _LINE) for lines in texts]
+    for lines, place in zip(texts, label_places(corners, sizes, (image.shape[1], image.shape[0])), strict=True):
+        if place is not None:
+            for number, line in enumerate(lines, 1):
+                for colour, thick in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+                    cv2.putText(image, line, (place[0], place[1] + number * _LINE - 4), *_FONT, colour, thick)
     return image
+
+
+def label_places(
+    corners: Sequence[tuple[int, int]], sizes: Sequence[tuple[int, int]], picture: tuple[int, int]
+) -> list[tuple[int, int] | None]:
+    """Returns the upper left corner (column, row) [px] of each label: above the corner that it belongs to, moved into
+    the picture. None where an earlier label is in the way.
+
+    Args:
+        corners: column and row of what each label belongs to, the most important first [px].
+        sizes: width and height of each label [px].
+        picture: width and height of the picture [px].
+    """
+    places: list[tuple[int, int] | None] = []
+    taken: list[tuple[int, int, int, int]] = []
+    for (column, row), (width, height) in zip(corners, sizes, strict=True):
+        left = max(min(column, picture[0] - width), 0)
+        top = max(min(row - height, picture[1] - height), 0)
+        right, bottom = left + width, top + height
+        is_free = all(left >= x1 or right <= x0 or top >= y1 or bottom <= y0 for x0, y0, x1, y1 in taken)
+        places.append((left, top) if is_free else None)
+        if is_free:
+            taken.append((left, top, right, bottom))
+    return places
 
 
 def json_text(value: dict[str, Any]) -> str:
