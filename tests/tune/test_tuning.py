@@ -150,6 +150,10 @@ def test_tracks_that_tell_nothing_are_refused(track: Trajectory) -> None:
         tune(cane(), dataclasses.replace(track, position=rng.normal(0.0, 2e-3, track.position.shape)))
     with pytest.raises(TrajectoryError, match="less than one period"):
         tune(cane(), track.between(0.0, 0.45), release=0.25)
+    with pytest.raises(TrajectoryError, match=r"ends at 2\.167 s, and the release at 9 s is not before"):
+        tune(cane(), track, release=9.0)
+    with pytest.raises(TrajectoryError, match="less than one period"):  # the hold and two samples of the swing
+        tune(cane(), track.between(0.0, 0.25))
     with pytest.raises(UsageError, match="'colour' cannot be fitted; give one or more of: modulus"):
         tune(cane(), track, ("colour",))
     with pytest.raises(UsageError, match="marker 'middle' is not in the specimen, which has: tip"):

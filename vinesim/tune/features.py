@@ -196,7 +196,9 @@ def _find_release(track: Trajectory, features: Features) -> float:
     half = 0.5 / features.frequency
     first = min(features.release, float(time[0]))
     count = int((0.5 * (time[0] + time[-1]) - first) / half)
-    places = features.release + half * np.arange(-1, max(count, 1) + 1)
+    turn = np.arange(-1, max(count, 1) + 1)
+    places = features.release + half * turn
+    places = places[(turn <= 0) | (places <= time[-1] - 2.0 * half)]  # a whole period must follow a later release
     omega = 2.0 * np.pi * features.frequency
     ratio = features.damping_ratio
     after = np.maximum(time, places[:, None]) - features.release  # [place, sample]

@@ -76,6 +76,11 @@ def tune(
     if track.base is not None and (pushed or release is not None):
         what = "push" if pushed else "release"
         raise UsageError(f"{track.source}: its base is shaken, so there is no {what}; leave out --{what}")
+    if release is not None and not release < track.time[-3]:
+        raise TrajectoryError(
+            f"{track.source}: ends at {track.time[-1]:.4g} s, and the release at {release:g} s is not before its last "
+            "samples; give an earlier --release"
+        )
     features = extract_features(track, release)
     if release is not None:
         features = dataclasses.replace(features, release=release)
