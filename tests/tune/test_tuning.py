@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import pathlib
 
 import numpy as np
 import pytest
@@ -187,6 +188,47 @@ def test_scenes_load_what_was_fitted(track: Trajectory, tmp_path, capsys) -> Non
         scene.write_text(head + layout)
         stiffness.append(generate(load_scene(str(scene))).joint_stiffness.max())
     assert stiffness[1] / stiffness[0] == pytest.approx(modulus.value / 5.89e9, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("out", "nodir/fitted.toml", "--out nodir/fitted.toml cannot be written: there is no folder nodir"),
+        ("out", ".", "--out . is a folder; give a file"),
+        ("plot", "nodir/fit.png", "--plot nodir/fit.png cannot be written: there is no folder nodir"),
+        ("plot", "fit.xyz", "--plot is fit.xyz; give a file with the suffix .png, .pdf or .svg"),
+        ("truth", "bunch.toml", "--truth bunch.toml is a bunch, --model cane.toml a cane"),
+    ],
+)
+def test_files_that_cannot_be_used_are_refused_before_the_fit(tmp_path, monkeypatch, option, value, words) -> None:
+    """They are wrong use, exit code 2; exit code 5 means that the fit failed."""
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("cane.toml").write_text(specimen_toml(cane()))
+    pathlib.Path("bunch.toml").write_text(specimen_toml(bunch()))
+    places = {"out": None, "plot": None, "truth": None} | {option: pathlib.Path(value)}
+    arguments = pathlib.Path("missing.csv"), pathlib.Path("cane.toml"), "modulus,damping", places["out"], False
+    with pytest.raises(UsageError) as refused:
+        run(*arguments, places["plot"], None, False, 0, 0, "cpu", truth=places["truth"])
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("out", "hidden", "words"),
+    [
+        ("track.csv", "nodir/truth.toml", "--hidden nodir/truth.toml cannot be written: there is no folder nodir"),
+        ("track.csv", "track.csv", "--out and --hidden are the same file track.csv"),
+        ("track.csv", "cane.toml", "--hidden and --model are the same file cane.toml"),
+    ],
+)
+def test_an_experiment_writes_all_files_or_none(tmp_path, monkeypatch, out, hidden, words) -> None:
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("cane.toml").write_text(specimen_toml(cane()))
+    pathlib.Path("track.csv").write_text("former")
+    with pytest.raises(UsageError) as refused:
+        plan(SHORT, pathlib.Path("cane.toml"), pathlib.Path(out), "modulus", False, pathlib.Path(hidden))
+    assert words in str(refused.value)
+    assert pathlib.Path("track.csv").read_text() == "former"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cane.toml", "track.csv"]
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 import pathlib
 import re
@@ -96,6 +97,11 @@ class Trajectory:
 
     def write(self, path: str | pathlib.Path) -> None:
         """Write a CSV file for :func:`read_trajectory`, with positions in mm."""
+        with writing(path):
+            pathlib.Path(path).write_text(self.as_csv(), encoding="utf-8", newline="")
+
+    def as_csv(self) -> str:
+        """Returns the text of the file that :meth:`write` writes."""
         columns = [("time [s]", self.time)]
         for marker, axis in np.argwhere(self.tracked):
             name = "xyz"[axis] if self.markers[marker] == TIP else f"{self.markers[marker]} {'xyz'[axis]}"
@@ -104,12 +110,13 @@ class Trajectory:
             columns.append(("force [N]", self.force))
         if self.base is not None:
             columns += [(f"base {'xyz'[axis]} [mm]", 1e3 * self.base[:, axis]) for axis in _moved_axes(self.base)]
-        with writing(path), pathlib.Path(path).open("w", newline="", encoding="utf-8") as file:
-            out = csv.writer(file, lineterminator="\n")
-            out.writerow([name for name, _ in columns])
-            for row in zip(*(values.tolist() for _, values in columns), strict=True):
-                clock, *values = row  # microseconds are exact enough for times since 1970
-                out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
+        text = io.StringIO(newline="")
+        out = csv.writer(text, lineterminator="\n")
+        out.writerow([name for name, _ in columns])
+        for row in zip(*(values.tolist() for _, values in columns), strict=True):
+            clock, *values = row  # microseconds are exact enough for times since 1970
+            out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
+        return text.getvalue()
 
 
 def _moved_axes(base: np.ndarray) -> list[int]:
