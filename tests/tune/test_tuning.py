@@ -114,8 +114,19 @@ def test_outliers_and_gaps_hardly_matter(track: Trajectory) -> None:
     fit = tune(cane(8e9), dataclasses.replace(track, position=position))
     assert fit.ok
     assert fit.gaps == np.isnan(position).sum()
-    assert fit.outliers > 3
+    assert fit.left_out > 0
+    assert fit.outliers > fit.left_out + 3
+    assert np.isfinite(fit.model[np.isfinite(position[:, 0])]).all()  # also where samples are left out
     assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.02)
+
+
+@pytest.mark.parametrize("noise", [2e-3, 0.0])
+def test_noise_alone_makes_no_outliers(noise: float) -> None:
+    """The first cane of the tutorial: 5 Hz, so six pictures in each period."""
+    truth = cane(1.011e10, 0.00433)
+    fit = tune(cane(), measure(truth, Experiment(noise=noise)))
+    assert fit.ok
+    assert fit.outliers == 0
 
 
 def test_draws_of_the_posterior_agree_with_its_approximation(track: Trajectory) -> None:

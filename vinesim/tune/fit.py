@@ -152,10 +152,13 @@ class Fit:
     @property
     def outliers(self) -> int:
         """Number of samples that have less than half of the full weight, or that are left out as gross errors."""
-        data = self.track.position[:, self.track.tracked]
-        off = np.abs(self.model - data) / self.column_noise
-        gross = np.isfinite(data) & ~np.isfinite(self.model)
-        return int((off > math.sqrt(3.0) * SOFT).sum() + gross.sum())
+        off = np.abs(self.model - self.track.position[:, self.track.tracked]) / self.column_noise
+        return int(((off > math.sqrt(3.0) * SOFT) | self.features.gross).sum())
+
+    @property
+    def left_out(self) -> int:
+        """Number of samples that are left out as gross errors."""
+        return int(self.features.gross.sum())
 
     @property
     def gaps(self) -> int:
@@ -178,7 +181,8 @@ class Fit:
             f"{f.frequency:.3f} Hz, {f.damping_ratio:.4f} (log decrement {f.log_decrement:.3f})"
         )
         lines.append(
-            f"noise    {self._noise_words()}; {self.outliers} outliers have less weight, {self.gaps} positions missing"
+            f"noise    {self._noise_words()}; {self.outliers - self.left_out} outliers have less weight, "
+            f"{self.left_out} are left out; {self.gaps} positions missing"
         )
         for ridge in self.posterior.ridges:
             way = ", ".join(f"{name} {x:+.2f}" for name, x in ridge.direction.items())
@@ -228,6 +232,7 @@ class Fit:
             "noise_m": self.noise,
             "column_noise_m": dict(zip(self.track.column_names, self.column_noise.tolist(), strict=True)),
             "outliers": self.outliers,
+            "left_out": self.left_out,
             "gaps": self.gaps,
             "ridges": [dataclasses.asdict(ridge) for ridge in self.posterior.ridges],
             "minima": [dataclasses.asdict(minimum) for minimum in self.minima],

@@ -83,7 +83,7 @@ class Problem:
         self._device = device
         self.pushed = pushed
         self.candidates = Candidates(specimen, track.markers, dt=dt, device=device, least=9)
-        self.observed = columns_of(track)
+        self.observed = columns_of(track, features.gross)
         self.seen = np.isfinite(self.observed)
         self.axes = np.flatnonzero(track.tracked.any(0))
         tips = self.candidates.pull_axes()[:, self.axes]

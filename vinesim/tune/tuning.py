@@ -31,6 +31,8 @@ WIDE = 0.5
 """Width of the swing as a fraction of the plant's length [1]. A larger swing suggests a wrong unit."""
 UNEXPLAINED = 1.3
 """[1] Ratio of a fit's residuals to the residuals of a damped sinusoid from which the fit has failed."""
+EXACT = 3e-5
+"""[m] Smallest noise of a column that a fit assumes: just after the release its simulation is no more exact."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
 """[period] Growing durations after the release that are fitted if fitting the whole track at once fails."""
 MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
@@ -101,8 +103,8 @@ def tune(
     posterior = laplace(problem, theta, found, noise)
     faults = (*_faults(problem, posterior, _left(problem, found)), *_contradictions(problem, found, theta))
     sample = importance_sample(problem, posterior, noise, samples, seed) if samples else None
-    model = np.full(problem.observed.shape, np.nan)
-    model[problem.seen] = found.model
+    everywhere = problem.samples(theta[None], problem.row(theta)[None])[0][0]
+    model = np.where(np.isfinite(track.position[:, track.tracked]), everywhere, np.nan)
     swing = _fitted_features(problem, theta, model)
     return Fit(
         specimen=specimen,
@@ -188,7 +190,7 @@ def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarr
     """
     for _ in range(2):
         theta, found = problem.minimise(theta, noise)
-        left = np.array([max(robust_deviation(column), 1e-7) for column in problem.residuals(found.model).T])
+        left = np.array([max(robust_deviation(column), EXACT) for column in problem.residuals(found.model).T])
         if np.abs(np.log(left / noise)).max() < 0.3:
             break
         noise = left
