@@ -61,6 +61,8 @@ class Features:
     response of the oscillator."""
     noise: float
     """Robust standard deviation of the residuals of the curve [m]. The noise of the track is at most this."""
+    column_noise: np.ndarray
+    """[column] m, the same of each column."""
     explained: float
     """[1] Fraction of the motion after the release, relative to the base, that the curve explains."""
     curve: np.ndarray
@@ -256,6 +258,7 @@ def _shaken_features(track: Trajectory, gross: np.ndarray) -> Features:
         rest=found[0],
         displacement=np.abs(curves[:, 1]).max() * found[1],
         noise=max(robust_deviation(off), 1e-9),
+        column_noise=np.array([robust_deviation(column) for column in off.T]),
         explained=_explained(off, values),
         curve=base + curves @ found,
         gross=gross,
@@ -336,6 +339,7 @@ def _describe(
         rest=rest,
         displacement=basis[1:] @ found[1:],
         noise=max(robust_deviation(off), 1e-9),
+        column_noise=np.array([robust_deviation(column) for column in off.T]),
         explained=_explained(off, columns_of(track, gross)[track.time >= onset]),
         curve=wave @ found,
         gross=gross,
