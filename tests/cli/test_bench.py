@@ -17,6 +17,12 @@ def test_rows_are_of_the_bench_live_and_have_names() -> None:
         run(["plants"], as_json=True, rows=["demo"])
 
 
+def test_no_bench_lists_all_names() -> None:
+    with pytest.raises(NoSuchBench, match="give one or more benches; there are: plants, contact") as refused:
+        run([], as_json=True)
+    assert str(refused.value).count(",") == len(BENCHES) - 1
+
+
 def test_a_bench_without_such_a_name_is_refused_with_all_names() -> None:
     with pytest.raises(NoSuchBench, match="no bench 'soak'; there are: plants, contact") as refused:
         run(["plants", "soak"], as_json=True)

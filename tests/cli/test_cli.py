@@ -97,6 +97,14 @@ def test_an_option_of_another_kind_of_experiment_is_refused(kind, option, value,
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("command", [("experiment", "push"), ("tune", "pull.csv")])
+def test_missing_scipy_is_one_line_with_the_extra(command, tmp_path):
+    """A module that is None in sys.modules is one that cannot be imported."""
+    code = "import sys; sys.modules['scipy'] = None; from vinesim.cli import main; main()"
+    done = programs.run([sys.executable, "-c", code, *command, "--model", CANE], timeout=TIMEOUT, cwd=tmp_path)
+    assert_refused(done, 3, "scipy is not installed; run: pip install 'vinesim[tune]'")
+
+
 def test_an_invalid_urdf_is_refused(tmp_path):
     (tmp_path / "bad.urdf").write_text("<robot name='x'><link name='a'/></robot")
     assert_refused(

@@ -163,7 +163,7 @@ def test_less_damping_than_a_step_has_is_reported_once(
         Physics(model, parameters=PhysicsParameters(phi=phi))
     said = [record.getMessage() for record in caplog.records]
     assert len(said) == warnings
-    assert all(text.startswith("2 of 16 joints ask for less damping than beta = ") for text in said)
+    assert all(text.startswith("2 of 16 joints move with more damping than the model gives them: ") for text in said)
 
 
 def test_warnings_of_mujoco_go_to_the_log_and_not_to_a_file(

@@ -38,6 +38,25 @@ def test_a_release_after_a_hold_is_not_taken_for_half_a_period_earlier(noise: fl
         assert found.frequency == pytest.approx(17.0 / (2.0 * np.pi), rel=0.01)
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-4, 2e-3])
+def test_turning_points_between_few_pictures_are_no_gross_errors(noise: float) -> None:
+    """Six pictures in each period, as of a cane of 5 Hz: each turning point is far from its neighbours. Errors that the
+    swing does not explain are left out, at a turning point as well."""
+    time = np.arange(96) / 30.0
+    after = np.maximum(time - 0.2, 0.0)
+    wave = np.exp(-2.1 * after) * np.cos(2.0 * np.pi * 4.96 * after)
+    for seed in range(10):
+        position = np.full((96, 1, 3), np.nan)
+        position[:, 0, 2] = 0.1 * wave + np.random.default_rng(seed).normal(0.0, noise, 96)
+        assert not extract_features(Trajectory(time, position)).gross.any(), seed
+        wrong = [9, 12, 40, 70]
+        position[wrong, 0, 2] *= [30.0, 1e3, -1e3, 1e3]
+        found = extract_features(Trajectory(time, position))
+        assert np.flatnonzero(found.gross[:, 0]).tolist() == wrong, seed
+        assert found.frequency == pytest.approx(4.96, rel=5e-3)
+        np.testing.assert_allclose(found.curve[:, 0], 0.1 * wave, atol=1e-5 + 2.0 * noise)
+
+
 @pytest.mark.parametrize(("frequency", "ratio"), [(0.8, 0.05), (2.7, 0.01), (6.0, 0.03)])
 @pytest.mark.parametrize("hold", [True, False])
 def test_a_damped_sinusoid_is_recovered(frequency: float, ratio: float, hold: bool) -> None:

@@ -70,6 +70,7 @@ def test_a_track_survives_its_file(tmp_path) -> None:
         ("time [s],x [m],y [m]\n0,1,1\n", "1 samples", "give 8 or more"),
         ("time [s],x [m]\n" + "".join(f"{i},\n" for i in range(9)), "column tip x is empty in 100%", "remove"),
         ("\n", "is empty", "header"),
+        ("time [s],x [m]\n", "no samples follow the header", "give 8 or more"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, place, remedy) -> None:
@@ -82,5 +83,5 @@ def test_what_does_not_fit_is_refused_in_one_line(tmp_path, text, place, remedy)
 
 
 def test_a_file_that_is_missing_is_named(tmp_path) -> None:
-    with pytest.raises(TrajectoryError, match=r"none\.csv: cannot be read"):
+    with pytest.raises(TrajectoryError, match=r"none\.csv: no such file; give the CSV file"):
         read_trajectory(tmp_path / "none.csv")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
+import pathlib
 
 import numpy as np
 import pytest
@@ -113,8 +114,19 @@ def test_outliers_and_gaps_hardly_matter(track: Trajectory) -> None:
     fit = tune(cane(8e9), dataclasses.replace(track, position=position))
     assert fit.ok
     assert fit.gaps == np.isnan(position).sum()
-    assert fit.outliers > 3
+    assert fit.left_out > 0
+    assert fit.outliers > fit.left_out + 3
+    assert np.isfinite(fit.model[np.isfinite(position[:, 0])]).all()  # also where samples are left out
     assert fit.estimate("modulus").value == pytest.approx(5e9, rel=0.02)
+
+
+@pytest.mark.parametrize("noise", [2e-3, 0.0])
+def test_noise_alone_makes_no_outliers(noise: float) -> None:
+    """The first cane of the tutorial: 5 Hz, so six pictures in each period."""
+    truth = cane(1.011e10, 0.00433)
+    fit = tune(cane(), measure(truth, Experiment(noise=noise)))
+    assert fit.ok
+    assert fit.outliers == 0
 
 
 def test_draws_of_the_posterior_agree_with_its_approximation(track: Trajectory) -> None:
@@ -150,6 +162,10 @@ def test_tracks_that_tell_nothing_are_refused(track: Trajectory) -> None:
         tune(cane(), dataclasses.replace(track, position=rng.normal(0.0, 2e-3, track.position.shape)))
     with pytest.raises(TrajectoryError, match="less than one period"):
         tune(cane(), track.between(0.0, 0.45), release=0.25)
+    with pytest.raises(TrajectoryError, match=r"ends at 2\.167 s, and the release at 9 s is not before"):
+        tune(cane(), track, release=9.0)
+    with pytest.raises(TrajectoryError, match="less than one period"):  # the hold and two samples of the swing
+        tune(cane(), track.between(0.0, 0.25))
     with pytest.raises(UsageError, match="'colour' cannot be fitted; give one or more of: modulus"):
         tune(cane(), track, ("colour",))
     with pytest.raises(UsageError, match="marker 'middle' is not in the specimen, which has: tip"):
@@ -183,6 +199,47 @@ def test_scenes_load_what_was_fitted(track: Trajectory, tmp_path, capsys) -> Non
         scene.write_text(head + layout)
         stiffness.append(generate(load_scene(str(scene))).joint_stiffness.max())
     assert stiffness[1] / stiffness[0] == pytest.approx(modulus.value / 5.89e9, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "words"),
+    [
+        ("out", "nodir/fitted.toml", "--out nodir/fitted.toml cannot be written: there is no folder nodir"),
+        ("out", ".", "--out . is a folder; give a file"),
+        ("plot", "nodir/fit.png", "--plot nodir/fit.png cannot be written: there is no folder nodir"),
+        ("plot", "fit.xyz", "--plot is fit.xyz; give a file with the suffix .png, .pdf or .svg"),
+        ("truth", "bunch.toml", "--truth bunch.toml is a bunch, --model cane.toml a cane"),
+    ],
+)
+def test_files_that_cannot_be_used_are_refused_before_the_fit(tmp_path, monkeypatch, option, value, words) -> None:
+    """They are wrong use, exit code 2; exit code 5 means that the fit failed."""
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("cane.toml").write_text(specimen_toml(cane()))
+    pathlib.Path("bunch.toml").write_text(specimen_toml(bunch()))
+    places = {"out": None, "plot": None, "truth": None} | {option: pathlib.Path(value)}
+    arguments = pathlib.Path("missing.csv"), pathlib.Path("cane.toml"), "modulus,damping", places["out"], False
+    with pytest.raises(UsageError) as refused:
+        run(*arguments, places["plot"], None, False, 0, 0, "cpu", truth=places["truth"])
+    assert words in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("out", "hidden", "words"),
+    [
+        ("track.csv", "nodir/truth.toml", "--hidden nodir/truth.toml cannot be written: there is no folder nodir"),
+        ("track.csv", "track.csv", "--out and --hidden are the same file track.csv"),
+        ("track.csv", "cane.toml", "--hidden and --model are the same file cane.toml"),
+    ],
+)
+def test_an_experiment_writes_all_files_or_none(tmp_path, monkeypatch, out, hidden, words) -> None:
+    monkeypatch.chdir(tmp_path)
+    pathlib.Path("cane.toml").write_text(specimen_toml(cane()))
+    pathlib.Path("track.csv").write_text("former")
+    with pytest.raises(UsageError) as refused:
+        plan(SHORT, pathlib.Path("cane.toml"), pathlib.Path(out), "modulus", False, pathlib.Path(hidden))
+    assert words in str(refused.value)
+    assert pathlib.Path("track.csv").read_text() == "former"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["cane.toml", "track.csv"]
 
 
 @pytest.mark.parametrize(

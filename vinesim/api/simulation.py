@@ -9,6 +9,7 @@ Positions are in m, forces in N, in world axes (:mod:`vinesim.core.frames`).
 
 from __future__ import annotations
 
+import functools
 import pathlib
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
@@ -17,8 +18,9 @@ import msgspec
 import numpy as np
 
 from vinesim.api.energy import Energy, Momentum, energy, momentum
-from vinesim.core import frames
+from vinesim.core import frames, progress
 from vinesim.core.errors import UsageError, checked_index
+from vinesim.kernels.compilation import PHYSICS_PACKAGES, compile_kernels
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.builder import TreeBuilder
@@ -42,6 +44,13 @@ Source = Model | Scene | str | pathlib.Path | CaneBuilder | TreeBuilder | Iterab
 scene file; one or more builders of canes or trees."""
 
 
+@functools.cache
+def _compile_kernels() -> None:
+    """Wait until the kernels of the physics are compiled, with a message; once in a process."""
+    progress.show_by_default()
+    compile_kernels(PHYSICS_PACKAGES)
+
+
 class Simulation:
     """A world that moves when :meth:`step` is called; nothing runs in the background.
 
@@ -63,6 +72,8 @@ class Simulation:
     ) -> None:
         """Build the world; it does not move until :meth:`step`.
 
+        The first simulation on a computer waits until its kernels are compiled, and shows that on standard error.
+
         Args:
             source: see :data:`Source`. A scene provides its physics parameters and its wind.
             dt: duration of a step [s], 0.01 unless given here or in ``parameters``.
@@ -71,6 +82,7 @@ class Simulation:
             detach: whether bunches detach when they are pulled too hard.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants and for cameras and lidars.
         """
+        _compile_kernels()
         self.scene: Scene | None = None
         """The simulated scene; None for a model or canes."""
         if isinstance(source, (str, pathlib.Path)):

@@ -114,6 +114,8 @@ def run(names: list[str], as_json: bool, rows: Sequence[str] = ()) -> int:
 
     ``rows``: rows of the benchmark ``live``; all of them if empty.
     """
+    if not names:
+        raise NoSuchBench(f"give one or more benches; there are: {', '.join(BENCHES)}")
     if rows and "live" not in names:
         raise NoSuchBench("--row chooses rows of the bench live; leave it out")
     for name in names:

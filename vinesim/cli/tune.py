@@ -9,7 +9,7 @@ import pathlib
 import sys
 from typing import TYPE_CHECKING
 
-from vinesim.core.errors import UsageError
+from vinesim.core.errors import UsageError, require_place, writing
 
 if TYPE_CHECKING:
     from vinesim.tune.experiment import Experiment
@@ -51,9 +51,16 @@ def run(
     require_scipy()
     from vinesim.tune import load_specimen, read_trajectory, tune, with_cloud
 
+    if out is not None:
+        require_place("--out", out)
+    if plot is not None:
+        require_place("--plot", plot)
+        _require_picture("--plot", plot)
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     specimen = load_specimen(model)
     hidden = None if truth is None else load_specimen(truth)
+    if hidden is not None and hidden.organ != specimen.organ:
+        raise UsageError(f"--truth {truth} is a {hidden.organ}, --model {model} a {specimen.organ}; give the same plant")
     track = read_trajectory(data)
     if cloud is not None:
         specimen = with_cloud(specimen, cloud)
@@ -75,6 +82,15 @@ def run(
     if out is not None:
         found.write_plant(out)
     return 0
+
+
+def _require_picture(option: str, path: pathlib.Path) -> None:
+    """Raise :class:`UsageError` unless matplotlib writes files with the suffix of ``path``."""
+    from matplotlib.backend_bases import FigureCanvasBase
+
+    known = FigureCanvasBase.get_supported_filetypes()
+    if path.suffix and path.suffix[1:].lower() not in known:  # matplotlib adds .png where there is none
+        raise UsageError(f"{option} is {path}; give a file with the suffix .png, .pdf or .svg")
 
 
 def track(
@@ -157,28 +173,39 @@ def plan(
     ``hidden``: file for the truth, a specimen that is drawn from the seed; None: the truth is the model.
     """
     require_scipy()
-    from vinesim.core.errors import writing
+    from vinesim.sensors.export.files import write_files
     from vinesim.tune import hidden_specimen, load_specimen, measure
     from vinesim.tune.experiment import expected_deviations
     from vinesim.tune.fit import specimen_toml
 
+    experiment.check()
+    target = out or pathlib.Path(f"{experiment.kind}.csv")
+    places = {"--model": model, "--out": target} | ({} if hidden is None else {"--hidden": hidden})
+    for option, path in list(places.items())[1:]:
+        require_place(option, path)
+        if path.exists() and not path.is_file():
+            raise UsageError(f"{option} {path} is a device or a pipe, which cannot be replaced; give a file")
+        for other, used in places.items():
+            if other != option and used.resolve() == path.resolve():
+                raise UsageError(f"{option} and {other} are the same file {path}; give different ones")
     specimen = load_specimen(model)
     if hidden is not None:
         specimen = hidden_specimen(specimen, experiment.seed)
     track = measure(specimen, experiment)
-    target = out or pathlib.Path(f"{experiment.kind}.csv")
-    track.write(target)
-    if hidden is not None:
-        with writing(hidden):
-            hidden.write_text(specimen_toml(specimen), encoding="utf-8")
     parameters = [name.strip() for name in fit.split(",") if name.strip()]
     expected = expected_deviations(specimen, track, parameters, pushed=experiment.kind == "push")
+    files = {target: [track.as_csv().encode()]}
+    if hidden is not None:
+        files[hidden] = [specimen_toml(specimen).encode()]
+    replaced = {path: "; an earlier file was replaced" if path.exists() else "" for path in files}
+    with writing(" and ".join(map(str, files))):
+        write_files(files)
     if as_json:
         print(json.dumps({"track": str(target), "samples": len(track.time), "deviation": expected}))
         return 0
-    print(f"track    {target}: {len(track.time)} samples")
+    print(f"track    {target}: {len(track.time)} samples{replaced[target]}")
     if hidden is not None:
-        print(f"truth    {hidden}: drawn from seed {experiment.seed}; for --truth of vinesim tune")
+        print(f"truth    {hidden}: drawn from seed {experiment.seed}; for --truth of vinesim tune{replaced[hidden]}")
     for name, deviation in expected.items():
         unit = f"{1.645 * deviation:.4f} rad" if name.startswith("bow") else f"{164.5 * deviation:.2f} %"
         print(f"{name:8s} would be known to +- {unit} (90 %)")

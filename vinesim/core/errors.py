@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import operator
 import os
+import pathlib
 from collections.abc import Iterator
 from typing import SupportsIndex
 
@@ -37,6 +38,18 @@ def writing(place: str | os.PathLike[str]) -> Iterator[None]:
     except OSError as bad:
         reason = bad.strerror or str(bad)
         raise WriteError(f"{place} cannot be written: {reason}; make room there or give another place") from None
+
+
+def require_place(option: str, path: str | os.PathLike[str]) -> None:
+    """Raise :class:`UsageError` if the output file ``path`` of ``option`` cannot be written, before any work is done:
+    its folder does not exist, or the file or folder may not be changed."""
+    file = pathlib.Path(path)
+    if file.is_dir():
+        raise UsageError(f"{option} {file} is a folder; give a file")
+    if not file.parent.is_dir():
+        raise UsageError(f"{option} {file} cannot be written: there is no folder {file.parent}; make it first")
+    if not os.access(file if file.exists() else file.parent, os.W_OK):
+        raise UsageError(f"{option} {file} cannot be written: permission denied; give another place")
 
 
 def checked_index(what: str, index: SupportsIndex, count: int, error: type[ValueError] = ValueError) -> int:

@@ -4,6 +4,8 @@ seconds."""
 from __future__ import annotations
 
 import logging
+import multiprocessing
+import sys
 import time
 from typing import Self, TextIO
 
@@ -74,3 +76,10 @@ def show_on(stream: TextIO) -> None:
     log.handlers = [ProgressHandler(stream)]
     log.propagate = False
     log.setLevel(logging.INFO)
+
+
+def show_by_default() -> None:
+    """Show the progress messages of this program on standard error, unless the program shows or logs them already. A
+    process that another one has started through :mod:`multiprocessing` shows none."""
+    if not log.hasHandlers() and multiprocessing.parent_process() is None:
+        show_on(sys.stderr)

@@ -33,13 +33,14 @@ def warn_of_raised_damping(model: Model, dt: float, phi: float) -> None:
     raised = ((stiffness > 0.0) & (model.joint_damping < (1.0 - 1e-3) * floor * stiffness)).any(1)
     if raised.any():
         _log.warning(
-            "%d of %d joints ask for less damping than beta = (2 phi - 1) dt = %.2g ms, least of phi %g and dt %g s,"
-            " and have that; lower dt or phi (0.5 adds none), or raise their beta",
+            "%d of %d joints move with more damping than the model gives them: with steps of %g s and phi %g, a joint"
+            " has at least a damping of %.2g ms times its stiffness; lower dt or phi (0.5 adds none), or raise the"
+            " damping",
             raised.sum(),
             len(model.body_mass),
-            1e3 * floor,
-            phi,
             dt,
+            phi,
+            1e3 * floor,
         )
 
 

@@ -13,7 +13,7 @@ from vinesim.core.errors import UsageError
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.base_motion import Sweep
 from vinesim.tune.candidates import COLUMNS, Candidates
-from vinesim.tune.specimen import TIP, with_values
+from vinesim.tune.specimen import TIP
 from vinesim.tune.trajectory import Trajectory
 from vinesim.tune.tuning import tune
 
@@ -146,7 +146,13 @@ def hidden_specimen(specimen: Specimen, seed: int) -> Specimen:
     them."""
     rng = np.random.default_rng((seed, 1))  # the noise of the track has the seed alone
     factor = np.exp(rng.uniform(-math.log(HIDDEN), math.log(HIDDEN), 2)).tolist()
-    return with_values(specimen, modulus=specimen.modulus.value * factor[0], damping=specimen.damping.value * factor[1])
+    numbers = {
+        name: msgspec.structs.replace(
+            number, value=number.value * one, grade="GUESSED", source=f"drawn from seed {seed}, about {number.value:g}"
+        )
+        for name, number, one in zip(("modulus", "damping"), (specimen.modulus, specimen.damping), factor, strict=True)
+    }
+    return msgspec.structs.replace(specimen, **numbers)
 
 
 def _sweep(candidates: Candidates, experiment: Experiment) -> Sweep:

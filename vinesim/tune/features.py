@@ -33,6 +33,11 @@ Detection during the hold does.
 CLEARLY = 5.0
 """Reduction of the loss that another release time must achieve to replace the first estimate [squared standard
 deviations]."""
+GROSS_DEVIATIONS = 12.0
+"""Smallest distance of a gross error from the curve of the track [standard deviations]."""
+GROSS_SHARE = 0.3
+"""Smallest distance of a gross error from the curve of the track, as a fraction of the largest displacement [1]. The
+curve is not the plant: a wide swing and higher modes deviate from it."""
 DAMPING_RATIOS = np.array([0.003, 0.01, 0.02, 0.04, 0.07, 0.12, 0.2, 0.35])
 """Trial damping ratios."""
 
@@ -56,8 +61,15 @@ class Features:
     response of the oscillator."""
     noise: float
     """Robust standard deviation of the residuals of the curve [m]. The noise of the track is at most this."""
+    column_noise: np.ndarray
+    """[column] m, the same of each column."""
     explained: float
     """[1] Fraction of the motion after the release, relative to the base, that the curve explains."""
+    curve: np.ndarray
+    """[sample, column] m, the curve at the times of the track."""
+    gross: np.ndarray
+    """[sample, column] bool, gross errors such as swapped markers and wrong digits, which are left out: samples that
+    are far from their neighbours and from the curve."""
 
     @property
     def log_decrement(self) -> float:
@@ -65,12 +77,9 @@ class Features:
         return 2.0 * math.pi * self.damping_ratio / math.sqrt(1.0 - self.damping_ratio**2)
 
 
-def columns_of(track: Trajectory) -> np.ndarray:
-    """Returns the tracked columns [sample, column] m, with gross outliers replaced by NaN."""
-    values = track.position[:, track.tracked].copy()
-    for column in values.T:
-        column[_gross_outliers(column)] = np.nan
-    return values
+def columns_of(track: Trajectory, gross: np.ndarray) -> np.ndarray:
+    """Returns the tracked columns [sample, column] m, with the samples ``gross`` [sample, column] replaced by NaN."""
+    return np.where(gross, np.nan, track.position[:, track.tracked])
 
 
 def robust_deviation(values: np.ndarray) -> float:
@@ -79,9 +88,14 @@ def robust_deviation(values: np.ndarray) -> float:
     return 1.4826 * float(np.median(np.abs(values - np.median(values)))) if len(values) else math.nan
 
 
-def _gross_outliers(column: np.ndarray) -> np.ndarray:
-    """Returns which samples are far from the median of five neighbours [sample] bool, such as swapped markers and wrong
-    digits."""
+def _suspects(track: Trajectory) -> np.ndarray:
+    """Returns which samples are far from the median of five neighbours [sample, column] bool: gross errors, and turning
+    points of a swing with few samples in each period."""
+    return np.stack([_far_from_neighbours(column) for column in track.position[:, track.tracked].T], axis=1)
+
+
+def _far_from_neighbours(column: np.ndarray) -> np.ndarray:
+    """Returns which samples of one column [sample] are far from the median of five neighbours [sample] bool."""
     seen = np.flatnonzero(np.isfinite(column))
     if len(seen) < 5:
         return np.zeros(len(column), bool)
@@ -94,9 +108,9 @@ def _gross_outliers(column: np.ndarray) -> np.ndarray:
     return bad
 
 
-def find_onset(track: Trajectory) -> float:
+def _find_onset(track: Trajectory, gross: np.ndarray) -> float:
     """Returns the last time [s] before the motion, which is the first sample unless the track begins with a hold."""
-    values = columns_of(track)
+    values = columns_of(track, gross)
     seen = np.isfinite(values).any(1)
     values = values[seen]
     time = track.time[seen]
@@ -160,29 +174,40 @@ def _misfit(basis: np.ndarray, values: np.ndarray, weight: np.ndarray) -> tuple[
 def extract_features(track: Trajectory, onset: float | None = None) -> Features:
     """Returns the features of the motion after ``onset`` [s], which is detected unless given.
 
-    A track with a shaken base is used from its first sample on, at which the plant must be at rest.
+    A track with a shaken base is used from its first sample on, at which the plant must be at rest. Samples that are
+    far from their neighbours are left out at first; then those that are near the curve are used, too.
     """
+    suspects = _suspects(track)
+    found = _features_without(track, onset, suspects)
+    off = np.abs(track.position[:, track.tracked] - found.curve)
+    least = max(GROSS_DEVIATIONS * found.noise, GROSS_SHARE * float(np.abs(found.displacement).max()))
+    gross = suspects & (off > least)
+    return found if (gross == suspects).all() else _features_without(track, onset, gross)
+
+
+def _features_without(track: Trajectory, onset: float | None, gross: np.ndarray) -> Features:
+    """Returns the features without the samples ``gross`` [sample, column]."""
     if track.base is not None:
-        return _shaken_features(track)
+        return _shaken_features(track, gross)
     if onset is None:
-        found = _free_features(track, find_onset(track))
+        found = _free_features(track, _find_onset(track, gross), gross)
         release = _find_release(track, found)
         if release == found.release:
             return found
         onset = max(release, float(track.time[0]))
-    return _free_features(track, onset)
+    return _free_features(track, onset, gross)
 
 
-def _free_features(track: Trajectory, onset: float) -> Features:
+def _free_features(track: Trajectory, onset: float, gross: np.ndarray) -> Features:
     """Returns the features of the damped sinusoid that fits the track best after ``onset`` [s]."""
     here = track.time >= onset
     time = track.time[here] - onset
-    values = columns_of(track)[here]
+    values = columns_of(track, gross)[here]
     duration = float(time[-1] - time[0])
     step = 1.0 / (FREQUENCIES_PER_BIN * duration)
     grid = np.arange(0.5 / duration, max(0.45 * track.rate, 1.0 / duration), step)
     best, found, off = _search(functools.partial(_basis, time), values, grid, lambda _: step, 0.05 / duration)
-    return _describe(onset, best, found, off, values, 1.0 / track.rate)
+    return _describe(track, onset, best, found, off, gross)
 
 
 def _find_release(track: Trajectory, features: Features) -> float:
@@ -191,16 +216,16 @@ def _find_release(track: Trajectory, features: Features) -> float:
     This is the release in ``features``, unless a turning point one or more half periods earlier or later fits clearly
     better.
     """
-    values = columns_of(track)
+    values = columns_of(track, features.gross)
     time = track.time
     half = 0.5 / features.frequency
     first = min(features.release, float(time[0]))
     count = int((0.5 * (time[0] + time[-1]) - first) / half)
-    places = features.release + half * np.arange(-1, max(count, 1) + 1)
-    omega = 2.0 * np.pi * features.frequency
-    ratio = features.damping_ratio
+    turn = np.arange(-1, max(count, 1) + 1)
+    places = features.release + half * turn
+    places = places[(turn <= 0) | (places <= time[-1] - 2.0 * half)]  # a whole period must follow a later release
     after = np.maximum(time, places[:, None]) - features.release  # [place, sample]
-    wave = np.exp(-ratio / math.sqrt(1.0 - ratio**2) * omega * after) * np.cos(omega * after)
+    wave = _wave(after, features.frequency, features.damping_ratio)
     off = values - features.rest - wave[..., None] * features.displacement
     spread = np.array([robust_deviation(column) for column in off[int(np.argmin(np.abs(places - features.release)))].T])
     loss = np.nansum(np.sqrt(1.0 + (off / np.maximum(spread, 1e-9)) ** 2) - 1.0, (1, 2))
@@ -208,25 +233,35 @@ def _find_release(track: Trajectory, features: Features) -> float:
     return float(places[best]) if loss[best] < loss[1] - CLEARLY else features.release
 
 
-def _shaken_features(track: Trajectory) -> Features:
+def _wave(after: np.ndarray, frequency: float, ratio: float) -> np.ndarray:
+    """Returns a damped cosine of ``frequency`` [Hz] and damping ``ratio`` at times ``after`` its maximum [s]."""
+    omega = 2.0 * np.pi * frequency
+    return np.exp(-ratio / math.sqrt(1.0 - ratio**2) * omega * after) * np.cos(omega * after)
+
+
+def _shaken_features(track: Trajectory, gross: np.ndarray) -> Features:
     """Returns the features of the oscillator whose response to the base's motion fits the track best."""
     assert track.base is not None
     along = _direction(track.base)
     motion = SampledMotion(track.time, track.base @ along)
-    values = columns_of(track) - track.base[:, np.nonzero(track.tracked)[1]]
+    base = track.base[:, np.nonzero(track.tracked)[1]]
+    values = columns_of(track, gross) - base
     lowest = 0.5 / float(track.time[-1] - track.time[0])
     grid = np.exp(np.arange(math.log(lowest), math.log(max(0.45 * track.rate, 2.0 * lowest)), RELATIVE_STEP))
     basis = functools.partial(_response_basis, track.time, motion)
     best, found, off = _search(basis, values, grid, lambda frequency: RELATIVE_STEP * frequency, 0.1 * lowest)
-    response = basis(*(np.array([x]) for x in best))[0, :, 1]
+    curves = basis(*(np.array([x]) for x in best))[0]
     return Features(
         frequency=best[0],
         damping_ratio=best[1],
         release=float(track.time[0]),
         rest=found[0],
-        displacement=np.abs(response).max() * found[1],
+        displacement=np.abs(curves[:, 1]).max() * found[1],
         noise=max(robust_deviation(off), 1e-9),
+        column_noise=np.array([robust_deviation(column) for column in off.T]),
         explained=_explained(off, values),
+        curve=base + curves @ found,
+        gross=gross,
     )
 
 
@@ -280,12 +315,12 @@ def _explained(off: np.ndarray, values: np.ndarray) -> float:
 
 
 def _describe(
+    track: Trajectory,
     onset: float,
     best: tuple[float, float],
     found: np.ndarray,
     off: np.ndarray,
-    values: np.ndarray,
-    step: float,
+    gross: np.ndarray,
 ) -> Features:
     frequency, ratio = best
     rest, cosine, sine = found
@@ -293,9 +328,10 @@ def _describe(
     phase = math.atan2(sine[strong], cosine[strong])  # phase at which the column with the largest swing has its maximum
     turning = phase - math.pi * round(phase / math.pi)
     shift = turning / (2.0 * math.pi * frequency)
-    if shift > 1.5 * step:  # the track begins within a swing, after the release
+    if shift > 1.5 / track.rate:  # the track begins within a swing, after the release
         shift -= 0.5 / frequency
     basis = _basis(np.array([shift]), np.array([frequency]), np.array([ratio]))[0, 0]
+    wave = _basis(np.maximum(track.time - onset, shift), np.array([frequency]), np.array([ratio]))[0]
     return Features(
         frequency=frequency,
         damping_ratio=ratio,
@@ -303,5 +339,8 @@ def _describe(
         rest=rest,
         displacement=basis[1:] @ found[1:],
         noise=max(robust_deviation(off), 1e-9),
-        explained=_explained(off, values),
+        column_noise=np.array([robust_deviation(column) for column in off.T]),
+        explained=_explained(off, columns_of(track, gross)[track.time >= onset]),
+        curve=wave @ found,
+        gross=gross,
     )

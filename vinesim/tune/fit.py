@@ -22,6 +22,8 @@ from vinesim.tune.problem import SOFT
 from vinesim.tune.trajectory import Trajectory
 
 _UNITS = {"modulus": "Pa", "damping": "s", "mass": "1", "bow_y": "rad", "bow_z": "rad"}
+WEAK = 0.3
+"""Smallest share of a parameter in the direction of a ridge with which the data do not decide the parameter [1]."""
 _LOGARITHMIC = ("modulus", "damping", "mass")
 
 
@@ -72,9 +74,12 @@ class Comparison:
         """Returns the comparison as one line of text."""
         off = f"{100.0 * (self.value / self.truth - 1.0):+.2f} %" if self.truth else f"{self.value:+.4f} {self.unit}"
         where = "inside" if self.inside else "outside"
+        gaps = (self.high - self.low, abs(self.truth - self.low), abs(self.truth - self.high))
+        numbers = (_rounded(x, min(gaps)) for x in (self.truth, self.value, self.low, self.high))
+        truth, value, low, high = numbers
         return (
-            f"truth    {self.name} {_short(self.truth)} {self.unit}; estimate {_short(self.value)} ({off}), {where} "
-            f"the 90 % interval {_short(self.low)} to {_short(self.high)}"
+            f"truth    {self.name} {truth} {self.unit}; estimate {value} ({off}), {where} the 90 % interval {low} to "
+            f"{high}"
         )
 
 
@@ -122,7 +127,7 @@ class Fit:
     @property
     def estimates(self) -> tuple[Estimate, ...]:
         """The plant's fitted numbers, in SI units."""
-        weak = {name for ridge in self.posterior.ridges for name, x in ridge.direction.items() if abs(x) > 0.3}
+        weak = {name for ridge in self.posterior.ridges for name, x in ridge.direction.items() if abs(x) > WEAK}
         return tuple(self._estimate(name, name not in weak) for name in self.posterior.names[: self.posterior.physical])
 
     def estimate(self, name: str) -> Estimate:
@@ -152,10 +157,13 @@ class Fit:
     @property
     def outliers(self) -> int:
         """Number of samples that have less than half of the full weight, or that are left out as gross errors."""
-        data = self.track.position[:, self.track.tracked]
-        off = np.abs(self.model - data) / self.column_noise
-        gross = np.isfinite(data) & ~np.isfinite(self.model)
-        return int((off > math.sqrt(3.0) * SOFT).sum() + gross.sum())
+        off = np.abs(self.model - self.track.position[:, self.track.tracked]) / self.column_noise
+        return int(((off > math.sqrt(3.0) * SOFT) | self.features.gross).sum())
+
+    @property
+    def left_out(self) -> int:
+        """Number of samples that are left out as gross errors."""
+        return int(self.features.gross.sum())
 
     @property
     def gaps(self) -> int:
@@ -171,18 +179,19 @@ class Fit:
         lines.append(f"{'fitted' if self.ok else 'FAILED'}: {self.track.source}, {len(self.track.time)} samples")
         for e in self.estimates:
             note = "" if e.known else "  NOT DECIDED BY THE DATA"
-            lines.append(f"{e.name:8s} {_short(e.value)} {e.unit}, 90 % {_short(e.low)} to {_short(e.high)}{note}")
+            value, low, high = (_rounded(x, e.high - e.low) for x in (e.value, e.low, e.high))
+            lines.append(f"{e.name:8s} {value} {e.unit}, 90 % {low} to {high}{note}")
             lines.append(f"{'':8s} before: {e.prior}")
         lines.append(
             f"swing    {self.frequency:.3f} Hz, damping ratio {self.damping_ratio:.4f}; of the track alone: "
             f"{f.frequency:.3f} Hz, {f.damping_ratio:.4f} (log decrement {f.log_decrement:.3f})"
         )
         lines.append(
-            f"noise    {self._noise_words()}; {self.outliers} outliers have less weight, {self.gaps} positions missing"
+            f"noise    {self._noise_words()}; {self.outliers - self.left_out} outliers have less weight, "
+            f"{self.left_out} are left out; {self.gaps} positions missing"
         )
         for ridge in self.posterior.ridges:
-            way = ", ".join(f"{name} {x:+.2f}" for name, x in ridge.direction.items())
-            lines.append(f"ridge    the data hardly change along ({way}): {self._remedy(ridge.direction)}")
+            lines.append(f"ridge    {_ridge_words(ridge.direction)}: {self._remedy(ridge.direction)}")
         for minimum in self.minima[:3]:
             lines.append(
                 f"minimum  another at {_short(minimum.modulus)} Pa, with {minimum.loss_ratio:.1f} times the loss"
@@ -228,6 +237,7 @@ class Fit:
             "noise_m": self.noise,
             "column_noise_m": dict(zip(self.track.column_names, self.column_noise.tolist(), strict=True)),
             "outliers": self.outliers,
+            "left_out": self.left_out,
             "gaps": self.gaps,
             "ridges": [dataclasses.asdict(ridge) for ridge in self.posterior.ridges],
             "minima": [dataclasses.asdict(minimum) for minimum in self.minima],
@@ -237,11 +247,14 @@ class Fit:
     # ------------------------------------------------------------------ file
 
     def fitted_specimen(self) -> Specimen:
-        """Returns the specimen with its fitted numbers, which have the grade FITTED."""
+        """Returns the specimen with its fitted numbers, which have the grade FITTED. Numbers that the data do not decide
+        stay as they were."""
         text = f"{datetime.date.today().isoformat()}, vinesim tune of {self.track.source}"
         changes: dict[str, Any] = {}
         bow = list(self.specimen.bow)
         for e in self.estimates:
+            if not e.known:
+                continue
             told = f"{text}: 90 % {_short(e.low)} to {_short(e.high)}"
             if e.name.startswith("bow"):
                 bow["yz".index(e.name[-1])] = float(_short(e.value))
@@ -276,6 +289,14 @@ class Fit:
             text = _replace_line(text, "bunch", "mass", fitted.tip_mass)
         with writing(path):
             pathlib.Path(path).write_text(text + "\n" + specimen_toml(fitted), encoding="utf-8")
+
+
+def _ridge_words(direction: dict[str, float]) -> str:
+    """Returns a sentence about a direction that the data hardly determine, without names that hardly take part."""
+    strong = {name: x for name, x in direction.items() if abs(x) > WEAK}
+    first, *rest = sorted(strong, key=lambda name: -abs(strong[name]))
+    others = [f"{name} {'rises' if strong[name] * strong[first] > 0.0 else 'falls'}" for name in rest]
+    return f"the track hardly changes if {first} rises" + f" and {', '.join(others)} with it" * bool(others)
 
 
 def specimen_toml(specimen: Specimen) -> str:
@@ -326,6 +347,12 @@ def _scale_green(text: str, woody: Any) -> str:
     return _replace_line(
         text, "cane", "green_modulus", _replaced(woody, float(f"{woody.value * values[1] / values[0]:.5g}"), source)
     )
+
+
+def _rounded(value: float, gap: float) -> str:
+    """Returns a number with four digits, or with as many as tell it from a number at the distance ``gap``."""
+    digits = math.ceil(math.log10(abs(value) / gap)) + 1 if value and gap > 0.0 else 4
+    return f"{value:.{min(max(digits, 4), 9)}g}"
 
 
 def _short(value: float) -> str:

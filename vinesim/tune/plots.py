@@ -15,7 +15,8 @@ from vinesim.tune.posterior import Z90
 
 SIZE = (11.0, 4.6)
 """[inch] Width and height of :func:`draw_fit`."""
-_ORDER = ("modulus", "damping", "mass")
+_LABELS = {name: f"ln {name} ratio" for name in ("modulus", "damping", "mass")}
+_LABELS |= {"bow_y": "bow_y [rad]", "bow_z": "bow_z [rad]"}
 
 
 def plot_fit(fit: Fit, path: str | pathlib.Path) -> None:
@@ -44,31 +45,36 @@ def strongest_column(fit: Fit) -> int:
 def draw_track(fit: Fit, axes: Axes, column: int | None = None) -> None:
     """Draw one column of the track, the fitted candidate, and the 90 % band from parameters and noise."""
     column = strongest_column(fit) if column is None else column
-    seen = np.isfinite(fit.model)
+    gross = fit.features.gross[:, column]
+    used = np.isfinite(fit.model) & ~fit.features.gross
     spread = np.full(fit.model.shape, np.nan)
-    spread[seen] = np.einsum("oi,ij,oj->o", fit.jacobian, fit.posterior.covariance, fit.jacobian)
-    half = Z90 * np.sqrt(spread[:, column] + fit.column_noise[column] ** 2)
+    spread[used] = np.einsum("oi,ij,oj->o", fit.jacobian, fit.posterior.covariance, fit.jacobian)
     data = fit.track.position[:, fit.track.tracked][:, column]
     time = fit.track.time
     model = fit.model[:, column]
+    half = Z90 * np.sqrt(spread[:, column] + fit.column_noise[column] ** 2)
+    half[gross] = np.interp(time[gross], time[used[:, column]], half[used[:, column]])
     axes.fill_between(time, 1e3 * (model - half), 1e3 * (model + half), color="C0", alpha=0.25, lw=0, label="90 %")
     axes.plot(time, 1e3 * model, color="C0", lw=1.0, label="fitted")
-    axes.plot(time, 1e3 * data, ".", color="k", ms=3.0, label="track")
+    axes.plot(time[~gross], 1e3 * data[~gross], ".", color="k", ms=3.0, label="track")
+    if gross.any():  # at the edge of the axes if they are far away
+        low, high = axes.get_ylim()
+        axes.plot(time[gross], np.clip(1e3 * data[gross], low, high), "x", color="C3", ms=6.0, label="left out")
     axes.set_ylabel(f"{fit.track.column_names[column]} [mm]")
     axes.set_title(f"{fit.frequency:.2f} Hz, damping ratio {fit.damping_ratio:.3f}", fontsize="medium")
     axes.legend(fontsize="small", loc="upper right")
 
 
 def draw_residuals(fit: Fit, axes: Axes) -> None:
-    """Draw the residuals of every column and the noise."""
-    off = 1e3 * (fit.track.position[:, fit.track.tracked] - fit.model)
+    """Draw the residuals of every column and the noise, without the samples that are left out."""
+    off = np.where(fit.features.gross, np.nan, 1e3 * (fit.track.position[:, fit.track.tracked] - fit.model))
     for column, noise, name in zip(off.T, fit.column_noise, fit.track.column_names, strict=True):
         (dots,) = axes.plot(fit.track.time, column, ".", ms=3.0, label=name)
         for sign in (-Z90, Z90):
             axes.axhline(1e3 * sign * noise, color=dots.get_color(), lw=0.6, ls="--")
     axes.set_ylabel("residual [mm]")
     axes.set_xlabel("time [s]")
-    axes.legend(fontsize="small", loc="upper right", ncols=3)
+    axes.legend(fontsize="x-small", loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=6, frameon=False)
 
 
 def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
@@ -77,12 +83,13 @@ def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
     posterior = fit.posterior
     count = fit.posterior.physical
     names = posterior.names[:count]
-    labels = [f"ln {name}" if name in _ORDER else name for name in names]
+    labels = [_LABELS[name] for name in names]
     deviation = posterior.deviation
     for row in range(count):
         for column in range(count):
             axes: Axes = grid[row, column]
             axes.tick_params(labelsize="x-small")
+            axes.locator_params(nbins=4)
             if column > row:
                 axes.set_axis_off()
                 continue
@@ -94,13 +101,18 @@ def draw_posterior(fit: Fit, grid: np.ndarray) -> None:
                 if fit.sample is not None:
                     axes.hist(fit.sample.draws[:, row], 40, density=True, color="0.8", label="draws")
                 axes.set_yticks([])
-                axes.legend(fontsize="x-small")
             else:
                 _draw_ellipses(axes, posterior.mean, posterior.covariance, column, row)
             if row == count - 1:
-                axes.set_xlabel(labels[column])
+                axes.set_xlabel(labels[column], fontsize="small")
+            if row == column == 0:
+                axes.set_title("ratio = fitted / given in the model", fontsize="x-small", loc="left")
             if column == 0 and row:
-                axes.set_ylabel(labels[row])
+                axes.set_ylabel(labels[row], fontsize="small")
+    if count:
+        first: Axes = grid[0, 0]
+        last: Axes = grid[0, -1]  # empty if there are two numbers or more
+        last.legend(*first.get_legend_handles_labels(), fontsize="x-small", loc="center" if count > 1 else "best")
 
 
 def draw_held_out(fit: Fit, held_out: Fit, axes: Axes) -> None:

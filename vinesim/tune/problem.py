@@ -83,7 +83,7 @@ class Problem:
         self._device = device
         self.pushed = pushed
         self.candidates = Candidates(specimen, track.markers, dt=dt, device=device, least=9)
-        self.observed = columns_of(track)
+        self.observed = columns_of(track, features.gross)
         self.seen = np.isfinite(self.observed)
         self.axes = np.flatnonzero(track.tracked.any(0))
         tips = self.candidates.pull_axes()[:, self.axes]
@@ -101,6 +101,12 @@ class Problem:
         known = priors | {"release": Prior(features.release, turn, "onset of the motion")}
         self.priors = [known.get(name, flat) for name in self.names]
         self.force = _force_reading(track, features.release, pushed)
+        if track.force is not None and self.force is None and _force_reading(track, features.release, not pushed):
+            when, remedy = ("before", "leave out --push") if pushed else ("after", "give --push")
+            raise TrajectoryError(
+                f"{track.source}: 'force' has readings above 0 only {when} {features.release:.2f} s, where the motion "
+                f"begins, as of a {'pull' if pushed else 'push'}; {remedy}"
+            )
         if track.force is not None and self.force is None and "mass" in fitted:
             when = "after the push" if pushed else f"before the release at {features.release:.2f} s"
             raise TrajectoryError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import io
 import math
 import pathlib
 import re
@@ -96,6 +97,11 @@ class Trajectory:
 
     def write(self, path: str | pathlib.Path) -> None:
         """Write a CSV file for :func:`read_trajectory`, with positions in mm."""
+        with writing(path):
+            pathlib.Path(path).write_text(self.as_csv(), encoding="utf-8", newline="")
+
+    def as_csv(self) -> str:
+        """Returns the text of the file that :meth:`write` writes."""
         columns = [("time [s]", self.time)]
         for marker, axis in np.argwhere(self.tracked):
             name = "xyz"[axis] if self.markers[marker] == TIP else f"{self.markers[marker]} {'xyz'[axis]}"
@@ -104,12 +110,13 @@ class Trajectory:
             columns.append(("force [N]", self.force))
         if self.base is not None:
             columns += [(f"base {'xyz'[axis]} [mm]", 1e3 * self.base[:, axis]) for axis in _moved_axes(self.base)]
-        with writing(path), pathlib.Path(path).open("w", newline="", encoding="utf-8") as file:
-            out = csv.writer(file, lineterminator="\n")
-            out.writerow([name for name, _ in columns])
-            for row in zip(*(values.tolist() for _, values in columns), strict=True):
-                clock, *values = row  # microseconds are exact enough for times since 1970
-                out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
+        text = io.StringIO(newline="")
+        out = csv.writer(text, lineterminator="\n")
+        out.writerow([name for name, _ in columns])
+        for row in zip(*(values.tolist() for _, values in columns), strict=True):
+            clock, *values = row  # microseconds are exact enough for times since 1970
+            out.writerow([f"{round(clock, 6):.16g}", *("" if math.isnan(x) else f"{x:.6g}" for x in values)])
+        return text.getvalue()
 
 
 def _moved_axes(base: np.ndarray) -> list[int]:
@@ -138,13 +145,19 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
     path = pathlib.Path(path)
     try:
         lines = path.read_text("utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as bad:
-        raise TrajectoryError(f"{path}: cannot be read: {bad}; give a CSV file in UTF-8") from None
+    except FileNotFoundError:
+        raise TrajectoryError(f"{path}: no such file; give the CSV file of a track") from None
+    except OSError as bad:
+        raise TrajectoryError(f"{path}: cannot be read: {bad.strerror}; give the CSV file of a track") from None
+    except UnicodeDecodeError as bad:
+        raise TrajectoryError(f"{path}: is not text in UTF-8: {bad}; save it as CSV in UTF-8") from None
     rows = [(number, row) for number, row in enumerate(lines, 1) if row.strip() and not row.startswith("#")]
     if not rows:
         raise TrajectoryError(f"{path}: is empty; give a header such as 'time [s],x [mm],z [mm]' and samples")
     cells = [(number, next(csv.reader([row]))) for number, row in rows]
     columns = _read_header(path, *cells[0])
+    if len(cells) == 1:
+        raise TrajectoryError(f"{path}: no samples follow the header; give {MIN_SAMPLES} or more lines of numbers")
     table = np.array([_read_row(path, number, row, columns, cells[0][1]) for number, row in cells[1:]])
     table = table.reshape(-1, len(columns))
     clock = next(i for i, column in enumerate(columns) if column.kind == "time")
@@ -168,7 +181,7 @@ def _assemble(path: pathlib.Path, columns: list[_Column], table: np.ndarray, clo
         elif column.kind == "base" and base is not None:
             base[:, column.axis] = table[:, i]
         elif column.kind == "position":
-            missing = float(np.mean(np.isnan(table[:, i]))) if len(table) else 1.0
+            missing = float(np.mean(np.isnan(table[:, i])))
             if missing > MAX_MISSING:
                 raise TrajectoryError(
                     f"{path}: column {column.marker} {'xyz'[column.axis]} is empty in {missing:.0%} of the lines; "

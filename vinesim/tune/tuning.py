@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from vinesim.core.errors import UsageError
+from vinesim.scene import plausibility
 from vinesim.scene.plant_parameters import Specimen
 from vinesim.tune.candidates import COLUMNS
 from vinesim.tune.features import Features, extract_features, robust_deviation
@@ -31,6 +32,20 @@ WIDE = 0.5
 """Width of the swing as a fraction of the plant's length [1]. A larger swing suggests a wrong unit."""
 UNEXPLAINED = 1.3
 """[1] Ratio of a fit's residuals to the residuals of a damped sinusoid from which the fit has failed."""
+EXACT = 3e-5
+"""[m] Smallest noise of a column that a fit assumes: just after the release its simulation is no more exact."""
+COLUMN_UNEXPLAINED = 1.25
+"""[1] The same ratio in a single column that swings. Good fits have 0.8 to 1.1, those with a late time of release 1.5 or
+more, and those with a wrong unit of the positions 1.3."""
+SWINGS = 0.3
+"""Smallest displacement of a column that swings, relative to the column with the largest displacement [1]. Columns that
+hardly swing consist of noise, whose robust deviation scatters."""
+FREQUENCIES_AGREE = 0.03
+"""Largest relative difference between the frequencies of the fit and of the track alone [1]. Good fits of canes and
+bunches differ by 0.2 % at most."""
+DAMPINGS_AGREE = 0.25
+"""Largest difference between the logarithms of the damping ratios of the fit and of the track alone [1], or else four
+standard deviations. Good fits differ by 4 % with 2 mm of noise, by 14 % with 10 mm."""
 HORIZONS = (1.0, 2.0, 4.0, 8.0)
 """[period] Growing durations after the release that are fitted if fitting the whole track at once fails."""
 MINIMA = 2.0 ** np.linspace(-2.0, 2.0, 24)
@@ -76,6 +91,11 @@ def tune(
     if track.base is not None and (pushed or release is not None):
         what = "push" if pushed else "release"
         raise UsageError(f"{track.source}: its base is shaken, so there is no {what}; leave out --{what}")
+    if release is not None and not release < track.time[-3]:
+        raise TrajectoryError(
+            f"{track.source}: ends at {track.time[-1]:.4g} s, and the release at {release:g} s is not before its last "
+            "samples; give an earlier --release"
+        )
     features = extract_features(track, release)
     if release is not None:
         features = dataclasses.replace(features, release=release)
@@ -94,11 +114,15 @@ def tune(
         theta = problem.correct_discretisation(theta, noise)
         found = problem.evaluate(theta)
     posterior = laplace(problem, theta, found, noise)
-    faults = (*_faults(problem, posterior, _left(problem, found)), *_contradictions(problem, found, theta))
     sample = importance_sample(problem, posterior, noise, samples, seed) if samples else None
-    model = np.full(problem.observed.shape, np.nan)
-    model[problem.seen] = found.model
+    everywhere = problem.samples(theta[None], problem.row(theta)[None])[0][0]
+    model = np.where(np.isfinite(track.position[:, track.tracked]), everywhere, np.nan)
     swing = _fitted_features(problem, theta, model)
+    faults = (
+        *_faults(problem, posterior, _left(problem, found), noise),
+        *_disagreements(problem, posterior, swing),
+        *_contradictions(problem, found, noise, theta),
+    )
     return Fit(
         specimen=specimen,
         track=track,
@@ -183,7 +207,7 @@ def _settle(problem: Problem, theta: np.ndarray, noise: Noise) -> tuple[np.ndarr
     """
     for _ in range(2):
         theta, found = problem.minimise(theta, noise)
-        left = np.array([max(robust_deviation(column), 1e-7) for column in problem.residuals(found.model).T])
+        left = np.array([max(robust_deviation(column), EXACT) for column in problem.residuals(found.model).T])
         if np.abs(np.log(left / noise)).max() < 0.3:
             break
         noise = left
@@ -230,7 +254,19 @@ def _fitted_features(problem: Problem, theta: np.ndarray, model: np.ndarray) -> 
     return extract_features(dataclasses.replace(problem.track, position=position), release)
 
 
-def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, ...]:
+def _unexplained(problem: Problem, noise: float, column_noise: np.ndarray) -> list[str]:
+    """Returns the names of the columns in which the residuals of the fit are clearly larger than those of the curve,
+    or "all columns", for the noise of all columns together and of each column [m]."""
+    features = problem.features
+    if noise > UNEXPLAINED * features.noise:
+        return ["all columns"]
+    size = np.abs(features.displacement)
+    more = column_noise > COLUMN_UNEXPLAINED * np.maximum(features.column_noise, EXACT)
+    more &= size > SWINGS * size.max()
+    return [name for name, one in zip(problem.track.column_names, more, strict=True) if one]
+
+
+def _faults(problem: Problem, posterior: Posterior, noise: float, column_noise: np.ndarray) -> tuple[str, ...]:
     """Returns reasons not to trust the fit; empty if there are none."""
     faults = []
     features = problem.features
@@ -240,6 +276,13 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
             f"the residuals of the fit are {1e3 * noise:.3g} mm, those of a damped {curve} "
             f"only {1e3 * features.noise:.3g} mm: another minimum, or a plant that the specimen "
             "does not describe (length, diameters, direction, tip mass)"
+        )
+    elif columns := _unexplained(problem, noise, column_noise):
+        at = problem.track.column_names.index(columns[0])
+        faults.append(
+            f"the residuals of the fit in {columns[0]} are {1e3 * column_noise[at]:.3g} mm, those of a damped {curve} "
+            f"only {1e3 * features.column_noise[at]:.3g} mm: check the unit of the positions, the axes (z is up), the "
+            "time of the release (--release), and whether it is a pull or a push (--push)"
         )
     if posterior.correlation_time > 4.0:
         faults.append(
@@ -253,14 +296,41 @@ def _faults(problem: Problem, posterior: Posterior, noise: float) -> tuple[str, 
     return tuple(faults)
 
 
-def _contradictions(problem: Problem, found: Evaluation, theta: np.ndarray) -> list[str]:
+def _disagreements(problem: Problem, posterior: Posterior, swing: Features) -> list[str]:
+    """Returns sentences about a frequency or damping ratio of the track alone that the fitted plant does not have, or
+    that no vine has."""
+    own = problem.features
+    faults = []
+    if abs(math.log(swing.frequency / own.frequency)) > FREQUENCIES_AGREE:
+        faults.append(
+            f"the fitted plant swings at {swing.frequency:.4g} Hz, the track alone at {own.frequency:.4g} Hz: check the "
+            "unit of the time, the axes of the columns (z is up), and length, diameters and masses of the plant"
+        )
+    known = plausibility.RANGES["frequency"]
+    if not known.low <= own.frequency <= known.high:
+        faults.append(
+            f"the track swings at {own.frequency:.4g} Hz, plants at {known.low:g} to {known.high:g} Hz: check the "
+            "unit of the time (s, ms); numbers of pictures are no time"
+        )
+    if "damping" in problem.fitted:
+        deviation = float(posterior.deviation[problem.names.index("damping")])
+        differ = abs(math.log(swing.damping_ratio / own.damping_ratio))
+        if differ > max(DAMPINGS_AGREE, 4.0 * deviation):
+            faults.append(
+                f"the damping ratio of the fitted plant is {swing.damping_ratio:.4f}, that of the track alone "
+                f"{own.damping_ratio:.4f}: check the time of the release (--release), and that one swing is in the track"
+            )
+    return faults
+
+
+def _contradictions(problem: Problem, found: Evaluation, noise: np.ndarray, theta: np.ndarray) -> list[str]:
     """Returns sentences about numbers given by the user, other than the track, that contradict the fit."""
     faults = []
     features = problem.features
     specimen = problem.specimen
     reach = float(np.abs(features.displacement).max())
     length = specimen.length.value
-    failed = _left(problem, found) > UNEXPLAINED * features.noise
+    failed = bool(_unexplained(problem, _left(problem, found), noise))
     if reach > WIDE * length and failed:
         faults.append(f"the swing is {reach:.3g} m wide, the plant {length:.3g} m long: is the unit right (m, cm, mm)?")
     if problem.force is not None and "mass" not in problem.names and failed:

@@ -10,8 +10,11 @@ import typer
 
 def bench(
     names: Annotated[
-        list[str], typer.Argument(help="Benchmarks to run one after the other, such as plants, camera, live.")
-    ],
+        list[str] | None,
+        typer.Argument(
+            help="Benchmarks to run one after the other: plants, contact, tick, start, camera, lidar, live, ros, tune."
+        ),
+    ] = None,
     json: Annotated[bool, typer.Option("--json", help="One JSON object a line, nothing else on stdout.")] = False,
     row: Annotated[
         list[str] | None,
@@ -35,7 +38,7 @@ def bench(
     """
     from vinesim.cli.bench import run
 
-    raise typer.Exit(run(names, json, row or ()))
+    raise typer.Exit(run(names or [], json, row or ()))
 
 
 def doctor(

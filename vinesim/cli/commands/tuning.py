@@ -59,8 +59,8 @@ def tune(
     """Fit a cane, or a bunch on its peduncle, to the track of a pull and release, a push, or a shaken base.
 
     Prints modulus, damping and the other fitted quantities with 90 % intervals, directions that the data do not
-    determine, and faults of the fit. With a fault the exit code is 5, and --out is not written. Needs scipy (extra:
-    tune).
+    determine, and faults of the fit. With a fault the exit code is 5, and --out is not written. Places that cannot be
+    written are refused before the fit, with exit code 2. Needs scipy (extra: tune).
 
     \b
     Examples:
@@ -191,7 +191,9 @@ def experiment(
       vinesim experiment push --model examples/cane.toml --out push.csv
       vinesim experiment shake --model examples/cane.toml --amplitude 0.003 --from 2 --to 6 --rate 60
     """
-    from vinesim.cli.tune import plan
+    from vinesim.cli.tune import plan, require_scipy
+
+    require_scipy()
     from vinesim.tune.experiment import Experiment
 
     what = Experiment(
