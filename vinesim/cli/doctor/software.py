@@ -87,13 +87,7 @@ def ros() -> Finding:
         return Finding("ros", WARNING, reason, f"{remedy}; robots run without topics until then")
     from vinesim.ros.messages import message_packages as messages
 
-    missing = [
-        package
-        for package in messages.available_packages()
-        if messages.place_of_official(package) is None
-        and not messages.is_installed(package)
-        and not messages.is_built(package)
-    ]
+    missing = messages.unbuilt()
     domain = os.environ.get("ROS_DOMAIN_ID", "0")
     found = f"{middleware.WHEEL_MIDDLEWARE if _wheels() else os.environ.get('ROS_DISTRO', '?')}, domain {domain}"
     if not missing:

@@ -29,10 +29,12 @@ from vinesim.client.sound.microphone_step import at_place
 from vinesim.client.tasks.ros_command_handler import RosCommandHandler
 from vinesim.client.tasks.simulation_control import SimulationControl
 from vinesim.core import frames
+from vinesim.core.progress import ProgressLine
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.robot.drives.joint_servos import series_stiffness
 from vinesim.ros.commands.types import Command, GoalResult
+from vinesim.ros.messages import message_packages
 from vinesim.scene.ids import Organ
 from vinesim.scene.model import Model
 from vinesim.scene.values import ComponentStatus, JointReference, RigidVisual
@@ -40,7 +42,7 @@ from vinesim.scene.values.signals import Color
 
 log = logging.getLogger(__name__)
 
-START_TIMEOUT = 120.0
+START_TIMEOUT = 300.0
 """Longest time in which the process starts [s]. A first run builds message packages."""
 FREE_BACKLOG = 0.2
 """Share of the queue of step records that may be occupied before the world slows down."""
@@ -139,7 +141,7 @@ class RosProcess:
         """
         self.client = client
         self.robot = robot or client.robot
-        self.worker.wait_until_ready(START_TIMEOUT)
+        self.wait_until_ready()
         client.post_step.append(self._after_step)
         client.wake_readers.append(self._wake)
         client.holds.append(self.held)
@@ -158,6 +160,17 @@ class RosProcess:
         if self._leads:
             self._simulation = SimulationControl(client, lambda reply: self.worker.send("simulated", reply))
             client.between_steps.append(self._simulation)
+
+    def wait_until_ready(self) -> None:
+        """Wait until the process is ready, and show meanwhile which message packages it builds, which may take a
+        minute. Raises :class:`WorkerError` if the process fails."""
+
+        def show() -> None:
+            if unbuilt := message_packages.unbuilt():
+                line.show(f"building ROS messages, once on this machine: {', '.join(unbuilt)}")
+
+        with ProgressLine() as line:
+            self.worker.wait_until_ready(START_TIMEOUT, show)
 
     # ------------------------------------------------------------------ in the loop
 

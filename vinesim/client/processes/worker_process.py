@@ -390,10 +390,16 @@ class WorkerProcess(Generic[S]):
 
     # ------------------------------------------------------------------ outside the loop
 
-    def wait_until_ready(self, timeout: float) -> None:
-        """Wait until the first run is ready. Raises :class:`WorkerError` if it fails, or after ``timeout`` [s]."""
-        if not self._first_result.wait(timeout):
-            raise WorkerError(f"{self.title} was not ready within {timeout:.0f} s")
+    def wait_until_ready(self, timeout: float, waiting: Callable[[], object] = lambda: None) -> None:
+        """Wait until the first run is ready. Raises :class:`WorkerError` if it fails, or after ``timeout`` [s].
+
+        ``waiting()`` is called about once a second meanwhile.
+        """
+        until = time.monotonic() + timeout
+        while not self._first_result.wait(min(1.0, max(until - time.monotonic(), 0.0))):
+            if time.monotonic() >= until:
+                raise WorkerError(f"{self.title} was not ready within {timeout:.0f} s")
+            waiting()
         self.raise_failure()
 
     def raise_failure(self) -> None:

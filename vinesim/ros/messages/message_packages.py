@@ -330,6 +330,16 @@ def is_built(package: str) -> bool:
     return _place(package).is_dir()
 
 
+def unbuilt() -> list[str]:
+    """Returns the names of the packages that a client builds at its first start, because they can neither be imported
+    nor are in the cache."""
+    return [
+        package
+        for package in available_packages()
+        if place_of_official(package) is None and not is_installed(package) and not is_built(package)
+    ]
+
+
 def build(packages: Iterable[str]) -> dict[str, pathlib.Path]:
     """Build the packages that are not in the cache, in parallel. Returns the folder to put on ``sys.path``, by
     package."""
