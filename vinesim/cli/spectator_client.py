@@ -16,7 +16,7 @@ def run(options: ClientOptions) -> int:
     with ClientSession(options) as session:
         pose = options.pose
         if pose is None:
-            start = spawn_pose(session.scene, session.spawn)
+            start = spawn_pose(session.scene, session.spawn or 0)
             pose = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))
         if options.out is not None:
             with writing(options.out):
