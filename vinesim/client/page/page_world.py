@@ -139,6 +139,8 @@ class PageWorld:
         self._hands: dict[str, np.ndarray] = {}
         """Poses [2, 7] of the person's left and right hand: the simulated palms, and the controllers that they
         followed."""
+        self._held = ["", ""]
+        """What the person's left and right hand hold, as text such as "the bunch"; "" for nothing."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
         self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
@@ -201,6 +203,7 @@ class PageWorld:
                 "hand_proxy": np.array([hand.pose for hand in hands], np.float32),
                 "hand_controller": np.array([hand.controller for hand in hands], np.float32),
             }
+            self._held = [_held_thing(hand.held, self._client.model) for hand in hands]
             if physics.tick % BLADE_STEPS == 0:
                 between = self._client.humans[self._client.name].between_blades()
                 self._shears = {**self._shears, "between": list(between)}
@@ -330,6 +333,7 @@ class PageWorld:
             shown["replay"] = self._replay.status()
         if self._person is not None:
             shown["shears"] = self._shears
+            shown["held"] = self._held
             driver = self._driver
             shown["control"] = "" if driver is None else "this" if driver == page else "other"
         state = array_message.encode(
@@ -485,6 +489,18 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
         (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
         person.shears,
     )
+
+
+def _held_thing(held: tuple[str, str] | None, model: Model) -> str:
+    """Returns what a hand holds as text for people: "the bunch", "the cane", "the box" or an actor's name; "" for
+    nothing. ``held``: as in :class:`vinesim.scene.values.HandSample`."""
+    if held is None:
+        return ""
+    actor, link = held
+    if actor == "plants":
+        return "the bunch" if model.body_organ[int(link.removeprefix("body/"))] == Organ.BUNCH else "the cane"
+    kind, _, number = actor.partition("/")
+    return f"the {kind}" if number else actor
 
 
 def _within_reach(model: Model) -> dict[str, np.ndarray]:

@@ -435,7 +435,7 @@ class Viewer {
     if (this.headset.isWorn) return { head: pose, ...this.headset.hands() };
     this.hand.withShears = this.shears.taken.right;
     const right = this.hand.tracked(pose, this.eyes.yaw, this.ray(this.hand.cursor), this.world, seconds);
-    this.hand.show(this.shears.between[1]);
+    this.hand.show(this.shears.between[1], this.shears.held[1]);
     return { head: pose, left: null, right };
   }
 
