@@ -199,7 +199,7 @@ class Recorded:
         """Returns the recorded message with the shapes of the robot and the people."""
         return self._rigid
 
-    def state(self, since: int) -> tuple[int, bytes] | None:
+    def state(self, since: int, page: int) -> tuple[int, bytes] | None:
         """Returns the number and the message of the next state, or None if none is due."""
         if self._sent >= self._count:
             return None

@@ -420,15 +420,25 @@ def test_arms_reach_from_shoulders_to_wrists(posture: str):
         assert np.linalg.norm(upper[:3] - shoulder) < 0.07  # the shoulder moves a little
 
 
-def test_an_arm_that_is_too_short_points_to_its_hand():
+@pytest.mark.parametrize("ahead", [0.75, 3.0])
+def test_an_arm_that_is_too_short_points_to_its_hand_and_is_joined_to_it(ahead: float):
+    limbs = appearance.load_human_model(1.75).limbs
     pose = standing_pose(frames.pose(np.zeros(3)))
-    reaching = dataclasses.replace(pose, left=frames.pose(np.array([3.0, 0.2, 1.2])))
+    reaching = dataclasses.replace(pose, left=frames.pose(np.array([ahead, 0.2, 1.2])))
     _, at = link_poses(reaching)
     upper = at["left_upper_arm"]
     fore = at["left_forearm"]
     assert frames.rotate(upper[3:], np.array([1.0, 0, 0])) == pytest.approx(
         frames.rotate(fore[3:], np.array([1.0, 0, 0])), abs=0.01
     )
+    wrist = at["left_hand"][:3] + frames.rotate(at["left_hand"][3:], np.array(limbs.wrist))
+    end = fore[:3] + frames.rotate(fore[3:], np.array([limbs.forearm, 0, 0]))
+    assert end == pytest.approx(wrist, abs=1e-3)
+    if ahead < 1.0:  # at the reach of a person without a headset, the gaps are inside the sleeve
+        shoulder = at["chest"][:3] + frames.rotate(at["chest"][3:], np.array(limbs.shoulder))
+        elbow = upper[:3] + frames.rotate(upper[3:], np.array([limbs.upper_arm, 0, 0]))
+        assert np.linalg.norm(upper[:3] - shoulder) < 0.13
+        assert np.linalg.norm(fore[:3] - elbow) < 0.065
     assert np.isfinite(np.concatenate(list(at.values()))).all()
 
 

@@ -31,6 +31,7 @@ from vinesim.scene import appearance
 from vinesim.scene.ids import Organ
 from vinesim.scene.values import INTENTIONS, HumanSpec
 from vinesim.web.array_message import decode
+from vinesim.web.page_input import PageInput, TrackedPerson
 from vinesim.web.page_server import WINDOW, PageServer
 
 MAX_CALLS = 20
@@ -519,6 +520,38 @@ def test_a_page_comes_back_by_itself_and_says_what_happened_meanwhile(page):
         ):
             page.open(live.server.address, before=lacks)
             wait(lambda said=said: said in (page.run(missing) or ""), said)
+
+
+@pytest.mark.slow
+@pytest.mark.xdist_group("browser")
+def test_a_later_page_of_a_person_watches_until_it_is_loaded_again(page):
+    """It says who controls the person, has the controls of a spectator, and says when the person is free."""
+    with MemoryHub().bus("viewer") as bus, LiveVineyard(bus, is_person=True) as live:
+        head = tuple(live.client.humans["viewer"].pose.head.tolist())
+        live.world.take(99, PageInput(1, head, TrackedPerson(head)))  # the other page
+        open_page(page, live)
+        notices = "document.getElementById('notices').textContent"
+        visible = "document.getElementById('{}').checkVisibility()"
+        assert "Another page controls the person" in page.run(notices)
+        assert not page.run("vinesim.viewer.isPerson")
+        assert not page.run(visible.format("tools"))
+        assert page.run("document.querySelector('#guide li[aria-current]').dataset.name") == "look"
+        assert page.run("document.querySelector('#guide li:last-child').dataset.name") == "follow"
+        wait(lambda: page.run("vinesim.viewer.labels.has('viewer')"), "the person's name")
+        press(page, "Space")
+        is_drawn_anew(page)
+        assert not live.client.humans["viewer"].pose.right_closed
+        live.world.leave(99)
+        wait(lambda: "page that controlled the person was closed" in page.run(notices), "it says so")
+        open_page(page, live)
+        assert page.run("vinesim.viewer.isPerson")
+        wait(lambda: live.world._driver is not None, "this page controls the person")
+
+        live.world._driver = 99  # two pages were opened at once, and the other one was first
+        wait(
+            lambda: page.run("window.vinesim?.viewer?.isPerson === false"), "the page is loaded again, and watches", 30
+        )
+        assert page.errors == []
 
 
 @pytest.mark.slow

@@ -22,8 +22,15 @@ def test_a_newcomer_looks_walks_reaches_holds_and_picks(page):
         open_page(page, live)
         assert page.run(STEP) == "look"
         assert not page.run(HELP), "one thing at a time"
-        page.run("vinesim.viewer.eyes.place[0] -= 1.5, vinesim.viewer.eyes.yaw += 0.6, 0")
+        page.run("vinesim.viewer.eyes.place[0] += 0.1, vinesim.viewer.eyes.yaw += 0.6, 0")
         wait(lambda: page.run(STEP) == "walk", "the person has looked around")
+        near = "vinesim.viewer.guide.nearestBunch(vinesim.viewer.eyes.place).away < 0.75"
+        assert page.run(near)
+        updated = page.run("vinesim.viewer.guide.updatedAt")
+        wait(lambda: page.run("vinesim.viewer.guide.updatedAt") > updated, "another look at what was done")
+        assert page.run(STEP) == "walk", "a person who stands before a bunch has not walked yet"
+        page.run("vinesim.viewer.eyes.place[0] -= 1.6, 0")
+        wait(lambda: not page.run(near) and page.run("vinesim.viewer.guide.hasWalked"), "the person has walked")
         where = page.run("document.querySelector('#guide p').textContent")
         assert "nearest bunch" in where
         start = page.run("vinesim.viewer.eyes.place[0]")
@@ -31,10 +38,20 @@ def test_a_newcomer_looks_walks_reaches_holds_and_picks(page):
         wait(lambda: page.run(STEP) == "reach", "a bunch is within reach")
         look_at(page, live.bunch)
         is_drawn_anew(page)
+        button = "document.querySelector('#hold span').textContent"
+        press(page, "Space")
+        wait(lambda: page.run(button) == "open", "a closed hand that holds nothing")
+        press(page, "Space")
+        wait(lambda: page.run(button) == "grasp", "an open hand")
         page.run("vinesim.viewer.reach([0, 0]), 0")
         wait(lambda: page.run(STEP) == "hold", "the hand reaches for the bunch")
+        wait(lambda: live.client.physics.hand("viewer", "right").touching, "the hand is there")
         press(page, "Space")
-        wait(lambda: page.run(STEP) == "pick", "the hand is closed")
+        wait(lambda: page.run(STEP) == "pick", "the hand holds the bunch")
+        assert page.run(button) == "let go"
+        press(page, "KeyT")
+        said = page.run("document.getElementById('notices').textContent")
+        assert "The right hand let go of the bunch to take the shears." in said
         live.due.append(lambda: live.client.physics.pick(BUNCH))
         wait(lambda: not page.run(IS_OPEN), "all steps are done")
         assert "Well done" in page.run("document.getElementById('notices').textContent")

@@ -39,7 +39,7 @@ class CountingWorld:
     def rigid(self):
         return b"rigid"
 
-    def state(self, since):
+    def state(self, since, page):
         return (self.tick, str(self.tick).encode()) if self.tick > since else None
 
     def take(self, page, said):

@@ -7,16 +7,18 @@ from vinesim.avatar.scripted_human import ScriptedHuman
 from vinesim.avatar.tracked_human import TrackedHuman
 from vinesim.client.client import Client
 from vinesim.client.page.page_world import ELSE_LOADED, LOADED, PageWorld
+from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.spectator import Spectator, standing_view
 from vinesim.client.tasks.start_poses import bunch_centres
 from vinesim.core import frames
 from vinesim.net.transport.memory_bus import MemoryHub
+from vinesim.rigid.human_posture import standing_pose
 from vinesim.robot.description.loader import load_description
 from vinesim.scene.generation.vineyard import generate
 from vinesim.scene.ids import Organ
 from vinesim.scene.spec import load_scene
 from vinesim.scene.state import State
-from vinesim.scene.values import INTENTIONS, LightPattern
+from vinesim.scene.values import INTENTIONS, HumanSpec, LightPattern
 from vinesim.web.array_message import decode
 from vinesim.web.page_input import PageInput, TrackedHand, TrackedPerson
 from vinesim.wires.wire_segments import wire_segments
@@ -217,6 +219,56 @@ def test_only_the_first_page_moves_the_person(anna):
         client.tick()
     np.testing.assert_allclose(client.humans["anna"].pose.head[:3], mine[:3], atol=1e-9)
     assert client.humans["anna"].intention == ""
+
+
+def test_a_page_that_watches_never_takes_the_person_over_and_is_told_who_has_it(anna):
+    client, world = anna
+    mine = (-2.0, 0.1, 1.6, 0.0, 0.0, 0.0, 1.0)
+
+    def control(page):
+        client.tick()
+        return decode(world.state(-1, page)[1])[0]["control"]
+
+    header, arrays = decode(world.scene())
+    assert not header["is_controlled"]
+    np.testing.assert_allclose(arrays["start"], client.humans["anna"].pose.head, atol=1e-6)
+    world.take(1, PageInput(1, mine))
+    assert control(0) == control(1) == ""
+    world.take(0, PageInput(1, mine, TrackedPerson(mine)))
+    assert control(0) == "this"
+    assert control(1) == "other"
+    header, arrays = decode(world.scene())
+    assert header["is_controlled"]
+    apart = np.linalg.norm(arrays["start"][:2] - client.humans["anna"].pose.root[:2])
+    assert apart > 1.0, "a page that watches begins behind the person"
+    world.leave(0)
+    world.take(1, PageInput(1, mine))
+    assert control(1) == ""
+
+
+@pytest.mark.parametrize("begins_behind_actor", [True, False])
+def test_a_spectator_begins_behind_the_nearest_actor_until_its_page_has_moved(shown, begins_behind_actor):
+    client, world = shown
+    client.begins_behind_actor = begins_behind_actor
+    before = client.pose.copy()
+    near, far = (frames.pose(before[:3] * [1.0, 1.0, 0.0] + [away, 0.0, 0.0]) for away in (0.1, 4.0))
+    for name, root in (("near", near), ("far", far)):
+        pose = standing_pose(root)
+        client.physics.add_human(HumanSpec(name, 1, pose), is_remote=True)
+        client.remote_actors[name] = human = RemoteHuman(client.physics.rigid, name)
+        human.pose = pose
+    start = decode(world.scene())[1]["start"]
+    if not begins_behind_actor:
+        np.testing.assert_allclose(start, before, atol=1e-6)
+        return
+    way = near[:2] - start[:2]
+    assert 1.0 < np.linalg.norm(way) < 3.0
+    ahead = frames.rotate(start[3:].astype(float), np.array([1.0, 0.0, 0.0]))[:2]
+    assert ahead @ way > 0.95 * np.linalg.norm(way), "it looks at the actor"
+    here = (4.0, 5.0, 2.0, 0.0, 0.0, 1.0, 0.0)
+    world.take(0, PageInput(1, here))
+    client.tick()
+    np.testing.assert_allclose(decode(world.scene())[1]["start"], here, atol=1e-6)
 
 
 def test_a_page_is_told_of_the_shears_in_its_persons_hand_and_of_what_they_cut(anna):

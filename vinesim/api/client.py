@@ -20,6 +20,7 @@ import numpy as np
 from vinesim.api.simulation import base_pose
 from vinesim.client.client import Client as RobotClient
 from vinesim.client.rate_loop import paced_loop
+from vinesim.client.tasks.free_places import choose_places
 from vinesim.client.tasks.start_poses import start_pose
 from vinesim.net.transport.memory_bus import MemoryHub
 from vinesim.robot.description.loader import load_description
@@ -46,7 +47,7 @@ class Client:
         name: str,
         connect: str | None = None,
         pose: Sequence[float] | np.ndarray | None = None,
-        spawn: int = 0,
+        spawn: int | None = None,
         certificates: pathlib.Path | None = None,
         device: str = "cpu",
     ) -> None:
@@ -60,7 +61,7 @@ class Client:
             connect: endpoint of the server such as ``tcp/127.0.0.1:7447``; without it the client is alone in its own
                 world.
             pose: (x, y, yaw) in m and rad, or pose [7] of the base; by default a start place of the scene.
-            spawn: index of the start place in the scene.
+            spawn: index of the start place in the scene; by default the first one where no other actor stands.
             certificates: folder of this actor's certificate, for a server with TLS.
             device: ``"cpu"``, ``"cuda"`` or ``"cuda:N"``, for stepping plants.
 
@@ -71,7 +72,6 @@ class Client:
         self.scene: Scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.model: Model = generate(self.scene)
         described = load_description(robot)
-        place = start_pose(self.scene, spawn) if pose is None else base_pose(pose)
         self._is_shared = connect is not None
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:
@@ -82,6 +82,11 @@ class Client:
                 from vinesim.net.transport.zenoh_bus import ZenohBus
 
                 bus = stack.enter_context(ZenohBus(name, connect=connect, certificates=certificates))
+            if pose is None:
+                (queue,) = choose_places(self.scene, self.model, bus, number=spawn)
+                place = start_pose(self.scene, spawn or 0, queue=queue)
+            else:
+                place = base_pose(pose)
             executor = stack.enter_context(ThreadPoolExecutor(1, "spawner"))
             self._client = RobotClient(
                 self.scene, self.model, described, bus, name=name, pose=place, executor=executor, device=device

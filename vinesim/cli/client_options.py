@@ -64,7 +64,12 @@ class ClientOptions:
         ),
     ] = None
     """None: one robot of the kind vinebot."""
-    spawn: Annotated[int, typer.Option(min=0, help="Index of one of the scene's start poses.")] = 0
+    spawn: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help="Index of one of the scene's start poses; by default the first one where nobody stands."
+        ),
+    ] = None
     pose: Annotated[
         Pose | None, typer.Option(help="Start at X Y [m] with YAW [rad] instead of a start pose of the scene.")
     ] = None

@@ -20,6 +20,7 @@ from vinesim.client.client import Client
 from vinesim.client.rate_loop import RateLoop, paced_loop
 from vinesim.client.recording.bunch_trace import Trace
 from vinesim.client.status import Status
+from vinesim.client.tasks.free_places import choose_places
 from vinesim.client.tasks.start_poses import with_start_pose
 from vinesim.core import allocator
 from vinesim.core.errors import writing
@@ -64,7 +65,7 @@ class ClientSession:
         self.name = options.name or (options.role if options.connect is None else f"{options.role}-{os.getpid()}")
         self.scene = with_seed(load_scene(options.scene), options.seed)
         self.spawn = options.spawn
-        """Index of the start pose in the scene."""
+        """Index of the start pose in the scene; None: the first one that is free."""
         if options.pose is not None:
             self.scene = with_start_pose(self.scene, *options.pose)
             self.spawn = 0
@@ -105,6 +106,11 @@ class ClientSession:
             "device": options.device,
             "executor": self.enter(ThreadPoolExecutor(1, "spawner")),
         }
+
+    def choose_places(self, bus: Bus, count: int = 1) -> list[int]:
+        """Returns the ``queue`` numbers of the start places of this client's ``count`` actors, see
+        :func:`vinesim.client.tasks.free_places.choose_places`."""
+        return choose_places(self.scene, self.model, bus, number=self.spawn, count=count)
 
     def leave_at_end(self, client: Client) -> None:
         """At the end of the session, let a client announce that it leaves, before its buses close."""

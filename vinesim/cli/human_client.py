@@ -40,7 +40,8 @@ def run(options: ClientOptions) -> int:
         if options.out is not None:
             with writing(options.out):
                 options.out.mkdir(parents=True, exist_ok=True)
-        start = start_pose(session.scene, session.spawn)
+        bus = session.bus(session.name)
+        start = start_pose(session.scene, session.spawn or 0, queue=session.choose_places(bus)[0])
         human = ScriptedHuman(start, options.height)
         if options.is_for_page:
             human = TrackedHuman(start, options.height, gestures=gestures)
@@ -48,7 +49,7 @@ def run(options: ClientOptions) -> int:
             session.scene,
             session.model,
             None,
-            session.bus(session.name),
+            bus,
             pose=start,
             source=human,
             height=options.height,

@@ -17,6 +17,7 @@ from vinesim.client.tasks.motions import DriveTo, LookAt
 from vinesim.client.tasks.planning import plan_task, validate_task_name
 from vinesim.client.tasks.start_poses import start_pose, validate_bunch
 from vinesim.core.errors import writing
+from vinesim.net.transport.bus import Bus
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
@@ -30,12 +31,9 @@ def run(options: ClientOptions) -> int:
     validate_task_name(options.job)
     descriptions = [load_description(robot) for robot in options.robot or ["vinebot"]]
     with ClientSession(options) as session:
-        start = start_pose(session.scene, session.spawn, options.approach)
-        begin = None
-        approach = options.approach
+        begin = start = None
         if options.job is not None:
-            begin, start = plan_task(options.job, session.model, start_pose(session.scene, session.spawn))
-            approach = 0.0
+            begin, start = plan_task(options.job, session.model, start_pose(session.scene, session.spawn or 0))
         for bunch in (options.push, options.watch):
             validate_bunch(session.model, bunch)
         if options.out is not None:
@@ -45,12 +43,21 @@ def run(options: ClientOptions) -> int:
         if len(descriptions) > 1:
             names = [f"{session.name}_{i + 1}" for i in range(len(descriptions))]
         sensors = _start_sensors(session, names, descriptions)
-        client = _build_client(session, names, descriptions, start, approach)
+        if options.connect is not None:  # it may take a minute, in which another actor could take the chosen place
+            for process in sensors:
+                process.wait_for_ros()
+        bus = session.bus(names[0])
+        # a robot with a task starts where the task requires it
+        places = [*range(len(names))] if start is not None else session.choose_places(bus, len(names))
+        approach = 0.0 if start is not None else options.approach
+        starts = [start_pose(session.scene, session.spawn or 0, approach, place) for place in places]
+        goals = [start_pose(session.scene, session.spawn or 0, queue=place) for place in places]
+        client = _build_client(session, bus, names, descriptions, starts if start is None else [start, *starts[1:]])
         for name, process in zip(names, sensors, strict=True):
             # a run of given length waits for its sensors, so that they record its beginning; other runs begin at once
             process.attach(client, client.robots[name], wait_for_sensors=options.seconds is not None)
         task = None if begin is None else begin(client.physics, client.robot)
-        _add_behaviour(session, client, task, approach)
+        _add_behaviour(session, client, task, goals if approach > 0.0 else [])
         digest = StateDigest() if sensors[0].sensors.is_lockstep else None
         if digest is not None:
             client.post_step.append(digest)
@@ -155,38 +162,35 @@ def _sensor_status(processes: list[RobotProcesses]) -> dict[str, Any]:
 
 
 def _build_client(
-    session: ClientSession, names: list[str], descriptions: list[RobotDescription], start: np.ndarray, approach: float
+    session: ClientSession, bus: Bus, names: list[str], descriptions: list[RobotDescription], starts: list[np.ndarray]
 ) -> Client:
-    """Returns a client that simulates all robots, the first at ``start`` [7], the others at the next start poses."""
+    """Returns a client that simulates all robots at ``starts`` [7]. ``bus``: of the first robot."""
     client = Client(
         session.scene,
         session.model,
         descriptions[0],
-        session.bus(names[0]),
-        pose=start,
+        bus,
+        pose=starts[0],
         **session.client_options(names[0]),
     )
     for i in range(1, len(names)):
-        pose = start_pose(session.scene, session.spawn, approach, i)
-        client.add_robot(descriptions[i], names[i], pose, session.bus(names[i]))
+        client.add_robot(descriptions[i], names[i], starts[i], session.bus(names[i]))
     session.leave_at_end(client)
     return client
 
 
-def _add_behaviour(session: ClientSession, client: Client, task: Task | None, approach: float) -> None:
-    """Let the robots drive to their start poses, push the bunch of ``--push``, do the ``task``, and look at their
-    work."""
+def _add_behaviour(session: ClientSession, client: Client, task: Task | None, goals: list[np.ndarray]) -> None:
+    """Let the robots drive to ``goals`` [7] (none: they stay), push the bunch of ``--push``, do the ``task``, and look
+    at their work."""
     options = session.options
-    given = {"--job": options.job, "--push": options.push, "--watch": options.watch, "--approach": approach or None}
+    given = {"--job": options.job, "--push": options.push, "--watch": options.watch, "--approach": goals or None}
     client.script = next((name for name, value in given.items() if value is not None), "")
     watched = options.watch if options.watch is not None else options.push
     if watched is not None:
         session.trace(client, watched)
-    if approach > 0.0:
-        may_start = (lambda: client.remote_actors) if options.connect else (lambda: True)
-        for i, robot in enumerate(client.robots.values()):
-            pose = start_pose(session.scene, session.spawn, queue=i)
-            client.pre_step.append(DriveTo(robot, pose, may_start=may_start))
+    may_start = (lambda: client.remote_actors) if options.connect else (lambda: True)
+    for robot, goal in zip(client.robots.values(), goals, strict=False):
+        client.pre_step.append(DriveTo(robot, goal, may_start=may_start))
     if options.push is not None and client.trace is not None:
         side = client.side_of(client.trace.centre())
         client.pre_step.append(PushBunch(client.robot, side, client.trace.centre).control)

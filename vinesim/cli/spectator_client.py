@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from vinesim.cli.client_options import ClientOptions
 from vinesim.cli.client_session import ClientSession
+from vinesim.client.page.first_view import first_view
 from vinesim.client.spectator import PictureWriter, Spectator, standing_view
 from vinesim.client.tasks.start_poses import spawn_pose
+from vinesim.core import frames
 from vinesim.core.errors import writing
 
 
 def run(options: ClientOptions) -> int:
     """Watch until a signal or the time limit; pictures go to ``--out``. Returns the exit code."""
     with ClientSession(options) as session:
-        pose = options.pose
-        if pose is None:
-            start = spawn_pose(session.scene, session.spawn)
-            pose = float(start[0]), float(start[1]), 2.0 * float(np.arctan2(start[5], start[6]))
+        start = spawn_pose(session.scene, session.spawn or 0)
+        eyes = standing_view(float(start[0]), float(start[1]), frames.to_yaw(start[3:]))
+        if session.spawn is None:  # an actor may stand there
+            model = session.model
+            eyes = first_view(start, model, model.forward_kinematics(model.joint_settled)[:, :3])
         if options.out is not None:
             with writing(options.out):
                 options.out.mkdir(parents=True, exist_ok=True)
@@ -26,9 +27,10 @@ def run(options: ClientOptions) -> int:
             session.model,
             None,
             session.bus(session.name),
-            pose=standing_view(*pose),
+            pose=eyes,
             **session.client_options(),
         )
+        spectator.begins_behind_actor = session.spawn is None
         pictures = None
         if options.out is not None:
             pictures = PictureWriter(

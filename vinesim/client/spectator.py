@@ -51,6 +51,8 @@ class Spectator(Client):
 
     picking = False  # owners of plants report detachments
     slows_the_world = False
+    begins_behind_actor = False
+    """Whether its first page begins behind the nearest actor, wherever the eyes are."""
 
     def _add_own_actor(
         self,

@@ -71,9 +71,9 @@ class World(Protocol):
         """Returns a message with the shapes of the present rigid bodies."""
         ...
 
-    def state(self, since: int) -> tuple[int, bytes] | None:
+    def state(self, since: int, page: int) -> tuple[int, bytes] | None:
         """Returns the tick of the newest state, and a message with everything that has moved after tick ``since``; None
-        without changes."""
+        without changes. ``page``: number of the page that receives it."""
         ...
 
     def take(self, page: int, said: PageInput) -> None:
@@ -262,7 +262,7 @@ class PageServer:
             while not (reader.done() or self._stopping is None or self._stopping.is_set()):
                 await fresh.wait()
                 fresh.clear()
-                if len(flight) >= WINDOW or reader.done() or (found := self._world.state(tick)) is None:
+                if len(flight) >= WINDOW or reader.done() or (found := self._world.state(tick, page)) is None:
                     continue
                 tick, message = found
                 flight.append(tick)

@@ -16,6 +16,7 @@ from vinesim.avatar.gestures import OPEN_HAND
 from vinesim.avatar.tracked_human import TrackedHuman, TrackedPoints
 from vinesim.client.client import Client
 from vinesim.client.page.first_view import first_view
+from vinesim.client.remote.remote_human import RemoteHuman
 from vinesim.client.spectator import Spectator
 from vinesim.kernels.shading import materials
 from vinesim.rigid.human_posture import SIDES
@@ -128,7 +129,8 @@ class PageWorld:
         self._visuals: tuple[Any, ...] | None = None
         client.after_reset.append(self._follow_reset)
         self._driver: int | None = None
-        """The page that controls the spectator's eyes or the person: the first page that sends a message."""
+        """The page that controls the spectator's eyes or the person: the first page that sends a message, with a person
+        if there is one."""
         self._eyes: np.ndarray | None = None
         self._intention = ""
         self._overlay_pages: set[int] = set()
@@ -137,6 +139,8 @@ class PageWorld:
         self._hands: dict[str, np.ndarray] = {}
         """Poses [2, 7] of the person's left and right hand: the simulated palms, and the controllers that they
         followed."""
+        self._held = ["", ""]
+        """What the person's left and right hand hold, as text such as "the bunch"; "" for nothing."""
         self._haptics: dict[str, Haptic] = {}
         """Strongest vibration of each hand since the last state."""
         self._shears: dict[str, Any] = {"closures": 0, "said": [], "between": ["", ""]}
@@ -199,6 +203,7 @@ class PageWorld:
                 "hand_proxy": np.array([hand.pose for hand in hands], np.float32),
                 "hand_controller": np.array([hand.controller for hand in hands], np.float32),
             }
+            self._held = [_held_thing(hand.held, self._client.model) for hand in hands]
             if physics.tick % BLADE_STEPS == 0:
                 between = self._client.humans[self._client.name].between_blades()
                 self._shears = {**self._shears, "between": list(between)}
@@ -255,6 +260,7 @@ class PageWorld:
                 "ground": [float(ground.ground_x), float(ground.ground_y), float(ground.ground_cell)],
                 "ground_columns": int(ground.ground_sky.shape[1]),
                 "person": None if self._person is None else self._client.name,
+                "is_controlled": self._person is not None and self._driver is not None,
                 "mouth": None if self._person is None else load_shears().mouth[:3].tolist(),
                 "limbs": None if self._person is None else self._limbs(),
                 "replay": None if self._replay is None else self._replay.status(),
@@ -300,12 +306,13 @@ class PageWorld:
         """Returns a message with the shapes of the present robots, people, boxes and picked bunches."""
         return self._rigid
 
-    def state(self, since: int) -> tuple[int, bytes] | None:
+    def state(self, since: int, page: int = -1) -> tuple[int, bytes] | None:
         """Returns the newest state as a message, with its tick before it; None if the state is not newer than tick
         ``since``.
 
         The message contains the poses of the bodies of trees that moved after tick ``since``, the poses of all rigid
-        bodies, and which bunches are picked.
+        bodies, and which bunches are picked. For a person it also says which page controls the person: ``page``, which
+        receives the state ("this"), another one ("other"), or none ("").
         """
         with self._lock:
             newest = self._snapshot
@@ -326,6 +333,9 @@ class PageWorld:
             shown["replay"] = self._replay.status()
         if self._person is not None:
             shown["shears"] = self._shears
+            shown["held"] = self._held
+            driver = self._driver
+            shown["control"] = "" if driver is None else "this" if driver == page else "other"
         state = array_message.encode(
             {
                 **shown,
@@ -388,7 +398,7 @@ class PageWorld:
         (self._overlay_pages.add if said.overlays else self._overlay_pages.discard)(page)
         if said.replay is not None and self._replay is not None:
             self._replay.take(said.replay)
-        if self._driver is None:
+        if self._driver is None and (self._person is None or said.person is not None):
             self._driver = page
         if page != self._driver:
             return
@@ -399,7 +409,8 @@ class PageWorld:
                 self._intention = said.person.intention
 
     def leave(self, page: int) -> None:
-        """Forget a page that has disconnected. If it controlled the person or the eyes, another page may do so now."""
+        """Forget a page that has disconnected. If it controlled the eyes, another page does so now. If it controlled
+        the person, the person stands still until a page is opened or loaded again."""
         self._overlay_pages.discard(page)
         if page == self._driver:
             self._driver = None
@@ -412,15 +423,30 @@ class PageWorld:
         return np.repeat(first - (np.cumsum(size) - size), size) + np.arange(size.sum())
 
     def _start_view(self) -> np.ndarray:
-        """Returns the first viewpoint of a page: a spectator's eyes, or the view of the client's own actor."""
+        """Returns the first viewpoint of a page: a spectator's eyes, those of the person whom the page controls, or a
+        view over the shoulder of an actor."""
         client = self._client
-        if isinstance(client, Spectator):
-            return client.pose
-        if self._person is not None:
+        if self._person is not None and self._driver is None:
             return client.humans[client.name].pose.head
-        name = next(iter(client.robots), client.name)
-        root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
+        if not isinstance(client, Spectator):
+            name = next(iter(client.robots), client.name)
+            root = client.physics.rigid.base_state(name)[0] if client.robots else client.humans[name].pose.root
+        elif self._eyes is not None or not client.begins_behind_actor or (root := self._nearest_root()) is None:
+            return client.pose
         return first_view(np.asarray(root, float), client.model, self._at_rest[:, :3])
+
+    def _nearest_root(self) -> np.ndarray | None:
+        """Returns the pose [7] of the base of the remote actor that is nearest to a spectator's eyes; None if there is
+        none."""
+        client = self._client
+        assert isinstance(client, Spectator)
+        roots = []
+        for name, actor in tuple(client.remote_actors.items()):
+            if isinstance(actor, RemoteHuman):
+                roots += [] if actor.pose is None else [actor.pose.root]
+            else:
+                roots.append(client.physics.rigid.base_state(name)[0])
+        return min(roots, key=lambda root: float(np.linalg.norm(root[:2] - client.pose[:2])), default=None)
 
 
 def _light(height: float) -> dict[str, Any]:
@@ -463,6 +489,18 @@ def _tracked(person: TrackedPerson) -> TrackedPoints:
         (OPEN_HAND if hands[0] is None else hands[0].fingers, OPEN_HAND if hands[1] is None else hands[1].fingers),
         person.shears,
     )
+
+
+def _held_thing(held: tuple[str, str] | None, model: Model) -> str:
+    """Returns what a hand holds as text for people: "the bunch", "the cane", "the box" or an actor's name; "" for
+    nothing. ``held``: as in :class:`vinesim.scene.values.HandSample`."""
+    if held is None:
+        return ""
+    actor, link = held
+    if actor == "plants":
+        return "the bunch" if model.body_organ[int(link.removeprefix("body/"))] == Organ.BUNCH else "the cane"
+    kind, _, number = actor.partition("/")
+    return f"the {kind}" if number else actor
 
 
 def _within_reach(model: Model) -> dict[str, np.ndarray]:

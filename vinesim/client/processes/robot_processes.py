@@ -113,6 +113,11 @@ class RobotProcesses:
         if self.ros is not None:
             self.ros.attach(client, robot)
 
+    def wait_for_ros(self) -> None:
+        """Wait until the ROS process is ready, if there is one. Raises :class:`WorkerError` if the process fails."""
+        if self.ros is not None:
+            self.ros.wait_until_ready()
+
     def sent_messages(self) -> dict[str, int]:
         """Returns the number of ROS messages sent so far, by topic."""
         return self.sensors.sent_messages() | ({} if self.ros is None else self.ros.sent_messages())

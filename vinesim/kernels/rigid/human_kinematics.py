@@ -126,7 +126,8 @@ def pose_arms_and_fingers(
     lengths of the arm [m]; other lengths [m] and positions [m] are of the left side, the right side mirrors them;
     limbs: [part, 7].
     """
-    # If the hand is out of the arm's reach, the shoulder moves towards it, by at most a fifth of the upper arm.
+    # If the hand is out of the arm's reach, the shoulder makes two thirds of the missing way and the elbow stretches by
+    # one third, so that the hand stays joined to the arm. Both gaps are then inside the sleeve.
     thread = wp.tid()
     zero = wp.float64(0.0)
     one = wp.float64(1.0)
@@ -144,7 +145,8 @@ def pose_arms_and_fingers(
         reach = wp.length(target - joint)
         way = wp.normalize(target - joint)
         most = upper + lower - wp.float64(1.0e-6)
-        joint = joint + wp.clamp(reach - most, zero, wp.float64(0.2) * upper) * way
+        stretch = wp.max(reach - most, zero) / wp.float64(3.0)
+        joint = joint + wp.float64(2.0) * stretch * way
         reach = wp.clamp(wp.length(target - joint), wp.abs(upper - lower) + wp.float64(1.0e-3), most)
         along = (upper * upper - lower * lower + reach * reach) / (wp.float64(2.0) * reach)
         out = perpendicular(rotate_by_pose(held, 0, wp.cw_mul(pole, mirror)), way)
@@ -153,7 +155,7 @@ def pose_arms_and_fingers(
         fore = wp.normalize(joint + reach * way - elbow)
         write_pose(joint, rotation_from_axes(arm, perpendicular(-out, arm)), 2 * thread - 1, limbs_out)
         back = rotate_by_pose(held, hand, z) + wp.float64(1.0e-3) * rotate_by_pose(held, hand, x)
-        write_pose(elbow, rotation_from_axes(fore, perpendicular(back, fore)), 2 * thread, limbs_out)
+        write_pose(elbow + stretch * way, rotation_from_axes(fore, perpendicular(back, fore)), 2 * thread, limbs_out)
     else:
         finger = thread - 3
         hand = 2 + finger / 5

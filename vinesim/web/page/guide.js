@@ -12,10 +12,12 @@ const LOOKED = 0.35,
   MOVED = 0.5; // rad, m: motions that count as done
 const ALL_DONE = "Well done, those were the first steps. H, or 'keys' under 'show', lists everything else.";
 
+const LOOK = "Drag with the mouse to look around: the picture follows the mouse, so dragging down looks up.";
+
 /** Steps of a person and of a spectator: name, text for keys and mouse, text for touch. */
 const STEPS = {
   person: [
-    ["look", "Drag with the mouse to look around.", "Drag with one finger to look around."],
+    ["look", LOOK, "Drag with one finger to look around: the picture follows the finger."],
     [
       "walk",
       "Walk to a bunch of grapes with <kbd>W</kbd> <kbd>A</kbd> <kbd>S</kbd> <kbd>D</kbd>.",
@@ -35,7 +37,7 @@ const STEPS = {
     ],
   ],
   spectator: [
-    ["look", "Drag with the mouse to look around.", "Drag with one finger to look around."],
+    ["look", LOOK, "Drag with one finger to look around: the picture follows the finger."],
     [
       "move",
       "Fly with <kbd>W</kbd> <kbd>A</kbd> <kbd>S</kbd> <kbd>D</kbd>, down and up with <kbd>Q</kbd> <kbd>E</kbd>.",
@@ -66,6 +68,7 @@ export class Guide {
 
   /** Begin with the first step. */
   open() {
+    this.hasWalked = false;
     this.start = null; // eyes and number of picked bunches at the beginning
     this.list.replaceChildren(
       ...STEPS[this.isPerson ? "person" : "spectator"].map(([name, keys, touch], k) => {
@@ -98,15 +101,17 @@ export class Guide {
     this.start ??= { place: [...place], yaw, pitch, picked };
     const { start } = this,
       bunch = this.nearestBunch(place);
+    const moved = Math.hypot(...place.map((value, axis) => value - start.place[axis]));
+    this.hasWalked ||= moved > MOVED; // the person may stand before a bunch from the start
     const turned = Math.abs(Math.sin((yaw - start.yaw) / 2)) * 2 + Math.abs(pitch - start.pitch);
     const isReaching = hand?.reaching && hand.target?.what === "bunch";
     const done = {
       look: turned > LOOKED,
-      move: Math.hypot(...place.map((value, axis) => value - start.place[axis])) > MOVED,
+      move: moved > MOVED,
       follow: isFollowing,
-      walk: bunch !== null && bunch.away < this.reach,
+      walk: this.hasWalked && bunch !== null && bunch.away < this.reach,
       reach: isReaching,
-      hold: isReaching && hand.closed,
+      hold: isReaching && hand.held === "the bunch",
       pick: picked > start.picked,
     };
     // steps are done in this order, so that nothing is checked off by chance; a pick is the aim, however it was done

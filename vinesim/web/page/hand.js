@@ -33,6 +33,7 @@ export class Hand {
   constructor(element, gestures, mouth, tap) {
     this.mouth = mouth;
     this.withShears = false;
+    this.held = "";
     this.fingers = null;
     this.reaching = this.closed = false;
     this.opensAfterCut = false;
@@ -125,12 +126,20 @@ export class Hand {
     if (this.opensAfterCut) this.closed = this.opensAfterCut = false;
   }
 
-  /** Show on the buttons the state of the hand, and with shears the wood that is `between` the blades. */
-  show(between) {
+  /** Show on the buttons the state of the hand, what it has `held` in the newest state, and with shears the wood that is
+   * `between` the blades. */
+  show(between, held) {
+    this.held = held;
     const { reach, hold } = this.buttons;
     reach.setAttribute("aria-pressed", String(this.reaching));
     hold.setAttribute("aria-pressed", String(this.closed));
-    const says = this.withShears ? `cut${between ? ` ${between}` : ""}` : this.closed ? "let go" : "grasp";
+    const says = this.withShears
+      ? `cut${between ? ` ${between}` : ""}`
+      : this.closed
+        ? held
+          ? "let go"
+          : "open"
+        : "grasp";
     if (hold.lastElementChild.textContent !== says) hold.lastElementChild.textContent = says;
   }
 

@@ -81,8 +81,8 @@ export class LateHands {
 
 /**
  * Returns the poses (Matrix4) of upper arm and forearm between the poses of chest and hand, as the client computes them
- * (vinesim/kernels/rigid/human_kinematics.py). If the hand is out of the arm's reach, the shoulder moves towards it as far
- * as necessary: the person leans forward. `mirror`: 1 for the left side, -1 for the right one.
+ * (vinesim/kernels/rigid/human_kinematics.py). If the hand is out of the arm's reach, shoulder and elbow make the missing
+ * way. `mirror`: 1 for the left side, -1 for the right one.
  */
 function armBetween(chest, hand, { shoulder, upper_arm: upper, forearm: lower, wrist, elbow }, mirror) {
   const point = ([x, y, z], pose) => new THREE.Vector3(x, mirror * y, z).applyMatrix4(pose);
@@ -92,7 +92,8 @@ function armBetween(chest, hand, { shoulder, upper_arm: upper, forearm: lower, w
     most = upper + lower - 1e-6;
   const away = target.distanceTo(joint),
     way = target.clone().sub(joint).normalize();
-  joint.addScaledVector(way, Math.max(away - most, 0));
+  const stretch = Math.max(away - most, 0) / 3;
+  joint.addScaledVector(way, 2 * stretch);
   const reach = Math.min(Math.max(target.distanceTo(joint), Math.abs(upper - lower) + 1e-3), most);
   const along = (upper * upper - lower * lower + reach * reach) / (2 * reach);
   const out = across(turned([elbow[0], mirror * elbow[1], elbow[2]], chest), way);
@@ -102,6 +103,7 @@ function armBetween(chest, hand, { shoulder, upper_arm: upper, forearm: lower, w
     .addScaledVector(out, Math.sqrt(Math.max(upper * upper - along * along, 0)));
   const arm = bend.clone().sub(joint).normalize(),
     fore = joint.clone().addScaledVector(way, reach).sub(bend).normalize();
+  bend.addScaledVector(way, stretch);
   const back = turned([0, 0, 1], hand).addScaledVector(turned([1, 0, 0], hand), 1e-3);
   return [poseOf(joint, arm, across(out.negate(), arm)), poseOf(bend, fore, across(back, fore))];
 }

@@ -2,12 +2,9 @@
 // sun, sky, canopy and ground, and tone mapping. Linear RGB. With PLAIN defined, for browsers without a graphics card, a
 // pixel reads few texels: such browsers execute both sides of every condition.
 
-export const LIGHT = /* glsl */ `
-precision highp float;
-precision highp int;
+/** Light for shaders that already have the uniforms eye and sun. */
+export const LIGHT_AT_VERTICES = /* glsl */ `
 precision highp sampler2DArray;
-uniform vec3 eye;
-uniform vec3 sun;
 uniform vec3 sunColour;
 uniform vec3 skyColour;
 uniform vec3 hazeColour;
@@ -119,6 +116,13 @@ vec3 display(vec3 light) {
 }
 `;
 
+export const LIGHT = /* glsl */ `
+precision highp float;
+precision highp int;
+uniform vec3 eye;
+uniform vec3 sun;
+${LIGHT_AT_VERTICES}`;
+
 export const MATERIALS = /* glsl */ `
 const uint FOLIAGE = 0u, BERRY = 1u, CANE = 2u, BARK = 3u, POST = 4u, WIRE = 5u, STEM = 6u, PLASTIC = 7u, CLOTH = 8u;
 const uint SKIN = 9u, PAINT = 10u, GRASS = 11u, LAMP = 12u, RUBBER = 13u, METAL = 14u, STRAW = 15u, REFLEX = 16u, GLASS = 17u;
@@ -153,9 +157,17 @@ Surface berry(vec3 n, vec3 tint, float sky, vec3 local, vec4 neighbours) {
 }
 `;
 
-/** Leaves, grass and fallen leaves: local is u, v and the number of the outline; detail is the midrib and the age. */
-export const LEAVES = /* glsl */ `
-uniform sampler2DArray leaves; // veins, slopes of the relief across and along (0.5: none), tone
+const FOLIAGE = /* glsl */ `
+const vec3 THROUGH = vec3(2.3, 2.0, 0.75); // light through a leaf, relative to its albedo
+
+// The upper side or the lower one: paler, felted, its veins stand out. Returns the colour of veins and its share.
+vec4 sided(inout Surface s, bool isBelow) {
+  s.albedo = isBelow ? mix(s.albedo * 1.05, vec3(0.22, 0.27, 0.16), 0.42) : s.albedo;
+  s.specular = isBelow ? 0.012 : 0.05;
+  s.shininess = isBelow ? 6.0 : 22.0;
+  s.reflectivity = isBelow ? 0.0 : 0.55;
+  return isBelow ? vec4(0.34, 0.38, 0.20, 0.7) : vec4(0.20, 0.28, 0.08, 0.40);
+}
 
 vec3 autumn(vec3 albedo, vec2 uv, float edge, float seed, float old) {
   float age = max(old - 0.42, 0.0) * 1.7; // a leaf turns late
@@ -165,14 +177,38 @@ vec3 autumn(vec3 albedo, vec2 uv, float edge, float seed, float old) {
   return mix(mix(albedo, vec3(0.40, 0.34, 0.05), step(0.02, age) * clamp(yellow, 0.0, 1.0)), vec3(0.16, 0.085, 0.03), brown);
 }
 
+void grass(inout Surface s, vec3 plain, float height) {
+  s.albedo *= 0.35 + 0.75 * (0.5 + 0.5 * height);
+  s.transmission = s.albedo * 0.7;
+  s.specular = 0.012;
+  s.normal = normalize(plain * 0.5 + vec3(0.0, 0.0, 0.8));
+  s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, height);
+}
+`;
+
+/** Leaves, grass and fallen leaves: local is u, v and the number of the outline; detail is the midrib and the age. */
+export const LEAVES = /* glsl */ `
+uniform sampler2DArray leaves; // veins, slopes of the relief across and along (0.5: none), tone
+#ifdef PLAIN
+in vec3 vColour;
+in vec3 vVein;
+in vec3 vGloss;
+in float vClear;
+
+// Light from the corners of a leaf, with the texture's tone and veins.
+vec3 bladeLight(vec3 local, uint material) {
+  vec2 across = dFdx(local.xy), down = dFdy(local.xy), uv = vec2((local.x + 1.0) * 0.5, (local.y + 0.75) * 0.5);
+  float texel = sqrt(max(dot(across, across), dot(down, down)));
+  float isNear = step(texel, 0.1) * float(material != GRASS);
+  vec4 table = texture(leaves, vec3(uv, local.z));
+  return vColour * mix(1.0, 0.72 + 0.5 * table.w, isNear) + vVein * (table.x * isNear * vClear / (1.0 + 6.0 * texel)) + vGloss;
+}
+#else
+${FOLIAGE}
 Surface blade(vec3 plain, vec3 tint, float sky, vec3 local, float seed, vec4 detail, uint material, vec3 d) {
   Surface s = diffuse(plain, tint, sky);
   if (material == GRASS) {
-    s.albedo *= 0.35 + 0.75 * (0.5 + 0.5 * local.y);
-    s.transmission = s.albedo * 0.7;
-    s.specular = 0.012;
-    s.normal = normalize(plain * 0.5 + vec3(0.0, 0.0, 0.8));
-    s.occlusion = 0.35 + 0.65 * smoothstep(-0.75, 0.0, local.y);
+    grass(s, plain, local.y);
     return s;
   }
   vec2 across = dFdx(local.xy), down = dFdy(local.xy), uv = vec2((local.x + 1.0) * 0.5, (local.y + 0.75) * 0.5);
@@ -183,25 +219,49 @@ Surface blade(vec3 plain, vec3 tint, float sky, vec3 local, float seed, vec4 det
   vec3 rib = normalize(detail.xyz), side = cross(rib, plain);
   s.normal = normalize(plain - (side * (table.y - 0.5) + rib * (table.z - 0.5)) * 1.2 * clear);
   s.albedo *= mix(1.0, 0.72 + 0.5 * table.w, isNear);
-#ifdef PLAIN
-  float edge = 0.06;
-#else
   float edge = (255.0 * texture(outlines, vec3(uv, local.z)).x - 128.0) * 0.0025;
-#endif
   s.albedo = autumn(s.albedo, local.xy, edge, seed, detail.w);
-  s.transmission = s.albedo * vec3(2.3, 2.0, 0.75) * (1.0 - 0.7 * vein);
-  if (dot(plain, d) > 0.0) { // from below: paler, felted, veins stand out
-    s.albedo = mix(mix(s.albedo * 1.05, vec3(0.22, 0.27, 0.16), 0.42), vec3(0.34, 0.38, 0.20), vein * 0.7);
-    s.specular = 0.012;
-    s.shininess = 6.0;
-  } else {
-    s.albedo = mix(s.albedo, vec3(0.20, 0.28, 0.08), vein * 0.40);
-    s.specular = 0.05;
-    s.shininess = 22.0;
-    s.reflectivity = 0.55;
-  }
+  s.transmission = s.albedo * THROUGH * (1.0 - 0.7 * vein);
+  vec4 veins = sided(s, dot(plain, d) > 0.0);
+  s.albedo = mix(s.albedo, veins.xyz, veins.w * vein);
   return s;
 }
+#endif
+`;
+
+/** Light at the corners of leaves, for browsers without a graphics card. The light that leaves a pixel is linear in the
+ * tone and the veins of the texture: vColour is for tone 1, vVein for veins 1; vGloss has no texture. */
+export const LEAVES_AT_VERTICES = /* glsl */ `
+#ifdef PLAIN
+${LIGHT_AT_VERTICES}
+const uint GRASS = 11u;
+out vec3 vColour;
+out vec3 vVein;
+out vec3 vGloss;
+out float vClear;             // share of the veins that is visible
+${FOLIAGE}
+void lightLeaf(vec3 plain, float seed) {
+  vec3 d = normalize(vPlace - eye);
+  bool isBelow = dot(plain, d) > 0.0;
+  Surface s = diffuse(plain, vTint, vSky);
+  vec4 veins = vec4(0.0);
+  vClear = clamp(abs(dot(plain, d)) * 2.2, 0.0, 1.0);
+  if (vSurface.y == GRASS) grass(s, plain, vLocal.y);
+  else {
+    s.albedo = autumn(s.albedo, vLocal.xy, 0.06, seed, vDetail.w);
+    s.transmission = s.albedo * THROUGH;
+    veins = sided(s, isBelow);
+  }
+  vec3 n = isBelow ? -s.normal : s.normal;
+  float facing = dot(n, sun), lit = sunShare(vPlace, dot(plain, sun) < 0.0 ? -plain : plain, s.sky);
+  vec3 direct = max(facing, 0.0) * sunColour * lit * (0.35 + 0.65 * s.occlusion) + ambient(n, s.sky) * s.occlusion;
+  vec3 through = s.transmission * (sunColour * max(-facing, 0.0) * lit * 0.55 + ambient(-n, s.sky) * 0.30 * s.occlusion);
+  float haze = 0.6 * (1.0 - exp(-length(vPlace - eye) * 0.006));
+  vColour = (s.albedo * direct + through) * (1.0 - haze);
+  vVein = ((veins.xyz - s.albedo) * veins.w * direct - 0.7 * through) * (1.0 - haze);
+  vGloss = mix(glossed(s, true, d, n, facing, lit), hazeColour, haze);
+}
+#endif
 `;
 
 /** Wood and manufactured objects: grain is the position across (x, y) and along (z) the grain [m]. */

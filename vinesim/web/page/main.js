@@ -45,6 +45,9 @@ const RATE = 60;
 const TOO_SLOW = "This browser draws slowly, perhaps without its graphics card: pictures are coarser.";
 const NOBODY =
   "Nobody else is here yet: a client sees the people and robots of the server that it joined by --connect.";
+const WATCHES = "Another page controls the person; this one watches.";
+const RELEASED =
+  "The page that controlled the person was closed: the person stands still until you load this page again.";
 const element = (id) => document.getElementById(id);
 
 /** Returns a number in the page's address (triangles, rate or shadows), null if it is missing. */
@@ -103,6 +106,8 @@ class Viewer {
     this.absence = new Absence();
     this.overlays = new Overlays(world);
     this.lateHands = new LateHands(world);
+    this.control = null; // of a page that watches a person: which page controls the person, as in the last state
+    if (world.header.watched !== null) say(WATCHES, { stays: true });
     this.help = document.querySelector(this.isPerson ? ".person" : ".spectator");
     this.guide = new Guide(world, this.isPerson, ARM, () => {
       this.help.hidden = true;
@@ -212,6 +217,7 @@ class Viewer {
     element("state").textContent = "the client is gone; waiting for it ...";
     try {
       const header = await load("scene");
+      watchIfControlled(header, this.world.header.watched !== null);
       const { scene, seed, person } = this.world.header;
       if (header.scene !== scene || header.seed !== seed || header.person !== person) location.reload();
       this.world.rest(header.arrays.poses);
@@ -227,6 +233,7 @@ class Viewer {
 
   async take(state) {
     // poses of trees are sent once, so poses in a state that is replaced before it is drawn must be used, too
+    if (this.hasLostControl(state.control)) return location.reload();
     this.world.apply(state);
     this.newest = state;
     if (this.timeline?.show(state.replay)) this.absence.expect();
@@ -236,13 +243,24 @@ class Viewer {
     this.heardAt = performance.now();
     for (const [hand, pulse] of Object.entries(state.haptics)) page.haptics[hand] = pulse;
     this.headset.pulse(state.haptics);
-    if (this.shears.take(state)) this.hand.cut();
+    if (this.shears.take(state)) this.hand?.cut();
     if (state.rigid > Math.max(this.world.rigidVersion, this.shapes?.version ?? 0) && !this.loading) {
       this.loading = true;
       this.shapes = await load("rigid").catch(() => null); // if the client has ended meanwhile, the socket waits for it
       this.loading = false;
       this.takeRigid(this.latest);
     }
+  }
+
+  /** Called with the page that controls the person: "this", "other", or "" for none. Returns whether this page has to be
+   * loaded again, because it was made for the other role. */
+  hasLostControl(control) {
+    if (this.isPerson) return control === "other"; // two pages were opened at the same time
+    if (this.world.header.watched === null) return false;
+    const before = this.control;
+    this.control = control;
+    if (before === "other" && control === "") say(RELEASED, { stays: true });
+    return before === null && control === ""; // this page was loaded while the other one was about to close
   }
 
   /** Update rigid bodies from a state. Shapes and poses change together, because a row may belong to another body. */
@@ -417,7 +435,7 @@ class Viewer {
     if (this.headset.isWorn) return { head: pose, ...this.headset.hands() };
     this.hand.withShears = this.shears.taken.right;
     const right = this.hand.tracked(pose, this.eyes.yaw, this.ray(this.hand.cursor), this.world, seconds);
-    this.hand.show(this.shears.between[1]);
+    this.hand.show(this.shears.between[1], this.shears.held[1]);
     return { head: pose, left: null, right };
   }
 
@@ -536,6 +554,14 @@ function graphicsCard() {
   return card;
 }
 
+/** Let a page watch whose person another page controls, or that watches already: its header becomes that of a spectator,
+ * with the name of the person as `watched`. */
+function watchIfControlled(header, watches = false) {
+  header.watched = null;
+  if (header.person === null || !(header.is_controlled || watches)) return;
+  Object.assign(header, { watched: header.person, person: null, mouth: null, intentions: [] });
+}
+
 function fail(failure) {
   page.failure = String(failure?.message ?? failure);
   element("failure").textContent = page.failure;
@@ -550,6 +576,7 @@ addEventListener("error", (event) => {
 if (window.pageMisses) throw new Error(window.pageMisses);
 page.voice = new Voice();
 const header = await load("scene");
+watchIfControlled(header);
 const world = new World(header);
 if (asked("triangles") > 0) world.setBudget(asked("triangles"));
 page.viewer = new Viewer(world, [...header.arrays.start]);

@@ -1,7 +1,7 @@
 // GLSL of the primitives of cameras and lidars (vinesim/kernels/raster/primitives.py). Every vertex reads its primitive
 // and the pose of its carrier from textures, so that moving a body changes only eight numbers.
 
-import { BERRIES, GROUND, LEAVES, LIGHT, MATERIALS, SKY, SOLIDS } from "./light.js";
+import { BERRIES, GROUND, LEAVES, LEAVES_AT_VERTICES, LIGHT, MATERIALS, SKY, SOLIDS } from "./light.js";
 
 /** Width of the texture with the rows of the primitives that are drawn. */
 export const LIST_WIDTH = 1024;
@@ -48,14 +48,14 @@ vec3 unpackNormal(float packed) {
 }
 `;
 
-const FINISH = /* glsl */ `
+const PLACED = /* glsl */ `
   vec4 q = texel(poses, vSurface.z * 2u + 1u, 9);
   vPlace = texel(poses, vSurface.z * 2u, 9).xyz + turn(q, p);
   vNormal = turn(q, n);
   vDetail.xyz = turn(q, vDetail.xyz);
   gl_Position = projectionMatrix * modelViewMatrix * vec4(vPlace, 1.0);
-}
 `;
+const FINISH = `${PLACED}}`;
 
 const START = /* glsl */ `
 void main() {
@@ -188,6 +188,7 @@ export const VERTEX = {
   // position: x from -1 to 1 across, y from 0 to 1 along
   leaf:
     COMMON +
+    LEAVES_AT_VERTICES +
     START +
     /* glsl */ `
   vec4 c = shape(2), d = shape(3);
@@ -201,7 +202,13 @@ export const VERTEX = {
   vSurface.w = floatBitsToUint(c.w);
   vDetail = vec4(b.xyz, d.w); // midrib and age
 ` +
-    FINISH,
+    PLACED +
+    /* glsl */ `
+#ifdef PLAIN
+  lightLeaf(vNormal, c.w);
+#endif
+}
+`,
 };
 
 const VARYINGS = /* glsl */ `
@@ -277,8 +284,12 @@ ${CUT}
 ` +
     (isLeaf
       ? /* glsl */ `
+#ifdef PLAIN
+  vec3 light = bladeLight(local, material);
+#else
   Surface s = blade(n, tint, vSky, local, seed, vDetail, material, d);
   vec3 light = leaving(s, n, place, true, false);
+#endif
 `
       : kind === "spheroid" || isBall
         ? /* glsl */ `

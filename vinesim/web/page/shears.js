@@ -17,6 +17,7 @@ export class Shears {
     this.mouth = mouth;
     this.taken = { left: false, right: false };
     this.between = ["", ""]; // the kind of wood that the blades of both hands would cut
+    this.held = ["", ""]; // what both hands hold
     this.closures = null; // number of closings that the page has reported
     this.told = []; // sentences shown so far
     document.getElementById("tools").hidden = mouth === null;
@@ -36,6 +37,8 @@ export class Shears {
   toggle(side) {
     if (this.mouth === null || !(side in this.taken)) return;
     this.taken[side] = !this.taken[side];
+    const held = this.held[SIDES.indexOf(side)];
+    if (this.taken[side] && held) say(`The ${side} hand let go of ${held} to take the shears.`);
     this.button.setAttribute("aria-pressed", String(this.taken.right));
   }
 
@@ -46,8 +49,9 @@ export class Shears {
 
   /** Called when a state has arrived: report the result of each closing of the shears since the last state. Returns
    * whether they have closed. */
-  take({ shears }) {
+  take({ shears, held }) {
     if (!shears) return false;
+    this.held = held;
     const since = this.closures === null ? 0 : Math.max(shears.closures - this.closures, 0);
     for (const said of since ? shears.said.slice(-since) : []) {
       this.told.push(said);
