@@ -14,6 +14,7 @@ import typer
 
 from vinesim.cli.commands.options import Pose, RealTimeFactor, Scene, Seconds, Seed, StatusFormat, World
 from vinesim.core.errors import UsageError
+from vinesim.ros.names import ros_namespace
 
 ROLES = ("robot", "human", "spectator")
 
@@ -224,6 +225,7 @@ def check_options(options: ClientOptions) -> None:
     from vinesim.scene.values import SensorMode
 
     check_status(options.status)
+    ros_namespace(options.namespace)
     if options.sensors is not None and options.sensors not in tuple(SensorMode):
         raise UsageError(f"--sensors {options.sensors!r}: give {', '.join(SensorMode)}")
     if options.page_lan and options.page is None and not options.is_for_page:

@@ -120,7 +120,7 @@ def topics(namespace: str, with_types: bool) -> int:
     if stop.is_set():
         return 130
     if not found:
-        where = f"namespace {namespace} of " if namespace else ""
+        where = f"namespace {namespace.strip('/')} of " if namespace else ""
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         print(
             f"no topics in {where}ROS_DOMAIN_ID {domain}; start a robot, or set the domain of the robot",
