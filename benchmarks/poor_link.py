@@ -61,7 +61,7 @@ def run_poor_link(protocol: str, seconds: float) -> tuple[int, int, float]:
 
         def start_process(name: str, x: float) -> FakeClientProcess:
             return FakeClientProcess(
-                f"{protocol}/{net.hub(name)}:7447",
+                f"{protocol}/{net.hub(name)}:7377",
                 [{"name": name, "place": [x, 0.0]}],
                 start=lambda *a, **k: net.start(name, *a, **k),
                 certificates=str(certificates) if secured else "",

@@ -86,7 +86,7 @@ def run_clients(line: Link) -> tuple[Rows, Rows]:
         net.start_server("--insecure")
         processes = []
         for name, role in roles.items():
-            place = ["--connect", f"tcp/{net.hub(name)}:7447", "--name", name, "--out", f"{folder}/{name}"]
+            place = ["--connect", f"tcp/{net.hub(name)}:7377", "--name", name, "--out", f"{folder}/{name}"]
             processes.append(net.start(name, [*client, *role, *place, "--seconds", str(SECONDS)]))
         end = time.monotonic() + SECONDS + START
         for process in processes:
@@ -108,7 +108,7 @@ def measure_notification(line: Link, touches: int = TOUCHES) -> list[float]:
         def start_process(name: str, x: float) -> FakeClientProcess:
             fake_clients = [{"name": name, "place": [x, 0.0]}]
             return FakeClientProcess(
-                f"tcp/{net.hub(name)}:7447", fake_clients, start=lambda *a, **k: net.start(name, *a, **k)
+                f"tcp/{net.hub(name)}:7377", fake_clients, start=lambda *a, **k: net.start(name, *a, **k)
             )
 
         with start_process("ada", 1.0) as ada, start_process("bob", 2.0) as bob:

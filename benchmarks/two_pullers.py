@@ -162,7 +162,7 @@ def run_two_pullers(seconds: float = SECONDS, protocol: str = "tcp") -> tuple[fl
         files = {name: pathlib.Path(folder) / f"{name}.npz" for name in SIDES}
         people: list[subprocess.Popen] = []
         for name, file in files.items():
-            wanted = {"connect": f"{protocol}/{net.hub(name)}:7447", "name": name, "seconds": seconds, "out": str(file)}
+            wanted = {"connect": f"{protocol}/{net.hub(name)}:7377", "name": name, "seconds": seconds, "out": str(file)}
             command = [sys.executable, "-m", "benchmarks.two_pullers", json.dumps(wanted)]
             people.append(net.start(name, command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True))
         watchdog = threading.Timer(START, lambda: [person.kill() for person in people])

@@ -1,7 +1,7 @@
 r"""Clients without physics: scripted poses and objects on a real replicator, to measure and test the network.
 
     python -m benchmarks.support.fake_client \\
-        '{"connect": "tcp/127.0.0.1:7447", "fake_clients": [{"name": "ada", "place": [1, 0]}]}'
+        '{"connect": "tcp/127.0.0.1:7377", "fake_clients": [{"name": "ada", "place": [1, 0]}]}'
 
 Such a process reads JSON objects from its standard input, one a line, and answers each with one line. ``{"who": "ada",
 "touch": [3]}`` is a command for one client (:meth:`FakeClient.apply`); the answer is the client's

@@ -2,7 +2,7 @@
 
     with NetworkEmulator({"ada": Link(LinkProfile(0.05, 0.02, 0.01)), "bob": Link()}) as net:
         server = net.start("hub", ["vinesim", "server", "--insecure"])
-        client = net.start("ada", ["vinesim", "client", "--connect", f"tcp/{net.hub('ada')}:7447"])
+        client = net.start("ada", ["vinesim", "client", "--connect", f"tcp/{net.hub('ada')}:7377"])
         sent, received = net.counts("ada")
 
 Each end of the star is a namespace of its own. A pair of TUN devices joins it to the namespace of the hub, and a

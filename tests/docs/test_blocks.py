@@ -146,7 +146,7 @@ def pages_that_run() -> list:
     """Parameters of a test: pages with blocks that run. They use the usual port of a server, one after the other."""
     found = []
     for name in dict.fromkeys(block.page for block in BLOCKS if is_run(block)):
-        marks = [pytest.mark.slow, pytest.mark.ros, pytest.mark.xdist_group("port 7447")]
+        marks = [pytest.mark.slow, pytest.mark.ros, pytest.mark.xdist_group("port 7377")]
         marks += [] if name in SHORT else [pytest.mark.long]
         found.append(pytest.param(name, id=name, marks=marks))
     return found

@@ -15,7 +15,7 @@ from vinesim.net.codec.control import Hello, RetainedRecord, encode_hello, encod
 from vinesim.net.server.server import Server
 from vinesim.net.transport import certificate_watch
 from vinesim.net.transport.access_control import CertificateError, Role
-from vinesim.net.transport.bus import BusError
+from vinesim.net.transport.bus import BusError, JoinRejected
 from vinesim.net.transport.certificates import create
 from vinesim.net.transport.zenoh_bus import ZenohBus
 from vinesim.scene.ids import ObjectKind, object_id
@@ -28,7 +28,10 @@ def _fast_watch(monkeypatch):
 
 def joined(name: str, server: Server, certs: pathlib.Path) -> ZenohBus | None:
     """A bus whose actor was let in; None if it was refused."""
-    bus = ZenohBus(name, connect=server.endpoint, certificates=certs)
+    try:
+        bus = ZenohBus(name, connect=server.endpoint, certificates=certs)
+    except JoinRejected:
+        return None
     try:
         bus.join(encode_hello(Hello(name, digest="D1", scene="vsp")))
     except BusError:

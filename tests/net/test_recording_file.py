@@ -247,14 +247,17 @@ def test_other_files_are_refused(tmp_path, content):
 def test_missing_files_folders_and_other_mcap_files_are_refused(tmp_path):
     with pytest.raises(InvalidRecording, match=r"nowhere\.mcap.*No such file"):
         read_recording(tmp_path / "nowhere.mcap")
-    with pytest.raises(InvalidRecording, match="cannot read"):
+    with pytest.raises(InvalidRecording, match=r"is a folder: give a file that 'vinesim record' wrote"):
         read_recording(tmp_path)
-    with (tmp_path / "other.mcap").open("wb") as file:
-        writer = Writer(file)
-        writer.start()
-        writer.finish()
-    with pytest.raises(InvalidRecording, match="another program"):
-        read_recording(tmp_path / "other.mcap")
+    for profile, words in (("", "another program"), ("ros2", "play it by: vinesim ros play")):
+        with (tmp_path / "other.mcap").open("wb") as file:
+            writer = Writer(file)
+            writer.start(profile)
+            writer.finish()
+        with pytest.raises(InvalidRecording, match=words):
+            read_recording(tmp_path / "other.mcap")
+    with pytest.raises(InvalidRecording, match="is a folder of rosbag2: play its ROS topics by: vinesim ros play"):
+        read_recording(tmp_path)
 
 
 def test_another_protocol_version_is_refused(tmp_path):

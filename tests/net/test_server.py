@@ -34,10 +34,11 @@ from vinesim.net.server import retained_store
 from vinesim.net.server.admission import SceneId
 from vinesim.net.server.retained_store import Quota
 from vinesim.net.server.server import PortTaken, Server
+from vinesim.net.transport import endpoints
 from vinesim.net.transport.bus import KEEP_ALL, JoinRejected, NameTaken
 from vinesim.net.transport.endpoints import resolve_ports
 from vinesim.net.transport.zenoh_bus import ZenohBus
-from vinesim.net.transport.zenoh_session import close_session, config, open_session
+from vinesim.net.transport.zenoh_session import NoServer, close_session, config, open_session
 from vinesim.scene.ids import ObjectKind, object_id
 
 
@@ -60,7 +61,7 @@ def test_a_taken_port_is_one_clear_line():
     Server(running.endpoint).close()
 
 
-@pytest.mark.parametrize("endpoint", ["", "7447", "tls/127.0.0.1:0", "tcp/127.0.0.1", "tcp/:x", "tcp/1.2.3.4:99999"])
+@pytest.mark.parametrize("endpoint", ["", "7377", "tls/127.0.0.1:0", "tcp/127.0.0.1", "tcp/:x", "tcp/1.2.3.4:99999"])
 def test_an_invalid_endpoint_is_refused(endpoint):
     with pytest.raises(ValueError, match=r"expected tcp/HOST:PORT"):
         Server(endpoint)
@@ -191,13 +192,31 @@ def test_a_reply_of_another_protocol_is_refused_with_both_versions():
                 ada.join(hello("ada"))
 
 
-def test_a_stock_router_admits_every_client_and_this_is_logged(caplog):
+@pytest.mark.parametrize(
+    ("tokens", "words"), [([], "a Zenoh router, as of rmw_zenohd of ROS 2"), (["@ros2_lv/0/a/b"], "a ROS 2 graph")]
+)
+@pytest.mark.parametrize("is_live", [True, False])
+def test_a_router_of_another_program_is_no_server(tokens, words, is_live):
+    """A client, or a recorder, at the router of rmw_zenoh is told what is there; its own router routes other keys."""
     (endpoint,) = resolve_ports(["tcp/127.0.0.1:0"])
     router = open_session(config("router", listen__endpoints=[endpoint.locator]))
-    with caplog.at_level("INFO"), ZenohBus("ada", connect=str(endpoint)) as ada:
-        ada.join(hello("ada"))
+    declared = [router.liveliness().declare_token(token) for token in tokens]
+    others = router.declare_queryable("vs/2/*/server/*", lambda query: query.reply(str(query.key_expr), b""))
+    with pytest.raises(NoServer, match="no vinesim server there") as caught:
+        ZenohBus("ada", connect=str(endpoint), live=is_live)
+    assert str(endpoint) in str(caught.value)
+    assert words in str(caught.value)
+    assert "'vinesim server'" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    del declared, others
     close_session(router)
-    assert len([line for line in caplog.messages if "no vinesim server keeps world" in line]) == 1
+
+
+def test_the_default_port_is_none_of_zenoh_or_dds():
+    """DDS gives participant p of domain d the ports 7400 + 250 d + 10 + 2 p and the next one."""
+    assert endpoints.PORT != 7447
+    assert 1024 < endpoints.PORT < 7400
+    assert Server.__init__.__defaults__ == (f"tcp/127.0.0.1:{endpoints.PORT}",)
 
 
 def test_a_client_announces_itself_again_to_a_restarted_server():
@@ -512,8 +531,8 @@ def test_the_documented_configuration_for_stock_routers_works():
     snippet = re.search(r"```json5\n(.*?)```", text, re.S).group(1)
     stream, datagrams = resolve_ports(["tcp/127.0.0.1:0", "udp/127.0.0.1:0"])
     with Server(("tcp/127.0.0.1:0", "udp/127.0.0.1:0")) as hub:
-        snippet = snippet.replace("0.0.0.0:7447", f"127.0.0.1:{stream.port}")
-        snippet = snippet.replace("10.0.0.1:7447", hub.endpoint.partition("/")[2])
+        snippet = snippet.replace("0.0.0.0:7377", f"127.0.0.1:{stream.port}")
+        snippet = snippet.replace("10.0.0.1:7377", hub.endpoint.partition("/")[2])
         router = open_session(zenoh.Config.from_json5(snippet))
         with ZenohBus("ada", connect=hub.endpoint) as ada, ZenohBus("bob", connect=str(datagrams)) as bob:
             assert len(bob.links) == 3

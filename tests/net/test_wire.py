@@ -64,11 +64,11 @@ class NetworkTestbed:
 
     def __init__(self, net: NetworkEmulator) -> None:
         self.net = net
-        self.server = ServerProcess("tcp/0.0.0.0:7447", lambda *a, **k: net.start("hub", *a, **k))
+        self.server = ServerProcess("tcp/0.0.0.0:7377", lambda *a, **k: net.start("hub", *a, **k))
         places = {"ada": 1.0, "bob": 2.0, "cleo": 30.0}
         self.clients = {
             name: FakeClientProcess(
-                f"tcp/{net.hub(name)}:7447",
+                f"tcp/{net.hub(name)}:7377",
                 [{"name": name, "place": [x, 0.0], "restless": False}],
                 trees=60,
                 start=lambda *a, name=name, **k: net.start(name, *a, **k),
@@ -186,9 +186,9 @@ def test_puts_without_subscribers_cost_nothing():
     require_network_emulation()
     with (
         NetworkEmulator({"ada": Link()}) as net,
-        ServerProcess("tcp/0.0.0.0:7447", lambda *a, **k: net.start("hub", *a, **k)),
+        ServerProcess("tcp/0.0.0.0:7377", lambda *a, **k: net.start("hub", *a, **k)),
     ):
-        command = [sys.executable, "-c", UNMATCHED, f"tcp/{net.hub('ada')}:7447"]
+        command = [sys.executable, "-c", UNMATCHED, f"tcp/{net.hub('ada')}:7377"]
         ada = net.start("ada", command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         assert ada.stdin is not None
         assert ada.stdout is not None

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.controller_manager import ControllerManager, GoalResult
+from vinesim.robot.control.gripper_controllers import GOAL_TOLERANCE, STALL_DURATION, STALL_SPEED
 from vinesim.robot.control.trajectory_controller import Outcome, Trajectory
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.description.urdf import DescriptionError
@@ -111,7 +114,7 @@ def test_after_a_trajectory_was_stopped_the_desired_state_is_that_the_joints_hol
     managed = ManagedRobot()
     manager = managed.manager
     joints = managed.robot.joint_indices(ARM)
-    manager.start_trajectory("arm_left_controller", managed.swing(0.5), managed.time, b"a")
+    manager.start_trajectory("arm_left_controller", managed.swing(0.3), managed.time, b"a")
     managed.run(0.5)
     assert (manager.desired_velocity[joints] > 0.1).all()
     if how == "cancel":
@@ -139,6 +142,63 @@ def test_a_gripper_reaches_its_goal_or_stalls() -> None:
     assert opened is not None
     assert opened.stalled
     assert not opened.reached_goal
+
+
+def test_a_gripper_that_passes_its_goal_has_not_reached_it() -> None:
+    """Fingers that open fast get a goal just ahead of them: it counts when they stand still there, not before."""
+    managed = ManagedRobot()
+    robot = managed.robot
+    fingers = robot.description.joint_indices("gripper_left")
+    managed.manager.start_gripper("gripper_left_controller", 0.0, None, 0.0, b"close")
+    managed.run(5.0, until=b"close")
+    managed.manager.start_gripper("gripper_left_controller", 0.08, None, managed.time, b"open")
+    before = robot.gripper_opening("gripper_left")
+    managed.run(0.3)
+    speed = np.abs(managed.rigid.joint_measurements("anna")[1][fingers]).max()
+    assert robot.gripper_opening("gripper_left") > before
+    assert speed > 10.0 * STALL_SPEED
+    here = robot.gripper_opening("gripper_left")
+    managed.manager.start_gripper("gripper_left_controller", here, None, managed.time, b"here")
+    managed.run(0.02)
+    assert b"here" not in managed.ended
+    managed.run(5.0, until=b"here")
+    reached = managed.ended[b"here"].gripper
+    assert reached is not None
+    assert reached.reached_goal
+    assert abs(reached.position - here) <= GOAL_TOLERANCE
+    assert np.abs(managed.rigid.joint_measurements("anna")[1][fingers]).max() <= STALL_SPEED
+
+
+def test_a_gripper_stalls_after_the_stall_timeout() -> None:
+    managed = ManagedRobot()
+    managed.manager.start_gripper("gripper_left_controller", 0.5, None, 0.0, b"a")
+    managed.run(8.0, until=b"a")
+    managed.manager.start_gripper("gripper_left_controller", 0.5, None, managed.time, b"b")  # it cannot move on
+    began = managed.time
+    managed.run(8.0, until=b"b")
+    assert managed.ended[b"b"].gripper.stalled
+    assert managed.time - began == pytest.approx(STALL_DURATION, abs=0.03)
+
+
+@pytest.mark.parametrize(
+    ("trajectory", "words"),
+    [
+        (lambda managed: managed.swing(9.0), "point 0 moves arm_left_1_joint to"),
+        (
+            lambda managed: dataclasses.replace(managed.swing(0.1), start_time=1.76e9),
+            "s from now; stamp it with the time of /clock",
+        ),
+    ],
+)
+def test_a_trajectory_that_cannot_be_followed_ends_with_the_reason(trajectory, words) -> None:
+    """Beyond a joint's limit, or with the stamp of another clock: INVALID_GOAL at once, and the joints stay."""
+    managed = ManagedRobot()
+    before = managed.arm()
+    managed.manager.start_trajectory("arm_left_controller", trajectory(managed), 0.0, b"a")
+    managed.run(0.1)
+    assert managed.ended[b"a"].outcome is Outcome.INVALID_GOAL
+    assert words in managed.ended[b"a"].text
+    np.testing.assert_allclose(managed.arm(), before, atol=1e-3)
 
 
 def test_impedance_and_motor_commands() -> None:

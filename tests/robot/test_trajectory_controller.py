@@ -9,7 +9,9 @@ import pytest
 
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.control.trajectory_controller import (
+    LIMIT_SLACK,
     MAX_SPLINES,
+    MAX_WAIT,
     GoalHandle,
     Outcome,
     Tolerance,
@@ -248,6 +250,39 @@ def test_joints_that_a_newer_trajectory_does_not_name_follow_the_older_one() -> 
     assert not arm.controller.is_moving
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_waypoints_may_be_at_a_limit_but_not_beyond_it(side: float) -> None:
+    arm = ControlledArm()
+    robot = arm.robot
+    joint = robot.joint_indices(TWO)[1]
+    limit = (robot.lower_limit if side < 0.0 else robot.upper_limit)[joint]
+    for beyond, is_allowed in ((0.0, True), (0.5 * LIMIT_SLACK, True), (0.02, False)):
+        points = np.tile(arm.at(TWO), (2, 1))
+        points[1, 1] = limit + side * beyond
+        plan = Trajectory(TWO, np.array([5.0, 9.0]), points)
+        if is_allowed:
+            arm.controller.start(plan, 0.0)
+        else:
+            with pytest.raises(
+                TrajectoryError, match=r"point 1 moves arm_left_4_joint to .*give a position between"
+            ) as no:
+                arm.controller.start(plan, 0.0)
+            assert no.value.code is Outcome.INVALID_GOAL
+
+
+@pytest.mark.parametrize(("ahead", "is_allowed"), [(MAX_WAIT - 1.0, True), (MAX_WAIT + 1.0, False), (1.76e9, False)])
+def test_a_stamp_far_ahead_is_of_another_clock(ahead: float, is_allowed: bool) -> None:
+    arm = ControlledArm()
+    arm.time = 20.0
+    plan = dataclasses.replace(swing(arm), start_time=arm.time + ahead)
+    if is_allowed:
+        assert arm.controller.start(plan, arm.time).start_time == arm.time + ahead
+    else:
+        with pytest.raises(TrajectoryError, match="at most 60 s ahead, or with 0") as no:
+            arm.controller.start(plan, arm.time)
+        assert no.value.code is Outcome.INVALID_GOAL
+
+
 def test_trajectories_that_wait_are_bounded() -> None:
     """Each of them replaces the one before only for the last part of its time, so that all are kept."""
     arm = ControlledArm()
@@ -256,7 +291,7 @@ def test_trajectories_that_wait_are_bounded() -> None:
     for i in range(MAX_SPLINES):
         arm.controller.start(Trajectory(TWO, one, here, start_time=1.0 + i), 0.0)
     with pytest.raises(TrajectoryError, match="32 trajectories are executed or wait"):
-        arm.controller.start(Trajectory(TWO, one, here, start_time=100.0), 0.0)
+        arm.controller.start(Trajectory(TWO, one, here, start_time=50.0), 0.0)
     now = arm.controller.start(Trajectory(TWO, one, here), 0.0)  # replaces all
     arm.run(2.0, until=now)
     assert now.outcome is Outcome.SUCCESSFUL

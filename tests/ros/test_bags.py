@@ -15,12 +15,14 @@ if middleware.unavailable_reason() is not None:
     pytest.skip(str(middleware.unavailable_reason()), allow_module_level=True)
 
 from mcap.reader import make_reader
+from mcap.writer import Writer
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import deserialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from tests.support.stock_node import StockNode, wait_until
+from vinesim.core.bag_files import BagError
 from vinesim.ros.messages.definitions import UnknownTypeError, message_definition
 from vinesim.ros.tools import bag_player
 from vinesim.ros.tools.bag_recorder import BagRecorder
@@ -90,10 +92,49 @@ def test_definitions_hold_what_they_refer_to_and_unknown_types_are_named():
         message_definition("no_such_msgs/msg/Thing")
 
 
+def test_a_rosbag2_folder_plays_and_what_is_whole_of_a_cut_file(tmp_path, caplog):
+    """Two files, the second one cut off: all messages of the first, and those before the cut."""
+    folder = tmp_path / "mybag"
+    folder.mkdir()
+    texts = [f"note {number}" for number in range(20)]
+    for part in range(2):
+        with (folder / f"mybag_{part}.mcap").open("wb") as stream:
+            writer = Writer(stream, use_chunking=False)
+            writer.start(profile="ros2")
+            schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+            channel = writer.register_channel("/note", "cdr", schema, {"offered_qos_profiles": ""})
+            for number in range(10 * part, 10 * part + 10):
+                time = 10_000_000 * number
+                writer.add_message(channel, time, serialize_message(String(data=texts[number])), time)
+            writer.finish()
+    (folder / "metadata.yaml").write_text(
+        "rosbag2_bagfile_information:\n  relative_file_paths:\n    - mybag_0.mcap\n    - mybag_1.mcap\n"
+    )
+    last = folder / "mybag_1.mcap"
+    whole = last.read_bytes()
+    last.write_bytes(whole[: whole.index(b"note 17")])
+    heard: list[str] = []
+    with StockNode() as peer:
+        peer.node.create_subscription(String, "/note", lambda message: heard.append(message.data), 100)
+        player = threading.Thread(target=bag_player.play, args=(folder,))
+        player.start()
+        wait_until(lambda: not player.is_alive() and len(heard) == 17, peer.spin, "the played messages")
+    assert heard == texts[:17]
+    assert f"{last}: is cut off after message 7; the messages before are played" in caplog.text
+
+
 def test_what_is_no_recording_is_refused_in_words(tmp_path):
     wrong = tmp_path / "wrong.mcap"
     wrong.write_bytes(b"nothing")
-    with pytest.raises(bag_player.BagError, match="give a recording of ROS topics"):
+    with pytest.raises(BagError, match="give a recording of ROS topics"):
         bag_player.play(wrong)
-    with pytest.raises(bag_player.BagError, match="No such file"):
+    with pytest.raises(BagError, match="No such file"):
         bag_player.play(tmp_path / "missing.mcap")
+    with wrong.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start()
+        schema = writer.register_schema("vinesim", "jsonschema", b"{}")
+        writer.register_channel("hello/ada", "json", schema)
+        writer.finish()
+    with pytest.raises(BagError, match="by: vinesim replay"):
+        bag_player.play(wrong)

@@ -29,8 +29,9 @@ from std_msgs.msg import String
 
 from tests.support import sensor_scenes
 from tests.support.stock_node import StockNode, wait_until
+from vinesim.core.errors import UsageError
 from vinesim.ros.messages import message_packages
-from vinesim.ros.names import ros_name
+from vinesim.ros.names import ros_name, ros_namespace
 from vinesim.ros.robot_node import RobotNode
 from vinesim.ros.sensor_node import SensorNode
 from vinesim.scene.values import CameraFrame, CameraInfo, CameraOutput, ComponentStatus, JointSample, RobotSample
@@ -357,3 +358,28 @@ def test_names_of_actors_become_names_of_nodes(actor: str, name: str):
 
     assert ros_name(actor) == name
     assert validate_node_name(name)
+
+
+@pytest.mark.parametrize(
+    ("text", "namespace"),
+    [("", ""), ("/", ""), ("//", ""), ("north", "north"), ("/north/", "north"), ("a//b/", "a/b"), ("_1/B2", "_1/B2")],
+)
+def test_slashes_around_a_namespace_do_not_matter(text: str, namespace: str):
+    from rclpy.validate_namespace import validate_namespace
+
+    assert ros_namespace(text) == namespace
+    assert validate_namespace(f"/{namespace}")
+
+
+@pytest.mark.parametrize(
+    "text", ["1", "a b", "a-b", "n\N{LATIN SMALL LETTER O WITH DIAERESIS}rd", "/a/~", "a/{x}", "a" * 300]
+)
+def test_what_ros_refuses_as_a_namespace_is_refused_in_one_line(text: str):
+    from rclpy.exceptions import InvalidNamespaceException
+    from rclpy.validate_namespace import validate_namespace
+
+    with pytest.raises(InvalidNamespaceException):
+        validate_namespace("/" + text.strip("/"))
+    with pytest.raises(UsageError, match="is no ROS namespace") as refused:
+        ros_namespace(text)
+    assert "\n" not in str(refused.value)

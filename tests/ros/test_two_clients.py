@@ -94,7 +94,7 @@ class World:
             "--name",
             name,
             "--namespace",
-            name,
+            f"/{name}/",
             "--spawn",
             str(spawn),
             "--status",

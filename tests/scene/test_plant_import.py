@@ -134,7 +134,70 @@ def test_what_is_missing_is_filled_and_marked(tmp_path):
     assert load_imported_plant(str(tmp_path / "plant.toml")) == plant
 
 
+MEASURED = """\
+/P1/E1\t\t\t0\t0\t0\t20\t01/03/24
+*\t\t\t\t\t\t22\t01/05/24
+^<E2\t\t\t0\t0\t0,3\t12\t01/03/24
+*\t\t\t\t\t\t0\t01/05/24
+^<E3\t\t\t0\t0\t0,6\t0\t01/05/24
+^<E4\t\t\t0\t0\t0,8\tNA\t01/05/24
+^<E5\t\t\t0\t0\t0,9\t6,5\t01/05/24
+"""
+
+
+def test_dates_and_diameters_that_were_not_measured(tmp_path):
+    """The last measurement of each entity counts; 0 and NA are none; decimals may have commas."""
+    table = TABLE.replace("diam\tREAL\n", "diam\tREAL\nDate\tDD/MM/YY\n").replace("ZZ\tdiam\n", "ZZ\tdiam\tDate\n")
+    plant = imported(tmp_path, table + MEASURED, diameter_unit="mm")
+    diameter = np.array(plant.nodes)[:, 4]
+    assert plant.filled == (2, 3)
+    np.testing.assert_allclose(diameter[[0, 1, 4]], [0.022, 0.012, 0.0065])
+    assert 0.0065 < diameter[3] < diameter[2] < 0.012
+    assert np.array(plant.nodes)[:, 3].tolist() == [0.0, 0.3, 0.6, 0.8, 0.9]
+    assert plant.notes[1:] == ("1 diameters are 0, which is taken as not measured",)
+
+
+def test_a_ply_file_with_other_line_ends_lists_and_faces_first(tmp_path):
+    """The same five vertices, as a mesh program and as an editor of Windows write them."""
+    rows = ["0 0 0 0.02", "0 0 0.3 0.015", "0.02 0 0.6 0.01", "0.05 0.02 0.9 0.006", "0.2 0 0.5 0.005"]
+    head = "ply\nformat ascii 1.0\nelement face 1\nproperty list uchar int vertex_indices\nelement vertex 5\n"
+    head += "".join(f"property float {name}\n" for name in ("x", "y", "z", "scalar_Radius"))
+    head += "property list uchar float near\nelement edge 4\nproperty int vertex1\nproperty int vertex2\nend_header\n"
+    body = "3 0 1 2\n" + "".join(f"{row} {i} {'7 ' * i}\n" for i, row in enumerate(rows)) + "0 1\n1 2\n2 3\n4 1\n"
+    wanted = None
+    for end in ("\n", "\r\n", "\r"):
+        (tmp_path / "plant.ply").write_bytes((head + body).replace("\n", end).encode())
+        plant = vinesim.import_plant(tmp_path / "plant.ply")
+        wanted = wanted or plant.nodes
+        assert plant.nodes == wanted
+    parent, _, _, height, diameter = np.array(wanted).T
+    assert parent.tolist() == [-1, 0, 1, 1, 2]
+    np.testing.assert_allclose(height, [0.0, 0.3, 0.6, 0.5, 0.9])
+    np.testing.assert_allclose(diameter, [0.04, 0.03, 0.02, 0.01, 0.012])
+
+
 BAD = {
+    "blanks for tabs": ("plant.mtg", HEAD + "ENTITY-CODE XX YY ZZ\n/P1 0 0 0\n", "line 10: has no tabs; separate"),
+    "two of three axes": ("plant.mtg", TABLE + "/P1\t\t\t0\t0\n", "line 11: has XX and YY alone; give XX, YY and ZZ"),
+    "both decimals": ("plant.mtg", TABLE + "/P1\t\t\t0.5\t0,5\t0\n", "yy is '0,5', and other numbers have"),
+    "negative diameter": ("plant.mtg", TABLE + "/E1\t\t\t0\t0\t0\t-1\n^<E2\t\t\t0\t0\t9\n", "give one above 0, or 0"),
+    "thick": ("plant.mtg", TABLE + "/E1\t\t\t0\t0\t0\t9\n^<E2\t\t\t0\t0\t9\n", "give the unit of diameters, up to"),
+    "picture": ("plant.ply", "ply\n" + "\0" * 90, "has no line 'end_header'"),
+    "long row": (
+        "plant.ply",
+        PLY + "property int parent\nend_header\n0 0 0 -1\n0 0 1 0 5\n0 0 2 1\n",
+        "line 10: a row",
+    ),
+    "too many rows": (
+        "plant.ply",
+        PLY + "property int parent\nend_header\n" + "0 0 0 -1\n" * 4,
+        "line 12: follows the last",
+    ),
+    "parent between": (
+        "plant.ply",
+        PLY + "property float parent\nend_header\n0 0 0 -1\n0 0 1 0\n0 0 2 0.5\n",
+        "parent is 0.5",
+    ),
     "no MTG": ("plant.mtg", "hello\n", "has no section 'MTG:'"),
     "another code": ("plant.mtg", HEAD.replace("FORM-A", "FORM-B"), "only FORM-A can be read"),
     "no geometry": ("plant.mtg", TABLE + "/P1\n^<E2\n", "no entity has coordinates"),

@@ -212,8 +212,8 @@ def test_files_that_are_no_recording_are_refused(tmp_path: pathlib.Path) -> None
     (tmp_path / "empty" / "records").mkdir(parents=True)
     for name, words in (
         ("nothing", "is not there"),
-        ("old", "ros2 bag convert"),
-        ("text.mcap", "no whole MCAP file"),
+        ("old", "is no MCAP or SQLite file"),
+        ("text.mcap", "is no MCAP or SQLite file"),
         ("empty", "is empty"),
     ):
         with pytest.raises(RecordedPicturesError, match=words):

@@ -53,11 +53,13 @@ def test_a_track_survives_its_file(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("text", "place", "remedy"),
     [
-        ("time [s],x\n" + ROWS, "track.csv:1: column 2 'x' has no unit", "'x [mm]'"),
+        ("time [s],x,y [m]\n" + ROWS, "track.csv:1: column 2 'x' has no unit", "'x [mm]'"),
         ("time [s],x [inch]\n", "track.csv:1: column 2 'x [inch]': unit 'inch'", "m or cm or mm"),
         ("time [s],x [px]\n", "track.csv:1: column 2 'x [px]': a position in pixels", "the mm of a pixel"),
         ("frame,x [mm]\n", "track.csv:1: column 1 'frame' numbers pictures", "'time [s]'"),
-        ("time [s];x [mm]\n", "column 1 'time [s];x [mm]' holds several names", "by commas"),
+        ("time [s],x [mm]\n0,00,1,5\n", "track.csv:2: 4 cells, the header has 2", "by semicolons"),
+        ("time [s];x [mm]\n0,5;1.5\n", "track.csv:2: column 'x [mm]' is '1.5'", "all decimals as points"),
+        ('time [s],x [mm]\n0,"1\n', "track.csv:2: has a quotation mark", "close it"),
         ("time [s],x [mm],force [kg]\n", "unit 'kg' of a force; give N", "9.81 N"),
         ("time [s],colour [m]\n", "column 2 'colour [m]' is not known", "MARKER x"),
         ("time [s],x [m],x [mm]\n" + ROWS, "columns 2 and 3 are the same", "remove one"),

@@ -1,6 +1,6 @@
 """A client in Python: joins a vineyard as a robot, steps, leaves.
 
-    with Client("demo", "vinebot", connect="tcp/127.0.0.1:7447", name="picker") as client:
+    with Client("demo", "vinebot", connect="tcp/127.0.0.1:7377", name="picker") as client:
         client.robot.command_base(0.3, 0.0, client.time)
         client.run(0.4)
 
@@ -58,7 +58,7 @@ class Client:
                 clients of a world.
             robot: name from ``data/robots``, or the path of a URDF file.
             name: unique name of this actor in the world.
-            connect: endpoint of the server such as ``tcp/127.0.0.1:7447``; without it the client is alone in its own
+            connect: endpoint of the server such as ``tcp/127.0.0.1:7377``; without it the client is alone in its own
                 world.
             pose: (x, y, yaw) in m and rad, or pose [7] of the base; by default a start place of the scene.
             spawn: index of the start place in the scene; by default the first one where no other actor stands.

@@ -14,6 +14,7 @@ import typer
 
 from vinesim.cli.commands.options import Pose, RealTimeFactor, Scene, Seconds, Seed, StatusFormat, World
 from vinesim.core.errors import UsageError
+from vinesim.ros.names import ros_namespace
 
 ROLES = ("robot", "human", "spectator")
 
@@ -44,13 +45,13 @@ class ClientOptions:
         str | None, typer.Option(help="The actor's unique name; by default ROLE-PID, or ROLE without a server.")
     ] = None
     connect: Annotated[
-        str | None, typer.Option(help="Server, such as tcp/192.168.1.5:7447; by default none: the client is alone.")
+        str | None, typer.Option(help="Server, such as tcp/192.168.1.5:7377; by default none: the client is alone.")
     ] = None
     """None: the client is alone and has no network."""
     tls: Annotated[
         pathlib.Path | None,
         typer.Option(
-            help="Folder with ca.pem, NAME.pem and NAME.key, for a server with certificates at tls/HOST:7447."
+            help="Folder with ca.pem, NAME.pem and NAME.key, for a server with certificates at tls/HOST:7377."
         ),
     ] = None
     scene: Scene = "demo"
@@ -229,14 +230,15 @@ def check_options(options: ClientOptions) -> None:
     from vinesim.scene.values import SensorMode
 
     check_status(options.status)
+    ros_namespace(options.namespace)
     if options.sensors is not None and options.sensors not in tuple(SensorMode):
         raise UsageError(f"--sensors {options.sensors!r}: give {', '.join(SensorMode)}")
     if options.page_lan and options.page is None and not options.is_for_page:
         raise UsageError("--page-lan without a page: give --page PORT, too")
     if options.tls is not None and options.connect is None:
-        raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7447")
+        raise UsageError(f"--tls {options.tls} without a server: give --connect tls/HOST:7377")
     if options.world != DEFAULT_WORLD and options.connect is None:
-        raise UsageError(f"--world {options.world} without a server: give --connect tcp/HOST:7447")
+        raise UsageError(f"--world {options.world} without a server: give --connect tcp/HOST:7377")
     if options.world != DEFAULT_WORLD and options.tls is not None:
         raise UsageError(
             f"--world {options.world} --tls {options.tls}: a server with certificates has one world; leave --world out"

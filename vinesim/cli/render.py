@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import csv
 import dataclasses
+import logging
 import pathlib
 import re
 from collections.abc import Sequence
@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 
 from vinesim.core.errors import UsageError, WriteError
+from vinesim.core.text_files import CUT, NumberReader, TextError, read_table, read_text
 
 if TYPE_CHECKING:
     from vinesim.client.composition.scene_composer import SceneComposer
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from vinesim.sensors.camera.camera import CameraSpec
     from vinesim.sensors.primitives.ray_caster import RayCaster
     from vinesim.sensors.primitives.scene_primitives import Primitives
+
+log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
@@ -341,37 +344,60 @@ def _read_path(path: pathlib.Path) -> list[Viewpoint]:
     """Returns the viewpoints of a CSV file with the columns x, y, z, look_x, look_y, look_z [m], or of a JSON list of
     objects with those keys. Raises :class:`UsageError` if there are none or one is wrong."""
     try:
-        text = path.read_text()
-    except (OSError, UnicodeDecodeError) as bad:
-        raise UsageError(f"--path {path} cannot be read: {getattr(bad, 'strerror', None) or bad}") from None
-    form = (
-        f"give a CSV file with the columns {', '.join(_COLUMNS)} in metres, or a JSON list of objects with these keys"
-    )
-    try:
-        rows = msgspec.json.decode(text) if path.suffix == ".json" else list(csv.DictReader(text.splitlines()))
-    except (msgspec.DecodeError, csv.Error) as bad:
-        raise UsageError(f"--path {path}: {bad}; {form}") from None
-    if not isinstance(rows, list):
-        raise UsageError(f"--path {path} is no list; {form}")
-    points = []
-    for number, row in enumerate(rows):
-        values = [row.get(name) if isinstance(row, dict) else None for name in _COLUMNS]
-        for name, value in zip(_COLUMNS, values, strict=True):
-            if not _is_number(value):
-                what = f"has no {name}" if value is None else f"has the {name} {value!r}"
-                raise UsageError(f"--path {path}, viewpoint {number} {what}; {form}")
-        points.append(np.array(values, float))
+        points = _read_json(path) if path.suffix.lower() == ".json" else _read_csv(path)
+    except OSError as bad:
+        raise UsageError(f"--path {path} cannot be read: {bad.strerror}; give a CSV or JSON file") from None
+    except TextError as bad:
+        raise UsageError(f"--path {bad.at(path)}") from None
     if not points:
-        raise UsageError(f"--path {path} has no viewpoint")
-    return [Viewpoint(p[:3], p[3:], f"--path {path}, viewpoint {i}") for i, p in enumerate(points)]
+        raise UsageError(f"--path {path} has no viewpoint; give a line for each")
+    return [Viewpoint(np.array(p[:3]), np.array(p[3:]), f"--path {path}, viewpoint {i}") for i, p in enumerate(points)]
 
 
-def _is_number(value: Any) -> bool:
+def _read_csv(path: pathlib.Path) -> list[list[float]]:
+    """Returns the rows of the six columns. Raises :class:`TextError`."""
+    table = read_table(path)
+    if table is None:
+        return []
+    names = [name.lower() for name in table.head.cells]
+    for name in _COLUMNS:
+        if names.count(name) != 1:
+            raise TextError(
+                f"{names.count(name)} columns are named {name!r}; give the columns {', '.join(_COLUMNS)} in metres, "
+                "once each",
+                table.head.line,
+            )
+    numbers = NumberReader()
+    points = []
+    for line, cells in table.rows:
+        points.append([])
+        for name in _COLUMNS:
+            try:
+                points[-1].append(numbers.read(cells[names.index(name)]))
+            except TextError as bad:
+                raise TextError(f"column {name!r} is {bad}", line) from None
+    if table.is_cut:
+        log.warning("%s: %s", path, CUT)
+    return points
+
+
+def _read_json(path: pathlib.Path) -> list[list[float]]:
+    """Returns the six numbers of each object in a list. Raises :class:`TextError`."""
+    keys = f"give a list of objects with {', '.join(_COLUMNS)} in metres"
     try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return True
+        rows = msgspec.json.decode(read_text(path))
+        if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
+            raise TextError(f"is no list of objects; {keys}")
+        points = [[float(row[name]) for name in _COLUMNS] for row in rows]
+    except msgspec.DecodeError as bad:
+        raise TextError(f"is no JSON: {bad}; {keys}") from None
+    except TextError:
+        raise
+    except (KeyError, TypeError, ValueError) as bad:
+        raise TextError(f"has no viewpoint with all numbers ({type(bad).__name__} {bad}); {keys}") from None
+    if not np.isfinite(points).all():
+        raise TextError(f"has a number that is not finite; {keys}")
+    return points
 
 
 def parse_composition(robots: Sequence[str], people: Sequence[str], crates: Sequence[str]) -> SceneComposer:

@@ -22,7 +22,7 @@ from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
 from vinesim.robot.tasks.push import PushBunch
 from vinesim.robot.tasks.task import Task
-from vinesim.ros.names import ros_name
+from vinesim.ros.names import ros_name, ros_namespace
 from vinesim.scene.values import SensorMode, SensorPacing
 
 
@@ -91,9 +91,10 @@ def _start_sensors(
 ) -> list[RobotProcesses]:
     """Start the sensor processes of each robot. If there are several robots, each publishes in its own namespace."""
     options = session.options
+    space = ros_namespace(options.namespace)
     processes = []
     for i, (name, description) in enumerate(zip(names, descriptions, strict=True)):
-        parts = (options.namespace,) if len(names) == 1 else (options.namespace, ros_name(name))
+        parts = (space,) if len(names) == 1 else (space, ros_name(name))
         process = RobotProcesses(
             name,
             session.scene,

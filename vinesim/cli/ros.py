@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from vinesim.cli.signals import stop_at_signals
+from vinesim.core.bag_files import BagError
 from vinesim.core.errors import UsageError
 from vinesim.net.recording.mcap_writer import free_path
 from vinesim.ros import middleware
@@ -88,7 +89,7 @@ def play(path: pathlib.Path, rate: float) -> int:
     print(f"playing {path}", flush=True)
     try:
         played = bag_player.play(path, rate=rate, is_stopped=stop.is_set)
-    except bag_player.BagError as error:
+    except BagError as error:
         raise UsageError(str(error)) from None
     print(f"{path}: {played.total()} messages of {len(played)} topics")
     return 0
@@ -119,7 +120,7 @@ def topics(namespace: str, with_types: bool) -> int:
     if stop.is_set():
         return 130
     if not found:
-        where = f"namespace {namespace} of " if namespace else ""
+        where = f"namespace {namespace.strip('/')} of " if namespace else ""
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
         print(
             f"no topics in {where}ROS_DOMAIN_ID {domain}; start a robot, or set the domain of the robot",

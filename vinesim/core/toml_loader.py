@@ -31,7 +31,7 @@ def load_toml(path: pathlib.Path, kind: type[T], error: type[DataError] = DataEr
     """Returns the content of the TOML file at ``path`` as an object of the class ``kind``. Raises ``error`` if the file
     cannot be read or does not fit ``kind``."""
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
+        data = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except tomllib.TOMLDecodeError as bad:
         raise error(f"{path}: not valid TOML: {_one_line(bad)}; correct the syntax there") from None
     except (OSError, UnicodeDecodeError) as bad:

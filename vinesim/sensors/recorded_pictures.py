@@ -1,4 +1,4 @@
-"""Reader of recorded RGB-D pictures: MCAP files of rosbag2, without ROS, or folders written by ``vinesim dataset``.
+"""Reader of recorded RGB-D pictures: files of rosbag2, without ROS, or folders written by ``vinesim dataset``.
 
 Of ROS messages (CDR, XCDR1), only sensor_msgs/Image and sensor_msgs/CameraInfo are decoded.
 """
@@ -8,6 +8,7 @@ from __future__ import annotations
 import collections
 import dataclasses
 import json
+import logging
 import pathlib
 import struct
 from collections.abc import Iterator
@@ -15,10 +16,11 @@ from typing import Any
 
 import cv2
 import numpy as np
-from mcap.exceptions import McapError
-from mcap.reader import make_reader
 
+from vinesim.core.bag_files import Bag, BagError, open_bag
 from vinesim.scene.values import CameraFrame, CameraInfo
+
+log = logging.getLogger(__name__)
 
 LEVEL_POSE = np.array([0.0, 0.0, 0.0, -np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 """[7] Pose of the optical frame of a level camera that looks along the world's y axis: x to the right, z up."""
@@ -44,7 +46,7 @@ def read_pictures(
     pose: np.ndarray | None = None,
     rate: float | None = None,
 ) -> Iterator[CameraFrame]:
-    """Yield the pictures of an MCAP file, of a rosbag2 folder with such files, or of a data set, sorted by time.
+    """Yield the pictures of a file of rosbag2 (MCAP, SQLite), a folder of such files, or a data set, sorted by time.
 
     A colour picture without a depth picture has depth NaN.
 
@@ -63,11 +65,11 @@ def read_pictures(
         raise RecordedPicturesError(f"{path}: is not there; give an MCAP file, a rosbag2 folder or a data set")
     if path.is_dir() and (path / "records").is_dir():
         return _dataset(path, pose, rate)
-    files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
-    if not files:
-        other = " convert it by: ros2 bag convert, storage mcap" if list(path.glob("*.db3")) else ""
-        raise RecordedPicturesError(f"{path}: no *.mcap and no records/ in it;{other or ' give a recording'}")
-    return _bag(files, image, depth, LEVEL_POSE if pose is None else pose)
+    try:
+        bag = open_bag(path)
+    except BagError as bad:
+        raise RecordedPicturesError(str(bad)) from None
+    return _bag(bag, image, depth, LEVEL_POSE if pose is None else pose)
 
 
 # ---------------------------------------------------------------------- data sets
@@ -120,9 +122,12 @@ def _metres(depth: np.ndarray) -> np.ndarray:
 # ---------------------------------------------------------------------- ROS recordings
 
 
-def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: np.ndarray) -> Iterator[CameraFrame]:
-    name = files[0].parent.name if len(files) > 1 else files[0].name
-    types = _topics(files)
+def _bag(bag: Bag, image: str | None, depth: str | None, pose: np.ndarray) -> Iterator[CameraFrame]:
+    name = bag.path.name
+    types = {topic: about.type_name for topic, about in bag.topics.items()}
+    if bag.damage:
+        log.warning("%s; the pictures before are read", bag.damage)
+    known = bag.damage
     image = _choose(name, types, image, ("rgb", "color", "colour"), "--image")
     depth = _choose(name, types, depth, ("depth",), "--depth")
     beside = image.rsplit("/", 1)[0] + "/camera_info"
@@ -133,7 +138,7 @@ def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: 
     info = None
     waiting = collections.deque()
     depths = collections.deque()
-    for topic, data in _messages(files, [image, depth, beside]):
+    for topic, _, data in bag.messages({image, depth, beside}):
         try:
             if topic == beside:
                 info = info or _read_info(data)
@@ -143,24 +148,11 @@ def _bag(files: list[pathlib.Path], image: str | None, depth: str | None, pose: 
             raise RecordedPicturesError(f"{name}: a message of {topic} cannot be read: {bad}") from None
         if info is not None:
             yield from _pair(name, image, waiting, depths, info, pose, last=False)
+    if bag.damage != known:
+        log.warning("%s; the pictures before were read", bag.damage)
     if info is None:
         raise RecordedPicturesError(f"{name}: {beside} has no messages; record it with the pictures")
     yield from _pair(name, image, waiting, depths, info, pose, last=True)
-
-
-def _topics(files: list[pathlib.Path]) -> dict[str, str]:
-    """Returns the message type of each topic in MCAP files, by topic."""
-    types: dict[str, str] = {}
-    for file in files:
-        try:
-            with file.open("rb") as stream:
-                summary = make_reader(stream).get_summary()
-        except (OSError, McapError, struct.error) as bad:
-            raise RecordedPicturesError(f"{file}: is no whole MCAP file: {bad or 'empty'}; give a recording") from None
-        if summary is None:
-            raise RecordedPicturesError(f"{file}: was cut off; mend it with: mcap recover")
-        types |= {c.topic: summary.schemas[c.schema_id].name for c in summary.channels.values() if c.schema_id}
-    return types
 
 
 def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[str, ...], option: str) -> str:
@@ -189,16 +181,6 @@ def _choose(name: str, types: dict[str, str], given: str | None, words: tuple[st
             f"{', '.join(found or images)}"
         )
     return found[0]
-
-
-def _messages(files: list[pathlib.Path], topics: list[str]) -> Iterator[tuple[str, bytes]]:
-    for file in files:
-        with file.open("rb") as stream:
-            try:
-                for _, channel, message in make_reader(stream).iter_messages(topics=topics):
-                    yield channel.topic, message.data
-            except (McapError, struct.error) as bad:
-                raise RecordedPicturesError(f"{file}: is damaged: {bad}; mend it with: mcap recover") from None
 
 
 def _pair(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import logging
 import math
 import pathlib
 import re
@@ -12,7 +13,10 @@ import re
 import numpy as np
 
 from vinesim.core.errors import writing
+from vinesim.core.text_files import CUT, NumberReader, Row, TextError, read_table
 from vinesim.tune.specimen import TIP
+
+log = logging.getLogger(__name__)
 
 MIN_SAMPLES = 8
 """Smallest number of samples of a track."""
@@ -20,6 +24,8 @@ MAX_MISSING = 0.6
 """[1] Largest fraction of a column that may be missing."""
 _SCALE = {"s": 1.0, "ms": 1e-3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "N": 1.0}
 _UNITS = {"time": ("s", "ms"), "force": ("N",), "position": ("m", "cm", "mm"), "base": ("m", "cm", "mm")}
+_MISSING = ("", "nan", "na", "n/a")
+"""Cells of gaps, in lower case."""
 BASE = "base"
 """Name of the columns for the motion of the base; no marker may have this name."""
 _HEADER = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
@@ -138,35 +144,37 @@ def read_trajectory(path: str | pathlib.Path) -> Trajectory:
     The first line names columns with units: ``time [s]``, ``x [mm]`` for the tip, ``NAME x [mm]`` for a marker, ``base
     x [mm]`` for the displacement of the base, ``force [N]``. Axes are x, y and z of the world, z up. Units are s or ms,
     and m, cm or mm, in brackets [] or (). Empty cells and ``nan`` are gaps, which are not allowed in time and base.
-    Lines that begin with ``#`` are skipped.
+    Lines that begin with ``#`` are skipped. Columns may stand in any order, and be separated by commas, semicolons or
+    tabs; between semicolons or tabs, decimals may have commas. If the last line has no line end, a warning is logged.
 
     Raises :class:`TrajectoryError` with line, column, value and correction if a line is invalid.
     """
     path = pathlib.Path(path)
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        content = read_table(path)
     except FileNotFoundError:
         raise TrajectoryError(f"{path}: no such file; give the CSV file of a track") from None
     except OSError as bad:
-        raise TrajectoryError(f"{path}: cannot be read: {bad.strerror}; give the CSV file of a track") from None
-    except UnicodeDecodeError as bad:
-        raise TrajectoryError(f"{path}: is not text in UTF-8: {bad}; save it as CSV in UTF-8") from None
-    rows = [(number, row) for number, row in enumerate(lines, 1) if row.strip() and not row.startswith("#")]
-    if not rows:
+        raise TrajectoryError(f"{path}: cannot be read: {bad.strerror}; give a CSV file") from None
+    except TextError as bad:
+        raise TrajectoryError(bad.at(path)) from None
+    if content is None:
         raise TrajectoryError(f"{path}: is empty; give a header such as 'time [s],x [mm],z [mm]' and samples")
-    cells = [(number, next(csv.reader([row]))) for number, row in rows]
-    columns = _read_header(path, *cells[0])
-    if len(cells) == 1:
+    columns = _read_header(path, *content.head)
+    if not content.rows:
         raise TrajectoryError(f"{path}: no samples follow the header; give {MIN_SAMPLES} or more lines of numbers")
-    table = np.array([_read_row(path, number, row, columns, cells[0][1]) for number, row in cells[1:]])
+    numbers = NumberReader()
+    table = np.array([_read_row(path, row, columns, content.head.cells, numbers) for row in content.rows])
     table = table.reshape(-1, len(columns))
     clock = next(i for i, column in enumerate(columns) if column.kind == "time")
     for row in range(1, len(table)):
         if not table[row, clock] > table[row - 1, clock]:
             raise TrajectoryError(
-                f"{path}:{cells[row + 1][0]}: column {cells[0][1][clock]!r} does not increase: {table[row, clock]:g} s "
-                f"after {table[row - 1, clock]:g} s; sort the lines and remove repeated ones"
+                f"{path}:{content.rows[row].line}: column {content.head.cells[clock]!r} does not increase: "
+                f"{table[row, clock]:g} s after {table[row - 1, clock]:g} s; sort the lines and remove repeated ones"
             )
+    if content.is_cut:
+        log.warning("%s: %s", path, CUT)
     return _assemble(path, columns, table, clock)
 
 
@@ -210,9 +218,7 @@ def _read_name(place: str, text: str) -> _Column:
     found = _HEADER.fullmatch(text.strip())
     if not found and text.strip().lower() in ("frame", "frames", "picture"):
         raise TrajectoryError(f"{place} numbers pictures; divide it by the pictures a second and name it 'time [s]'")
-    if not found or ";" in text or "\t" in text:
-        if ";" in text or "\t" in text:
-            raise TrajectoryError(f"{place} holds several names; separate the columns by commas, decimals by points")
+    if not found:
         raise TrajectoryError(f"{place} has no unit; name it with its unit, e.g. 'time [s]', 'x [mm]', 'force [N]'")
     name = found["name"].strip()
     unit = found["unit"].strip()
@@ -248,19 +254,18 @@ def _read_name(place: str, text: str) -> _Column:
     return _Column(kind, _SCALE[unit], marker, axis)
 
 
-def _read_row(path: pathlib.Path, line: int, row: list[str], columns: list[_Column], names: list[str]) -> list[float]:
-    if len(row) != len(columns):
-        raise TrajectoryError(f"{path}:{line}: {len(row)} cells, the header has {len(columns)}; complete the line")
+def _read_row(
+    path: pathlib.Path, row: Row, columns: list[_Column], names: list[str], numbers: NumberReader
+) -> list[float]:
     values = []
-    for cell, column, name in zip(row, columns, names, strict=True):
-        text = cell.strip()
+    for text, column, name in zip(row.cells, columns, names, strict=True):
+        is_whole = column.kind in ("time", "base")
+        if not is_whole and text.lower() in _MISSING:
+            values.append(math.nan)
+            continue
         try:
-            value = float(text) if text else math.nan
-        except ValueError:
-            value = math.inf
-        whole = column.kind in ("time", "base")
-        if math.isinf(value) or (whole and math.isnan(value)):
-            remedy = "give a number" + ", or leave the cell empty where there is none" * (not whole)
-            raise TrajectoryError(f"{path}:{line}: column {name.strip()!r} is {text!r}; {remedy}")
-        values.append(value * column.scale)
+            values.append(numbers.read(text) * column.scale)
+        except TextError as bad:
+            remedy = "" if is_whole else ", or leave the cell empty where there is none"
+            raise TrajectoryError(f"{path}:{row.line}: column {name!r} is {bad}{remedy}") from None
     return values

@@ -18,12 +18,12 @@ def client(ctx: typer.Context, **values: Any) -> None:
     \b
     Examples:
       vinesim client --role robot
-      vinesim client --role robot --connect tcp/127.0.0.1:7447 --name picker --spawn 1
+      vinesim client --role robot --connect tcp/127.0.0.1:7377 --name picker --spawn 1
       vinesim client --role robot --robot my-robot.urdf --scene vsp --namespace picker
       vinesim client --role robot --robot vinebot --robot my-robot.urdf --name farm
-      vinesim client --role spectator --connect tcp/127.0.0.1:7447 --pose 2 0 1.57 --out pictures
-      vinesim client --role spectator --connect tcp/127.0.0.1:7447
-      vinesim client --role human --connect tcp/127.0.0.1:7447 --name eva --outfit green
+      vinesim client --role spectator --connect tcp/127.0.0.1:7377 --pose 2 0 1.57 --out pictures
+      vinesim client --role spectator --connect tcp/127.0.0.1:7377
+      vinesim client --role human --connect tcp/127.0.0.1:7377 --name eva --outfit green
     """
     gc.disable()  # the collector takes a sixth of the start time; the loop enables it again
     options = ClientOptions(**values)

@@ -14,7 +14,7 @@ def record(
     file: Annotated[
         pathlib.Path, typer.Argument(help="The MCAP file to write; an existing file is kept, and FILE-2 is written.")
     ],
-    connect: Annotated[str, typer.Option(help="Server.")] = "tcp/127.0.0.1:7447",
+    connect: Annotated[str, typer.Option(help="Server.")] = "tcp/127.0.0.1:7377",
     world: World = "vineyard",
     tls: Annotated[
         pathlib.Path | None, typer.Option(help="Folder with ca.pem, NAME.pem and NAME.key of a spectator; see --name.")
@@ -40,7 +40,7 @@ def record(
     \b
     Examples:
       vinesim record run.mcap
-      vinesim record run.mcap --connect tcp/192.168.1.5:7447 --seconds 60
+      vinesim record run.mcap --connect tcp/192.168.1.5:7377 --seconds 60
       vinesim record run.mcap --area -5 -5 5 5 --only poses,trees
     """
     options = dict(locals())
@@ -91,8 +91,8 @@ def replay(
       vinesim replay run.mcap --page 8080
       vinesim replay run.mcap --out pictures
       vinesim replay run.mcap --ros
-      vinesim replay run.mcap --connect tcp/127.0.0.1:7447 --from 20 --to 40
-      vinesim replay run.mcap --listen tcp/127.0.0.1:7447 --speed 0.5
+      vinesim replay run.mcap --connect tcp/127.0.0.1:7377 --from 20 --to 40
+      vinesim replay run.mcap --listen tcp/127.0.0.1:7377 --speed 0.5
     """
     options = dict(locals())
     from vinesim.cli.replay import run

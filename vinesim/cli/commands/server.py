@@ -14,8 +14,8 @@ def server(
     listen: Annotated[
         list[str] | None,
         typer.Option(
-            help="Where to listen, several times if need be; port 0 takes a free one. tcp/127.0.0.1:7447 for "
-            "everything and udp/127.0.0.1:7447 for poses, this machine alone, unless given; with --tls tls/ and quic/ "
+            help="Where to listen, several times if need be; port 0 takes a free one. tcp/127.0.0.1:7377 for "
+            "everything and udp/127.0.0.1:7377 for poses, this machine alone, unless given; with --tls tls/ and quic/ "
             "on all interfaces."
         ),
     ] = None,
@@ -65,7 +65,7 @@ def server(
       vinesim server --real-time-factor 0.2
       vinesim server --tls certs/
       vinesim server --insecure
-      vinesim server --connect tcp/192.168.1.5:7447
+      vinesim server --connect tcp/192.168.1.5:7377
     """
     options = dict(locals())
     from vinesim.cli.server import run

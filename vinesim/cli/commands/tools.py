@@ -124,7 +124,7 @@ def ros_record(
 
 
 def ros_play(
-    path: Annotated[pathlib.Path, typer.Argument(help="An MCAP file of ROS topics, of vinesim or rosbag2.")],
+    path: Annotated[pathlib.Path, typer.Argument(help="MCAP or SQLite file of ROS topics, or a rosbag2 folder.")],
     rate: Annotated[float, typer.Option(min=0.01, max=100.0, help="Speed as a multiple of the recorded one.")] = 1.0,
 ) -> None:
     """Publish the topics of a recording again, /clock included.
@@ -132,7 +132,7 @@ def ros_play(
     \b
     Examples:
       vinesim ros play run.mcap
-      vinesim ros play run.mcap --rate 0.5
+      vinesim ros play mybag/ --rate 0.5
     """
     from vinesim.cli.ros import play
 

@@ -76,7 +76,7 @@ def tune(
 def track(
     recording: Annotated[
         pathlib.Path,
-        typer.Argument(help="MCAP file of ROS topics, rosbag2 folder of MCAP files, or data set of vinesim dataset."),
+        typer.Argument(help="MCAP or SQLite file of ROS topics, rosbag2 folder, or data set of vinesim dataset."),
     ],
     marker: Annotated[
         list[str] | None,

@@ -13,11 +13,10 @@ import sys
 import time
 
 from vinesim.cli.doctor.finding import ERROR, OK, WARNING, Finding, amount
+from vinesim.net.transport.endpoints import PORT
 
 CORES = 2
 """Smallest number of cores with which cameras and steps run in parallel."""
-PORT = 7447
-"""Default port of a server."""
 SHARED_MEMORY = pathlib.Path("/dev/shm")
 LEAST_SHARED_MEMORY = 64 << 20
 """[B] Shared memory needed by one robot: a segment of 24 MiB for its sensors, and the state of the world."""

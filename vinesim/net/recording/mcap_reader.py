@@ -6,11 +6,12 @@ import base64
 import binascii
 import dataclasses
 import pathlib
+import struct
 from typing import NamedTuple
 
 import msgspec
 from mcap.exceptions import EndOfFile, InvalidMagic
-from mcap.records import Channel, Message, Metadata
+from mcap.records import Channel, Header, Message, Metadata
 from mcap.stream_reader import StreamReader
 
 from vinesim.net.codec.header import PROTOCOL
@@ -75,12 +76,18 @@ def read_recording(path: pathlib.Path) -> Recording:
     metadata: dict[str, str] = {}
     recorded: list[RecordedMessage] = []
     channels: dict[int, str] = {}
-    damage = ""
+    damage = profile = ""
+    if path.is_dir():
+        is_bag = any(file.suffix in (".mcap", ".db3") for file in path.iterdir())
+        remedy = "play its ROS topics by: vinesim ros play" if is_bag else "give a file that 'vinesim record' wrote"
+        raise InvalidRecording(f"{path} is a folder{' of rosbag2' if is_bag else ''}: {remedy}")
     try:
         with path.open("rb") as file:
             try:
                 for record in StreamReader(file, validate_crcs=True, record_size_limit=MAX_RECORD_LENGTH).records:
-                    if isinstance(record, Metadata) and record.name == METADATA_NAME:
+                    if isinstance(record, Header):
+                        profile = record.profile
+                    elif isinstance(record, Metadata) and record.name == METADATA_NAME:
                         metadata |= record.metadata
                     elif isinstance(record, Channel):
                         channels[record.id] = record.topic
@@ -90,9 +97,10 @@ def read_recording(path: pathlib.Path) -> Recording:
                         )
             except InvalidMagic:
                 if file.tell() <= 8:
-                    raise InvalidRecording(f"{path} is no MCAP file: give one that 'vinesim record' wrote") from None
+                    kind = "no MCAP file" if file.tell() else "empty"
+                    raise InvalidRecording(f"{path} is {kind}: give one that 'vinesim record' wrote") from None
                 damage = "it is not whole"
-            except EndOfFile:
+            except (EndOfFile, struct.error):
                 damage = "it ends in the middle"
             except OSError:
                 raise
@@ -103,7 +111,12 @@ def read_recording(path: pathlib.Path) -> Recording:
             f"cannot read {path}: {error.strerror}; give a file that 'vinesim record' wrote"
         ) from error
     if "protocol" not in metadata:
-        raise InvalidRecording(f"{path} holds no recording of vinesim: {damage or 'another program wrote it'}")
+        if profile == "ros2":
+            raise InvalidRecording(f"{path} is a recording of ROS topics: play it by: vinesim ros play")
+        raise InvalidRecording(
+            f"{path} holds no recording of vinesim: {damage or 'another program wrote it'}; give a file that 'vinesim "
+            "record' wrote"
+        )
     if metadata["protocol"] != str(PROTOCOL):
         raise InvalidRecording(
             f"{path} speaks protocol version {metadata['protocol']}, this program version {PROTOCOL}: "

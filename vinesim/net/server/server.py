@@ -35,8 +35,8 @@ from vinesim.scene.triangles import is_digest
 
 log = logging.getLogger(__name__)
 
-LISTEN = "tcp/127.0.0.1:7447"
-"""Default endpoint of a server: Zenoh's port, reachable from this machine only."""
+LISTEN = f"tcp/127.0.0.1:{endpoints.PORT}"
+"""Default endpoint of a server, reachable from this machine only."""
 
 LEASE = 1000
 """Time after which a silent server is considered lost [ms]: half of the time for an actor."""
@@ -64,7 +64,7 @@ class PortTaken(BusError):
         protocol = endpoint.partition("/")[0]
         super().__init__(
             f"cannot listen on {endpoint} ({reason}): another server is running there, or choose another port, "
-            f"e.g. {protocol}/0.0.0.0:7448, or port 0 for any free one"
+            f"e.g. {protocol}/0.0.0.0:{endpoints.PORT + 1}, or port 0 for any free one"
         )
 
 
@@ -85,7 +85,7 @@ class Server:
         world: str = WORLD,
         real_time_factor: float | None = None,
     ) -> None:
-        """Listen on endpoints like ``tcp/0.0.0.0:7447``. Port 0 chooses a free port, see :attr:`endpoint`.
+        """Listen on endpoints like ``tcp/0.0.0.0:7377``. Port 0 chooses a free port, see :attr:`endpoint`.
 
         ``connect``: endpoints of routers or servers to link to. A server that is linked to another one only routes. The
         server that connects to no other one admits actors and retains records. ``state_folder``: folder of the
@@ -187,6 +187,7 @@ class Server:
                 session.declare_queryable(f"{root}/offer/*", self._on_mesh_offer),
                 session.declare_queryable(f"{root}/mesh/*", self._on_mesh_query),
             ]
+        declared.append(session.declare_queryable(f"{root}/server/*", _on_server_query))
         return declared
 
     @property
@@ -516,6 +517,13 @@ def _open_router(
 def _strip_root(key: zenoh.KeyExpr) -> str:
     """Returns a key without :data:`ROOT`, so that its first chunk is the world."""
     return str(key)[len(ROOT) + 1 :]
+
+
+def _on_server_query(query: zenoh.Query) -> None:
+    """Tell a client that a server of vinesim is here, which a Zenoh router of another program does not."""
+    with query:
+        if "*" not in str(query.key_expr):
+            query.reply(str(query.key_expr), b"")
 
 
 def _query_payload(query: zenoh.Query) -> bytes:

@@ -96,7 +96,7 @@ def server_answers_config(root: str) -> dict[str, Any]:
     The settings keep other programs that connect to the server from answering queries that actors send to the server.
     ``root``: first chunks of all keys, like ``vs/1``.
     """
-    questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**")]
+    questions = [f"{root}/*/{question}" for question in ("clock/**", "join/**", "snap/**", "server/**")]
     rule = {
         "id": "answers of the server",
         "permission": "deny",
@@ -149,11 +149,12 @@ def acl_config(root: str, actors: Mapping[str, Role]) -> dict[str, Any]:
         own = [
             rule(f"{name} is there", "ingress", ["liveliness_token", "declare_queryable", "reply"], *about_itself),
             rule(
-                f"{name} asks to be let in, and the time",
+                f"{name} asks for the server, to be let in, and the time",
                 "ingress",
                 ["query"],
                 f"{root}/join/{name}/*",
                 f"{root}/clock/{name}",
+                f"{root}/server/{name}",
             ),
         ]
         if role == Role.ROBOT:

@@ -14,8 +14,9 @@ from typing import NamedTuple
 
 from vinesim.core.errors import UsageError
 
-PORT = 7447
-"""Default port of Zenoh."""
+PORT = 7377
+"""Default port of a server. It differs from the default port of Zenoh (7447), where ``rmw_zenohd`` of ROS 2 listens,
+and lies below the ports of DDS (from 7400), which any ROS 2 program on the machine may hold."""
 
 _COUNTERPART = {"tcp": "udp", "udp": "tcp", "tls": "quic", "quic": "tls"}
 _MIXED = {"udp": "?rel=1;mixed_rel=auto", "quic": "?mixed_rel=auto"}

@@ -16,12 +16,15 @@ from vinesim.audio.hearing import SpectatorsSpeakTo
 from vinesim.net.codec.control import Welcome, decode_welcome
 from vinesim.net.codec.header import PROTOCOL, MessageError, WrongVersion
 from vinesim.net.transport.bus import JoinRejected
-from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, has_match
+from vinesim.net.transport.zenoh_session import CONNECT_TIMEOUT, NoServer, has_match
 
 log = logging.getLogger(__name__)
 
 RETRY_PERIOD = 0.05
-"""Time between two attempts to be admitted by a restarted server [s]."""
+"""Time between two attempts to reach a server that has just started, or was restarted [s]."""
+
+ROS_TOKENS = "@ros2_lv/**"
+"""Keys of the liveliness tokens by which nodes with ``rmw_zenoh`` announce themselves and their topics."""
 
 
 class ServerAdmission:
@@ -42,6 +45,7 @@ class ServerAdmission:
         ``endpoint``: text of the server's endpoint. ``is_secured``: whether certificates are used. ``submit(task)``
         runs a function in the bus's own thread."""
         self._session = session
+        self._server_key = f"{prefix}server/{name}"
         self._key = f"{prefix}join/{name}/{session.zid()}"
         self._name = name
         self._world = world
@@ -73,6 +77,28 @@ class ServerAdmission:
         """
         return self._servers is None or (replier is not None and str(replier.zid) in self._servers)
 
+    def find_server(self) -> None:
+        """Return when a server of vinesim has answered, which may keep this world or only route.
+
+        Raises :class:`NoServer` if a router answers, but no server does within :data:`CONNECT_TIMEOUT`; with
+        certificates :class:`JoinRejected`, because a server does not answer names without a certificate in its folder.
+        """
+        deadline = time.monotonic() + CONNECT_TIMEOUT
+        while not any(reply.ok is not None for reply in self._session.get(self._server_key, timeout=CONNECT_TIMEOUT)):
+            if time.monotonic() > deadline:
+                if self._is_secured:
+                    raise self._unknown_name()
+                tokens = self._session.liveliness().get(ROS_TOKENS, timeout=CONNECT_TIMEOUT)
+                raise NoServer(self._endpoint, sum(reply.ok is not None for reply in tokens))
+            time.sleep(RETRY_PERIOD)
+
+    def _unknown_name(self) -> JoinRejected:
+        """Returns the error for an actor to which a server with certificates does not reply."""
+        return JoinRejected(
+            f"the server at {self._endpoint} refuses actors named {self._name!r} in world {self._world!r}: its folder "
+            f"of certificates must hold {self._name}.pem, which it notices within seconds, and it must keep that world"
+        )
+
     def join(self, hello: bytes) -> None:
         """Send an encoded hello to the server, and wait for the reply.
 
@@ -83,10 +109,7 @@ class ServerAdmission:
         if welcomes and welcomes[0].refused:
             raise JoinRejected(welcomes[0].refused)
         if not welcomes and self._is_secured:
-            raise JoinRejected(
-                f"the server at {self._endpoint} refuses actors named {self._name!r}: its folder of certificates must "
-                f"hold {self._name}.pem, which it notices within seconds"
-            )
+            raise self._unknown_name()
         if not welcomes:
             log.info("%s: no vinesim server keeps world %r; actors check each other", self._name, self._world)
         elif len(welcomes) > 1:

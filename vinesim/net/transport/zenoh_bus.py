@@ -28,7 +28,7 @@ from vinesim.core.errors import UsageError
 from vinesim.net.codec.header import MAX_MESSAGE, is_valid_name
 from vinesim.net.transport.access_control import tls_config
 from vinesim.net.transport.bus import KEEP_ALL, KEEP_LAST_1, NameTaken, Reply, SampleStore
-from vinesim.net.transport.endpoints import Endpoint, client_links
+from vinesim.net.transport.endpoints import PORT, Endpoint, client_links
 from vinesim.net.transport.name_holders import NameHolders, bound_name
 from vinesim.net.transport.zenoh_admission import ServerAdmission
 from vinesim.net.transport.zenoh_session import (
@@ -49,7 +49,7 @@ ROOT = "vs/1"
 WORLD = "vineyard"
 """Default name of a world."""
 
-CONNECT = "tcp/127.0.0.1:7447"
+CONNECT = f"tcp/127.0.0.1:{PORT}"
 """Default endpoint: a server on this machine."""
 
 WATCH_PERIOD = 0.5
@@ -100,8 +100,10 @@ class ZenohBus:
         ``tls/HOST:PORT`` or ``quic/HOST:PORT``. ``live``: whether to declare a liveliness token, without which others
         do not know of this actor. Which sessions are opened: :func:`endpoints.client_links`.
 
-        Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NameTaken` if another session
-        holds the name, and :class:`vinesim.core.errors.UsageError` if the name, the world or the endpoint is invalid.
+        Raises :class:`ServerUnreachable` after two seconds without a server, :class:`NoServer` after two seconds at a
+        Zenoh router without one, :class:`JoinRejected` if the server does not know the certificate, :class:`NameTaken`
+        if another session holds the name, and :class:`vinesim.core.errors.UsageError` if the name, the world or the
+        endpoint is invalid.
         """
         for what, text in (("actor name", name), ("world", world)):
             if not is_valid_name(text):
@@ -146,6 +148,7 @@ class ZenohBus:
             submit=self.submit,
         )
         try:
+            self._admission.find_server()
             liveliness = self._session.liveliness()
             self._declared: list[object] = [
                 self._watch_connection(self._session, self.endpoint),

@@ -16,7 +16,7 @@ import zenoh
 
 from vinesim.net.codec.header import MAX_MESSAGE
 from vinesim.net.transport.bus import BusError
-from vinesim.net.transport.endpoints import Endpoint
+from vinesim.net.transport.endpoints import PORT, Endpoint
 
 if TYPE_CHECKING:
     from vinesim.net.transport.certificate_watch import CertificateWatch
@@ -42,7 +42,21 @@ class ServerUnreachable(BusError):
     def __init__(self, endpoint: str, reason: str) -> None:
         super().__init__(
             f"no vinesim server answers at {endpoint} within {CONNECT_TIMEOUT:g} s ({reason}): "
-            f"start one with 'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:7447"
+            f"start one with 'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:{PORT}"
+        )
+
+
+class NoServer(BusError):
+    """A Zenoh router without a vinesim server answers at an endpoint."""
+
+    def __init__(self, endpoint: str, ros_nodes: int) -> None:
+        """``ros_nodes``: number of ROS 2 nodes and topics that the router knows."""
+        kind = (
+            "the router of a ROS 2 graph (rmw_zenohd)" if ros_nodes else "a Zenoh router, such as rmw_zenohd of ROS 2"
+        )
+        super().__init__(
+            f"no vinesim server there: at {endpoint} is {kind}, and no server answers through it: start one with "
+            f"'vinesim server', or give its endpoint, e.g. {endpoint.partition('/')[0]}/HOST:{PORT}"
         )
 
 

@@ -14,11 +14,15 @@ from vinesim.robot.drives.controlled_robot import Robot
 from vinesim.scene.values import GripperState
 
 GOAL_TOLERANCE = 2e-3
-"""[m or rad] Distance from its goal within which a gripper has reached the goal."""
+"""[m or rad] Distance from its goal within which a gripper has reached the goal, once it has settled there."""
 STALL_SPEED = 1e-3
-"""[m/s or rad/s] Speed below which a gripper counts as stalled: the default of ``gripper_action_controller``."""
-STALL_DURATION = 0.3
-"""[s] Time for which a gripper must be slower than :data:`STALL_SPEED` to be stalled. GUESSED: a tenth of the time that
+"""[m/s or rad/s] Speed of the fingers up to which they stand still: ``stall_velocity_threshold`` of
+``gripper_action_controller`` in ros2_controllers, its default."""
+STALL_DURATION = 1.0
+"""[s] Time for which fingers must stand still away from their goal to be stalled: ``stall_timeout`` of
+``gripper_action_controller``, its default."""
+SETTLE_DURATION = 0.3
+"""[s] Time at its goal after which a gripper has settled even if its fingers tremble. GUESSED: a tenth of the time that
 it takes to close."""
 
 
@@ -48,22 +52,23 @@ class FingersController(GripperController):
     """Moves fingers to an opening. They keep pressing after the goal has ended, so that they hold an object.
 
     Goal: the opening [m or rad], and the largest effort of each finger [N or N m]; see :meth:`Robot.command_gripper`.
-    Result: the opening, and the largest effort of a finger. The result is ``stalled`` if an object is between the
-    fingers.
+    Result: the opening, and the largest effort of a finger. The goal is reached when the fingers stand still at it, not
+    while they pass it. The result is ``stalled`` if an object is between the fingers.
     """
 
     def __init__(self, robot: Robot, group: str) -> None:
         super().__init__(robot, group)
         self._fingers = robot.description.joint_indices(group)
         self._goal = robot.gripper_opening(group)
-        self._slow_since: float | None = None
+        self._moved = self._came = 0.0
+        """Last times [s] at which the fingers moved, and at which they were away from their goal."""
 
     def start(self, position: float, effort: float | None, time: float) -> None:
         """Start to move the fingers to the opening ``position`` at ``time`` [s], with at most ``effort`` [N or N m]
         each; None: the drives' own limit."""
         self.robot.command_gripper(self.group, position, effort)
         self._goal = position
-        self._slow_since = None
+        self._moved = self._came = time
 
     def state(self, time: float) -> GripperState:
         """Returns opening and largest effort of the fingers at ``time`` [s], and whether they have reached their
@@ -72,14 +77,14 @@ class FingersController(GripperController):
         _, velocity, effort, _ = robot.rigid.joint_measurements(robot.name)
         opening = robot.gripper_opening(self.group)
         strongest = float(np.abs(effort[self._fingers]).max())
+        is_moving = np.abs(velocity[self._fingers]).max() > STALL_SPEED
+        if is_moving:
+            self._moved = time
         if abs(opening - self._goal) <= GOAL_TOLERANCE:
-            return GripperState(opening, strongest, reached_goal=True)
-        if np.abs(velocity[self._fingers]).max() > STALL_SPEED:
-            self._slow_since = None
-        elif self._slow_since is None:
-            self._slow_since = time
-        stalled = self._slow_since is not None and time - self._slow_since >= STALL_DURATION
-        return GripperState(opening, strongest, stalled=stalled)
+            has_settled = not is_moving or time - self._came >= SETTLE_DURATION
+            return GripperState(opening, strongest, reached_goal=has_settled)
+        self._came = time
+        return GripperState(opening, strongest, stalled=time - self._moved >= STALL_DURATION)
 
     def cancel(self, time: float) -> None:
         """Hold the fingers at their present positions."""

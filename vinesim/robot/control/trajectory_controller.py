@@ -142,6 +142,11 @@ class _Spline:
         return place, (first + s * (2.0 * square + 3.0 * s * cube)) / span
 
 
+LIMIT_SLACK = 1e-3
+"""[rad or m] Distance by which a waypoint may be beyond a joint's limits: rounding, and the give of a stop."""
+MAX_WAIT = 60.0
+"""[s] Longest time for which a trajectory may wait for its start. A later start is a stamp of another clock, such as
+the time of day in a simulation that began at 0."""
 MAX_SPLINES = 32
 """Largest number of trajectories of one controller that are being executed or wait for their start. Further ones are
 refused."""
@@ -285,7 +290,35 @@ class TrajectoryController:
                 Outcome.OLD_HEADER_TIMESTAMP,
                 f"{name}: trajectory ended at {t.start_time + t.times[-1]:.2f} s, now is {time:.2f} s; send it in time",
             )
-        return np.array([self.joints.index(joint) for joint in t.joints])
+        if t.start_time > time + MAX_WAIT:
+            raise TrajectoryError(
+                Outcome.INVALID_GOAL,
+                f"{name}: trajectory starts at {t.start_time:.2f} s, {t.start_time - time:.0f} s from now; stamp it "
+                f"with the time of /clock, at most {MAX_WAIT:g} s ahead, or with 0 to start at once",
+            )
+        order = np.array([self.joints.index(joint) for joint in t.joints])
+        self._check_limits(t, self.indices[order])
+        return order
+
+    def _check_limits(self, trajectory: Trajectory, joints: np.ndarray) -> None:
+        """Raise :class:`TrajectoryError` if a waypoint is beyond the limits of one of the robot's ``joints`` [k].
+
+        A joint that was pushed beyond a limit may begin there.
+        """
+        robot = self.robot
+        here = robot.rigid.joint_measurements(robot.name)[0][joints]
+        lower = np.minimum(robot.lower_limit[joints], here) - LIMIT_SLACK
+        upper = np.maximum(robot.upper_limit[joints], here) + LIMIT_SLACK
+        beyond = np.argwhere((trajectory.positions < lower) | (trajectory.positions > upper))
+        if len(beyond):
+            point, column = beyond[0].tolist()
+            joint = joints[column]
+            raise TrajectoryError(
+                Outcome.INVALID_GOAL,
+                f"{robot.name}: point {point} moves {trajectory.joints[column]} to "
+                f"{trajectory.positions[point, column]:.4f}, its limits are {robot.lower_limit[joint]:.4f} and "
+                f"{robot.upper_limit[joint]:.4f}; give a position between them",
+            )
 
     # ------------------------------------------------------------------ each step
 

@@ -11,7 +11,7 @@ from typing import Any, Self
 import rclpy
 from rclpy.context import Context
 from rclpy.duration import Duration
-from rclpy.exceptions import InvalidNamespaceException, InvalidServiceNameException, InvalidTopicNameException
+from rclpy.exceptions import InvalidServiceNameException, InvalidTopicNameException
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -23,6 +23,7 @@ from vinesim.core.errors import UsageError
 from vinesim.core.progress import ProgressLine
 from vinesim.ros import middleware
 from vinesim.ros.messages import message_packages
+from vinesim.ros.names import ros_namespace
 from vinesim.ros.tools.subscribing import message_class, offered_qos
 
 DISCOVERY_TIME = 10.0
@@ -64,23 +65,20 @@ class GraphNode:
     def __init__(self, is_stopped: Callable[[], bool], namespace: str = "") -> None:
         """``namespace``: in which relative names are. Raises :class:`vinesim.core.errors.UsageError` for an invalid
         one."""
+        namespace = ros_namespace(namespace)
         middleware.configure(large_messages=False)
         message_packages.ensure_importable(message_packages.available_packages())
         self._is_stopped = is_stopped
         self._classes: dict[str, type] = {}
         self._context = Context()
         rclpy.init(args=[], context=self._context, signal_handler_options=SignalHandlerOptions.NO)
-        try:
-            self._node = rclpy.create_node(
-                "vinesim_tool",
-                context=self._context,
-                namespace=namespace,
-                enable_rosout=False,
-                start_parameter_services=False,
-            )
-        except InvalidNamespaceException:
-            self._context.shutdown()
-            raise UsageError(f"--namespace {namespace!r} is no ROS namespace; give letters, digits, _ and /") from None
+        self._node = rclpy.create_node(
+            "vinesim_tool",
+            context=self._context,
+            namespace=namespace,
+            enable_rosout=False,
+            start_parameter_services=False,
+        )
         self._namespace = self._node.get_namespace().rstrip("/")
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self._node)

@@ -14,7 +14,8 @@ import xml.etree.ElementTree as ElementTree
 
 import numpy as np
 
-from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_nodes
+from vinesim.core.text_files import CUT, NumberReader, TextError, is_cut
+from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, read_plant, sort_nodes
 
 _COLUMNS = 9
 """Number of columns that are read: radius, length, start (3), axis (3), parent."""
@@ -29,14 +30,16 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
     Raises :class:`PlantFileError` for a row that is not a cylinder or does not start on another cylinder.
     """
     rows = []
-    for number, line in enumerate(path.read_text("utf-8", "replace").splitlines()[1:], 2):
+    numbers = NumberReader()
+    text = read_plant(path)
+    for number, line in enumerate(text.split("\n")[1:], 2):
         if not line.strip():
             continue
         cells = line.split("\t")
         try:
-            rows.append([float(cell) for cell in cells[:_COLUMNS]])
-        except ValueError:
-            raise PlantFileError(f"{path}: line {number}: {line.strip()!r} is no row of numbers; give one") from None
+            rows.append([numbers.read(cell) for cell in cells[:_COLUMNS]])
+        except TextError as bad:
+            raise PlantFileError(f"{path}: line {number}: a cell is {bad}, with tabs between") from None
         if len(rows[-1]) < _COLUMNS or not rows[-1][0] > 0.0 or not rows[-1][1] > 0.0:
             raise PlantFileError(
                 f"{path}: line {number}: give radius and length above 0 [m], start, axis and parent, with tabs between"
@@ -66,7 +69,7 @@ def read_cylinders(path: pathlib.Path) -> Skeleton:
         2.0 * np.concatenate([table[:1, 0], table[:, 0]]),
         np.zeros(len(table) + 1),
         "cylinders (TreeQSM, Helios)",
-        notes if moved else (),
+        (*(notes if moved else ()), *([CUT] if is_cut(text) else [])),
     )
 
 

@@ -3,23 +3,29 @@
 The reader takes every entity with coordinates (XX, YY, ZZ), whatever its class; the point is the end of the entity. The
 wood of an entity runs to this point from the point of its parent, or of the nearest ancestor with coordinates. Classes,
 scales and all other features are ignored. Grammar: Godin et al. 1997, AMAPmod. As in OpenAlea's own reader, ``+``
-begins a branch, which ends at the first line that begins in an earlier column.
+begins a branch, which ends at the first line that begins in an earlier column, and a line ``*`` measures the entity of
+the line above again, at a later date: the last measurement of each feature counts.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import pathlib
 import re
 
 import numpy as np
 
-from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, sort_nodes
+from vinesim.core.text_files import CUT, NumberReader, TextError, is_cut
+from vinesim.scene.plant_import.skeleton import PlantFileError, Skeleton, read_plant, sort_nodes
 
 _SECTIONS = ("CODE", "CLASSES", "DESCRIPTION", "FEATURES", "MTG")
 _STEP = re.compile(r"(\^|/|<<|<|\+\+|\+)([A-Za-z]+)?(\d+)?")
 _DIAMETERS = {"diameter": 1.0, "diam": 1.0, "topdia": 1.0, "radius": 2.0}
 """Features (in lower case) that contain the thickness of wood, with the factor that converts them to a diameter."""
+_AXES = ("xx", "yy", "zz")
+_MISSING = ("", "na", "nan", "n/a", "?", "-")
+"""Cells without a measurement, in lower case."""
 _BUNCH = "bunch"
 """Name of the feature with the mass [kg] of a bunch that hangs from an entity."""
 
@@ -42,10 +48,11 @@ def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
     Raises:
         PlantFileError: for a line that cannot be read, no coordinates, or several plants.
     """
-    header, lines = _sections(path)
+    text = read_plant(path)
+    header, lines = _sections(path, text)
     table, columns = _table_head(path, header, lines)
     entities = _entities(path, table, columns)
-    placed = [i for i, e in enumerate(entities) if {"xx", "yy", "zz"} <= e.values.keys()]
+    placed = [i for i, e in enumerate(entities) if "zz" in e.values]
     if not placed:
         raise PlantFileError(
             f"{path}: no entity has coordinates XX, YY and ZZ; give a file with geometry (write them as FEATURES)"
@@ -58,24 +65,30 @@ def read_mtg(path: pathlib.Path, unit: float, diameter_unit: float) -> Skeleton:
             below = entities[below].below
         parent[node] = number.get(below, -1)
     values = [entities[i].values for i in placed]
-    named = [[scale * v[n] for n, scale in _DIAMETERS.items() if n in v] for v in values]
+    notes = [f"{len(entities) - len(placed)} entities have no coordinates of their own"] * (len(placed) < len(entities))
     return sort_nodes(
         path,
         unit * np.array([[v["xx"], v["yy"], v["zz"]] for v in values]),
         parent,
-        diameter_unit * np.array([found[0] if found else np.nan for found in named]),
+        diameter_unit * np.array([_thickness(v) for v in values]),
         np.array([v.get(_BUNCH, 0.0) for v in values]),
         "OpenAlea MTG",
-        (f"{len(entities) - len(placed)} entities have no coordinates of their own",) * (len(placed) < len(entities)),
+        (*notes, *([CUT] if is_cut(text) else [])),
     )
 
 
-def _sections(path: pathlib.Path) -> tuple[list[str], list[tuple[int, str]]]:
+def _thickness(values: dict[str, float]) -> float:
+    """Returns the first diameter that was measured [diameter unit], else 0 if one was given, else NaN."""
+    given = [scale * values[name] for name, scale in _DIAMETERS.items() if name in values]
+    return next((one for one in given if one), 0.0 if given else math.nan)
+
+
+def _sections(path: pathlib.Path, text: str) -> tuple[list[str], list[tuple[int, str]]]:
     """Returns the names of the features, and the lines of the section MTG with their line numbers."""
     section = ""
     features = []
     lines = []
-    for number, raw in enumerate(path.read_text("utf-8", "replace").splitlines(), 1):
+    for number, raw in enumerate(text.split("\n"), 1):
         line = raw.split("#", 1)[0].rstrip()
         head = re.match(r"\s*([A-Z]+)\s*:\s*(.*)", line)
         if head and head[1] in _SECTIONS:
@@ -97,6 +110,8 @@ def _table_head(
     """Returns the lines below the table's head, and the feature of each column after the topology columns."""
     number, head = lines[0]
     cells = head.split("\t")
+    if len(cells) == 1 and len(cells[0].split()) > 1 and cells[0].split()[0] in ("ENTITY-CODE", "TOPO"):
+        raise PlantFileError(f"{path}: line {number}: has no tabs; separate the columns by tabs")
     if cells[0].strip() not in ("ENTITY-CODE", "TOPO"):
         raise PlantFileError(f"{path}: line {number}: begins with {cells[0].strip()!r}; give ENTITY-CODE or TOPO there")
     columns = {i: cell.strip().lower() for i, cell in enumerate(cells) if i and cell.strip()}
@@ -111,6 +126,7 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
     entities: list[_Entity] = []
     first_feature = min(columns, default=1 << 30)
     last: list[int] = []  # by column, the entity that the next line continues
+    numbers = NumberReader()
     for number, line in table:
         cells = line.split("\t")
         column = next((i for i, cell in enumerate(cells[:first_feature]) if cell.strip()), None)
@@ -118,6 +134,11 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
         if column is None:
             raise PlantFileError(f"{place}: has features but no entity; give one, or remove the line")
         code = cells[column].replace(" ", "")
+        features = _features(place, cells, columns, numbers)
+        if code == "*" and entities:  # the same entity at a later date
+            measured = {name: value for name, value in features.items() if value or name not in _DIAMETERS}
+            entities[-1].values.update(measured)
+            continue
         steps = _steps(place, code)
         same = steps[0][0] == "^"
         if column > len(last) or (same and column >= len(last)):
@@ -134,7 +155,7 @@ def _entities(path: pathlib.Path, table: list[tuple[int, str]], columns: dict[in
             for _ in range(int(repeat)):
                 entities.append(_Entity(below, {"index": float(index)}))
                 below = len(entities) - 1
-        entities[below].values.update(_features(place, cells, columns))
+        entities[below].values.update(features)
         last = [*last[: column + 1], below] if branch else [*last[:column], below]
     return entities
 
@@ -160,15 +181,20 @@ def _steps(place: str, code: str) -> list[tuple[str, int]]:
     return found
 
 
-def _features(place: str, cells: list[str], columns: dict[int, str]) -> dict[str, float]:
+def _features(place: str, cells: list[str], columns: dict[int, str], numbers: NumberReader) -> dict[str, float]:
     """Returns the features of one line of the file, by name: coordinates, thickness, and mass of a hanging bunch. All
     other features are ignored.
     """
     values = {}
     for i, name in columns.items():
-        if i < len(cells) and cells[i].strip() and (name in ("xx", "yy", "zz", _BUNCH) or name in _DIAMETERS):
+        if i >= len(cells) or cells[i].strip().lower() in _MISSING:
+            continue
+        if name in _AXES or name == _BUNCH or name in _DIAMETERS:
             try:
-                values[name] = float(cells[i])
-            except ValueError:
-                raise PlantFileError(f"{place}: {name} is {cells[i].strip()!r}; give a number") from None
+                values[name] = numbers.read(cells[i])
+            except TextError as bad:
+                raise PlantFileError(f"{place}: {name} is {bad}") from None
+    axes = [name.upper() for name in _AXES if name in values]
+    if 0 < len(axes) < len(_AXES):
+        raise PlantFileError(f"{place}: has {' and '.join(axes)} alone; give XX, YY and ZZ, or none of them")
     return values

@@ -7,6 +7,7 @@ import pathlib
 
 import numpy as np
 
+from vinesim.core.text_files import TextError, read_text
 from vinesim.core.toml_loader import DataError
 
 MAX_NODES = 20_000
@@ -37,6 +38,14 @@ class Skeleton:
     """What was repaired or left out when the file was read, one fact each."""
 
 
+def read_plant(path: pathlib.Path) -> str:
+    r"""Returns the text of a plant file with ``\n`` as line end. Raises :class:`PlantFileError` if it is no text."""
+    try:
+        return read_text(path)
+    except TextError as bad:
+        raise PlantFileError(bad.at(path)) from None
+
+
 def check_skeleton(path: pathlib.Path, skeleton: Skeleton) -> Skeleton:
     """Check that ``skeleton`` is one connected plant, and return it. Raises :class:`PlantFileError` otherwise."""
     nodes = np.arange(len(skeleton.parent))
@@ -57,13 +66,12 @@ def check_skeleton(path: pathlib.Path, skeleton: Skeleton) -> Skeleton:
             f"{path}: reaches {size:.4g} m from its base; give the unit of its lengths (m, cm or mm), at most "
             f"{MAX_HEIGHT:.0f} m"
         )
-    known = np.isfinite(skeleton.diameter)
+    known = ~np.isnan(skeleton.diameter)
     if (bad := known & ~((skeleton.diameter > 0.0) & (skeleton.diameter <= 1.0))).any():
         node = _first(bad)
-        raise PlantFileError(
-            f"{path}: diameter of point {node} is {skeleton.diameter[node]:.4g} m; give the unit of diameters, above 0 "
-            "and up to 1 m"
-        )
+        size = skeleton.diameter[node]
+        remedy = "give the unit of diameters, up to 1 m" if size > 1.0 else "give one above 0, or 0 where it is unknown"
+        raise PlantFileError(f"{path}: diameter of point {node} is {size:.4g} m; {remedy}")
     if (bad := ~((skeleton.bunch >= 0.0) & (skeleton.bunch <= 5.0))).any():
         node = _first(bad)
         raise PlantFileError(f"{path}: bunch of point {node} is {skeleton.bunch[node]:.4g} kg; give 0 to 5 kg")
@@ -83,8 +91,14 @@ def sort_nodes(
     format: str,
     notes: tuple[str, ...] = (),
 ) -> Skeleton:
-    """Sort nodes so that the base is first and parents precede children. Returns the checked skeleton."""
+    """Sort nodes so that the base is first and parents precede children. Returns the checked skeleton.
+
+    A diameter of 0 counts as missing, as programs write it for wood that was not measured.
+    """
     count = len(parent)
+    if unmeasured := int((diameter == 0.0).sum()):
+        diameter = np.where(diameter == 0.0, np.nan, diameter)
+        notes = (*notes, f"{unmeasured} diameters are 0, which is taken as not measured")
     if ((parent < -1) | (parent >= count)).any():
         node = _first((parent < -1) | (parent >= count))
         raise PlantFileError(f"{path}: parent of point {node} is {parent[node]}; give one of 0 to {count - 1}")
