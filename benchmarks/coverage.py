@@ -26,7 +26,8 @@ def coverage(
 ) -> Iterator[Measurement]:
     """Fit plants of the ``seeds`` seeds from ``first`` on to tracks.
 
-    ``plants``: a key of :data:`DRAWS`, or "both". ``tracks_from``: "marker" or "rgbd". ``announce`` is called with a line of text about the progress.
+    ``plants``: a key of :data:`DRAWS`, or "both". ``tracks_from``: "marker" or "rgbd". ``announce`` is called with
+    a line of text about the progress.
     """
     for plant, (draw, film, bar) in DRAWS.items():
         if plants not in ("both", plant):

@@ -63,7 +63,7 @@ PAINT = (0.85, 0.05, 0.35)
 
 
 def with_nodes(specimen: Specimen, pieces: int) -> tuple[Specimen, tuple[str, ...]]:
-    """Returns the specimen with markers at the ends of equal pieces, and the markers' names from the base to the tip."""
+    """Returns the specimen with markers at the ends of equal pieces, and their names from the base to the tip."""
     count = pieces + 1 if specimen.organ == "bunch" else pieces
     names = tuple(f"node {i}" for i in range(1, count))
     along = {name: specimen.length.value * (i + 1) / pieces for i, name in enumerate(names)}

@@ -151,7 +151,7 @@ def pixels_within(picture: CameraFrame, clamp: np.ndarray, near: float, far: flo
 
 
 def _centre_by_colour(rgb: np.ndarray, place: np.ndarray, off: np.ndarray, across: np.ndarray) -> np.ndarray:
-    """Returns the offsets [n] pixel of the cane's middle from the line ``place`` + ``off`` * ``across``, by its colours.
+    """Returns offsets [n] pixel of the cane's middle from the line ``place`` + ``off`` * ``across``, by its colours.
 
     Args:
         rgb: picture [height, width, 3].
