@@ -63,12 +63,12 @@ def _soak(minutes: float, real_time_factor: float | None) -> Iterator[Measuremen
     return _call("soak:soak")(minutes, real_time_factor, _announce)
 
 
-def _coverage(seeds: int, first: int, plants: str) -> Iterator[Measurement]:
+def _coverage(seeds: int, first: int, plants: str, tracks: str) -> Iterator[Measurement]:
     if seeds < 1:
         raise UsageError(f"--seeds is {seeds}: give 1 or more")
     if first < 0:
         raise UsageError(f"--first is {first}: give 0 or more")
-    return _call("coverage:coverage")(seeds, first, plants, _announce)
+    return _call("coverage:coverage")(seeds, first, plants, tracks, _announce)
 
 
 def _later(path: str) -> Callable[..., Iterator[Measurement]]:
@@ -100,6 +100,7 @@ BENCHMARKS: dict[str, tuple[Callable[..., Iterator[Measurement]], str, dict[str,
             "seeds": {"type": int, "default": 50, "help": "number of fits of each plant"},
             "first": {"type": int, "default": 0, "help": "first seed"},
             "plants": {"default": "both", "choices": ["both", "cane", "bunch"], "help": "plants that are fitted"},
+            "tracks": {"default": "marker", "choices": ["marker", "rgbd"], "help": "what is tracked"},
         },
     ),
     "traffic": (_later("traffic:traffic"), "bytes that a client of a full vineyard receives and sends", {}),

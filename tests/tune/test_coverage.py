@@ -37,6 +37,7 @@ def test_intervals_of_a_linear_problem_cover_whatever_the_noise_is_estimated_as(
         priors=[Prior(0.0, 1e6, "flat")] * 5,
         names=tuple("abcde"),
         fitted=("a", "b"),
+        observed=np.zeros((samples, 3)),
         residuals=lambda model: model.reshape(samples, 3),
     )
     inside = 0
@@ -50,6 +51,35 @@ def test_intervals_of_a_linear_problem_cover_whatever_the_noise_is_estimated_as(
         low, high = posterior.interval("a")
         inside += low <= 0.0 <= high
     assert inside / draws == pytest.approx(0.9, abs=0.025)
+
+
+def test_intervals_cover_when_the_error_of_the_track_depends_on_the_displacement() -> None:
+    """A decaying swing, whose tracker adds a cubic and a quartic of the displacement to white noise. With white noise
+    alone in the posterior, 73 % of the intervals held the truth, with the error
+    ten times as large 35 % (now 75 %)."""
+    rng = np.random.default_rng(1)
+    time = np.linspace(0.0, 3.0, 90)
+    swing, beside = np.exp(-time) * np.cos(12.0 * time), np.exp(-time) * np.sin(12.0 * time)
+    rows = np.stack([-time * swing, -time * beside, swing, np.ones(90)], -1)  # decay, frequency, pull, origin
+    bends = np.polynomial.legendre.legvander(swing, 5)[:, 2:]
+    problem = types.SimpleNamespace(
+        seen=np.ones((90, 1), bool),
+        priors=[Prior(0.0, 1e6, "flat")] * 4,
+        names=tuple("abcd"),
+        fitted=("a", "b"),
+        observed=swing[:, None],
+        residuals=lambda model: model.reshape(90, 1) - swing[:, None],
+    )
+    inside = 0
+    draws = 300
+    for _ in range(draws):
+        error = rng.normal(size=90) + 0.5 * bends @ rng.normal(size=4)
+        theta = np.linalg.lstsq(rows, error, rcond=None)[0]  # the truth is 0
+        left = rows @ theta - error
+        found = Evaluation(left + swing, rows, np.zeros(0), np.zeros((0, 4)))
+        low, high = laplace(problem, theta, found, np.array([robust_deviation(left)])).interval("a")
+        inside += low <= 0.0 <= high
+    assert 0.85 < inside / draws < 0.99
 
 
 def test_an_exact_track_of_a_bunch_tells_its_modulus() -> None:

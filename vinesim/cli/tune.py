@@ -107,19 +107,26 @@ def track(
     cane: pathlib.Path | None = None,
     base: tuple[float, float, float] | None = None,
     percent: int = 80,
+    bunch: pathlib.Path | None = None,
 ) -> int:
-    """Write the track of markers, or of a bare cane, in recorded pictures, and print how often each was found. Returns
-    the exit code."""
+    """Write the track of markers, of a bare cane or of a bunch in recorded pictures, and print how often each was
+    found. Returns the exit code."""
     require_scipy()
     import numpy as np
 
     from vinesim.sensors.recorded_pictures import read_pictures
-    from vinesim.tune import load_specimen, track_cane, track_marker
+    from vinesim.tune import load_specimen, track_bunch, track_cane, track_marker
 
-    if cane is None and (not markers or radius is None or base is not None):
-        raise UsageError("give --marker and --radius of coloured balls, or --cane and --base of a cane without balls")
-    if cane is not None and (markers or radius is not None or base is None):
-        raise UsageError(f"--cane {cane} is followed without balls; give --base X Y Z, and no --marker or --radius")
+    plant = cane or bunch
+    if plant is None and (not markers or radius is None or base is not None):
+        raise UsageError(
+            "give --marker and --radius of coloured balls, or --cane or --bunch and --base of a plant without balls"
+        )
+    if cane is not None and bunch is not None:
+        raise UsageError(f"--cane {cane} and --bunch {bunch} are given; give one of them")
+    if plant is not None and (markers or radius is not None or base is None):
+        option = "--bunch" if cane is None else "--cane"
+        raise UsageError(f"{option} {plant} is followed without balls; give --base X Y Z, and no --marker or --radius")
     if radius is not None and not radius > 0.0:
         raise UsageError(f"--radius is {radius:g}; give the ball's radius in metres, above 0")
     if rate is not None and not rate > 0.0:
@@ -133,8 +140,14 @@ def track(
         where[3:] /= size
     colours = dict(_read_marker(text) for text in markers)
     pictures = read_pictures(recording, image=image, depth=depth, pose=where, rate=rate)
-    if cane is not None and base is not None:
-        specimen = load_specimen(cane)
+    if plant is not None and base is not None:
+        specimen = load_specimen(plant)
+        organ = "bunch" if cane is None else "cane"
+        if specimen.organ != organ:
+            raise UsageError(f"{plant}: its organ is {specimen.organ}; follow it with --{specimen.organ}")
+    if bunch is not None:
+        found = track_bunch(pictures, specimen, base=np.array(base), source=recording.name)
+    elif cane is not None:
         found = track_cane(pictures, specimen, base=np.array(base), percent=percent, source=recording.name)
     else:
         found = track_marker(pictures, colours, radius=radius or 0.0, source=recording.name)

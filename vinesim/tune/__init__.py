@@ -12,6 +12,7 @@ docs/tuning.md has examples. This package needs scipy: ``pip install 'vinesim[tu
 from __future__ import annotations
 
 from vinesim.scene.plant_parameters import Specimen, load_specimen
+from vinesim.tune.bunch_track import track_bunch
 from vinesim.tune.cane_track import track_cane
 from vinesim.tune.experiment import Experiment, hidden_specimen, measure
 from vinesim.tune.features import Features, extract_features
@@ -34,6 +35,7 @@ __all__ = [
     "load_specimen",
     "measure",
     "read_trajectory",
+    "track_bunch",
     "track_cane",
     "track_marker",
     "tune",

@@ -28,11 +28,12 @@ SLAB = 0.3
 across the cane, and a wall may be behind it."""
 CLEAR = 0.05
 """[1] Distance from the clamp below which points do not count, in lengths of the cane: the clamp itself is there."""
-WINDOW = 0.06
-"""Length of the cane, on each side of the tracked point, from which its position is computed, in lengths of the cane
-[1]."""
 DEGREE = 3
-"""Degree of the polynomials through all pixels along the cane, by which the distance from the clamp is measured."""
+"""Degree of the polynomial across the cane through the pixels with depth, near which the colours are searched."""
+LINE_DEGREE = 5
+"""Degree of the polynomial across the cane through its colours; the second mode has three extrema."""
+DEPTH_DEGREE = 2
+"""Degree of the polynomial of the depth along the cane."""
 GROW = 3
 """[pixel] Gaps in the depth of a cane that do not separate its parts."""
 PROFILE = 14
@@ -102,54 +103,55 @@ def _follow(picture: CameraFrame, specimen: Specimen, base: np.ndarray, share: f
         """Points [n, 3] m in the camera's frame of pixels ``at`` along and ``off`` across the cane, ``away`` [m]."""
         return back_project(start + at[:, None] * along + off[:, None] * across, away, picture.info)
 
-    # the distance from the clamp along a smooth curve through all pixels
     scale = float(u.max())
-    grid = np.linspace(0.0, scale, 200)
-    side = np.polynomial.Polynomial(_robust_fit(u / scale, v, DEGREE, through=0.0))(grid / scale)
-    away = np.polynomial.Polynomial(_robust_fit(u / scale, depth, DEGREE, through=float(clamp[2])))(grid / scale)
-    curve = line(grid, side, away)
+    rough = np.polynomial.Polynomial(_robust_fit(u / scale, v, DEGREE, through=0.0))
+    away = np.polynomial.Polynomial(_robust_fit(u / scale, depth, DEPTH_DEGREE, through=float(clamp[2])))
+    # the middle of the cane across it by the colours of all of its pixels, then the distance from the clamp along it
+    columns = np.arange(np.ceil(u.min()), scale)
+    centre = rough(columns / scale)
+    centre = centre + _centre_by_colour(picture.rgb, start + columns[:, None] * along, centre, across)
+    side = np.polynomial.Polynomial(_robust_fit(columns / scale, centre, LINE_DEGREE))
+    grid = np.linspace(0.0, scale, 400)
+    curve = line(grid, side(grid / scale), away(grid / scale))
     way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(curve, axis=0), axis=1))])
     if way[-1] < share * length:
         return np.full(3, np.nan)
-    place = float(np.interp(share * length, way, grid))
-    # the position there, from the pixels around it
-    half = WINDOW * scale
-    near = np.abs(u - place) < half
-    if near.sum() < MIN_PIXELS or u[near].min() > place or u[near].max() < place:
-        return np.full(3, np.nan)
-    local = (u[near] - place) / half
-    v0, slope = _robust_fit(local, v[near], 1).tolist()
-    z0 = _robust_fit(local, depth[near], 1)[0]
-    at = np.arange(-np.floor(half), half)
-    v0 += _centre_by_colour(picture.rgb, start + (place + at)[:, None] * along, v0 + slope * at / half, across)
-    point = line(np.array([place]), np.array([v0]), np.array([z0]))[0]
+    place = np.array([np.interp(share * length, way, grid)])
+    point = line(place, side(place / scale), away(place / scale))[0]
     return picture.pose[:3] + frames.rotate(picture.pose[3:], point)
 
 
 def _cane_pixels(picture: CameraFrame, clamp: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray]:
     """Returns the pixels [n, 2] (column, row) of the cane and their depths [n] m. ``clamp`` [3] m: in the camera's
     frame."""
-    seen = np.isfinite(picture.depth) & (np.abs(picture.depth - clamp[2]) < SLAB * length)
+    near, far = CLEAR * length, REACH * length
+    row, column = np.nonzero(pixels_within(picture, clamp, near, far, SLAB * length))
+    return np.stack([column, row], -1).astype(float), picture.depth[row, column].astype(float)
+
+
+def pixels_within(picture: CameraFrame, clamp: np.ndarray, near: float, far: float, slab: float) -> np.ndarray:
+    """Returns the pixels [height, width] bool of the largest connected things whose measured points are ``near``
+    to ``far`` [m] from the ``clamp`` and differ in depth by less than ``slab`` [m] from it.
+
+    ``clamp`` [3] m: in the camera's frame.
+    """
+    seen = np.isfinite(picture.depth) & (np.abs(picture.depth - clamp[2]) < slab)
     row, column = np.nonzero(seen)
     pixel = np.stack([column, row], -1).astype(float)
-    depth = picture.depth[seen].astype(float)
-    off = np.linalg.norm(back_project(pixel, depth, picture.info) - clamp, axis=1)
-    inside = (off < REACH * length) & (off > CLEAR * length)
-    if not inside.any():
-        return np.zeros((0, 2)), np.zeros(0)
+    off = np.linalg.norm(back_project(pixel, picture.depth[seen].astype(float), picture.info) - clamp, axis=1)
+    inside = (off < far) & (off > near)
     mask = np.zeros(seen.shape, bool)
     mask[row[inside], column[inside]] = True
     parts = np.zeros(mask.shape, np.int32)
     ndimage.label(ndimage.binary_dilation(mask, iterations=GROW), output=parts)
-    sizes = np.bincount(parts[mask])
+    sizes = np.bincount(parts[mask], minlength=2)
     sizes[0] = 0
-    # parts of the cane behind a gap count; specks do not
-    kept = inside & np.isin(parts[row, column], np.flatnonzero(sizes > 0.05 * sizes.max()))
-    return pixel[kept], depth[kept]
+    # parts of the plant behind a gap count; specks do not
+    return mask & np.isin(parts, np.flatnonzero(sizes > 0.05 * sizes.max()))
 
 
-def _centre_by_colour(rgb: np.ndarray, place: np.ndarray, off: np.ndarray, across: np.ndarray) -> float:
-    """Returns the offset [pixel] of the cane's middle from the line ``place`` + ``off`` * ``across``, by its colours.
+def _centre_by_colour(rgb: np.ndarray, place: np.ndarray, off: np.ndarray, across: np.ndarray) -> np.ndarray:
+    """Returns offsets [n] pixel of the cane's middle from the line ``place`` + ``off`` * ``across``, by its colours.
 
     Args:
         rgb: picture [height, width, 3].
@@ -169,10 +171,7 @@ def _centre_by_colour(rgb: np.ndarray, place: np.ndarray, off: np.ndarray, acros
     top = contrast.max(1)
     weight = np.maximum(contrast - 0.3 * top[:, None], 0.0)
     clear = top > LEAST_CONTRAST
-    if clear.sum() < 0.5 * len(clear):
-        return 0.0
-    centre = (weight[clear] @ reach) / weight[clear].sum(1)
-    return float(_robust_fit(np.linspace(-1.0, 1.0, len(centre)), centre, 1)[0])
+    return np.where(clear, (weight @ reach) / np.maximum(weight.sum(1), 1e-9), 0.0)
 
 
 def _principal_direction(pixel: np.ndarray, start: np.ndarray) -> np.ndarray:

@@ -103,13 +103,19 @@ class Experiment:
 
 
 def measure(
-    specimen: Specimen, experiment: Experiment = Experiment(), *, exact: bool = False, step: float = TRUTH_STEP
+    specimen: Specimen,
+    experiment: Experiment = Experiment(),
+    *,
+    exact: bool = False,
+    step: float = TRUTH_STEP,
+    segments: int = TRUTH_SEGMENTS,
 ) -> Trajectory:
-    """Simulate an experiment on a specimen in steps of ``step`` [s] and return its track; ``exact``: without noise."""
+    """Simulate an experiment on a specimen in steps of ``step`` [s] with at least ``segments`` segments, and return its
+    track; ``exact``: without noise."""
     experiment.check()
     e = experiment
     rng = np.random.default_rng(experiment.seed)
-    specimen = msgspec.structs.replace(specimen, segments=max(TRUTH_SEGMENTS, specimen.segments))
+    specimen = msgspec.structs.replace(specimen, segments=max(segments, specimen.segments))
     candidates = Candidates(specimen, e.markers, dt=step)
     row = np.zeros((1, len(COLUMNS)))
     row[0, 3:5] = specimen.bow

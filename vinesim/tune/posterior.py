@@ -19,6 +19,9 @@ direction [1]."""
 LEVERAGE_ROUNDS = 3
 """Number of rounds in which the degrees of freedom of the columns and the covariance are computed from each other."""
 _CORRELATED = 3.0
+BENDS = (2, 3, 4, 5)
+"""Degrees of the polynomials (Legendre's, of the displacement) whose sum is a tracker's systematic error. Degrees 0 and
+1 do no harm: origin and pull are fitted."""
 
 
 @dataclasses.dataclass(frozen=True, slots=True)
@@ -67,7 +70,8 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
 
     The covariance is that of an M-estimator (Huber 1981) with the soft L1 loss, so outliers and heavy tails widen it.
     The spread of the residuals is estimated for each column, since usually one column determines the plant. Correlated
-    residuals count as a smaller number of independent residuals.
+    residuals count as a smaller number of independent residuals. An error of the tracker that depends on the
+    displacement widens the intervals as far as the residuals show it.
     """
     table = problem.residuals(found.model) / noise
     correlation_time = _correlation_time(table)
@@ -85,7 +89,12 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
         covariance = _inverse(columns.sum(0) + gauge + np.diag(prior))
         fitted = np.einsum("pq,cqp->c", covariance, columns)
     parts = np.einsum("ip,cpq,qi->ci", covariance, columns, covariance)
-    freedom = parts.sum(0) ** 2 / np.maximum((parts**2 / np.maximum(count - fitted, 1.0)[:, None]).sum(0), 1e-300)
+    spread = squares / np.maximum(count - fitted, 1.0) / slope**2  # variance of a residual, in those of the noise
+    bent = _systematic_covariance(problem, found, weighted, table, spread, covariance, columns, information)
+    covariance = covariance + bent.sum(0)
+    parts = np.concatenate([parts, np.einsum("cii->ci", bent)])
+    few = np.concatenate([np.maximum(count - fitted, 1.0), np.full(len(count), float(len(BENDS) - 1))])
+    freedom = parts.sum(0) ** 2 / np.maximum((parts**2 / few[:, None]).sum(0), 1e-300)
     return Posterior(
         problem.names,
         theta.copy(),
@@ -96,6 +105,56 @@ def laplace(problem: Problem, theta: np.ndarray, found: Evaluation, noise: np.nd
         np.maximum(freedom, 1.0),
         slope * np.maximum(count - fitted, 1.0) / squares / correlation_time,
     )
+
+
+def _systematic_covariance(
+    problem: Problem,
+    found: Evaluation,
+    weighted: np.ndarray,
+    table: np.ndarray,
+    spread: np.ndarray,
+    covariance: np.ndarray,
+    columns: np.ndarray,
+    information: np.ndarray,
+) -> np.ndarray:
+    """Returns the covariance [column, parameter, parameter] that the tracker's systematic errors add.
+
+    A systematic error is a polynomial of the displacement. A fit hides a part of it in its parameters, since such an
+    error of odd degree looks like a swing that decays faster. The part that it leaves in the residuals of a column
+    tells the variance of the coefficients, and thereby of the hidden part.
+
+    Args:
+        problem: the fit.
+        found: its evaluation at the minimum.
+        weighted: Jacobian [sample, column, parameter] in units of the noise.
+        table: residuals [sample, column] in units of the noise.
+        spread: variance of a residual in each column, in those of the noise.
+        covariance: [parameter, parameter] without systematic errors.
+        columns: information of each column [column, parameter, parameter].
+        information: the same before it was scaled by the spread of the residuals.
+    """
+    model = problem.residuals(found.model) + problem.observed
+    off = np.nan_to_num(model - np.nanmean(model, axis=0))
+    along = off @ np.linalg.svd(off, full_matrices=False)[2][0]
+    bends = np.polynomial.legendre.legvander(along / max(float(np.abs(along).max()), 1e-12), max(BENDS))[:, list(BENDS)]
+    added = np.zeros_like(columns)
+    for c in range(len(columns)):
+        seen = np.isfinite(table[:, c])
+        jacobian, shape = weighted[seen, c], bends[seen]
+        left = np.clip(table[seen, c], -SOFT, SOFT)
+        size = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-12)
+        basis, values, _ = np.linalg.svd(jacobian / size, full_matrices=False)
+        basis = basis[:, values > 1e-6 * values[0]]
+        shown = shape - basis @ (basis.T @ shape)  # the part of each polynomial that no parameter hides
+        known = np.linalg.pinv(shown.T @ shown, rcond=1e-9, hermitian=True)
+        coefficient = known @ (shown.T @ left)
+        noise = np.maximum(np.diag(known) * spread[c], 1e-300)
+        variance = float(((coefficient**2 - noise) / noise**2).sum() / (1.0 / noise**2).sum())
+        if variance > 0.0:
+            scale = float(np.trace(columns[c]) / max(float(np.trace(information[c])), 1e-300))
+            moved = scale * covariance @ (jacobian.T @ shape)
+            added[c] = variance * moved @ moved.T
+    return added
 
 
 def _residual_sums(table: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -25,10 +25,11 @@ from vinesim.tune.trajectory import Trajectory, TrajectoryError
 PHYSICAL = COLUMNS[:5]
 SOFT = 3.0
 """[standard deviations] Size from which residuals have reduced weight (soft L1)."""
-FINER = 3
+FINER = 9
 """Factor by which the finer run that determines the discretisation bias has more steps and segments."""
-CORRECTIONS = 2
-"""Number of rounds in which this bias is determined. It is 5 % of a bunch's modulus, and one round leaves 0.6 %."""
+CORRECTIONS = 4
+"""Number of rounds in which this bias is determined. It is 5 % of a bunch's modulus, and one round leaves 0.6 %. With
+both numbers 0.01 % remains; 3 and 2 left 0.1 % of a bunch's modulus and 0.2 % of its damping."""
 Noise = float | np.ndarray
 """[m] Standard deviation of all columns together, or of each column [column]."""
 PHASE_STEP = 0.05

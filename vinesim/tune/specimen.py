@@ -19,6 +19,7 @@ from vinesim.scene.plant_parameters import Specimen
 TIP = "tip"
 """Name of the marker at the tip, which every specimen has."""
 _PERCENT = re.compile(r"(\d\d?) percent")
+_BELOW = re.compile(r"(\d+) mm")
 _DIRECTIONS = {"cane": (1.0, 0.0, 0.0), "bunch": (0.0, 0.0, -1.0)}
 
 
@@ -120,6 +121,11 @@ def marker_at(percent: int) -> str:
     return f"{percent} percent"
 
 
+def marker_below(distance: float) -> str:
+    """Returns the name of the marker on a bunch's axis at a ``distance`` [m] from the clamp, which every bunch has."""
+    return f"{round(1e3 * distance)} mm"
+
+
 def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Returns the body [k] of each marker in the specimen's tree, and the marker's position [k, 3] m in that body's
     frame.
@@ -130,10 +136,12 @@ def place_markers(specimen: Specimen, names: tuple[str, ...]) -> tuple[np.ndarra
     bodies = []
     points = []
     for name in names:
-        if name == TIP and specimen.organ == "bunch":
+        below = _BELOW.fullmatch(name)
+        if specimen.organ == "bunch" and (name == TIP or below):
             tree = build_tree(specimen)
+            far = 1e-3 * int(below[1]) - specimen.length.value if below else float(tree.bodies[-1]["length"])
             bodies.append(len(tree.bodies) - 1)
-            points.append((float(tree.bodies[-1]["length"]), 0.0, 0.0))
+            points.append((far, 0.0, 0.0))
             continue
         share = _PERCENT.fullmatch(name) if specimen.organ == "cane" else None
         if name != TIP and name not in specimen.markers and share is None:

@@ -18,7 +18,7 @@ from vinesim.tune.features import Features, extract_features, robust_deviation
 from vinesim.tune.fit import Fit, Minimum
 from vinesim.tune.posterior import Posterior, importance_sample, laplace
 from vinesim.tune.priors import physical_priors
-from vinesim.tune.problem import FINER, Evaluation, Noise, Problem
+from vinesim.tune.problem import Evaluation, Noise, Problem
 from vinesim.tune.start import start_values
 from vinesim.tune.trajectory import Trajectory, TrajectoryError
 
@@ -28,6 +28,8 @@ PARAMETERS = {"modulus": ("modulus",), "damping": ("damping",), "mass": ("mass",
 """Parameters that can be fitted, and their columns in :data:`vinesim.tune.candidates.COLUMNS`."""
 CONTRADICTS = 4.0
 """[standard deviations] Distance of a fitted mass from its prior beyond which it cannot be a mass of wood."""
+UNFITTED = 3
+"""Factor by which all candidates have more segments and steps if the modulus is not fitted."""
 WIDE = 0.5
 """Width of the swing as a fraction of the plant's length [1]. A larger swing suggests a wrong unit."""
 UNEXPLAINED = 1.3
@@ -104,8 +106,8 @@ def tune(
     chain = specimen
     coarse = "modulus" in fitted
     if not coarse:  # a coarse chain swings up to 1 % too slowly; only a fitted modulus can compensate this
-        chain = msgspec.structs.replace(specimen, segments=FINER * specimen.segments)
-        dt = dt / FINER
+        chain = msgspec.structs.replace(specimen, segments=UNFITTED * specimen.segments)
+        dt = dt / UNFITTED
     problem = Problem(chain, track, features, fitted, physical_priors(specimen), dt, device, pushed)
     theta, found, noise = _minimise(problem, start_values(problem))
     minima: tuple[Minimum, ...] = ()

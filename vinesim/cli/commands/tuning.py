@@ -89,8 +89,13 @@ def track(
         pathlib.Path | None,
         typer.Option(help="Without balls: the file of this cane, a table [specimen]; the cane itself is followed."),
     ] = None,
+    bunch: Annotated[
+        pathlib.Path | None,
+        typer.Option(help="Without balls: the file of this bunch, a table [specimen]; the bunch itself is followed."),
+    ] = None,
     base: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="With --cane: X Y Z of its clamp in the world [m].")
+        tuple[float, float, float] | None,
+        typer.Option(help="With --cane or --bunch: X Y Z of its clamp in the world [m]."),
     ] = None,
     percent: Annotated[
         int, typer.Option(min=20, max=97, help="With --cane: place of the tracked point, of the cane's length [%].")
@@ -113,7 +118,7 @@ def track(
         float | None, typer.Option(help="Pictures a second, for a data set whose records have no time.")
     ] = None,
 ) -> None:
-    """Track coloured balls, or a bare cane, through recorded RGB-D pictures, into a CSV for vinesim tune.
+    """Track coloured balls, a bare cane or a bunch through recorded RGB-D pictures, into a CSV for vinesim tune.
 
     No ROS is needed. Pictures in which the ball or that part of the cane is hidden are gaps. Needs scipy (extra: tune).
 
@@ -122,12 +127,13 @@ def track(
       vinesim track pull.mcap --marker 224,60,130 --radius 0.012 --out pull.csv
       vinesim track pull.mcap --marker 224,60,130 --marker middle=30,90,220 --radius 0.012
       vinesim track pull.mcap --cane cane.toml --base -0.5 0.9 0
+      vinesim track swing.mcap --bunch bunch.toml --base 0 0.5 0.1
       vinesim track pull/ --image /camera/color/image_raw --depth /camera/aligned_depth_to_color/image_raw \\
         --marker 224,60,130 --radius 0.012
     """
     from vinesim.cli.tune import track
 
-    raise typer.Exit(track(recording, marker or [], radius, out, image, depth, pose, rate, cane, base, percent))
+    raise typer.Exit(track(recording, marker or [], radius, out, image, depth, pose, rate, cane, base, percent, bunch))
 
 
 def experiment(
