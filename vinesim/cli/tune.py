@@ -60,7 +60,9 @@ def run(
     specimen = load_specimen(model)
     hidden = None if truth is None else load_specimen(truth)
     if hidden is not None and hidden.organ != specimen.organ:
-        raise UsageError(f"--truth {truth} is a {hidden.organ}, --model {model} a {specimen.organ}; give the same plant")
+        raise UsageError(
+            f"--truth {truth} is a {hidden.organ}, --model {model} a {specimen.organ}; give the same plant"
+        )
     track = read_trajectory(data)
     if cloud is not None:
         specimen = with_cloud(specimen, cloud)
