@@ -101,5 +101,5 @@ def test_a_hidden_truth_differs_from_the_guess_and_is_printed_beside_the_estimat
 def test_a_truth_beside_the_end_of_an_interval_is_printed_with_more_digits() -> None:
     """Four digits of 1.0112e10, outside of 1.0113e10 to 1.018e10, would be those of the end of the interval."""
     line = Comparison("modulus", 1.0112e10, 1.0146e10, 1.0113e10, 1.018e10, "Pa").line()
-    assert "modulus 1.01120e+10 Pa" in line
-    assert "outside the 90 % interval 1.01130e+10 to 1.01800e+10" in line
+    assert "modulus 1.0112e+10 Pa" in line
+    assert "outside the 90 % interval 1.0113e+10 to 1.0180e+10" in line

@@ -131,19 +131,25 @@ def test_outliers_and_gaps_hardly_matter(track: Trajectory) -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"time": 30.0}, "the track swings at 0.1654 Hz, plants at 0.2 to 50 Hz: check the unit of the time"),
         ({"axes": [2, 1, 0]}, "the fitted plant swings at 5"),
         ({"position": 10.0}, "is the unit right (m, cm, mm)?"),
         ({"release": 0.5}, "check the unit of the positions, the axes (z is up), the time of the release"),
     ],
 )
 def test_a_track_that_contradicts_the_fitted_plant_is_a_fault(change: dict, words: str) -> None:
-    """A number of the picture as time, x and z swapped, mm named cm, a late release: each fit was once accepted."""
+    """x and z swapped, mm named cm, a late release: each fit was once accepted."""
     track = measure(cane(1.011e10, 0.00433), Experiment())
     position = change.get("position", 1.0) * track.position[..., change.get("axes", [0, 1, 2])]
-    track = dataclasses.replace(track, time=change.get("time", 1.0) * track.time, position=position)
+    track = dataclasses.replace(track, position=position)
     fit = tune(cane(5.89e9), track, release=change.get("release"))
     assert any(words in fault for fault in fit.faults), fit.faults
+
+
+@pytest.mark.parametrize(("scale", "hertz"), [(1e-3, "34"), (30.0, "0.11")])
+def test_a_wrong_time_is_refused(track: Trajectory, scale: float, hertz: str) -> None:
+    """Seconds named milliseconds, and numbers of pictures named seconds."""
+    with pytest.raises(TrajectoryError, match=f"swings at {hertz}.* Hz, plants at 0.2 to 50 Hz; correct the unit"):
+        tune(cane(), dataclasses.replace(track, time=scale * track.time))
 
 
 def test_a_push_and_a_pull_are_told_apart_by_their_force() -> None:

@@ -353,7 +353,7 @@ def _scale_green(text: str, woody: Any) -> str:
 
 def _rounded(value: float, gap: float) -> str:
     """Returns a number with four digits, or with as many as tell it from a number at the distance ``gap``."""
-    digits = math.ceil(math.log10(abs(value) / gap)) + 1 if value and gap > 0.0 else 4
+    digits = math.floor(math.log10(abs(value))) - math.floor(math.log10(gap)) + 1 if value and gap > 0.0 else 4
     return f"{value:#.{min(max(digits, 4), 9)}g}".rstrip(".")
 
 

@@ -153,6 +153,12 @@ def _columns(parameters: Sequence[str]) -> tuple[str, ...]:
 def _check_track(specimen: Specimen, track: Trajectory, features: Features) -> None:
     """Raise an error for a track that cannot belong to this plant."""
     duration = float(track.time[-1] - features.release)
+    known = plausibility.RANGES["frequency"]
+    if not known.low <= features.frequency <= known.high:
+        raise TrajectoryError(
+            f"{track.source}: swings at {features.frequency:.4g} Hz, plants at {known.low:g} to {known.high:g} Hz; "
+            "correct the unit of the time (s, ms), and give times, not numbers of pictures"
+        )
     shaken = track.base is not None
     if duration * features.frequency < 1.0 and not shaken:
         raise TrajectoryError(
@@ -298,20 +304,14 @@ def _faults(problem: Problem, posterior: Posterior, noise: float, column_noise: 
 
 
 def _disagreements(problem: Problem, posterior: Posterior, swing: Features) -> list[str]:
-    """Returns sentences about a frequency or damping ratio of the track alone that the fitted plant does not have, or
-    that no vine has."""
+    """Returns sentences about a frequency or damping ratio of the track alone that the fitted plant does not
+    have."""
     own = problem.features
     faults = []
     if abs(math.log(swing.frequency / own.frequency)) > FREQUENCIES_AGREE:
         faults.append(
             f"the fitted plant swings at {swing.frequency:.4g} Hz, the track alone at {own.frequency:.4g} Hz: check "
             "the unit of the time, the axes of the columns (z is up), and length, diameters and masses of the plant"
-        )
-    known = plausibility.RANGES["frequency"]
-    if not known.low <= own.frequency <= known.high:
-        faults.append(
-            f"the track swings at {own.frequency:.4g} Hz, plants at {known.low:g} to {known.high:g} Hz: check the "
-            "unit of the time (s, ms); numbers of pictures are no time"
         )
     if "damping" in problem.fitted:
         deviation = float(posterior.deviation[problem.names.index("damping")])
