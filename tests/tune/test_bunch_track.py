@@ -69,7 +69,7 @@ def test_a_recording_of_a_bunch_becomes_a_track_by_the_command_of_the_page(tmp_p
     files = tmp_path / "swing.mcap", [], None, tmp_path / "filmed.csv"
     plant = {"base": (0.0, 0.5, 0.0), "bunch": tmp_path / "bunch.toml"}
     assert track(*files, None, None, None, None, **plant) == 0
-    assert "mm found in 24, the others are gaps" in capsys.readouterr().out
+    assert "mm   found in 24, the others are gaps" in capsys.readouterr().out
     found = read_trajectory(tmp_path / "filmed.csv")
     true = BASE + BELOW * np.stack([np.sin(angles), np.zeros(24), -np.cos(angles)], -1)
     assert 1e3 * np.std(found.position[:, 0, 0] - true[:, 0]) < 0.3

@@ -249,7 +249,9 @@ def test_times_since_1970_keep_their_microseconds(swing: Trajectory, tmp_path: p
 
 def test_balls_and_a_bare_cane_exclude_each_other(tmp_path) -> None:
     rest = (tmp_path / "track.csv", None, None, None, None)
-    with pytest.raises(UsageError, match="give --marker and --radius of coloured balls, or --cane and --base"):
+    with pytest.raises(
+        UsageError, match="give --marker and --radius of coloured balls, or --cane or --bunch and --base"
+    ):
         track_markers(tmp_path, [], None, *rest)
     with pytest.raises(UsageError, match=r"is followed without balls; give --base X Y Z, and no --marker"):
         track_markers(tmp_path, MARKERS, RADIUS, *rest, tmp_path / "cane.toml", (0.0, 0.9, 0.0))
