@@ -414,7 +414,7 @@ def test_faults_of_the_sidecar_name_the_toml_file(toml: str, words: str, tmp_pat
 
 
 def test_a_missing_optional_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vinesim.robot.description.loader.find_installed", lambda path: None)
+    monkeypatch.setattr("vinesim.robot.description.source.find_installed", lambda path: None)
     with pytest.raises(DescriptionError, match=r"tiago_pro: .*pip install 'vinesim\[tiago\]'"):
         load_description("tiago_pro")
 

@@ -13,7 +13,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.robot.description.kinematics import link_anchors
-from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, parse_inertial
+from vinesim.robot.description.urdf import MOVABLE_JOINT_TYPES, Joint, Robot, fix_joint, parse_inertial
 
 MOUNT = "world_mount"
 """New name of a root link ``world``. A robot whose root link has this name is bolted down."""
@@ -35,6 +35,42 @@ LEAST_MOMENT = 1e-12
 """[kg m2] Magnitude up to which a principal moment counts as 0."""
 LEAST_MOMENT_SHARE = 1e-3
 """Share of the largest principal moment to which principal moments with a rounding error are raised."""
+
+
+def drive_the_base(root: etree._Element, notes: list[str], assumed: list[str]) -> None:
+    """Remove the floating or planar joint at the root of a robot, and the link above it (``world``): the base is
+    driven. Floating and planar joints elsewhere become fixed. Adds this to ``notes`` or ``assumed``."""
+    children = {joint.find("child").get("link") for joint in root.iterfind("joint") if joint.find("child") is not None}
+    fixed = []
+    for joint in root.findall("joint"):
+        if joint.get("type") not in ("floating", "planar"):
+            continue
+        parent = joint.find("parent")
+        above = parent.get("link") if parent is not None else None
+        links = [link for link in root.iterfind("link") if link.get("name") == above]
+        beside = [other for other in root.iterfind("joint/parent") if other.get("link") == above]
+        is_bare = bool(links) and not any(links[0].find(tag) is not None for tag in ("visual", "collision", "inertial"))
+        if above not in children and len(beside) == 1 and (is_bare or above == "world"):
+            root.remove(joint)
+            root.remove(links[0])
+            notes.append(f"its base moves on a {joint.get('type')} joint: it is driven in the plane")
+        else:
+            fix_joint(joint)
+            fixed.append(joint.get("name", ""))
+    if fixed:
+        assumed.append(f"{some_names(fixed)} is floating or planar, but not at the root: fixed")
+
+
+def lift_to_ground(root: etree._Element, base: str, height: float, notes: list[str]) -> None:
+    """Add a root link on the ground, ``height`` [m] below the root link ``base``. Adds this to ``notes``."""
+    links = {link.get("name") for link in root.iterfind("link")}
+    name = next(one for one in ("base_footprint", "footprint", "ground_footprint") if one not in links)
+    etree.SubElement(root, "link", name=name)
+    joint = etree.SubElement(root, "joint", name=f"{name}_joint", type="fixed")
+    etree.SubElement(joint, "origin", xyz=f"0 0 {height:.6g}", rpy="0 0 0")
+    etree.SubElement(joint, "parent", link=name)
+    etree.SubElement(joint, "child", link=base)
+    notes.append(f"it stands on the ground, {height:.3g} m below {base!r}, by a new root link {name!r}")
 
 
 def rename_world(root: etree._Element, notes: list[str]) -> None:
