@@ -28,6 +28,10 @@ DEFAULT_SLIDE = 1.0
 """[m] Range to either side of a sliding joint without limits. GUESSED"""
 DEFAULT_SIZE = (640, 480)
 """[px] Size of the picture of a camera without a resolution."""
+BETWEEN_MASS = 1e-3
+"""[kg] Mass of a link between two joints of one body. GUESSED"""
+BETWEEN_RADIUS = 0.05
+"""[m] Radius of gyration of a link between two joints of one body. GUESSED"""
 _BALL = 3
 """Number of hinges that stand for a ball joint."""
 
@@ -133,7 +137,11 @@ class _Conversion:
         for number, (joint, kind, anchor, axis, limit, mimic) in enumerate(joints):
             is_last = number == len(joints) - 1
             link = name if is_last else f"{joint}_link"
-            self.parts.append(Part(link, pose, parent, joint, kind, anchor, axis, limit, mimic))
+            part = Part(link, pose, parent, joint, kind, anchor, axis, limit, mimic)
+            if not is_last:  # a link between two joints of one body, which needs a mass in physics
+                part.mass, part.centre = BETWEEN_MASS, frames.pose(anchor)
+                part.inertia = np.eye(3) * BETWEEN_MASS * BETWEEN_RADIUS**2
+            self.parts.append(part)
             parent = link
         part = self.parts[-1]
         self.link_of[body] = part.name

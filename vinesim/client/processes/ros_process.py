@@ -91,7 +91,7 @@ class RosProcess:
         self._records = StepRecords(name, description, series_stiffness(description.drives))
         config = RosConfig(
             name,
-            description.urdf,
+            description.ros_urdf or description.urdf,
             description.base,
             namespace,
             clock,

@@ -44,11 +44,11 @@ T = TypeVar("T")
 
 
 def make_names_valid(root: etree._Element, assumed: list[str]) -> dict[str, str]:
-    """Replace all names of links and joints of a URDF, and its own, that are not :data:`VALID`. Adds this to
+    """Replace all names of links and moving joints of a URDF, and its own, that are not :data:`VALID`. Adds this to
     ``assumed``. Returns the original name of each replaced one, by its new name."""
     originals: dict[str, str] = {}
     for kind in ("link", "joint"):
-        elements = root.findall(kind)
+        elements = [one for one in root.iterfind(kind) if one.get("type") != "fixed"]  # no topic has their names
         given = [element.get("name", "") for element in elements]
         renamed = valid_names(given, kind)
         for element, name in zip(elements, given, strict=True):

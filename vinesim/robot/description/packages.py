@@ -67,7 +67,7 @@ def find_package(name: str, file: pathlib.Path) -> pathlib.Path | None:
 
 def ros_address(uri: str, found: pathlib.Path) -> str:
     """Returns an address at which other programs on this machine find the file ``found`` by the rules of
-    ``resource_retriever``: ``uri`` itself if it is such an address, else the path with ``file://``."""
+    resource_retriever: ``uri`` itself if it is such an address, else the path with ``file://``."""
     scheme, separator, rest = uri.partition("://")
     if separator and scheme in ("http", "https"):
         return uri

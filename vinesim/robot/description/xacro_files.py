@@ -51,12 +51,12 @@ def expand_xacro(content: bytes, file: pathlib.Path, arguments: Mapping[str, str
     except ImportError:
         return _by_program(content, file, arguments)
 
+    missing: list[str] = []
+
     def find(name: str) -> str:
         folder = find_package(name, file)
         if folder is None:
-            raise description_error(
-                file, f"xacro does not find the package {name!r}", "source its workspace, or put it above the file"
-            )
+            missing.append(name)
         return str(folder)
 
     substitutions = importlib.import_module("xacro.substitution_args")
@@ -68,17 +68,37 @@ def expand_xacro(content: bytes, file: pathlib.Path, arguments: Mapping[str, str
     try:
         with contextlib.redirect_stderr(said):
             xacro.init_stacks(str(file))
-            document = xacro.parse(content)
-            xacro.process_doc(document, mappings=dict(arguments))
+            document = xacro.parse(io.BytesIO(content))
+            xacro.process_doc(document, mappings=_defaults(content, file) | dict(arguments))
             text = document.toxml()
-    except DescriptionError:
-        raise
     except Exception as error:  # its own, and those of Python expressions in the file
+        if missing:
+            raise _no_package(missing[0], file) from error
         reason = " ".join(str(error).split()) or type(error).__name__
         if "undefined substitution argument" in reason.lower() or "not defined" in reason.lower():
             raise description_error(file, f"xacro: {reason}", "give it by --xacro-args NAME:=VALUE") from error
         raise description_error(file, f"xacro: {reason}", "correct the file") from error
+    if missing:
+        raise _no_package(missing[0], file)
     return parse_xml(text.encode(), file)
+
+
+def _no_package(name: str, file: pathlib.Path) -> DescriptionError:
+    return description_error(
+        file, f"xacro does not find the package {name!r}", "source its workspace, or put it above the file"
+    )
+
+
+def _defaults(content: bytes, file: pathlib.Path) -> dict[str, str]:
+    """Returns the default values of a file's own arguments. xacro itself knows them only after the ``<robot>`` element,
+    whose name is often an argument."""
+    found = {}
+    for element in parse_xml(content, file):
+        name = etree.QName(element)
+        default = element.get("default")
+        if name.localname == "arg" and name.namespace and default is not None and "$" not in default:
+            found[element.get("name", "")] = default
+    return found
 
 
 def _by_program(content: bytes, file: pathlib.Path, arguments: Mapping[str, str]) -> etree._Element:
