@@ -128,7 +128,10 @@ def measure(file: pathlib.Path) -> dict[str, Any]:
 
 def _stand(description: Any) -> dict[str, Any]:
     """Returns how far a robot moves in :data:`STANDING` seconds, and how much of it is visible."""
+    from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
+
     from vinesim.rigid.rigid_world import RigidWorld
+    from vinesim.robot.description.extent import bounds
     from vinesim.robot.drives.controlled_robot import Robot
     from vinesim.scene.builder import assemble
 
@@ -157,23 +160,23 @@ def _stand(description: Any) -> dict[str, Any]:
     }
     if not shapes:
         return seen | {"pixels": 0, "visible": False}
-    pixels = _pixels(model, rigid)
+    box = bounds(description, etree.fromstring(description.urdf.encode()))
+    assert box is not None, "a robot with shapes has bounds"
+    pixels = _pixels(model, rigid, box)
     return seen | {"pixels": pixels, "visible": pixels >= LEAST_PIXELS}
 
 
-def _pixels(model: Any, rigid: Any) -> int:
-    """Returns the number of pixels that show the robot, in a picture in which it fits."""
+def _pixels(model: Any, rigid: Any, box: np.ndarray) -> int:
+    """Returns the number of pixels that show the robot, in a picture in which its ``box`` [2, 3] m fits."""
     from vinesim.scene.ids import LABEL_STRIDE, Organ
     from vinesim.scene.values import CameraInfo, CameraOutput
     from vinesim.sensors.camera.camera import Camera, CameraSpec
     from vinesim.sensors.primitives.scene_primitives import Primitives, rest_snapshot
 
     primitives = Primitives(model, grass=0.0)
-    places = rigid.visual_q()
-    primitives.update(rest_snapshot(model, rigid.visuals(), places))
-    low, high = places[:, :3].min(axis=0), places[:, :3].max(axis=0)
-    middle = 0.5 * (low + high)
-    distance = 2.0 * float(np.linalg.norm(high - low)) + 0.6
+    primitives.update(rest_snapshot(model, rigid.visuals(), rigid.visual_q()))
+    middle = box.mean(axis=0)
+    distance = 1.2 * float(np.linalg.norm(box[1] - box[0]))
     ahead = np.array([-1.0, -0.6, -0.4]) / np.linalg.norm([1.0, 0.6, 0.4])
     right = np.cross(ahead, [0.0, 0.0, 1.0])
     right /= np.linalg.norm(right)

@@ -349,6 +349,23 @@ def test_a_default_namespace_and_blank_lines_before_the_declaration_are_read(tmp
     assert etree.fromstring(described.ros_urdf).tag == "robot"
 
 
+def test_a_prefix_of_a_namespace_need_not_be_declared(tmp_path: pathlib.Path) -> None:
+    """As Drake's limits of acceleration, which have no declaration in many files."""
+    text = robot(link("base"), link("arm"), joint("j", "base", "arm", inside='<drake:acceleration value="2"/>'))
+    described = load_description(write(tmp_path / "a.urdf", text.replace("<limit ", '<limit drake:jerk="3" ')))
+    assert described.drives[0].upper == 2.0
+    assert etree.fromstring(described.ros_urdf).find("joint/limit").get("upper") == "2"
+    assert np.isfinite(Yard(described).run(0.1)).all()
+
+
+def test_a_mass_without_an_inertia_has_one(tmp_path: pathlib.Path, caplog: pytest.LogCaptureFixture) -> None:
+    bare = '<link name="camera"><inertial><mass value="0.07"/></inertial></link><link name="empty"><inertial/></link>'
+    fixed = joint("c", "base", "camera", "fixed") + joint("e", "base", "empty", "fixed")
+    described = load_description(write(tmp_path / "a.urdf", robot(link("base"), bare, fixed)))
+    assert "'camera' has no inertia" in warnings_of(caplog)[0]
+    assert np.isfinite(Yard(described).run(0.1)).all()
+
+
 def test_a_robot_is_read_from_a_pipe_and_from_the_standard_input(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -160,6 +160,8 @@ class _Loading:
         assembly = _Assembly(file, toml, sidecar, sensors, groups, self.home, is_remote=self.is_remote)
         made = assembly.description(root)
         box = None if self.is_remote else bounds(made[0], root)
+        if box is None and not self.is_remote:
+            notes.append("it has no shapes: it is invisible, and touches nothing")
         if box is not None:
             if (warning := size_warning(box)) is not None:
                 assumed.append(warning)

@@ -149,9 +149,18 @@ def _compose_mimics(joints: Mapping[str, etree._Element]) -> None:
 
 
 def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
-    """Increase principal moments of inertia that are 0, or negative by a rounding error, to a small positive value."""
+    """Increase principal moments of inertia that are 0, or negative by a rounding error, to a small positive value. Add
+    an inertia where there is only a mass."""
     repaired = []
+    lacking = []
     for link in root.iterfind("link"):
+        given = link.find("inertial")
+        if given is not None and given.find("mass") is None:
+            link.remove(given)
+        elif given is not None and given.find("inertia") is None:
+            mass = float(given.find("mass").get("value", 0.0))
+            _set_inertial(link, mass, np.identity(3) * max(mass, 0.0) * GYRATION_RADIUS**2)
+            lacking.append(link.get("name"))
         inertial = parse_inertial(link.find("inertial"))
         if inertial is None or inertial.inertia is None or not inertial.inertia.any():
             continue
@@ -161,6 +170,8 @@ def repair_inertias(root: etree._Element, assumed: list[str]) -> None:
         raised = np.maximum(moments, LEAST_MOMENT_SHARE * moments[2]) if moments[2] > LEAST_MOMENT else np.zeros(3)
         _set_inertial(link, inertial.mass or 0.0, axes * raised @ axes.T)
         repaired.append(link.get("name"))
+    if lacking:
+        assumed.append(f"{some_names(lacking)} has no inertia: radius of gyration {1e3 * GYRATION_RADIUS:g} mm")
     if repaired:
         assumed.append(f"inertia of {some_names(repaired)} is not positive definite: its smallest moments are raised")
 

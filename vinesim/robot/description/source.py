@@ -10,11 +10,13 @@ import dataclasses
 import pathlib
 import sys
 from collections.abc import Mapping
+from xml.etree import ElementTree
 
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has no type stubs
 
 from vinesim.core import data_files
 from vinesim.rigid.mjcf import MjcfError, urdf_of_mjcf
+from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.packages import find_installed
 from vinesim.robot.description.sdf import urdf_of_sdf
 from vinesim.robot.description.urdf import DescriptionError, description_error, parse_xml
@@ -45,6 +47,17 @@ class RobotSource:
     home: Mapping[str, float]
     """Home positions [rad or m] of joints, where the file gives them."""
     notes: tuple[str, ...] = ()
+
+
+def kept_robot_file(name: str, description: RobotDescription, folder: pathlib.Path) -> str:
+    """Returns a name by which other processes can read the robot called ``name``: itself, or the path of a file in
+    ``folder`` into which a robot that came through a pipe is written."""
+    given = pathlib.Path(name)
+    if name != "-" and (given.is_file() or not given.exists()):
+        return name
+    kept = folder / f"{description.name}.urdf"
+    kept.write_text(description.ros_urdf)
+    return str(kept)
 
 
 def read_source(name: str, arguments: Mapping[str, str]) -> RobotSource:
@@ -93,12 +106,13 @@ def _from_mjcf(content: bytes, file: pathlib.Path) -> RobotSource:
 
 
 def _is_plain(content: bytes) -> bool:
-    """Returns whether the text of a URDF can be given to ROS as it is: UTF-8, without an XML namespace as default."""
+    """Returns whether the text of a URDF can be given to ROS as it is: well-formed XML in UTF-8, without an XML
+    namespace as default."""
     try:
-        head = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
+        text = content.decode("utf-8-sig")
+        return ElementTree.fromstring(text).tag == "robot"
+    except (UnicodeDecodeError, ElementTree.ParseError, LookupError):
         return False
-    return 'xmlns="' not in head and "xmlns='" not in head and "\0" not in head
 
 
 def _read(name: str) -> tuple[pathlib.Path, bytes]:

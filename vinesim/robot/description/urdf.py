@@ -79,21 +79,30 @@ def parse_xml(content: bytes, file: pathlib.Path) -> etree._Element:
     """Returns the root element of the ``content`` of an XML file, without comments and without XML namespaces, except
     that of xacro. Raises :class:`DescriptionError` if it is not XML, or declares a document type.
 
-    A text in another encoding than its declaration says is read as Windows-1252, a superset of Latin-1.
+    A text in another encoding than its declaration says is read as Windows-1252, a superset of Latin-1. Prefixes of
+    namespaces need not be declared.
     """
     content = content.strip() if b"\0" not in content[:64] else content  # not of UTF-16
     try:
-        root = _parse(content, None)
+        root = _parse(content)
     except etree.XMLSyntaxError as error:
-        if "encoding" not in str(error).lower() and "utf-8" not in str(error).lower():
-            raise description_error(file, f"not well-formed XML: {error.msg}", "correct this line") from error
+        says = str(error).lower()
         try:
-            root = _parse(content, "cp1252")
+            if "encoding" in says or "utf-8" in says:
+                root = _parse(content, encoding="cp1252")
+            elif error.code == etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE:
+                root = _parse(content, recover=True)
+            else:
+                raise error
         except etree.XMLSyntaxError as worse:
             raise description_error(file, f"not well-formed XML: {worse.msg}", "correct this line") from worse
     if root.getroottree().docinfo.internalDTD is not None:
         raise description_error(file, "it declares a document type (DTD)", "remove <!DOCTYPE ...>: it is not needed")
     for element in root.iter(etree.Element):
+        if _has_unknown_prefix(element.tag):
+            element.tag = element.tag.replace(":", "_")
+        for key in filter(_has_unknown_prefix, list(element.attrib)):
+            element.set(key.replace(":", "_"), element.attrib.pop(key))
         name = etree.QName(element)
         if name.namespace and not is_of_xacro(name.namespace):
             element.tag = name.localname
@@ -106,9 +115,14 @@ def is_of_xacro(namespace: str) -> bool:
     return namespace.rstrip("/").endswith("xacro")
 
 
-def _parse(content: bytes, encoding: str | None) -> etree._Element:
+def _has_unknown_prefix(name: str) -> bool:
+    """Returns whether the name of an element or attribute has a prefix of a namespace that is not declared."""
+    return ":" in name and not name.startswith("{")
+
+
+def _parse(content: bytes, *, encoding: str | None = None, recover: bool = False) -> etree._Element:
     parser = etree.XMLParser(
-        remove_comments=True, remove_pis=True, resolve_entities=False, encoding=encoding, huge_tree=False
+        remove_comments=True, remove_pis=True, resolve_entities=False, encoding=encoding, recover=recover
     )
     return etree.fromstring(content, parser)
 
