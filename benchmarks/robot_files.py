@@ -70,7 +70,7 @@ def find_robot_files(place: pathlib.Path) -> list[pathlib.Path]:
         head = file.read_bytes()
         if (
             suffix in (".urdf", ".sdf")
-            or (suffix == ".xml" and b"<mujoco" in head and b"<worldbody" in head and b"<joint" in head)
+            or (suffix == ".xml" and b"<mujoco" in head and b"<mujocoinclude" not in head and b"<worldbody" in head and b"<joint" in head)
             or (suffix == ".xacro" and b"<robot" in head and file.name.endswith(".urdf.xacro"))
         ):
             found.append(file)

@@ -78,7 +78,9 @@ def read_source(name: str, arguments: Mapping[str, str]) -> RobotSource:
     if root.tag == "robot":
         text = content.decode("utf-8-sig", errors="replace") if _is_plain(content) else None
         return _named(root, file, text)
-    if root.tag in ("mujoco", "mujocoinclude"):
+    if root.tag == "mujocoinclude":
+        raise description_error(file, "it is a part of a MJCF file", "give the file that includes it")
+    if root.tag == "mujoco":
         return _from_mjcf(content, file)
     if root.tag in ("sdf", "gazebo", "world", "model"):
         found, notes = urdf_of_sdf(root, file)

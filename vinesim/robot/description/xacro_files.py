@@ -60,7 +60,7 @@ def expand_xacro(content: bytes, file: pathlib.Path, arguments: Mapping[str, str
         return str(folder)
 
     substitutions = importlib.import_module("xacro.substitution_args")
-    substitutions._eval_find = find
+    vars(substitutions)["_eval_find"] = find
     for table in vars(substitutions).values():  # the functions that $(eval ...) may call
         if isinstance(table, dict) and "find" in table:
             table["find"] = find
