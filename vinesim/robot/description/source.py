@@ -49,6 +49,11 @@ class RobotSource:
     notes: tuple[str, ...] = ()
 
 
+def is_shipped(name: str) -> bool:
+    """Returns whether ``name`` is that of a robot in ``data/robots`` or of an installed package, and not a path."""
+    return name == "tiago_pro" or name in {file.stem for file in (data_files.data_dir() / "robots").glob("*.urdf")}
+
+
 def kept_robot_file(name: str, description: RobotDescription, folder: pathlib.Path) -> str:
     """Returns a name by which other processes can read the robot called ``name``: itself, or the path of a file in
     ``folder`` into which a robot that came through a pipe is written."""
