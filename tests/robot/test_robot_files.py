@@ -366,6 +366,17 @@ def test_a_mass_without_an_inertia_has_one(tmp_path: pathlib.Path, caplog: pytes
     assert np.isfinite(Yard(described).run(0.1)).all()
 
 
+def test_a_massless_root_before_a_mass_without_inertia_is_simulated(tmp_path: pathlib.Path) -> None:
+    none = MOMENTS.replace("0.1", "0")
+    body = f'<link name="body"><inertial><mass value="4"/><inertia {none}/></inertial></link>'
+    text = robot(
+        '<link name="base"/>', body, joint("f", "base", "body", "fixed"), link("arm"), joint("j", "body", "arm")
+    )
+    described = load_description(write(tmp_path / "a.urdf", text))
+    assert described.mass == pytest.approx(5.0)
+    assert np.isfinite(Yard(described).run(0.1)).all()
+
+
 def test_a_robot_is_read_from_a_pipe_and_from_the_standard_input(
     tmp_path: pathlib.Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -487,6 +498,7 @@ def test_sensors_are_those_of_gazebos_tags(tmp_path: pathlib.Path, caplog: pytes
 <max>12</max></range><noise><stddev>0.02</stddev></noise></lidar></sensor></gazebo>
 <gazebo reference="imu_link"><sensor name="imu" type="imu"><imu><angular_velocity><x><noise>
 <stddev>0.003</stddev></noise></x></angular_velocity></imu></sensor></gazebo>
+<gazebo reference="head_joint"><sensor name="neck" type="force_torque"/></gazebo>
 <gazebo reference="head"><sensor name="gps" type="navsat"/></gazebo>"""
     fixed = "".join(
         f'<link name="{name}"/>{joint(name + "_joint", "base", name, "fixed")}'
@@ -509,6 +521,7 @@ def test_sensors_are_those_of_gazebos_tags(tmp_path: pathlib.Path, caplog: pytes
     assert (lidar.columns, lidar.sector) == (360, pytest.approx((-math.pi / 2, math.pi / 2)))
     assert (described.imus[0].name, described.imus[0].frame) == ("imu", "imu_link")
     assert described.imus[0].angular_velocity_noise == 0.003
+    assert [(one.name, one.frame) for one in described.wrenches] == [("neck", "head")]
     pose = described.link_poses(described.home)[camera.frame]  # it looks along x of its pose, 0.5 rad downwards
     np.testing.assert_allclose(pose[:3], [0.1, 0.0, 0.2], atol=1e-9)
     ahead = frames.rotate(pose[3:], np.array([0.0, 0.0, 1.0]))

@@ -19,8 +19,8 @@ from vinesim.rigid.mujoco_world import CompiledWorld
 from vinesim.rigid.rigid_world import RigidWorld
 from vinesim.robot.description.description import RobotDescription
 from vinesim.robot.description.loader import load_description
-from vinesim.robot.description.source import is_shipped
 from vinesim.robot.description.sidecar import decode_sidecar, encode_sidecar
+from vinesim.robot.description.source import is_shipped
 from vinesim.robot.description.urdf import DescriptionError
 from vinesim.robot.drives.robot_instance import RemoteRobot
 from vinesim.scene.values import HumanSpec, HumanUpdate, RobotSpec, RobotUpdate

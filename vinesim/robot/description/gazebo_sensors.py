@@ -14,7 +14,7 @@ from lxml import etree  # pyright: ignore[reportAttributeAccessIssue] lxml has n
 from vinesim.core import frames
 from vinesim.robot.description.names import valid_names
 from vinesim.robot.description.urdf import parse_origin
-from vinesim.scene.values import CameraMount, ImuMount, LidarMount, RenderedMount
+from vinesim.scene.values import CameraMount, ImuMount, LidarMount, RenderedMount, SensorMount
 
 COLOR_CAMERAS = ("camera", "wideanglecamera", "wide_angle_camera", "multicamera")
 DEPTH_CAMERAS = ("depth", "depth_camera", "rgbd", "rgbd_camera")
@@ -38,12 +38,17 @@ MAX_BEAMS = 128
 
 def read_sensors(
     root: etree._Element, notes: list[str], assumed: list[str]
-) -> tuple[list[RenderedMount], list[ImuMount]]:
-    """Returns cameras and lidars, and inertial sensors, of a URDF. Adds the frames that they need to ``root``, the
-    sensors that were found to ``notes``, and sensors that vinesim does not have to ``assumed``."""
+) -> tuple[list[RenderedMount], list[ImuMount], list[SensorMount]]:
+    """Returns cameras and lidars, inertial sensors, and force-torque sensors of a URDF.
+
+    Adds the frames that they need to ``root``, the sensors that were found to ``notes``, and sensors that vinesim does
+    not have to ``assumed``.
+    """
     links = {link.get("name") for link in root.iterfind("link")}
     rendered: list[RenderedMount] = []
     imus: list[ImuMount] = []
+    wrenches: list[SensorMount] = []
+    child_of = {joint.get("name"): joint.find("child").get("link") for joint in root.iterfind("joint/child/..")}
     unknown: list[str] = []
     taken: set[str] = set()
     found = [
@@ -54,6 +59,8 @@ def read_sensors(
         kind = (
             sensor.get("type") or next((one for one in ("camera", "ray") if sensor.find(one) is not None), "")
         ).lower()
+        if kind == "force_torque":  # of a joint: it measures at the joint's child
+            link = child_of.get(link, link)
         if link not in links:
             unknown.append(f"{kind} of the link {link!r}, which does not exist")
             continue
@@ -65,21 +72,23 @@ def read_sensors(
             rendered.append(_lidar(name, frame, sensor))
         elif kind == "imu":
             imus.append(_imu(name, frame, sensor))
+        elif kind == "force_torque":
+            wrenches.append(SensorMount(name, frame))
         else:
             taken.discard(name)
             unknown.append(f"{kind or 'a sensor'} of the link {link!r}")
-    if rendered or imus:
-        notes.append(f"sensors by Gazebo's tags: {', '.join(one.name for one in (*rendered, *imus))}")
+    if rendered or imus or wrenches:
+        notes.append(f"sensors by Gazebo's tags: {', '.join(one.name for one in (*rendered, *imus, *wrenches))}")
     if unknown:
         more = f" (and {len(unknown) - 1} more)" if len(unknown) > 1 else ""
-        assumed.append(f"no sensor for {unknown[0]}{more}: vinesim has cameras, lidars and IMUs")
-    return rendered, imus
+        assumed.append(f"no sensor for {unknown[0]}{more}: vinesim has cameras, lidars, IMUs and force-torque sensors")
+    return rendered, imus, wrenches
 
 
 def _owner(sensor: etree._Element) -> str | None:
-    """Returns the link of a ``<sensor>`` that is an element of the robot itself."""
+    """Returns the link or joint of a ``<sensor>`` that is an element of the robot itself."""
     parent = sensor.find("parent")
-    return parent.get("link") if parent is not None else None
+    return (parent.get("link") or parent.get("joint")) if parent is not None else None
 
 
 def _free_name(name: str, taken: set[str]) -> str:

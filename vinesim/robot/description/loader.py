@@ -188,7 +188,7 @@ class _Loading:
         """
         if self.is_remote:
             return msgspec.structs.replace(sidecar, imus=sidecar.imus or ()), ()
-        tagged, imus = read_sensors(self.root, self.notes, self.assumed)
+        tagged, imus, wrenches = read_sensors(self.root, self.notes, self.assumed)
         found: list[RenderedMount] = []
         for kind in SENSOR_KINDS:
             given = sidecar.mounts(kind)
@@ -199,6 +199,8 @@ class _Loading:
             found += given
         if sidecar.imus is None:
             sidecar = msgspec.structs.replace(sidecar, imus=tuple(imus) or guess_imus(self.root, self.notes))
+        if not sidecar.wrenches:
+            sidecar = msgspec.structs.replace(sidecar, wrenches=tuple(wrenches))
         return sidecar, tuple(found)
 
     def _read_srdf(self, sidecar: Sidecar, given: pathlib.Path | None) -> etree._Element | None:

@@ -24,6 +24,8 @@ MODEL_PATHS = ("GZ_SIM_RESOURCE_PATH", "IGN_GAZEBO_RESOURCE_PATH", "GAZEBO_MODEL
 """Environment variables with the folders in which Gazebo searches ``model://``."""
 CRAWL_DEPTH = 4
 """Number of levels of folders below an entry of ``ROS_PACKAGE_PATH`` in which packages are searched."""
+RELATIVE_LEVELS = 2
+"""Number of folders above that of the robot file in which a relative path is searched, too."""
 DOWNLOAD_TIMEOUT = 10.0
 """Longest time to wait for a server of a mesh [s]."""
 MAX_DOWNLOAD = 64 << 20
@@ -36,7 +38,7 @@ def find_resource(uri: str, file: pathlib.Path) -> pathlib.Path | None:
     """Returns the file that a robot ``file`` names by ``uri``; None if it is missing.
 
     ``uri`` is ``package://``, ``model://``, ``file://``, ``http://`` or ``https://``, or a path relative to the folder
-    of ``file``. A file on a server is downloaded into the cache.
+    of ``file`` or to one above. A file on a server is downloaded into the cache.
     """
     scheme, separator, rest = uri.partition("://")
     scheme = scheme.lower() if separator else ""
@@ -53,10 +55,11 @@ def find_resource(uri: str, file: pathlib.Path) -> pathlib.Path | None:
                 return found
         return None
     path = uri if not scheme else rest
-    for candidate in dict.fromkeys((path, urllib.parse.unquote(path), path.replace("\\", "/"))):
-        found = file.parent / candidate.removeprefix("localhost")  # file://localhost/... is a form of file:///...
-        if found.is_file():
-            return found.resolve()
+    for above in (file.parent, *file.resolve().parents[1 : 1 + RELATIVE_LEVELS]):
+        for candidate in dict.fromkeys((path, urllib.parse.unquote(path), path.replace("\\", "/"))):
+            found = above / candidate.removeprefix("localhost")  # file://localhost/... is a form of file:///...
+            if found.is_file():
+                return found.resolve()
     return None
 
 

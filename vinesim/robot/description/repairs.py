@@ -185,18 +185,21 @@ def add_missing_masses(root: etree._Element, robot: Robot, base: str, order: lis
     anchors = link_anchors(base, order)
     mass = dict.fromkeys((base, *(joint.child for joint in order if joint.type != "fixed")), 0.0)
     inertia = dict(mass)
+    heaviest: dict[str, tuple[float, str]] = {}
     for link in robot.links:
         if link.inertial is not None:
             anchor = anchors[link.name][0]
             mass[anchor] += link.inertial.mass or 0.0
+            heaviest[anchor] = max(heaviest.get(anchor, (0.0, link.name)), (link.inertial.mass or 0.0, link.name))
             inertia[anchor] += 0.0 if link.inertial.inertia is None else float(np.abs(link.inertial.inertia).max())
     lacking = [link for link in mass if mass[link] == 0.0 or inertia[link] == 0.0]
     elements = {link.get("name"): link for link in root.iterfind("link")}
     for link in lacking:
         own = mass[link] or DEFAULT_MASS
-        existing = parse_inertial(elements[link].find("inertial"))
-        kept = existing.mass if existing is not None and existing.mass else (0.0 if mass[link] else DEFAULT_MASS)
-        _set_inertial(elements[link], kept, np.identity(3) * own * GYRATION_RADIUS**2)
+        holder = heaviest[link][1] if mass[link] else link
+        existing = parse_inertial(elements[holder].find("inertial"))
+        kept = existing.mass if existing is not None and existing.mass else DEFAULT_MASS
+        _set_inertial(elements[holder], kept, np.identity(3) * own * GYRATION_RADIUS**2)
     if lacking:
         assumed.append(
             f"{some_names(lacking)} moves without mass or inertia: {1e3 * DEFAULT_MASS:g} g, "
