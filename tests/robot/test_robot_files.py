@@ -344,8 +344,9 @@ def test_texts_of_any_encoding_are_read(declared: str, encoding: str, tmp_path: 
 
 def test_a_default_namespace_and_blank_lines_before_the_declaration_are_read(tmp_path: pathlib.Path) -> None:
     text = robot(link("base"), link("arm"), joint("j", "base", "arm"), attributes='xmlns="http://www.ros.org"')
-    described = load_description(write(tmp_path / "a.urdf", f'\n\n<?xml version="1.0"?>\n{text}'))
-    assert described.joints == ("j",)
+    for version in ("1.0", "0.0"):
+        described = load_description(write(tmp_path / "a.urdf", f'\n\n<?xml version="{version}"?>\n{text}'))
+        assert described.joints == ("j",)
     assert etree.fromstring(described.ros_urdf).tag == "robot"
 
 

@@ -88,7 +88,9 @@ def parse_xml(content: bytes, file: pathlib.Path) -> etree._Element:
     except etree.XMLSyntaxError as error:
         says = str(error).lower()
         try:
-            if "encoding" in says or "utf-8" in says:
+            if error.code == etree.ErrorTypes.ERR_UNKNOWN_VERSION:
+                root = _parse(re.sub(rb"<\?xml[^>]*\?>", b"", content, count=1))
+            elif "encoding" in says or "utf-8" in says:
                 root = _parse(content, encoding="cp1252")
             elif error.code == etree.ErrorTypes.NS_ERR_UNDEFINED_NAMESPACE:
                 root = _parse(content, recover=True)
