@@ -1,4 +1,4 @@
-"""Robot files as people have them: formats, encodings, names, packages, meshes, sensors and groups."""
+"""Robot files as people have them: formats, encodings, names, packages, meshes, sensors and groups (docs/robots.md)."""
 
 from __future__ import annotations
 
