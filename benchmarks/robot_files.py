@@ -59,7 +59,8 @@ def robot_files(folders: Sequence[str]) -> Iterator[Measurement]:
 
 def find_robot_files(place: pathlib.Path) -> list[pathlib.Path]:
     """Returns the robot files at a place: itself, or those below a folder. Files of MJCF and xacro that are parts of
-    others are left out: those without bodies, and those whose name has the word ``macro`` or that lack a name."""
+    others are left out: those of MJCF without bodies or joints, and those of xacro whose name does not end with
+    ``.urdf.xacro``."""
     if place.is_file():
         return [place]
     found = []
@@ -67,11 +68,13 @@ def find_robot_files(place: pathlib.Path) -> list[pathlib.Path]:
         suffix = file.suffix.lower()
         if not file.is_file() or suffix not in (".urdf", ".sdf", ".xacro", ".xml"):
             continue
-        head = file.read_bytes()
+        content = file.read_bytes()
+        is_mjcf = b"<mujoco" in content and b"<mujocoinclude" not in content
+        is_robot = is_mjcf and b"<worldbody" in content and b"<joint" in content
         if (
             suffix in (".urdf", ".sdf")
-            or (suffix == ".xml" and b"<mujoco" in head and b"<mujocoinclude" not in head and b"<worldbody" in head and b"<joint" in head)
-            or (suffix == ".xacro" and b"<robot" in head and file.name.endswith(".urdf.xacro"))
+            or (suffix == ".xml" and is_robot)
+            or (suffix == ".xacro" and b"<robot" in content and file.name.endswith(".urdf.xacro"))
         ):
             found.append(file)
     return found
