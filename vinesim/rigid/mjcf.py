@@ -46,6 +46,8 @@ def urdf_of_mjcf(file: pathlib.Path, content: bytes) -> tuple[str, dict[str, flo
 
     Raises :class:`MjcfError` if MuJoCo cannot compile it or there is no robot.
     """
+    said: list[str] = []
+    mujoco.set_mju_user_warning(said.append)  # otherwise MuJoCo writes a log into the working folder
     try:
         if file.suffix.lower() == ".mjb":
             m = mujoco.MjModel.from_binary_path(str(file))
@@ -55,7 +57,10 @@ def urdf_of_mjcf(file: pathlib.Path, content: bytes) -> tuple[str, dict[str, flo
             m = mujoco.MjModel.from_xml_string(content.decode("utf-8-sig"))
     except (ValueError, UnicodeDecodeError) as error:
         raise MjcfError(f"MuJoCo cannot read it: {' '.join(str(error).split())}") from error
-    return _Conversion(m, file.stem).result()
+    finally:
+        mujoco.set_mju_user_warning(None)
+    urdf, home, notes = _Conversion(m, file.stem).result()
+    return urdf, home, (*notes, *(f"MuJoCo: {' '.join(text.split())}" for text in said))
 
 
 class _Conversion:
