@@ -122,7 +122,8 @@ def write_bag(
             if millimetres:
                 data = np.round(1e3 * depth).astype("<u2").tobytes()
                 far = Image(height=height, width=width, encoding="16UC1", step=2 * width, data=data)
-            stamp(info, t), stamp(image, t), stamp(far, t + late)
+            for message, when in ((info, t), (image, t), (far, t + late)):
+                stamp(message, when)
             put("color/camera_info", info, t)
             put("color/image_raw", image, t)
             put("depth/image_raw", far, t + 0.05)  # it arrives after the next colours

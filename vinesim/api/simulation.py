@@ -295,7 +295,7 @@ class Simulation:
         *,
         name: str = "",
     ) -> Robot:
-        """Add a robot, given by a name from ``data/robots`` or the path of a URDF file.
+        """Add a robot, given by a name from ``data/robots`` or the path of a URDF, xacro, SDF or MJCF file.
 
         Args:
             robot: name or path; :class:`~vinesim.robot.description.urdf.DescriptionError` if it cannot be used.
