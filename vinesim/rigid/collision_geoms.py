@@ -12,9 +12,9 @@ import numpy as np
 from vinesim.core.warp_arrays import SharedArrays
 from vinesim.kernels.contact import structs
 
-_PLANE, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
+_PLANE, _HEIGHT_FIELD, _SPHERE, _CAPSULE, _CYLINDER, _BOX, _MESH = (
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))  # int: NumPy compares with MuJoCo's enum entry by entry
-    for name in ("PLANE", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
+    for name in ("PLANE", "HFIELD", "SPHERE", "CAPSULE", "CYLINDER", "BOX", "MESH")
 )
 PLANE_HALF_SIZE = 1e6
 """Half edge [m] of the bounding box of the ground plane."""
@@ -29,15 +29,15 @@ class RigidGeoms:
     body: np.ndarray
     """[geom] index of the geom's MuJoCo body."""
     kind: np.ndarray
-    """[geom] MuJoCo's type: 0 plane, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
+    """[geom] MuJoCo's type: 0 plane, 1 height field, 2 sphere, 3 capsule, 4 ellipsoid, 5 cylinder, 6 box, 7 mesh. A flat mesh is
     replaced by its bounding box."""
     hull: np.ndarray
     """[geom] index of the convex hull in :func:`hull_arrays`; -1 if the geom has none."""
     size: np.ndarray
     """[geom, 3] size as in MuJoCo's ``geom_size``; for a mesh, half edges of its bounding box."""
     half: np.ndarray
-    """[geom, 3] m, half edges of the bounding box in the geom's axes. A plane has :data:`PLANE_HALF_SIZE` along x and
-    y, and 0 along z.
+    """[geom, 3] m, half edges of the bounding box in the geom's axes. A plane and a height field have
+    :data:`PLANE_HALF_SIZE` along x and y, and 0 along z.
     """
     center: np.ndarray
     """[geom, 3] m, centre of the shape in the geom's frame (not zero for meshes)."""
@@ -73,8 +73,12 @@ def colliding(m: mujoco.MjModel, geoms: RigidGeoms) -> RigidGeoms:
 
 
 def static_geoms(m: mujoco.MjModel) -> RigidGeoms:
-    """Returns the geoms of ground, trellis and old wood, which are MuJoCo's first geoms, whichever actors exist."""
-    ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0))
+    """Returns the geoms of ground, trellis and old wood, which are MuJoCo's first geoms, whichever actors exist.
+
+    On uneven ground the plane that catches objects beyond MuJoCo's height field is not among them.
+    """
+    is_ground = (m.geom_type == _PLANE) & (m.nhfield > 0)
+    ids = np.flatnonzero((m.geom_bodyid == 0) & (m.geom_contype != 0) & ~is_ground)
     return _of(m, ids, [("world", m.geom(g).name) for g in ids.tolist()])
 
 
@@ -96,7 +100,7 @@ def _of(m: mujoco.MjModel, ids: np.ndarray, names: list[tuple[str, str]]) -> Rig
     half[round_] = size[round_, :1] + size[round_, 1:2] * [0.0, 0.0, 1.0]
     cylinder = kind == _CYLINDER
     half[cylinder] = size[cylinder][:, [0, 0, 1]]
-    plane = kind == _PLANE
+    plane = (kind == _PLANE) | (kind == _HEIGHT_FIELD)
     half[plane] = (PLANE_HALF_SIZE, PLANE_HALF_SIZE, 0.0)
     radius[plane] = np.inf
     return RigidGeoms(
