@@ -245,9 +245,8 @@ class MujocoWorld:
             free_bunch.disable_collision(mj_model, slot)
         for slot, body in bunches.values():
             free_bunch.activate(mj_model, slot, body, self._derive(body))
-        return CompiledWorld(
-            robots, humans, boxes, slots, mj_model, WorldNames.of(mj_model), bunches, hull_arrays(mj_model)
-        )
+        hulls = hull_arrays(mj_model, self.model.terrain)
+        return CompiledWorld(robots, humans, boxes, slots, mj_model, WorldNames.of(mj_model), bunches, hulls)
 
     def _derive(self, body: FreeBunch) -> mujoco.MjModel:
         """Returns MuJoCo's constants of a free bunch, computed once; ``ValueError`` if it has too many shapes or
@@ -297,7 +296,7 @@ class MujocoWorld:
             for hand in human.hands:
                 self._restore_grasp(hand)
         if before is None:
-            self.static_geoms = collision_geoms.static_geoms(m)
+            self.static_geoms = collision_geoms.static_geoms(m, self.model.terrain)
         self._update_tables()
 
     def _restore_grasp(self, hand: HandBody) -> None:
