@@ -71,7 +71,7 @@ class Client:
         self.scene: Scene = scene if isinstance(scene, Scene) else load_scene(scene)
         self.model: Model = generate(self.scene)
         described = load_description(robot)
-        place = start_pose(self.scene, spawn) if pose is None else base_pose(pose)
+        place = start_pose(self.scene, spawn) if pose is None else base_pose(pose, self.model.terrain)
         self._is_shared = connect is not None
         self._stack = contextlib.ExitStack()
         with contextlib.ExitStack() as stack:

@@ -41,9 +41,9 @@ def run(options: ClientOptions) -> int:
             with writing(options.out):
                 options.out.mkdir(parents=True, exist_ok=True)
         start = start_pose(session.scene, session.spawn)
-        human = ScriptedHuman(start, options.height)
+        human = ScriptedHuman(start, options.height, terrain=session.model.terrain)
         if options.is_for_page:
-            human = TrackedHuman(start, options.height, gestures=gestures)
+            human = TrackedHuman(start, options.height, gestures=gestures, terrain=session.model.terrain)
         client = Client(
             session.scene,
             session.model,

@@ -42,8 +42,6 @@ class Viewpoint:
                 raise UsageError(f"{self.place} has the {name} {point.tolist()}; give x, y, z in metres")
         if np.linalg.norm(self.target - self.eye) < 1e-6:
             raise UsageError(f"{self.place} looks at the position of the camera; give another point")
-        if self.eye[2] <= 0.0:
-            raise UsageError(f"{self.place} is below the ground; give a height above 0")
 
 
 def run(
@@ -101,6 +99,7 @@ def run(
     primitives = Primitives(model, device=device)
     primitives.update(view)
     for viewpoint in viewpoints:
+        _check_above_ground(model, viewpoint)
         _check_not_enclosed(primitives, viewpoint)
     stage = _Stage(plan, model, staged, view, primitives, RayCaster(primitives), spec, info, time, mounts)
     try:
@@ -210,6 +209,15 @@ class _Stage:
             f"{len(in_sight)} bunches, {sum(t.berries_seen for t in in_sight)} of "
             f"{sum(t.berries for t in in_sight)} berries and {sum(t.cut_seen for t in in_sight)} cut points in sight"
         )
+
+
+def _check_above_ground(model: Model, viewpoint: Viewpoint) -> None:
+    """Raise :class:`UsageError` if the camera is not above the ground."""
+    from vinesim.scene.terrain import ground_height
+
+    ground = float(ground_height(model.terrain, *viewpoint.eye[:2]))
+    if viewpoint.eye[2] <= ground:
+        raise UsageError(f"{viewpoint.place} is below the ground; give a height above {ground:.4g}")
 
 
 def _check_not_enclosed(primitives: Primitives, viewpoint: Viewpoint) -> None:

@@ -26,7 +26,7 @@ def run(options: ClientOptions) -> int:
             session.model,
             None,
             session.bus(session.name),
-            pose=standing_view(*pose),
+            pose=standing_view(*pose, session.model.terrain),
             **session.client_options(),
         )
         pictures = None

@@ -138,6 +138,20 @@ def tilt(yaw: float, along: float, across: float) -> np.ndarray:
     return frames.multiply(frames.from_yaw(yaw), frames.from_matrix(axes.T))
 
 
+def on_ground(terrain: Terrain | None, pose: np.ndarray) -> np.ndarray:
+    """Returns an upright pose [7] higher by the height of the ground at its x and y."""
+    if terrain is None:
+        return pose
+    raised = np.array(pose, float)
+    raised[2] += terrain.height(raised[0], raised[1])
+    return raised
+
+
+def above_ground(terrain: Terrain | None, points: np.ndarray) -> np.ndarray:
+    """Returns the heights [...] m of ``points`` [..., 3] m above the ground."""
+    return points[..., 2] if terrain is None else points[..., 2] - terrain.height(points[..., 0], points[..., 1])
+
+
 def ground_height(terrain: Terrain | None, x: np.ndarray | float, y: np.ndarray | float) -> np.ndarray:
     """Returns the height [...] m of the ground at ``x``, ``y`` [...] m; 0 without terrain."""
     if terrain is None:
