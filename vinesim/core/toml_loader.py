@@ -102,6 +102,8 @@ def _step_in(kind: Any, steps: list[Any]) -> Any:
             at = at.item_types[step]
         else:
             at = at.item_type
+        if isinstance(at, msgspec.inspect.UnionType):  # an optional table
+            at = next((one for one in at.types if isinstance(one, msgspec.inspect.StructType)), at)
     return at
 
 
