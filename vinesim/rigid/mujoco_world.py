@@ -19,6 +19,7 @@ from vinesim.rigid import collision_geoms, free_bunch, recompile, static_world
 from vinesim.rigid.collision_geoms import hull_arrays
 from vinesim.rigid.effective_mass import EffectiveMass
 from vinesim.rigid.free_bunch import FreeBunch
+from vinesim.rigid.ground_contacts import GroundContacts
 from vinesim.rigid.human_body import HandBody, HumanBody, HumanError
 from vinesim.rigid.human_posture import BODY_PARTS, SIDES, VISUAL_PARTS
 from vinesim.rigid.mujoco_contacts import PairFriction, SoftWires, SpeculativeContacts
@@ -99,6 +100,7 @@ class MujocoWorld:
         self._pair_friction = PairFriction(parameters)
         self._speculative_contacts = SpeculativeContacts()
         self._soft_wires: SoftWires | None = None
+        self._ground_contacts = None if model.terrain is None else GroundContacts(model.terrain)
         _log_mujoco_warnings()
         self._recompile()
 
@@ -344,6 +346,8 @@ class MujocoWorld:
     def _update_geoms(self) -> None:
         """Update the list of colliding geoms after a hand closed or opened, and increment :attr:`generation`."""
         self.generation += 1
+        if self._ground_contacts is not None:
+            self._ground_contacts.use_world()
         self.geoms = collision_geoms.colliding(self.mj_model, self._owned_geoms)
 
 

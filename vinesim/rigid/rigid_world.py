@@ -209,6 +209,8 @@ class RigidWorld(MujocoWorld):
             self._soft_wires.place_geoms(m, d)
         # qfrc_applied still holds the forces of the last step, so a force on a sleeping box wakes it now
         mujoco.mj_step1(m, d)
+        if self._ground_contacts is not None:
+            self._ground_contacts.apply(m, d)
         if self._passing_bunches:
             self._end_passing()
         self._pair_friction.apply(m, d)
