@@ -330,6 +330,7 @@ def shade_pixels(
                 u = float(0.0)
                 v = float(0.0)
                 depth = float(0.0)
+                nearness = float(0.0)
                 share = float(0.0)
                 for k in range(c, corners):
                     x = left + (k & half)
@@ -340,11 +341,14 @@ def shade_pixels(
                             u += float(x)
                             v += float(y)
                             depth += float(keys[pixel] >> wp.int64(32))
+                            nearness += 1.0e6 / wp.max(float(keys[pixel] >> wp.int64(32)), 1.0)
                             share += 1.0
                 per = 1.0 / share
                 ray = back * wp.vec3((u * per - lens.cx) / lens.fx, (v * per - lens.cy) / lens.fy, 1.0)
                 z = depth * per * 1.0e-6
-                if i == -2 and not is_uneven(materials.ground):
+                if i == -2 and is_uneven(materials.ground):
+                    z = share / nearness  # on a plane 1 / z is linear in the picture
+                elif i == -2:
                     z = -lens.eye[2] / ray[2]
                 colour = wp.vec3(0.0, 0.0, 0.0)
                 if i == -1:
