@@ -60,15 +60,30 @@ class GroundFollower:
         self._stiffness = np.zeros(3)
         """[3] N/m, N m/rad, N m/rad."""
         self._damping = np.zeros(3)
+        self._weight = 0.0
+        """[N] Weight of the robot."""
+        self._drive = np.zeros((0, 2))
+        """MuJoCo's force range [2, 2] N of the base's servos along x and y."""
+        self._traction = 0.0
+        """[N] Largest force of the tracks."""
 
-    def find_indices(self, m: mujoco.MjModel, names: recompile.WorldNames, robot: str) -> None:
-        """Look up the MuJoCo indices of the joints in a recompiled world, and set the gains of their servos."""
+    def find_indices(
+        self, m: mujoco.MjModel, names: recompile.WorldNames, robot: str, drives: np.ndarray, traction: float
+    ) -> None:
+        """Look up the MuJoCo indices of the joints in a recompiled world, and set the gains of their servos.
+
+        ``drives`` [2]: actuators of the base along x and y; ``traction``: largest force of the tracks [N].
+        """
         joints = [names.joint[f"{robot}:{axis}"] for axis in AXES]
         self._q = m.jnt_qposadr[joints].astype(int)
         self._v = m.jnt_dofadr[joints].astype(int)
         self._actuator = np.array([names.actuator[f"{robot}:{axis}"] for axis in AXES], int)
         rate = 2.0 * np.pi * FREQUENCY
-        inertia = m.body_subtreemass[names.body[robot]] * np.array([1.0, GYRATION_RADIUS**2, GYRATION_RADIUS**2])
+        mass = float(m.body_subtreemass[names.body[robot]])
+        self._weight = -mass * float(m.opt.gravity[2])
+        self._drive = m.actuator_forcerange[drives[0] : drives[1] + 1]
+        self._traction = traction
+        inertia = mass * np.array([1.0, GYRATION_RADIUS**2, GYRATION_RADIUS**2])
         self._stiffness = inertia * rate * rate
         self._damping = 2.0 * inertia * rate
         m.actuator_biasprm[self._actuator, 1] = -self._stiffness
@@ -93,6 +108,14 @@ class GroundFollower:
         their rates."""
         now, then = self.standing(np.stack([base, base + dt * velocity]))
         d.ctrl[self._actuator] = self._stiffness * then + self._damping * (then - now) / dt
+        # MuJoCo's robots are weightless (gravcomp); the tracks have to carry what pulls the robot downhill
+        _, along, across = self.terrain.fit_plane(*base, self.footprint).tolist()
+        c = math.cos(base[2])
+        s = math.sin(base[2])
+        level = 1.0 / math.sqrt(1.0 + along * along + across * across)  # cosine of the incline
+        pull = -self._weight * level * level
+        downhill = np.array([[pull * (c * along - s * across)], [pull * (s * along + c * across)]])
+        self._drive[:] = downhill + level * np.array([-self._traction, self._traction])
 
     def level_velocity(self, d: mujoco.MjData, velocity: np.ndarray) -> tuple[float, float, float]:
         """Returns the rates of the horizontal position [m/s], in axes with the base's yaw, and of the yaw [rad/s].

@@ -183,7 +183,7 @@ class RobotBody:
         mine = name + "/"
         self.bodies = {n.removeprefix(mine): i for i, n in enumerate(names.bodies) if n.startswith(mine)}
         if self.follower is not None:
-            self.follower.find_indices(m, names, name)
+            self.follower.find_indices(m, names, name, self.base_actuator[:2], self.spec.base_effort[0])
         self._set_gains(m)
         self._controls_of = None
 
