@@ -141,6 +141,19 @@ def test_a_box_falls_onto_rough_ground_and_comes_to_rest_on_it() -> None:
     assert np.linalg.norm(rigid.visual_q()[0, :3] - rest[:3]) < 1e-3
 
 
+def test_contacts_that_are_not_used_have_no_rows() -> None:
+    """The solver of contacts with plants reads the rows of all contacts."""
+    rigid, _ = box_on(0.25, 0.8)
+    step(rigid, 5)
+    contact, rows = rigid.mj_data.contact, rigid.mj_data.nefc
+    used = contact.exclude == 0
+    assert 3 <= used.sum() <= 9
+    assert used.sum() < len(contact.exclude)
+    assert (contact.efc_address[~used] == -1).all()
+    assert (contact.efc_address[used] < rows).all()
+    assert rigid.penetrations() == [] or max(depth for *_, depth in rigid.penetrations()) < 2e-3
+
+
 def test_beyond_the_grid_a_box_is_caught() -> None:
     terrain = incline(0.1, nodes=21)
     model = bare(terrain, boxes=1)

@@ -58,6 +58,7 @@ class GroundContacts:
         point, normal, gap, owner = self._touching(m, d, np.unique(geom))
         contact.exclude[ours] = 1
         contact.dist[ours] = APART
+        contact.efc_address[ours] = -1
         for one in np.unique(geom).tolist():
             slots = ours[geom == one]
             found = np.flatnonzero(owner == one)
